@@ -1,0 +1,52 @@
+# Everything runs in .venv, which the first target that needs it builds from requirements.lock.
+#   make figures DATA=bandai PROFILE=laptop
+#   make test F3AMD_PYTHON=python3.12
+
+DATA ?= synthetic
+PROFILE ?= laptop
+LAB_OPTIONS ?=
+PYTEST_OPTIONS ?=
+
+SHELL := /bin/bash
+PYTHON := .venv/bin/python
+INSTALLED := .venv/installed
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+
+export F3AMD_PYTHON
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install figures smoke test lint lab clean
+
+help: ## Show this list
+	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
+	@awk -F ': .*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@echo "Settings: DATA=synthetic|bandai|100style|folder  PROFILE=smoke|laptop|gpu"
+	@echo "          F3AMD_PYTHON=python3.12   F3AMD_DATA_DIR=folder or zip with the motion data"
+
+$(INSTALLED): requirements.lock pyproject.toml scripts/bootstrap.sh
+	@bash scripts/bootstrap.sh
+
+install: $(INSTALLED) ## Build .venv and nothing else
+
+figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DATA/PROFILE
+	$(PYTHON) -m f3amd_lib.reproduce --data $(DATA) --profile $(PROFILE)
+
+smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
+	$(PYTHON) -m f3amd_lib.reproduce --data $(DATA) --profile smoke
+
+# Tests run on the CPU, and their results go nowhere near paper_figures/.
+test: lint ## Lint, run the tests and check the notebooks' committed outputs
+	env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest tests $(NOTEBOOKS) \
+	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 --durations=10 $(PYTEST_OPTIONS)
+
+lint: $(INSTALLED) ## Check .py and .ipynb files with ruff
+	$(PYTHON) -m ruff check .
+
+lab: $(INSTALLED) ## Open the notebooks in JupyterLab
+	$(PYTHON) -m jupyterlab --notebook-dir=notebooks $(LAB_OPTIONS)
+
+clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
+	rm -rf build dist .pytest_cache .ruff_cache .coverage ./*.egg-info
+	find . \( -path ./.venv -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
+	  -prune -o -type d \( -name __pycache__ -o -name .pytest_cache \) -exec rm -rf {} +

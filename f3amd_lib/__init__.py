@@ -1,0 +1,12 @@
+"""A readable companion to F3AMD, fast FiLM-conditioned Fourier autoregressive motion diffusion.
+
+The library takes the paper's road from end to end: motion capture comes in as BVH, a denoiser made
+of Fourier neural operators is trained on windows of it, an autoregressive rollout walks characters
+of a chosen style along a chosen path, and tables and figures come out with a record of how they
+were made. Rooms stand on each other in one direction: `motion`, `diffusion` and `models` know
+nothing of one another; `data` builds on motion; `training` and `evaluation` bring them together;
+`report` writes results down. Importing the package imports none of its rooms, so that looking at a
+BVH file does not start JAX.
+"""
+
+__version__ = "0.1.0"

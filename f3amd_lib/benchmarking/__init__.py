@@ -1,0 +1,1 @@
+"""Timing and the hardware it was done on; nothing here speaks about quality."""

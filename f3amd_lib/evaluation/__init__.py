@@ -1,0 +1,1 @@
+"""Root paths, autoregressive rollout and the measures of motion quality."""

@@ -1,0 +1,1 @@
+"""Rotations, skeletons, BVH files and the synthetic walker: motion without any learning."""

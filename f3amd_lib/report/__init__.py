@@ -1,0 +1,1 @@
+"""Run records, tables, figures and moving pictures: how results are written down."""
