@@ -1,0 +1,182 @@
+"""Rotations: 6D, matrices and Euler angles, facing and yaw.
+
+Every function takes numpy or JAX arrays and answers in kind, so that the same few lines serve the
+data pipeline (numpy) and the losses (JAX). Matrices act on column vectors. +Y is up; a character
+with yaw 0 faces +Z, a positive yaw is a turn to its left (towards +X).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+__all__ = [
+    "array_module",
+    "matrix_from_euler",
+    "euler_from_matrix",
+    "matrix_from_rotation_6d",
+    "rotation_6d_from_matrix",
+    "matrix_from_yaw",
+    "rotation_6d_from_yaw",
+    "yaw_from_direction",
+    "yaw_from_rotation_6d",
+    "wrap_angle",
+    "slerp_matrices",
+]
+
+
+def array_module(*arrays):
+    """Return `jax.numpy` if any argument is a JAX array (or tracer), else `numpy`."""
+    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+
+
+def rotation_6d_from_matrix(matrix):
+    """Keep the first two columns of a rotation matrix, one after the other.
+
+    Args:
+      matrix: rotation matrices, [..., 3, 3].
+
+    Returns:
+      6D rotations, [..., 6]: (R00 R10 R20 R01 R11 R21).
+
+    Source: paper section 3.2; Zhou et al. 2019, section 4 (columns, not rows).
+    """
+    xp = array_module(matrix)
+    return xp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
+
+
+def matrix_from_rotation_6d(rotation_6d, eps: float = 1e-8):
+    """Turn any six numbers into a rotation matrix by Gram-Schmidt.
+
+    Args:
+      rotation_6d: [..., 6], first column then second column; need not be orthonormal.
+      eps: added under the root, so that gradients stay finite at zero length.
+
+    Returns:
+      Rotation matrices, [..., 3, 3], determinant +1.
+
+    Source: paper section 3.2; Zhou et al. 2019, Eq. 15.
+    """
+    xp = array_module(rotation_6d)
+    first, second = rotation_6d[..., 0:3], rotation_6d[..., 3:6]
+
+    def unit(vector):
+        return vector / xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True) + eps * eps)
+
+    column_x = unit(first)
+    column_y = unit(second - xp.sum(column_x * second, axis=-1, keepdims=True) * column_x)
+    column_z = xp.cross(column_x, column_y)
+    return xp.stack([column_x, column_y, column_z], axis=-1)
+
+
+def matrix_from_yaw(yaw):
+    """Return the rotation about +Y that turns +Z to (sin yaw, 0, cos yaw).
+
+    Args:
+      yaw: radians, [...].
+
+    Returns:
+      Rotation matrices, [..., 3, 3].
+    """
+    xp = array_module(yaw)
+    cosine, sine = xp.cos(yaw), xp.sin(yaw)
+    zero, one = xp.zeros_like(cosine), xp.ones_like(cosine)
+    rows = [
+        xp.stack([cosine, zero, sine], axis=-1),
+        xp.stack([zero, one, zero], axis=-1),
+        xp.stack([-sine, zero, cosine], axis=-1),
+    ]
+    return xp.stack(rows, axis=-2)
+
+
+def rotation_6d_from_yaw(yaw):
+    """Return the 6D form of a yaw angle, the path's facing signal (paper section 3.3).
+
+    Args:
+      yaw: radians, [...].
+
+    Returns:
+      6D rotations, [..., 6].
+    """
+    return rotation_6d_from_matrix(matrix_from_yaw(yaw))
+
+
+def yaw_from_rotation_6d(rotation_6d):
+    """Return the yaw of a rotation about +Y given in 6D form, radians, [...]."""
+    xp = array_module(rotation_6d)
+    return xp.arctan2(-rotation_6d[..., 2], rotation_6d[..., 0])
+
+
+def yaw_from_direction(direction):
+    """Return the yaw of a direction on the ground plane.
+
+    Args:
+      direction: vectors [..., 3]; the height is ignored.
+
+    Returns:
+      Yaw in radians, [...], 0 for +Z and +pi/2 for +X.
+    """
+    xp = array_module(direction)
+    return xp.arctan2(direction[..., 0], direction[..., 2])
+
+
+def wrap_angle(angle):
+    """Map angles to [-pi, pi), radians, any shape."""
+    xp = array_module(angle)
+    return xp.mod(angle + xp.pi, 2.0 * xp.pi) - xp.pi
+
+
+def matrix_from_euler(order: str, degrees: np.ndarray) -> np.ndarray:
+    """Turn intrinsic Euler angles into matrices (numpy only).
+
+    Args:
+      order: axes in the order in which a BVH file lists them, such as "ZXY"; R = Rz Rx Ry.
+      degrees: [..., len(order)].
+
+    Returns:
+      Rotation matrices, [..., 3, 3], float64.
+
+    Raises:
+      ValueError: if the order is not made of X, Y, Z.
+    """
+    if not order or set(order) - set("XYZ"):
+        raise ValueError(f"Euler order {order!r} must be made of the letters X, Y, Z")
+    degrees = np.asarray(degrees, dtype=np.float64)
+    flat = degrees.reshape(-1, len(order))
+    matrices = Rotation.from_euler(order, flat, degrees=True).as_matrix()
+    return matrices.reshape(*degrees.shape[:-1], 3, 3)
+
+
+def euler_from_matrix(order: str, matrix: np.ndarray) -> np.ndarray:
+    """Turn matrices into intrinsic Euler angles in degrees (numpy only).
+
+    Args:
+      order: three axes, such as "ZXY" for R = Rz Rx Ry.
+      matrix: [..., 3, 3].
+
+    Returns:
+      Degrees, [..., 3]. At gimbal lock one of the many equal answers is given.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    rotation = Rotation.from_matrix(matrix.reshape(-1, 3, 3))
+    return rotation.as_euler(order, degrees=True).reshape(*matrix.shape[:-2], 3)
+
+
+def slerp_matrices(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Interpolate rotations along the shortest arc (numpy only).
+
+    Args:
+      first, second: rotation matrices, [..., 3, 3].
+      weight: 0 gives `first`, 1 gives `second`; broadcast against [...].
+
+    Returns:
+      Rotation matrices, [..., 3, 3].
+    """
+    first, second = np.broadcast_arrays(np.asarray(first, float), np.asarray(second, float))
+    shape = first.shape[:-2]
+    start = Rotation.from_matrix(first.reshape(-1, 3, 3))
+    step = (start.inv() * Rotation.from_matrix(second.reshape(-1, 3, 3))).as_rotvec()
+    amount = np.broadcast_to(np.asarray(weight, float), shape).reshape(-1, 1)
+    return (start * Rotation.from_rotvec(amount * step)).as_matrix().reshape(*shape, 3, 3)

@@ -1,0 +1,436 @@
+"""Skeletons and motions: forward kinematics, facing, contacts, mirroring, resampling.
+
+A `Skeleton` is a tree of joints with fixed bones; a `Motion` is a root path plus local rotations
+on it. Units are metres, frames per second and radians; +Y is up and the character's left is +X
+when it faces +Z. The root's rotation is global.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from f3amd_lib.motion.rotations import (
+    array_module,
+    matrix_from_yaw,
+    slerp_matrices,
+    yaw_from_direction,
+)
+
+__all__ = [
+    "Skeleton",
+    "Motion",
+    "forward_kinematics",
+    "global_rotations",
+    "facing_yaw",
+    "contact_labels",
+    "mirror",
+    "resample",
+    "turn",
+    "CONTACT_SPEED",
+]
+
+CONTACT_SPEED = 0.01
+"""A toe that moves less than this, metres in a frame at 30 fps, is in contact (CAMDM's rule)."""
+
+# What the conventions at hand call the joints we must find. First match wins.
+_ROLE_NAMES = {
+    "left_hip": ("UpperLeg_L", "LeftHip", "LeftUpLeg", "mixamorig:LeftUpLeg"),
+    "right_hip": ("UpperLeg_R", "RightHip", "RightUpLeg", "mixamorig:RightUpLeg"),
+    "left_toe": ("Toes_L", "LeftToe", "LeftToeBase", "mixamorig:LeftToeBase"),
+    "right_toe": ("Toes_R", "RightToe", "RightToeBase", "mixamorig:RightToeBase"),
+}
+
+
+def _other_side(name: str) -> str | None:
+    """Return the name of the joint on the other side of the body, or None for a middle joint."""
+    for left, right in (("Left", "Right"), ("left", "right")):
+        if left in name:
+            return name.replace(left, right)
+        if right in name:
+            return name.replace(right, left)
+    for left, right in (("_L", "_R"), ("_l", "_r")):
+        if name.endswith(left):
+            return name.removesuffix(left) + right
+        if name.endswith(right):
+            return name.removesuffix(right) + left
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A tree of joints with rigid bones.
+
+    Attributes:
+      names: joint names, the root first, every parent before its children.
+      parents: index of each joint's parent, -1 for the root.
+      offsets: position of each joint in its parent's frame, [J, 3], metres (root: zeros).
+      end_sites: (joint index, offset in metres) of BVH "End Site" tips; drawn and written, never
+        part of the features.
+
+    Raises:
+      ValueError: for lists of unlike length, a parent after its child, or non-finite offsets.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    end_sites: tuple[tuple[int, tuple[float, float, float]], ...] = ()
+
+    def __post_init__(self):
+        offsets = np.array(self.offsets, dtype=np.float64)
+        offsets.setflags(write=False)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "parents", tuple(int(parent) for parent in self.parents))
+        object.__setattr__(self, "offsets", offsets)
+        count = len(self.names)
+        if count == 0 or len(self.parents) != count or offsets.shape != (count, 3):
+            raise ValueError(
+                f"skeleton needs one name, parent and offset a joint; got {count} names, "
+                f"{len(self.parents)} parents and offsets of shape {offsets.shape}"
+            )
+        if len(set(self.names)) != count:
+            raise ValueError("skeleton joint names must be unique")
+        if self.parents[0] != -1 or any(
+            not 0 <= parent < joint for joint, parent in enumerate(self.parents[1:], start=1)
+        ):
+            raise ValueError("skeleton needs the root first and every parent before its children")
+        if not np.all(np.isfinite(offsets)):
+            raise ValueError("skeleton offsets must be finite")
+
+    def __eq__(self, other):
+        return (
+            isinstance(other, Skeleton)
+            and self.names == other.names
+            and self.parents == other.parents
+            and np.allclose(self.offsets, other.offsets, atol=1e-3)
+        )
+
+    def __hash__(self):
+        return hash((self.names, self.parents))
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, J."""
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Return a joint's index by name; ValueError lists the names if there is none."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise ValueError(
+                f"skeleton has no joint {name!r}; it has {', '.join(self.names)}"
+            ) from None
+
+    def role(self, role: str) -> int:
+        """Return the joint that plays a role: left_hip, right_hip, left_toe or right_toe."""
+        for name in _ROLE_NAMES[role]:
+            if name in self.names:
+                return self.names.index(name)
+        raise ValueError(
+            f"no joint of this skeleton is known as its {role}; looked for "
+            f"{', '.join(_ROLE_NAMES[role])} among {', '.join(self.names)}"
+        )
+
+    @property
+    def toes(self) -> tuple[int, int]:
+        """Indices of the left and the right toe joint."""
+        return self.role("left_toe"), self.role("right_toe")
+
+    @functools.cached_property
+    def levels(self) -> tuple[tuple[int, ...], ...]:
+        """Joints by depth: level 0 is the root. Kinematics walks levels, not joints."""
+        depth = [0] * self.num_joints
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                depth[joint] = depth[parent] + 1
+        return tuple(
+            tuple(joint for joint in range(self.num_joints) if depth[joint] == level)
+            for level in range(max(depth) + 1)
+        )
+
+    @functools.cached_property
+    def mirror_permutation(self) -> tuple[int, ...]:
+        """For each joint the index of its left-right twin (itself for middle joints)."""
+        permutation = []
+        for joint, name in enumerate(self.names):
+            twin = _other_side(name)
+            if twin is not None and twin not in self.names:
+                raise ValueError(f"joint {name!r} has no twin {twin!r}: it cannot be mirrored")
+            permutation.append(joint if twin is None else self.names.index(twin))
+        return tuple(permutation)
+
+    @functools.cached_property
+    def mirror_frames(self) -> np.ndarray:
+        """Reflection D_j, as a diagonal [J, 3], that carries each joint's frame over in a mirror.
+
+        A mirrored pose has global rotations G'_j = S G_twin(j) D_j with S = diag(-1, 1, 1). It
+        shows the mirrored positions exactly when D_j maps each child's offset to that of the
+        child's twin, which fixes D_j up to ties along single bones; ties follow the parent, and
+        else take -I, the convention of rigs whose right side points its bone axes backwards.
+        """
+        candidates = np.array(
+            [[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, -1.0]]
+        )
+        twin = self.mirror_permutation
+        frames = np.zeros((self.num_joints, 3))
+        for joint in range(self.num_joints):
+            children = [c for c, parent in enumerate(self.parents) if parent == joint]
+            error = np.zeros(4)
+            for child in children:
+                error += np.abs(candidates * self.offsets[child] - self.offsets[twin[child]]).sum(1)
+            if error.min() > 2e-3 * max(len(children), 1):
+                raise ValueError(
+                    f"bones below {self.names[joint]!r} are not mirror images of their twins "
+                    f"(off by {1000 * error.min():.1f} mm): skeleton cannot be mirrored"
+                )
+            tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
+            parent = self.parents[joint]
+            inherited = [
+                k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])
+            ]
+            if inherited:
+                choice = inherited[0]
+            else:
+                choice = 3 if 3 in tied and parent >= 0 else tied[0]
+            frames[joint] = candidates[choice]
+        return frames
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A skeleton in motion.
+
+    Attributes:
+      skeleton: the joints.
+      root_position: [T, 3], metres, global.
+      rotations: [T, J, 3, 3], local rotation matrices; the root's is global.
+      fps: frames per second.
+      name: where it came from, for messages and titles.
+
+    Raises:
+      ValueError: for shapes that do not agree, no frames, a bad fps, or numbers not finite.
+    """
+
+    skeleton: Skeleton
+    root_position: np.ndarray
+    rotations: np.ndarray
+    fps: float = 30.0
+    name: str = ""
+
+    def __post_init__(self):
+        root_position = np.asarray(self.root_position)
+        rotations = np.asarray(self.rotations)
+        object.__setattr__(self, "root_position", root_position)
+        object.__setattr__(self, "rotations", rotations)
+        label = f"motion {self.name!r}"
+        frames = root_position.shape[0] if root_position.ndim else 0
+        expected = (frames, self.skeleton.num_joints, 3, 3)
+        if frames == 0 or root_position.shape != (frames, 3) or rotations.shape != expected:
+            raise ValueError(
+                f"{label}: root_position must be [T, 3] with T > 0 and rotations "
+                f"[T, {self.skeleton.num_joints}, 3, 3]; got {root_position.shape} and "
+                f"{rotations.shape}"
+            )
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise ValueError(f"{label}: fps must be positive, got {self.fps}")
+        for what, array in (("root_position", root_position), ("rotations", rotations)):
+            if not np.all(np.isfinite(array)):
+                frame = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise ValueError(f"{label}: {what} is not finite at frame {frame}")
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return self.root_position.shape[0]
+
+    @functools.cached_property
+    def positions(self) -> np.ndarray:
+        """Global joint positions, [T, J, 3], metres."""
+        return forward_kinematics(self.skeleton, self.root_position, self.rotations)
+
+    @functools.cached_property
+    def yaw(self) -> np.ndarray:
+        """Facing angle of the hips per frame, [T], radians (see `facing_yaw`)."""
+        return facing_yaw(self.skeleton, self.positions)
+
+    @functools.cached_property
+    def contacts(self) -> np.ndarray:
+        """Toe contact per frame, [T, 2] of bool, left then right (see `contact_labels`)."""
+        return contact_labels(self.skeleton, self.positions, self.fps)
+
+    def slice(self, start: int, stop: int) -> Motion:
+        """Return frames start (included) to stop (excluded)."""
+        return dataclasses.replace(
+            self, root_position=self.root_position[start:stop], rotations=self.rotations[start:stop]
+        )
+
+    def replace(self, **changes) -> Motion:
+        """Return a copy with some attributes changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def _compose(first, second):
+    """Multiply stacks of 3 x 3 matrices.
+
+    In JAX as a sum of three outer products, which fuses with its neighbours; XLA's batched product
+    of such small matrices is slower on a CPU, and jax 0.10 refuses some of them inside a scan.
+    """
+    if array_module(first, second) is np:
+        return first @ second
+    return sum(first[..., :, k, None] * second[..., None, k, :] for k in range(3))
+
+
+def _walk(skeleton: Skeleton, root_position, rotations):
+    """Carry rotations and positions down the tree, one level at a time."""
+    xp = array_module(root_position, rotations)
+    offsets = skeleton.offsets.astype(rotations.dtype)
+    level_rotations = [rotations[..., 0:1, :, :]]
+    level_positions = [root_position[..., None, :]]
+    for previous, level in zip(skeleton.levels[:-1], skeleton.levels[1:], strict=True):
+        slot = np.array([previous.index(skeleton.parents[joint]) for joint in level])
+        joints = np.array(level)
+        above = level_rotations[-1][..., slot, :, :]
+        level_positions.append(
+            level_positions[-1][..., slot, :]
+            + sum(above[..., k] * offsets[joints, k, None] for k in range(3))
+        )
+        level_rotations.append(_compose(above, rotations[..., joints, :, :]))
+    order = np.argsort(np.array([joint for level in skeleton.levels for joint in level]))
+    positions = xp.concatenate(level_positions, axis=-2)[..., order, :]
+    turned = xp.concatenate(level_rotations, axis=-3)[..., order, :, :]
+    return positions, turned
+
+
+def forward_kinematics(skeleton: Skeleton, root_position, rotations):
+    """Turn local rotations into global joint positions (FK of Eqs 10, 12, 13).
+
+    Args:
+      skeleton: J joints.
+      root_position: [..., 3], metres.
+      rotations: local rotation matrices, [..., J, 3, 3], the root's global.
+
+    Returns:
+      Global positions, [..., J, 3], metres; numpy in, numpy out, JAX in, JAX out.
+    """
+    return _walk(skeleton, root_position, rotations)[0]
+
+
+def global_rotations(skeleton: Skeleton, rotations):
+    """Turn local rotation matrices [..., J, 3, 3] into global ones of the same shape."""
+    xp = array_module(rotations)
+    return _walk(skeleton, xp.zeros_like(rotations[..., 0, :, 0]), rotations)[1]
+
+
+def facing_yaw(skeleton: Skeleton, positions):
+    """Return the yaw of cross(left hip - right hip, +Y).
+
+    Args:
+      skeleton: the joints.
+      positions: global positions, [..., J, 3].
+
+    Returns:
+      Radians, [...]; 0 faces +Z, positive turns left.
+    """
+    xp = array_module(positions)
+    left = positions[..., skeleton.role("left_hip"), :]
+    right = positions[..., skeleton.role("right_hip"), :]
+    across = left - right
+    # cross(a, +Y) = (-a_z, 0, a_x)
+    forward = xp.stack([-across[..., 2], xp.zeros_like(across[..., 0]), across[..., 0]], axis=-1)
+    return yaw_from_direction(forward)
+
+
+def contact_labels(skeleton: Skeleton, positions, fps: float = 30.0, speed: float = CONTACT_SPEED):
+    """Mark toes that hardly move: 3D speed under `speed` metres per 1/30 s.
+
+    Args:
+      skeleton: the joints.
+      positions: global positions, [..., T, J, 3], metres.
+      fps: frames per second of `positions`.
+      speed: threshold in metres per frame at 30 fps (CAMDM: 0.01).
+
+    Returns:
+      Boolean [..., T, 2], left and right. Frame t is judged by the step t -> t + 1, the last frame
+      repeats its predecessor; a single frame counts as in contact.
+    """
+    xp = array_module(positions)
+    toes = positions[..., np.array(skeleton.toes), :]
+    if toes.shape[-3] < 2:
+        return xp.ones(toes.shape[:-1], dtype=bool)
+    step = toes[..., 1:, :, :] - toes[..., :-1, :, :]
+    moving = xp.sqrt(xp.sum(step * step, axis=-1)) * (fps / 30.0)
+    moving = xp.concatenate([moving, moving[..., -1:, :]], axis=-2)
+    return moving < speed
+
+
+def mirror(motion: Motion) -> Motion:
+    """Reflect a motion in the plane x = 0, left limbs becoming right ones.
+
+    Works for rigs whose left and right frames are plain mirror images (100STYLE) and for those
+    whose right-side bone axes point backwards (Bandai); see `Skeleton.mirror_frames`.
+
+    Returns:
+      A motion whose joint positions are the mirrored ones of the twin joints, to the accuracy with
+      which the skeleton itself is symmetric.
+    """
+    skeleton = motion.skeleton
+    twin = np.array(skeleton.mirror_permutation)
+    reflect = np.diag([-1.0, 1.0, 1.0])
+    turned = global_rotations(skeleton, np.asarray(motion.rotations, dtype=np.float64))
+    turned = reflect @ turned[:, twin] * skeleton.mirror_frames[None, :, None, :]
+    local = turned.copy()
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            local[:, joint] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, joint]
+    return motion.replace(
+        root_position=motion.root_position * np.array([-1.0, 1.0, 1.0]),
+        rotations=local.astype(motion.rotations.dtype),
+        name=f"{motion.name} (mirrored)" if motion.name else "",
+    )
+
+
+def resample(motion: Motion, fps: float = 30.0) -> Motion:
+    """Change the frame rate; whole ratios take every k-th frame, others interpolate.
+
+    Source: paper section 4 ("resample to 30 FPS"); CAMDM drops every second frame of 60.
+
+    Args:
+      motion: any motion.
+      fps: wanted rate, frames per second.
+
+    Returns:
+      A motion at exactly `fps`. Positions are interpolated linearly, rotations on the shortest arc.
+    """
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps must be positive, got {fps}")
+    ratio = motion.fps / fps
+    if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
+        stride = int(round(ratio))
+        return motion.replace(
+            root_position=motion.root_position[::stride],
+            rotations=motion.rotations[::stride],
+            fps=float(fps),
+        )
+    duration = (motion.num_frames - 1) / motion.fps
+    times = np.arange(int(np.floor(duration * fps + 1e-6)) + 1) / fps * motion.fps
+    low = np.minimum(np.floor(times).astype(int), motion.num_frames - 1)
+    high = np.minimum(low + 1, motion.num_frames - 1)
+    weight = times - low
+    root = (1 - weight)[:, None] * motion.root_position[low] + weight[
+        :, None
+    ] * motion.root_position[high]
+    rotations = slerp_matrices(motion.rotations[low], motion.rotations[high], weight[:, None])
+    return motion.replace(root_position=root, rotations=rotations, fps=float(fps))
+
+
+def turn(motion: Motion, yaw: float) -> Motion:
+    """Turn a whole motion about the world's +Y axis through the origin by `yaw` radians."""
+    matrix = matrix_from_yaw(np.float64(yaw))
+    rotations = np.array(motion.rotations, copy=True)
+    rotations[:, 0] = matrix @ rotations[:, 0]
+    return motion.replace(root_position=motion.root_position @ matrix.T, rotations=rotations)

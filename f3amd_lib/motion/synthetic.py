@@ -1,0 +1,1635 @@
+"""A procedural styled walker: the data set that needs no download.
+
+One hundred named styles are sets of parameters; a clip is a style, a length and a seed. A clip is
+made in the order in which an animator would plan it:
+
+1. a root path with turns, curves, stops, speed changes, sideways and backward stretches;
+2. footfalls along that path, each placed where the body will be in the middle of the stance;
+3. feet: a planted toe never moves, the heel rolls up around it, then the foot swings in an arc;
+4. pelvis: sway, bounce and twist, lowered wherever a leg would otherwise be too short;
+5. legs by two-bone inverse kinematics, knees bent forward;
+6. spine, head and arms.
+
+Only steps 1 and 2 depend on the order of events; everything else is one expression over all
+frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y is up, yaw 0 faces
++Z and the character's left is +X.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+__all__ = [
+    "ArmPose",
+    "StyleParameters",
+    "STYLES",
+    "SYNTHETIC_SKELETON",
+    "style_parameters",
+    "synthesize",
+    "synthesize_with_contacts",
+]
+
+# ------------------------------------------------------------------------------------ skeleton
+
+_SPINE = ("Chest", "Chest2", "Chest3", "Chest4")
+_THIGH, _SHANK = 0.430, 0.420
+_HIP_OFFSET = np.array([0.092, -0.010, 0.0])
+_TOE_OFFSET = np.array([0.0, -0.075, 0.135])
+_TOE_HEIGHT = 0.012
+_FOOT_LENGTH = float(np.hypot(_TOE_OFFSET[1], _TOE_OFFSET[2])) + 0.05
+"""From the back of the heel to the toe joint, metres: how far a toe rises on the heel."""
+
+
+def _build_skeleton() -> Skeleton:
+    """Lay out 23 joints in a T-pose that faces +Z with the left at +X."""
+    joints: list[tuple[str, str | None, tuple[float, float, float]]] = [
+        ("Hips", None, (0.0, 0.0, 0.0)),
+        ("Chest", "Hips", (0.0, 0.115, 0.0)),
+        ("Chest2", "Chest", (0.0, 0.100, 0.0)),
+        ("Chest3", "Chest2", (0.0, 0.095, 0.0)),
+        ("Chest4", "Chest3", (0.0, 0.095, 0.0)),
+        ("Neck", "Chest4", (0.0, 0.130, 0.0)),
+        ("Head", "Neck", (0.0, 0.090, 0.010)),
+    ]
+    ends: list[tuple[str, tuple[float, float, float]]] = [("Head", (0.0, 0.175, 0.0))]
+    for side, sign in (("Right", -1.0), ("Left", 1.0)):
+        joints += [
+            (f"{side}Collar", "Chest4", (sign * 0.030, 0.080, 0.0)),
+            (f"{side}Shoulder", f"{side}Collar", (sign * 0.150, 0.0, 0.0)),
+            (f"{side}Elbow", f"{side}Shoulder", (sign * 0.290, 0.0, 0.0)),
+            (f"{side}Wrist", f"{side}Elbow", (sign * 0.250, 0.0, 0.0)),
+        ]
+        ends.append((f"{side}Wrist", (sign * 0.180, 0.0, 0.0)))
+    mirror_x = np.array([-1.0, 1.0, 1.0])
+    for side, sign in (("Right", mirror_x), ("Left", np.ones(3))):
+        joints += [
+            (f"{side}Hip", "Hips", tuple(sign * _HIP_OFFSET)),
+            (f"{side}Knee", f"{side}Hip", (0.0, -_THIGH, 0.0)),
+            (f"{side}Ankle", f"{side}Knee", (0.0, -_SHANK, 0.0)),
+            (f"{side}Toe", f"{side}Ankle", tuple(sign * _TOE_OFFSET)),
+        ]
+        ends.append((f"{side}Toe", (0.0, -0.006, 0.065)))
+    names = tuple(name for name, _, _ in joints)
+    return Skeleton(
+        names=names,
+        parents=tuple(-1 if above is None else names.index(above) for _, above, _ in joints),
+        offsets=np.array([offset for _, _, offset in joints]),
+        end_sites=tuple((names.index(name), offset) for name, offset in ends),
+    )
+
+
+SYNTHETIC_SKELETON = _build_skeleton()
+"""23 joints with 100STYLE's names and axis-aligned T-pose (zero rotations), own proportions."""
+
+
+# ---------------------------------------------------------------------------------- parameters
+
+
+@dataclass(frozen=True)
+class ArmPose:
+    """How one arm is held and how it moves. All angles are relative to an arm hanging down.
+
+    Attributes:
+      forward_deg: shoulder raised forwards, degrees.
+      side_deg: shoulder raised sideways, away from the body, degrees.
+      twist_deg: upper arm turned inwards, degrees (brings a bent forearm across the body).
+      elbow_deg: elbow bend, degrees.
+      swing_deg: amplitude of the swing against the legs, degrees.
+      elbow_swing_deg: extra elbow bend while the arm is in front, degrees.
+      wave_forward_deg, wave_side_deg, wave_twist_deg, wave_elbow_deg: amplitudes of a gesture that
+        runs beside the gait (waving, flapping, rowing), degrees.
+      wave_hz: rate of that gesture, cycles per second.
+      hang: share of the trunk's lean that gravity takes back, 0 (held stiff) to 1 (hangs).
+    """
+
+    forward_deg: float = 2.0
+    side_deg: float = 10.0
+    twist_deg: float = 12.0
+    elbow_deg: float = 16.0
+    swing_deg: float = 22.0
+    elbow_swing_deg: float = 10.0
+    wave_forward_deg: float = 0.0
+    wave_side_deg: float = 0.0
+    wave_twist_deg: float = 0.0
+    wave_elbow_deg: float = 0.0
+    wave_hz: float = 1.0
+    hang: float = 0.8
+
+
+@dataclass(frozen=True)
+class StyleParameters:
+    """Everything that tells one style from another; the defaults are the style Neutral.
+
+    Attributes:
+      speed: usual speed on a straight path, m/s.
+      step_length: length of a step at that speed, metres.
+      duty: share of the stride for which a toe stays planted, 0 to 1 (walks 0.55, runs 0.35).
+      rhythm: share of the stride between a left and the next right footfall (0.5 is even; 0.3
+        gallops, 0.05 jumps off both feet).
+      step_width: distance between the feet across the direction of facing, metres.
+      toe_out_deg: feet turned outwards, degrees.
+      knee_out_deg: knees turned outwards, degrees.
+      foot_lift: height of the toe's arc, metres.
+      left_lift_scale, right_lift_scale: factor on the lift of one foot (0.1 drags it).
+      circumduction: how far a swinging foot is carried outwards, metres.
+      heel_off_deg: pitch of the foot as it leaves the ground, degrees.
+      toe_up_deg: how far the toes are raised before landing, degrees.
+      heel_raise_deg: heel held off the ground throughout, degrees (tiptoe).
+      crouch: pelvis lowered by this much, metres.
+      bounce: amplitude of the pelvis' rise at mid-stance, metres; negative for runs, which are
+        lowest there.
+      hop: amplitude of the pelvis' flight, once a stride, metres (jumps and gallops).
+      sway: amplitude of the pelvis' travel towards the standing leg, metres.
+      hip_twist_deg: amplitude of the pelvis' turn with the legs, degrees.
+      hip_roll_deg: amplitude of the pelvis' drop on the swinging side, degrees.
+      chest_twist_deg: amplitude of the shoulders' turn against the legs, degrees.
+      chest_roll_deg: amplitude of the shoulders' sideways rocking, degrees.
+      pelvis_pitch_deg: pelvis tipped forwards, degrees.
+      spine_pitch_deg, spine_roll_deg, spine_twist_deg: posture of the whole spine, degrees:
+        forwards, to the left, turned to the left.
+      head_pitch_deg, head_roll_deg, head_yaw_deg: head bowed, tilted to the left, turned left.
+      head_bob_deg: amplitude of nodding with each step, degrees.
+      shrug_deg: shoulders drawn up, degrees.
+      left_arm, right_arm: see `ArmPose`.
+      opposed_waves: the arms' gestures run in opposite phase.
+      limp: -1 to 1; positive spares the left leg (short stance, dip over it), negative the right.
+      heading_deg: moving direction against facing on a straight path, degrees, left positive.
+      unsteadiness: random scatter of footfalls and trunk, 0 (drilled) upwards; 1 is drunk.
+      stop_share: share of the time spent standing, 0 to 1.
+      turn_scale: factor on how sharply the path turns.
+    """
+
+    speed: float = 1.20
+    step_length: float = 0.62
+    duty: float = 0.55
+    rhythm: float = 0.5
+    step_width: float = 0.17
+    toe_out_deg: float = 7.0
+    knee_out_deg: float = 0.0
+    foot_lift: float = 0.045
+    left_lift_scale: float = 1.0
+    right_lift_scale: float = 1.0
+    circumduction: float = 0.01
+    heel_off_deg: float = 48.0
+    toe_up_deg: float = 14.0
+    heel_raise_deg: float = 0.0
+    crouch: float = 0.0
+    bounce: float = 0.022
+    hop: float = 0.0
+    sway: float = 0.022
+    hip_twist_deg: float = 5.0
+    hip_roll_deg: float = 3.0
+    chest_twist_deg: float = 6.0
+    chest_roll_deg: float = 1.0
+    pelvis_pitch_deg: float = 2.0
+    spine_pitch_deg: float = 3.0
+    spine_roll_deg: float = 0.0
+    spine_twist_deg: float = 0.0
+    head_pitch_deg: float = 2.0
+    head_roll_deg: float = 0.0
+    head_yaw_deg: float = 0.0
+    head_bob_deg: float = 1.0
+    shrug_deg: float = 0.0
+    left_arm: ArmPose = field(default_factory=ArmPose)
+    right_arm: ArmPose = field(default_factory=ArmPose)
+    opposed_waves: bool = False
+    limp: float = 0.0
+    heading_deg: float = 0.0
+    unsteadiness: float = 0.08
+    stop_share: float = 0.10
+    turn_scale: float = 1.0
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether a mirrored clip is again a clip of the same style."""
+        return (
+            self.left_arm == self.right_arm
+            and self.left_lift_scale == self.right_lift_scale
+            and self.rhythm == 0.5
+            and not any(
+                (
+                    self.limp,
+                    self.heading_deg,
+                    self.spine_roll_deg,
+                    self.spine_twist_deg,
+                    self.head_roll_deg,
+                    self.head_yaw_deg,
+                )
+            )
+        )
+
+
+def _both(**arm) -> dict:
+    """Give both arms the same pose."""
+    pose = ArmPose(**arm)
+    return {"left_arm": pose, "right_arm": pose}
+
+
+def _held(forward, side, twist, elbow, **more) -> ArmPose:
+    """Return an arm held in one place, with only a trace of swing."""
+    values = {"swing_deg": 3.0, "elbow_swing_deg": 2.0, "hang": 0.1} | more
+    return ArmPose(forward, side, twist, elbow, **values)
+
+
+def _held_both(forward, side, twist, elbow, **more) -> dict:
+    pose = _held(forward, side, twist, elbow, **more)
+    return {"left_arm": pose, "right_arm": pose}
+
+
+def _style(speed: float = 1.20, **changes) -> StyleParameters:
+    """Fill in a style; a slower walk takes shorter steps unless it says otherwise."""
+    step_length = changes.pop("step_length", 0.62 * np.sqrt(min(speed / 1.20, 1.3)))
+    return StyleParameters(speed=speed, step_length=float(step_length), **changes)
+
+
+def _table() -> dict[str, StyleParameters]:
+    """Write down the hundred styles."""
+    style = _style
+    on_hip = dict(forward=-10, side=38, twist=78, elbow=86)
+    across = dict(forward=34, side=6, twist=72, elbow=104)
+    cane = ArmPose(forward_deg=24, side_deg=14, elbow_deg=30, swing_deg=14, elbow_swing_deg=4)
+    phone = _held(48, 28, 28, 138)
+    up = _held(10, 168, 0, 12)
+    run_arms = _both(
+        forward_deg=-4, side_deg=15, twist_deg=6, elbow_deg=88, swing_deg=34, elbow_swing_deg=14
+    )
+    run = dict(duty=0.38, bounce=-0.030, heel_off_deg=66, toe_up_deg=6, foot_lift=0.15)
+    run |= dict(sway=0.012, step_width=0.11, pelvis_pitch_deg=6, spine_pitch_deg=7, crouch=0.035)
+    run |= run_arms
+    return {
+        # Moods
+        "Neutral": style(),
+        "Happy": style(
+            speed=1.35,
+            bounce=0.036,
+            chest_roll_deg=6,
+            head_pitch_deg=-9,
+            spine_pitch_deg=-4,
+            foot_lift=0.08,
+            head_bob_deg=4,
+            **_both(swing_deg=36, side_deg=27, elbow_deg=44, elbow_swing_deg=14),
+        ),
+        "Gloomy": style(
+            speed=0.78,
+            step_length=0.50,
+            spine_pitch_deg=20,
+            head_pitch_deg=34,
+            foot_lift=0.022,
+            shrug_deg=-6,
+            bounce=0.008,
+            **_both(swing_deg=9, forward_deg=6, elbow_deg=10),
+        ),
+        "Furious": style(
+            speed=1.55,
+            step_length=0.67,
+            spine_pitch_deg=13,
+            head_pitch_deg=6,
+            shrug_deg=12,
+            chest_twist_deg=15,
+            foot_lift=0.07,
+            bounce=0.026,
+            **_both(elbow_deg=58, side_deg=26, swing_deg=36, twist_deg=30),
+        ),
+        "Proud": style(
+            speed=1.10,
+            spine_pitch_deg=-13,
+            head_pitch_deg=-17,
+            chest_roll_deg=3,
+            shrug_deg=-7,
+            pelvis_pitch_deg=5,
+            **_both(side_deg=19, swing_deg=20, forward_deg=-14, twist_deg=-8),
+        ),
+        "Shy": style(
+            speed=0.85,
+            step_length=0.46,
+            step_width=0.10,
+            toe_out_deg=-12,
+            spine_pitch_deg=12,
+            head_pitch_deg=26,
+            shrug_deg=10,
+            **_held_both(12, 4, 44, 50),
+        ),
+        "Nervous": style(
+            speed=1.15,
+            step_length=0.44,
+            spine_pitch_deg=9,
+            shrug_deg=14,
+            head_bob_deg=5,
+            unsteadiness=0.35,
+            **_held_both(28, 8, 32, 100, wave_twist_deg=9, wave_hz=1.7),
+        ),
+        "Tired": style(
+            speed=0.74,
+            step_length=0.47,
+            spine_pitch_deg=15,
+            head_pitch_deg=18,
+            sway=0.045,
+            crouch=0.03,
+            foot_lift=0.02,
+            chest_roll_deg=6,
+            unsteadiness=0.25,
+            **_both(swing_deg=14, forward_deg=8, elbow_deg=8),
+        ),
+        "Sleepy": style(
+            speed=0.62,
+            step_length=0.42,
+            head_pitch_deg=28,
+            head_roll_deg=18,
+            spine_roll_deg=6,
+            sway=0.04,
+            foot_lift=0.018,
+            head_bob_deg=7,
+            unsteadiness=0.3,
+            **_both(swing_deg=6, elbow_deg=6),
+        ),
+        "Bored": style(
+            speed=0.82,
+            step_length=0.56,
+            pelvis_pitch_deg=-6,
+            spine_pitch_deg=14,
+            head_pitch_deg=-2,
+            head_roll_deg=12,
+            sway=0.035,
+            toe_out_deg=16,
+            **_both(swing_deg=26, elbow_deg=4, side_deg=8),
+        ),
+        "Confident": style(
+            speed=1.32,
+            step_length=0.70,
+            spine_pitch_deg=-6,
+            head_pitch_deg=-5,
+            chest_twist_deg=15,
+            hip_twist_deg=8,
+            chest_roll_deg=3,
+            shrug_deg=-6,
+            toe_out_deg=14,
+            **_both(swing_deg=30, side_deg=17, elbow_deg=14),
+        ),
+        "Heroic": style(
+            speed=1.30,
+            step_length=0.74,
+            step_width=0.24,
+            spine_pitch_deg=-7,
+            head_pitch_deg=-8,
+            **_both(side_deg=30, elbow_deg=40, swing_deg=24, twist_deg=30),
+        ),
+        "Elegant": style(
+            speed=1.05,
+            step_length=0.60,
+            step_width=0.08,
+            spine_pitch_deg=-4,
+            head_pitch_deg=-6,
+            hip_roll_deg=5,
+            bounce=0.010,
+            **_both(swing_deg=14, side_deg=22, elbow_deg=28, twist_deg=-10),
+        ),
+        "Curious": style(
+            speed=0.95,
+            spine_pitch_deg=16,
+            head_pitch_deg=-16,
+            head_roll_deg=-14,
+            head_bob_deg=4,
+            heel_raise_deg=8,
+            **_held_both(12, 14, 30, 74),
+        ),
+        "Cautious": style(
+            speed=0.66,
+            step_length=0.44,
+            crouch=0.07,
+            spine_pitch_deg=12,
+            head_pitch_deg=-8,
+            foot_lift=0.075,
+            **_held_both(34, 26, 14, 62, wave_forward_deg=5, wave_hz=0.5),
+        ),
+        "Relaxed": style(
+            speed=1.02,
+            step_length=0.60,
+            pelvis_pitch_deg=-9,
+            spine_pitch_deg=-3,
+            sway=0.040,
+            hip_twist_deg=10,
+            toe_out_deg=20,
+            head_pitch_deg=6,
+            **_both(swing_deg=28, elbow_deg=7),
+        ),
+        # Ages and conditions
+        "Old": style(
+            speed=0.66,
+            step_length=0.38,
+            crouch=0.07,
+            spine_pitch_deg=34,
+            head_pitch_deg=-4,
+            step_width=0.20,
+            foot_lift=0.025,
+            knee_out_deg=6,
+            unsteadiness=0.2,
+            **_both(forward_deg=14, elbow_deg=42, swing_deg=9),
+        ),
+        "Toddler": style(
+            speed=0.80,
+            step_length=0.34,
+            step_width=0.27,
+            crouch=0.03,
+            sway=0.05,
+            chest_roll_deg=7,
+            toe_out_deg=16,
+            unsteadiness=0.5,
+            **_both(side_deg=52, elbow_deg=72, twist_deg=-58, swing_deg=8),
+        ),
+        "Teenager": style(
+            speed=1.12,
+            spine_pitch_deg=22,
+            pelvis_pitch_deg=-8,
+            head_pitch_deg=4,
+            bounce=0.040,
+            shrug_deg=-6,
+            chest_roll_deg=7,
+            step_width=0.22,
+            **_both(swing_deg=32, forward_deg=12, elbow_deg=30, side_deg=16),
+        ),
+        "Drunk": style(
+            speed=0.80,
+            step_length=0.48,
+            step_width=0.24,
+            sway=0.06,
+            spine_pitch_deg=9,
+            head_pitch_deg=12,
+            unsteadiness=1.0,
+            turn_scale=1.3,
+            **_both(side_deg=28, elbow_deg=30, swing_deg=20),
+        ),
+        "Dizzy": style(
+            speed=0.62,
+            step_length=0.40,
+            step_width=0.26,
+            sway=0.05,
+            head_roll_deg=-16,
+            spine_roll_deg=-7,
+            unsteadiness=0.8,
+            right_arm=_held(50, 34, 40, 132),
+            left_arm=_held(10, 48, 0, 24),
+        ),
+        "Wounded": style(
+            speed=0.70,
+            step_length=0.42,
+            limp=-0.6,
+            spine_pitch_deg=24,
+            spine_roll_deg=-12,
+            head_pitch_deg=8,
+            crouch=0.05,
+            left_arm=_held(26, 0, 84, 100),
+            right_arm=ArmPose(swing_deg=10),
+        ),
+        "LimpLeft": style(
+            speed=0.85, step_length=0.48, limp=0.9, left_lift_scale=0.5, spine_roll_deg=3
+        ),
+        "LimpRight": style(
+            speed=0.85, step_length=0.48, limp=-0.9, right_lift_scale=0.5, spine_roll_deg=-3
+        ),
+        "DragLeftFoot": style(
+            speed=0.72,
+            step_length=0.44,
+            limp=0.4,
+            left_lift_scale=0.12,
+            hip_roll_deg=7,
+            spine_roll_deg=-9,
+            toe_out_deg=14,
+            left_arm=_held(10, 14, 60, 70),
+        ),
+        "DragRightFoot": style(
+            speed=0.72,
+            step_length=0.44,
+            limp=-0.4,
+            right_lift_scale=0.12,
+            hip_roll_deg=7,
+            spine_roll_deg=9,
+            toe_out_deg=14,
+            right_arm=_held(10, 14, 60, 70),
+        ),
+        "CaneLeft": style(
+            speed=0.78,
+            step_length=0.44,
+            limp=-0.5,
+            spine_pitch_deg=16,
+            spine_roll_deg=7,
+            left_arm=cane,
+            right_arm=ArmPose(swing_deg=8),
+        ),
+        "CaneRight": style(
+            speed=0.78,
+            step_length=0.44,
+            limp=0.5,
+            spine_pitch_deg=16,
+            spine_roll_deg=-7,
+            right_arm=cane,
+            left_arm=ArmPose(swing_deg=8),
+        ),
+        # Trunk and head
+        "BentForward": style(
+            speed=0.95,
+            step_length=0.54,
+            pelvis_pitch_deg=22,
+            spine_pitch_deg=42,
+            head_pitch_deg=22,
+            crouch=0.03,
+            **_both(swing_deg=16, hang=1.0),
+        ),
+        "Hunched": style(
+            speed=0.98,
+            spine_pitch_deg=36,
+            pelvis_pitch_deg=-8,
+            head_pitch_deg=-10,
+            shrug_deg=10,
+            **_both(forward_deg=10, elbow_deg=28, swing_deg=14),
+        ),
+        "LeaningBack": style(
+            speed=0.98,
+            pelvis_pitch_deg=-10,
+            spine_pitch_deg=-20,
+            head_pitch_deg=-8,
+            **_both(swing_deg=20, forward_deg=-4),
+        ),
+        "LeaningLeft": style(speed=1.02, spine_roll_deg=22, head_roll_deg=8),
+        "LeaningRight": style(speed=1.02, spine_roll_deg=-22, head_roll_deg=-8),
+        "StiffSpine": style(
+            speed=1.10,
+            chest_twist_deg=0.5,
+            hip_twist_deg=0.5,
+            sway=0.008,
+            hip_roll_deg=0.5,
+            bounce=0.006,
+            spine_pitch_deg=-3,
+            head_bob_deg=0,
+            chest_roll_deg=0,
+            **_both(swing_deg=5, elbow_deg=4, side_deg=7),
+        ),
+        "HeadDown": style(speed=1.05, head_pitch_deg=44, spine_pitch_deg=7),
+        "LookingUp": style(speed=0.92, head_pitch_deg=-44, spine_pitch_deg=-9),
+        "LookingLeft": style(speed=1.05, head_yaw_deg=56, spine_twist_deg=14),
+        "LookingRight": style(speed=1.05, head_yaw_deg=-56, spine_twist_deg=-14),
+        "TwistedLeft": style(speed=1.00, spine_twist_deg=40, head_yaw_deg=10),
+        "TwistedRight": style(speed=1.00, spine_twist_deg=-40, head_yaw_deg=-10),
+        # Arms held
+        "ArmsCrossed": style(
+            speed=1.00,
+            spine_pitch_deg=-2,
+            sway=0.03,
+            left_arm=_held(**across),
+            right_arm=_held(42, 4, 66, 98),
+        ),
+        "HandsOnHips": style(
+            speed=1.05, hip_roll_deg=5, spine_pitch_deg=-4, **_held_both(**on_hip)
+        ),
+        "LeftHandOnHip": style(
+            speed=1.05, hip_roll_deg=6, spine_roll_deg=4, left_arm=_held(**on_hip)
+        ),
+        "RightHandOnHip": style(
+            speed=1.05, hip_roll_deg=6, spine_roll_deg=-4, right_arm=_held(**on_hip)
+        ),
+        "HandsBehindBack": style(
+            speed=0.92, spine_pitch_deg=5, head_pitch_deg=8, **_held_both(-36, 14, 62, 52)
+        ),
+        "HandsOnHead": style(speed=0.95, spine_pitch_deg=-3, **_held_both(22, 122, -12, 138)),
+        "HandsUp": style(speed=0.92, **_held_both(14, 100, -84, 88)),
+        "ArmsOverhead": style(speed=0.98, **_held_both(8, 170, 0, 8)),
+        "ArmsWide": style(speed=1.02, **_held_both(0, 90, 0, 6)),
+        "ArmsForward": style(speed=0.98, **_held_both(88, 4, 0, 8)),
+        "LeftArmUp": style(speed=1.08, left_arm=up, spine_roll_deg=-4),
+        "RightArmUp": style(speed=1.08, right_arm=up, spine_roll_deg=4),
+        "PhoneLeft": style(speed=0.95, left_arm=phone, head_roll_deg=12),
+        "PhoneRight": style(speed=0.95, right_arm=phone, head_roll_deg=-12),
+        "Texting": style(
+            speed=0.80,
+            step_length=0.50,
+            head_pitch_deg=36,
+            spine_pitch_deg=8,
+            **_held_both(38, 6, 14, 82),
+        ),
+        "PocketHands": style(
+            speed=1.02, shrug_deg=9, spine_pitch_deg=8, sway=0.03, **_held_both(-10, 22, 34, 44)
+        ),
+        "CarryBox": style(
+            speed=0.92,
+            step_length=0.52,
+            spine_pitch_deg=-9,
+            crouch=0.02,
+            step_width=0.20,
+            **_held_both(26, 12, 8, 82),
+        ),
+        "CarryTray": style(
+            speed=0.98,
+            step_width=0.10,
+            bounce=0.006,
+            head_bob_deg=0,
+            right_arm=_held(34, 36, -70, 132),
+            left_arm=_held(-26, 14, 66, 60),
+        ),
+        "CarryBuckets": style(
+            speed=0.95,
+            step_length=0.52,
+            shrug_deg=-8,
+            chest_roll_deg=6,
+            sway=0.035,
+            **_held_both(0, 17, 0, 5),
+        ),
+        "HoldLantern": style(
+            speed=0.85,
+            step_length=0.50,
+            left_arm=_held(74, 14, 0, 26),
+            spine_pitch_deg=7,
+            head_yaw_deg=12,
+        ),
+        "PushCart": style(
+            speed=0.95,
+            step_length=0.58,
+            pelvis_pitch_deg=12,
+            spine_pitch_deg=18,
+            head_pitch_deg=-4,
+            heel_off_deg=58,
+            **_held_both(62, 10, 6, 34),
+        ),
+        "Praying": style(
+            speed=0.70,
+            step_length=0.44,
+            head_pitch_deg=26,
+            step_width=0.11,
+            **_held_both(30, 2, 31, 116),
+        ),
+        "Salute": style(
+            speed=1.15,
+            spine_pitch_deg=-8,
+            foot_lift=0.10,
+            toe_out_deg=2,
+            left_arm=ArmPose(swing_deg=38, elbow_deg=4, elbow_swing_deg=0),
+            right_arm=_held(30, 86, 14, 138),
+        ),
+        "ShieldArm": style(
+            speed=0.90,
+            crouch=0.08,
+            step_width=0.26,
+            spine_twist_deg=-22,
+            spine_pitch_deg=10,
+            left_arm=_held(64, 16, 48, 84),
+            right_arm=_held(-22, 36, 10, 92),
+        ),
+        # Arms in motion
+        "WaveLeft": style(
+            speed=1.05,
+            left_arm=_held(14, 118, -48, 58, wave_elbow_deg=24, wave_twist_deg=12, wave_hz=1.3),
+        ),
+        "WaveRight": style(
+            speed=1.05,
+            right_arm=_held(14, 118, -48, 58, wave_elbow_deg=24, wave_twist_deg=12, wave_hz=1.3),
+        ),
+        "FlappingWings": style(
+            speed=1.00,
+            bounce=0.030,
+            **_held_both(0, 70, 0, 22, wave_side_deg=38, wave_elbow_deg=14, wave_hz=0.9),
+        ),
+        "Gliding": style(
+            speed=1.28,
+            spine_pitch_deg=16,
+            pelvis_pitch_deg=8,
+            head_pitch_deg=-6,
+            opposed_waves=True,
+            chest_roll_deg=9,
+            **_held_both(-6, 84, 0, 4, wave_side_deg=16, wave_hz=0.35),
+        ),
+        "Swimming": style(
+            speed=0.95,
+            spine_pitch_deg=26,
+            pelvis_pitch_deg=10,
+            head_pitch_deg=-8,
+            **_held_both(
+                70,
+                34,
+                -20,
+                36,
+                wave_forward_deg=30,
+                wave_side_deg=26,
+                wave_elbow_deg=26,
+                wave_hz=0.55,
+            ),
+        ),
+        "Rowing": style(
+            speed=0.88,
+            spine_pitch_deg=10,
+            **_held_both(26, 14, 12, 74, wave_forward_deg=32, wave_elbow_deg=42, wave_hz=0.6),
+        ),
+        "Drumming": style(
+            speed=1.05,
+            opposed_waves=True,
+            head_bob_deg=7,
+            **_held_both(30, 20, 22, 82, wave_forward_deg=10, wave_elbow_deg=26, wave_hz=1.8),
+        ),
+        "Boxing": style(
+            speed=1.02,
+            step_length=0.46,
+            crouch=0.06,
+            opposed_waves=True,
+            spine_pitch_deg=13,
+            heel_raise_deg=10,
+            bounce=0.03,
+            spine_twist_deg=-10,
+            **_held_both(50, 12, 30, 92, wave_forward_deg=26, wave_elbow_deg=44, wave_hz=1.0),
+        ),
+        "Conducting": style(
+            speed=0.82,
+            **_held_both(
+                44,
+                40,
+                -8,
+                70,
+                wave_side_deg=18,
+                wave_elbow_deg=24,
+                wave_forward_deg=10,
+                wave_hz=0.8,
+            ),
+        ),
+        "Windmill": style(
+            speed=1.05,
+            opposed_waves=True,
+            **_held_both(92, 26, 0, 8, wave_forward_deg=78, wave_side_deg=24, wave_hz=0.55),
+        ),
+        "PumpingArms": style(
+            speed=1.45,
+            step_length=0.66,
+            **_both(elbow_deg=92, swing_deg=52, twist_deg=8, elbow_swing_deg=18, side_deg=14),
+        ),
+        # Legs and feet
+        "Tiptoe": style(
+            speed=0.86,
+            step_length=0.44,
+            heel_raise_deg=36,
+            heel_off_deg=58,
+            toe_up_deg=0,
+            foot_lift=0.055,
+            step_width=0.11,
+            **_both(side_deg=30, elbow_deg=34, swing_deg=9),
+        ),
+        "WideStance": style(
+            speed=0.95,
+            step_length=0.52,
+            step_width=0.46,
+            sway=0.07,
+            toe_out_deg=18,
+            knee_out_deg=12,
+            crouch=0.02,
+        ),
+        "Tightrope": style(
+            speed=0.58,
+            step_length=0.40,
+            step_width=0.015,
+            toe_out_deg=0,
+            unsteadiness=0.3,
+            sway=0.01,
+            chest_roll_deg=6,
+            opposed_waves=True,
+            turn_scale=0.5,
+            circumduction=0.06,
+            **_held_both(6, 84, 0, 8, wave_side_deg=13, wave_hz=0.6),
+        ),
+        "PigeonToed": style(
+            speed=0.92, step_length=0.50, toe_out_deg=-24, knee_out_deg=-14, step_width=0.16
+        ),
+        "DuckFooted": style(
+            speed=0.92,
+            step_length=0.50,
+            toe_out_deg=42,
+            knee_out_deg=24,
+            pelvis_pitch_deg=8,
+            spine_pitch_deg=-8,
+        ),
+        "HighKnees": style(
+            speed=1.02,
+            step_length=0.52,
+            foot_lift=0.34,
+            toe_up_deg=0,
+            bounce=0.022,
+            spine_pitch_deg=-3,
+            **_both(elbow_deg=66, swing_deg=34),
+        ),
+        "LongStrides": style(
+            speed=1.38,
+            step_length=0.80,
+            duty=0.52,
+            crouch=0.05,
+            hip_twist_deg=12,
+            chest_twist_deg=12,
+            heel_off_deg=58,
+            **_both(swing_deg=40),
+        ),
+        "Shuffling": style(
+            speed=0.52,
+            step_length=0.26,
+            foot_lift=0.008,
+            heel_off_deg=10,
+            toe_up_deg=2,
+            bounce=0.003,
+            spine_pitch_deg=10,
+            crouch=0.03,
+            **_both(swing_deg=4),
+        ),
+        "Stomping": style(
+            speed=0.98,
+            step_length=0.52,
+            foot_lift=0.16,
+            heel_off_deg=22,
+            toe_up_deg=0,
+            bounce=0.034,
+            step_width=0.26,
+            shrug_deg=5,
+            chest_roll_deg=6,
+            **_both(side_deg=30, elbow_deg=46, swing_deg=16),
+        ),
+        "BouncySteps": style(
+            speed=1.15,
+            bounce=0.058,
+            heel_off_deg=64,
+            heel_raise_deg=8,
+            foot_lift=0.07,
+            **_both(swing_deg=30),
+        ),
+        "StiffLegs": style(
+            speed=0.85,
+            step_length=0.48,
+            foot_lift=0.020,
+            circumduction=0.07,
+            heel_off_deg=20,
+            hip_roll_deg=8,
+            sway=0.045,
+            toe_up_deg=4,
+        ),
+        "DeepKnees": style(
+            speed=0.80,
+            step_length=0.54,
+            crouch=0.19,
+            spine_pitch_deg=6,
+            pelvis_pitch_deg=8,
+            heel_off_deg=30,
+            **_held_both(40, 10, 10, 30),
+        ),
+        "KneesTogether": style(
+            speed=0.72,
+            step_length=0.34,
+            step_width=0.13,
+            knee_out_deg=-9,
+            toe_out_deg=-10,
+            crouch=0.05,
+            spine_pitch_deg=9,
+            **_held_both(18, 0, 44, 46),
+        ),
+        "HipSwing": style(
+            speed=1.00,
+            step_width=0.08,
+            hip_roll_deg=11,
+            sway=0.055,
+            hip_twist_deg=11,
+            chest_twist_deg=11,
+            **_both(swing_deg=18, side_deg=18, elbow_deg=26),
+        ),
+        "Gallop": style(
+            speed=1.55,
+            step_length=0.62,
+            rhythm=0.30,
+            duty=0.42,
+            bounce=0.0,
+            hop=0.04,
+            foot_lift=0.10,
+            hip_twist_deg=2,
+            spine_pitch_deg=6,
+            **_held_both(36, 10, 16, 76, swing_deg=8),
+        ),
+        "TwoFootJump": style(
+            speed=0.85,
+            step_length=0.32,
+            rhythm=0.04,
+            duty=0.50,
+            bounce=0.0,
+            hop=0.075,
+            foot_lift=0.10,
+            crouch=0.06,
+            hip_twist_deg=0,
+            sway=0.0,
+            toe_up_deg=2,
+            spine_pitch_deg=10,
+            **_both(swing_deg=0, elbow_deg=66, forward_deg=10, side_deg=18),
+        ),
+        # Characters
+        "March": style(
+            speed=1.30,
+            step_length=0.66,
+            foot_lift=0.15,
+            spine_pitch_deg=-5,
+            toe_up_deg=4,
+            head_pitch_deg=-3,
+            unsteadiness=0.0,
+            bounce=0.014,
+            **_both(swing_deg=46, elbow_deg=3, elbow_swing_deg=0, side_deg=8),
+        ),
+        "Zombie": style(
+            speed=0.58,
+            step_length=0.40,
+            foot_lift=0.020,
+            spine_pitch_deg=13,
+            spine_roll_deg=7,
+            head_roll_deg=20,
+            limp=0.4,
+            sway=0.045,
+            step_width=0.22,
+            unsteadiness=0.35,
+            left_arm=_held(78, 10, 0, 18),
+            right_arm=_held(66, 6, 10, 32),
+        ),
+        "Penguin": style(
+            speed=0.60,
+            step_length=0.26,
+            toe_out_deg=34,
+            sway=0.055,
+            chest_roll_deg=11,
+            foot_lift=0.03,
+            heel_off_deg=14,
+            knee_out_deg=12,
+            spine_pitch_deg=-6,
+            **_held_both(-10, 34, -20, 6),
+        ),
+        "Gorilla": style(
+            speed=0.95,
+            step_length=0.54,
+            crouch=0.15,
+            spine_pitch_deg=36,
+            pelvis_pitch_deg=14,
+            head_pitch_deg=-8,
+            step_width=0.34,
+            chest_roll_deg=9,
+            knee_out_deg=18,
+            **_both(forward_deg=4, side_deg=36, elbow_deg=30, swing_deg=24),
+        ),
+        "Crab": style(
+            speed=0.52,
+            step_length=0.27,
+            heading_deg=88,
+            crouch=0.13,
+            step_width=0.38,
+            knee_out_deg=24,
+            toe_out_deg=22,
+            **_held_both(28, 66, -30, 96),
+        ),
+        "Cowboy": style(
+            speed=1.00,
+            step_width=0.32,
+            knee_out_deg=20,
+            toe_out_deg=16,
+            sway=0.045,
+            chest_roll_deg=5,
+            **_both(side_deg=36, elbow_deg=42, swing_deg=14, twist_deg=30),
+        ),
+        # Runs
+        "Jogger": style(speed=2.05, step_length=0.74, **run),
+        "Runner": style(
+            speed=2.75,
+            step_length=0.98,
+            **(
+                run
+                | dict(
+                    duty=0.35,
+                    foot_lift=0.22,
+                    pelvis_pitch_deg=9,
+                    hip_twist_deg=8,
+                    chest_twist_deg=11,
+                )
+            ),
+        ),
+        "HurriedSteps": style(
+            speed=1.65,
+            step_length=0.52,
+            duty=0.50,
+            spine_pitch_deg=11,
+            head_pitch_deg=-3,
+            **_both(elbow_deg=70, swing_deg=20, side_deg=14, twist_deg=8),
+        ),
+    }
+
+
+_STYLE_TABLE = _table()
+STYLES: tuple[str, ...] = tuple(sorted(_STYLE_TABLE))
+"""The hundred style names, sorted."""
+
+
+def style_parameters(name: str) -> StyleParameters:
+    """Look up a style by name.
+
+    Args:
+      name: one of `STYLES`.
+
+    Returns:
+      The style's parameters.
+
+    Raises:
+      ValueError: for an unknown name; the message lists the nearest known ones.
+    """
+    try:
+        return _STYLE_TABLE[name]
+    except KeyError:
+        near = difflib.get_close_matches(str(name), STYLES, n=5, cutoff=0.4) or STYLES[:5]
+        raise ValueError(
+            f"unknown synthetic style {name!r}; nearest: {', '.join(near)} "
+            f"(f3amd_lib.motion.synthetic.STYLES lists all {len(STYLES)})"
+        ) from None
+
+
+# ---------------------------------------------------------------------------------- small tools
+
+_GRID_RATE = 60.0
+"""Samples per second on which paths are planned, whatever the frame rate of the clip."""
+_LEAD = 3.0
+"""Seconds planned before the first and after the last frame, so that clips are cut from motion."""
+_STANDING_SPEED = 0.12
+"""Below this speed, m/s, the character stands instead of stepping."""
+
+
+def _generator(style: str, seed: int) -> np.random.Generator:
+    """Seed a generator from text, so that it draws the same on every machine."""
+    digest = hashlib.sha256(f"f3amd synthetic walker|{style}|{int(seed)}".encode()).digest()
+    words = np.frombuffer(digest, dtype="<u4").tolist()
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+
+
+def _smooth(signal: np.ndarray, sigma: float, rate: float) -> np.ndarray:
+    """Blur along the first axis; sigma in seconds."""
+    return gaussian_filter1d(signal, sigma * rate, axis=0, mode="nearest")
+
+
+def _wander(rng: np.random.Generator, count: int, sigma: float, channels: int) -> np.ndarray:
+    """Draw slow random signals of unit variance on the planning grid, [count, channels]."""
+    width = sigma * _GRID_RATE
+    noise = rng.standard_normal((count, channels))
+    # A Gaussian blur of white noise has variance 1 / (2 sqrt(pi) width).
+    return gaussian_filter1d(noise, width, axis=0, mode="reflect") * np.sqrt(
+        2.0 * np.sqrt(np.pi) * width
+    )
+
+
+def _ramp(x: np.ndarray) -> np.ndarray:
+    """Rise from 0 to 1 with level ends (3 x^2 - 2 x^3)."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _about(axis: int, degrees) -> np.ndarray:
+    """Return rotations about one coordinate axis, [..., 3, 3]; degrees in."""
+    angle = np.radians(np.asarray(degrees, dtype=np.float64))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    matrix = np.zeros((*angle.shape, 3, 3))
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    matrix[..., axis, axis] = 1.0
+    matrix[..., first, first] = matrix[..., second, second] = cosine
+    matrix[..., first, second] = -sine
+    matrix[..., second, first] = sine
+    return matrix
+
+
+def _yaw_pitch_roll(yaw_deg, pitch_deg, left_roll_deg) -> np.ndarray:
+    """Turn left, then bow forwards, then lean to the left (all in degrees), [..., 3, 3]."""
+    return _about(1, yaw_deg) @ _about(0, pitch_deg) @ _about(2, -np.asarray(left_roll_deg))
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
+
+
+# ------------------------------------------------------------------------------- 1. root path
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A root path on the planning grid: times [N], position [N, 2] (x, z), yaw, speed, turn."""
+
+    time: np.ndarray
+    position: np.ndarray
+    yaw: np.ndarray
+    speed: np.ndarray
+    turn: np.ndarray
+    heading: np.ndarray
+
+    def at(self, time: float) -> int:
+        """Return the grid index of a time, clipped to the plan."""
+        index = int(round((time - self.time[0]) * _GRID_RATE))
+        return min(max(index, 0), len(self.time) - 1)
+
+
+def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator) -> _Path:
+    """String random stretches together and smooth speed, turning and heading."""
+    count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
+    time = np.arange(count) / _GRID_RATE - _LEAD
+    kinds = np.array(
+        ["straight", "curve", "tight", "slalom", "fast", "slow", "diagonal", "side", "back"]
+    )
+    weights = np.array([0.20, 0.26, 0.15, 0.08, 0.07, 0.07, 0.06, 0.06, 0.05])
+    speed, turn, heading = np.zeros(count), np.zeros(count), np.zeros(count)
+    start, forced, stood = 0, "straight", False
+    # Runs bend their paths less per second of turning than walks.
+    pace = min(1.0, 1.3 / style.speed) * style.turn_scale
+    while start < count:
+        kind = forced or str(rng.choice(kinds, p=weights))
+        # Stops are dealt by count: a stop lasts about two thirds of an average stretch.
+        if not stood and not forced and rng.random() < 1.5 * style.stop_share:
+            kind = "stop"
+        length = rng.uniform(1.8, 4.2)
+        factor, rate, offset = rng.uniform(0.85, 1.12), rng.normal(0.0, 0.08), 0.0
+        sign = rng.choice([-1.0, 1.0])
+        if kind == "curve":
+            rate = sign * rng.uniform(0.25, 0.75) * pace
+        elif kind == "tight":
+            rate, length = sign * rng.uniform(0.9, 1.5) * pace, rng.uniform(1.0, 1.9)
+            factor *= 0.85
+        elif kind == "slalom":
+            length = 4.5
+        elif kind == "fast":
+            factor = rng.uniform(1.18, 1.35)
+        elif kind == "slow":
+            factor = rng.uniform(0.5, 0.7)
+        elif kind == "diagonal":
+            offset = sign * rng.uniform(25.0, 50.0)
+            factor *= 0.85
+        elif kind == "side":
+            offset = sign * 90.0
+            factor = min(0.55, 0.50 / style.speed) * rng.uniform(0.8, 1.1)
+        elif kind == "back":
+            offset = sign * 180.0
+            factor = min(0.62, 0.85 / style.speed) * rng.uniform(0.8, 1.1)
+        elif kind == "stop":
+            factor, length, rate = 0.0, rng.uniform(1.4, 3.2), 0.0
+            if rng.random() < 0.25:
+                rate = sign * rng.uniform(0.5, 0.9)  # turns on the spot
+        stop = min(count, start + int(length * _GRID_RATE))
+        span = slice(start, stop)
+        speed[span], turn[span], heading[span] = style.speed * factor, rate, offset
+        if kind == "slalom":
+            beat = 2.0 * np.pi * (time[span] - time[start]) / 2.25
+            turn[span] = sign * 0.9 * pace * np.sin(beat)
+        # After a sideways or backward stretch walk straight on: headings never jump by 270 degrees.
+        forced = "straight" if kind in ("side", "back") else ""
+        stood = kind == "stop"
+        start = stop
+    heading = _smooth(heading, 0.30, _GRID_RATE)
+    change = np.radians(np.abs(np.gradient(heading, 1.0 / _GRID_RATE)))
+    brisk = 0.30 if style.speed < 1.6 else 0.45
+    speed = _smooth(speed, brisk, _GRID_RATE) * np.exp(-np.square(change / 2.0))
+    speed *= 1.0 + 0.03 * _wander(rng, count, 1.0, 1)[:, 0]
+    speed = np.maximum(_smooth(speed, 0.15, _GRID_RATE), 0.0)
+    turn = _smooth(turn, 0.28, _GRID_RATE)
+    wobble = style.unsteadiness * _wander(rng, count, 0.6, 1)[:, 0]
+    turn = turn + 0.45 * wobble * np.clip(speed, 0.0, 1.0)
+    yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) / _GRID_RATE
+    going = yaw + np.radians(heading + style.heading_deg)
+    velocity = speed[:, None] * np.stack([np.sin(going), np.cos(going)], axis=-1)
+    position = np.cumsum(velocity, axis=0) / _GRID_RATE
+    position -= position[int(_LEAD * _GRID_RATE)]
+    return _Path(time, position, yaw, speed, turn, heading)
+
+
+# ------------------------------------------------------------------------------- 2. footfalls
+
+
+@dataclass(frozen=True)
+class _Plants:
+    """Where one toe stands, in order: landing and lifting times [K], (x, z) [K, 2], yaw [K]."""
+
+    land: np.ndarray
+    lift: np.ndarray
+    position: np.ndarray
+    yaw: np.ndarray
+
+
+def _home(style: StyleParameters, path: _Path, time: float, side: float, width: float):
+    """Return where a toe wants to stand (x, z) and its yaw, for the body's place at a time."""
+    index = path.at(time)
+    yaw = path.yaw[index]
+    left = np.array([np.cos(yaw), -np.sin(yaw)])
+    ahead = np.array([np.sin(yaw), np.cos(yaw)])
+    foot_yaw = yaw + side * np.radians(style.toe_out_deg)
+    toe = _TOE_OFFSET[2] * np.array([np.sin(foot_yaw), np.cos(foot_yaw)])
+    # Bowing forwards moves the pelvis back over the feet.
+    lean = np.radians(style.pelvis_pitch_deg + 0.6 * style.spine_pitch_deg)
+    balance = 0.10 * np.sin(lean)
+    place = path.position[index] + side * 0.5 * width * left + balance * ahead + toe
+    return place, foot_yaw, left
+
+
+def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generator):
+    """Walk along the path, one footfall after the other.
+
+    Returns:
+      Two `_Plants` (left, right), and the gait phase as knots: times [K] and strides [K], whole
+      numbers at left footfalls and (in a walk) halves at right ones.
+    """
+    sides = (1.0, -1.0)
+    step_time = style.step_length / style.speed
+    rhythm = style.rhythm - 0.07 * style.limp
+    # An uneven walk keeps its phase; a jump or gallop is a stride of its own.
+    share = 0.5 if abs(style.rhythm - 0.5) < 0.15 else style.rhythm
+    stretch = max(0.36, 1.12 * style.duty * style.step_length)
+    begin, end = path.time[0], path.time[-1]
+    land, lift, place, yaw = ([], []), ([], []), ([], []), ([], [])
+    for foot in (0, 1):
+        position, angle, _ = _home(style, path, begin, sides[foot], style.step_width)
+        land[foot].append(begin - 1.0)
+        place[foot].append(position)
+        yaw[foot].append(angle)
+    knots, strides = [begin], [share]
+    now, foot, standing = begin, int(rng.integers(2)), True
+    while now < end:
+        ahead = slice(path.at(now + 0.05), path.at(now + 0.40) + 1)
+        rate = path.speed[ahead].max() + 0.25 * np.abs(path.turn[ahead]).max()
+        middle = path.at(now + 0.7 * step_time)
+        width = style.step_width
+        if rate > _STANDING_SPEED:
+            # Step length and step rate share a change of speed evenly, as people do.
+            sideways = abs(np.sin(np.radians(path.heading[middle])))
+            usual = style.speed * (1.0 - 0.5 * sideways)
+            soon = slice(path.at(now), path.at(now + 1.1 * step_time) + 1)
+            pace = 0.5 * (path.speed[soon].max() + path.speed[middle])
+            pace = max(pace + 0.2 * abs(path.turn[middle]), 0.05)
+            beat = step_time * np.clip(np.sqrt(usual / pace), 0.75, 1.45)
+            beat = np.clip(beat * (1.0 + 0.03 * rng.standard_normal()), 0.22, 1.2)
+            stride = 2.0 * beat
+            swing = stride * (1.0 - style.duty)
+            if standing:
+                begun, landed = now, now + min(swing, max(0.3, beat))
+            else:
+                landed = now + stride * (rhythm if foot == 1 else 1.0 - rhythm)
+                begun = landed - swing
+            # A foot that the body outruns leaves early, but not before the other one stands.
+            earliest = max(now if standing else min(begun, now + 0.02), land[foot][-1] + 0.10)
+            while begun > earliest:
+                rest, _, _ = _home(style, path, begun, sides[foot], width)
+                if np.linalg.norm(rest - place[foot][-1]) < stretch:
+                    break
+                begun, landed = begun - 0.02, landed - 0.02
+            begun = max(begun, land[foot][-1] + 0.10)
+            landed = max(landed, begun + 0.20)
+            width += 0.5 * sideways * path.speed[middle] * beat
+            target = landed + style.duty * beat
+        else:
+            # Standing: bring a foot that was left behind back under the body.
+            errors = []
+            for other in (0, 1):
+                position, angle, _ = _home(style, path, now + 0.5, sides[other], width)
+                off = np.linalg.norm(position - place[other][-1])
+                errors.append(off + 0.12 * abs(angle - yaw[other][-1]))
+            foot = int(np.argmax(errors))
+            if errors[foot] < 0.06:
+                now, standing = now + 0.05, True
+                continue
+            begun = max(now + 0.03, land[foot][-1] + 0.12)
+            landed = begun + 0.42
+            target = landed + 0.3
+        scatter = 0.006 + 0.05 * style.unsteadiness
+        position, angle, left = _home(style, path, target, sides[foot], width)
+        # Do not reach further ahead than the leg allows at the moment of landing.
+        rest, _, _ = _home(style, path, landed, sides[foot], width)
+        excess = np.linalg.norm(position - rest) / stretch
+        if excess > 1.0:
+            position = rest + (position - rest) / excess
+        position = position + scatter * np.clip(rng.standard_normal(2), -2.0, 2.0)
+        angle = angle + 0.5 * scatter * rng.standard_normal()
+        # Feet keep clear of each other, unless the style walks on a line.
+        apart = sides[foot] * float((position - place[1 - foot][-1]) @ left)
+        clear = min(0.085, style.step_width)
+        if apart < clear:
+            position = position + sides[foot] * (clear - apart) * left
+        lift[foot].append(begun)
+        land[foot].append(landed)
+        place[foot].append(position)
+        yaw[foot].append(angle)
+        step = strides[-1] + 1e-3
+        strides.append(np.ceil(step) if foot == 0 else np.ceil(step - share) + share)
+        knots.append(landed)
+        now, foot, standing = landed, 1 - foot, False
+    plants = []
+    for foot in (0, 1):
+        lift[foot].append(end + 10.0)
+        plants.append(
+            _Plants(
+                np.array(land[foot]),
+                np.array(lift[foot]),
+                np.array(place[foot]),
+                np.array(yaw[foot]),
+            )
+        )
+    return plants, np.array(knots), np.array(strides)
+
+
+# ------------------------------------------------------------------------------------ 3. feet
+
+
+def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: float, fps: float):
+    """Turn plants into a toe path.
+
+    Returns:
+      toe position [T, 3], foot yaw [T] (radians), foot pitch [T] (degrees, heel up positive),
+      toe bend [T] (degrees), planted [T] of bool.
+    """
+    index = np.clip(np.searchsorted(plants.land, time, side="right") - 1, 0, None)
+    after = np.minimum(index + 1, len(plants.land) - 1)
+    planted = time <= plants.lift[index]
+    duration = np.maximum(plants.land[after] - plants.lift[index], 1e-6)
+    progress = np.where(planted, 0.0, np.clip((time - plants.lift[index]) / duration, 0.0, 1.0))
+    travel = plants.position[after] - plants.position[index]
+    # Between minimum jerk and a cubic: soft ends, and a foot that does not lag behind.
+    quintic = progress**3 * (10.0 - 15.0 * progress + 6.0 * progress**2)
+    share = 0.3 * quintic + 0.7 * _ramp(progress)
+    flat = plants.position[index] + share[:, None] * travel
+    yaw = plants.yaw[index] + share * (plants.yaw[after] - plants.yaw[index])
+    # Short steps (settling, turning on the spot) lift and roll less.
+    reach = np.linalg.norm(np.diff(plants.position, axis=0), axis=-1)
+    reach = np.append(reach, 0.0) / (2.0 * style.step_length)
+    effort = np.clip(0.30 + 0.70 * reach, 0.30, 1.15)
+    facing = np.stack([np.sin(plants.yaw), np.cos(plants.yaw)], axis=-1)
+    forward = np.append(np.sum(np.diff(plants.position, axis=0) * facing[:-1], -1), 0.0)
+    forward = np.clip(forward / (2.0 * style.step_length), -1.0, 1.15)
+    scale = style.left_lift_scale if side > 0 else style.right_lift_scale
+    arc = progress**2 * (1.0 - progress) ** 2.5 * 26.0
+    height = style.foot_lift * scale * effort[index] * arc
+    outwards = side * np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
+    flat = (
+        flat + (style.circumduction * 16.0 * (progress * (1.0 - progress)) ** 2)[:, None] * outwards
+    )
+
+    keys, values = [], []
+    raised = style.heel_raise_deg
+    for k in range(len(plants.land)):
+        stance = plants.lift[k] - plants.land[k]
+        roll = np.clip(forward[k], 0.12, 1.0) if forward[k] > 0 else 0.15
+        peak = max(style.heel_off_deg * roll * (0.4 + 0.6 * min(scale, 1.0)), raised)
+        keys += [plants.land[k], plants.lift[k] - min(0.48 * stance, 0.36), plants.lift[k]]
+        values += [raised, raised, raised + 0.78 * (peak - raised)]
+        if k + 1 < len(plants.land):
+            swing = plants.land[k + 1] - plants.lift[k]
+            keys += [plants.lift[k] + 0.14 * swing, plants.lift[k] + 0.80 * swing]
+            values += [peak, raised - style.toe_up_deg * max(forward[k], 0.0)]
+    pitch = PchipInterpolator(np.array(keys), np.array(values))(time)
+    pitch = _smooth(pitch, 0.025, fps)
+    # A foot that lands on its heel has its toe in the air by the foot's length.
+    height = height + _FOOT_LENGTH * np.sin(np.radians(np.maximum(-pitch, 0.0))) * ~planted
+    toe = np.stack([flat[:, 0], _TOE_HEIGHT + height, flat[:, 1]], axis=-1)
+    # On the ground toes stay flat while the heel rises; in the air they follow the foot.
+    flex = np.where(planted, 1.0, 1.0 - 0.85 * _ramp(progress / 0.3) * _ramp((1 - progress) / 0.2))
+    return toe, yaw, pitch, -np.maximum(pitch, 0.0) * flex, planted
+
+
+# ---------------------------------------------------------------------------- 4 and 5. the legs
+
+
+def _lower_pelvis(height, root_flat, pelvis, ankles, reach, fps):
+    """Lower the pelvis where a leg is too short, smoothly and never by less than needed."""
+    room = np.full(len(height), np.inf)
+    for side, ankle in zip((1.0, -1.0), ankles, strict=True):
+        hip = pelvis @ (_HIP_OFFSET * [side, 1.0, 1.0])
+        across = np.square(ankle[:, [0, 2]] - root_flat - hip[:, [0, 2]]).sum(-1)
+        rise = np.sqrt(np.maximum(reach**2 - across, 0.30**2))
+        room = np.minimum(room, ankle[:, 1] + rise - hip[:, 1])
+    lack = np.maximum(height - room, 0.0)
+    # A running maximum, then an average over the same span, stays above the need itself.
+    radius = max(2, int(round(0.13 * fps)))
+    lack = maximum_filter1d(lack, 2 * radius + 1, mode="nearest")
+    return height - gaussian_filter1d(lack, radius / 2.2, radius=radius, mode="nearest")
+
+
+def _bend_leg(hip: np.ndarray, ankle: np.ndarray, pole: np.ndarray):
+    """Solve one leg: global thigh and shank rotations, [T, 3, 3] each, knee towards the pole."""
+    line = ankle - hip
+    distance = np.linalg.norm(line, axis=-1)
+    distance = np.clip(distance, abs(_THIGH - _SHANK) + 0.05, 0.9995 * (_THIGH + _SHANK))
+    down = _unit(line)
+    hinge = _unit(np.cross(-down, pole))
+    front = np.cross(hinge, -down)
+    cosine = (distance**2 + _THIGH**2 - _SHANK**2) / (2.0 * distance * _THIGH)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
+    knee = hip + _THIGH * (np.cos(angle) * down + np.sin(angle) * front)
+    frames = []
+    for upper, lower in ((hip, knee), (knee, hip + distance[:, None] * down)):
+        axis_y = _unit(upper - lower)
+        frames.append(np.stack([hinge, axis_y, np.cross(hinge, axis_y)], axis=-1))
+    return frames
+
+
+# --------------------------------------------------------------------------------- 6. the arms
+
+
+def _arm(pose: ArmPose, side, swing, gesture, lean_deg, roll_deg, drift):
+    """Return local shoulder, elbow and wrist rotations of one arm, [T, 3, 3] each."""
+    forward = pose.forward_deg + pose.swing_deg * swing + pose.hang * lean_deg
+    forward = forward + pose.wave_forward_deg * np.cos(gesture) + 1.5 * drift[:, 0]
+    out = pose.side_deg + pose.wave_side_deg * np.sin(gesture) + 1.0 * drift[:, 1]
+    # An arm under a sideways lean hangs free on one side and rests against the ribs on the other.
+    ribs = min(pose.side_deg - 3.0, 5.0)
+    out = ribs + 3.0 * np.logaddexp(0.0, (out + side * pose.hang * roll_deg - ribs) / 3.0)
+    twist = pose.twist_deg + pose.wave_twist_deg * np.sin(gesture)
+    elbow = pose.elbow_deg + pose.elbow_swing_deg * np.maximum(swing + 0.3, 0.0) ** 2
+    elbow = np.maximum(elbow + pose.wave_elbow_deg * np.sin(gesture) + 1.5 * drift[:, 2], 2.0)
+    shoulder = _about(0, -forward) @ _about(2, side * (out - 90.0)) @ _about(0, twist)
+    wrist = _about(2, -side * (4.0 + 2.0 * drift[:, 1])) @ _about(1, -side * (6.0 + 3.0 * swing))
+    return shoulder, _about(1, -side * elbow), wrist
+
+
+# ------------------------------------------------------------------------------------ assembly
+
+
+def synthesize_with_contacts(
+    style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0
+) -> tuple[Motion, np.ndarray]:
+    """Make a clip of styled locomotion together with its planned contacts.
+
+    Args:
+      style: one of `STYLES`.
+      seconds: length of the clip, seconds.
+      seed: any integer; equal (style, seconds, seed, fps) give equal clips.
+      fps: frames per second.
+
+    Returns:
+      The motion ([T, 3] metres and [T, 23, 3, 3] local rotations, T = round(seconds * fps)) and
+      the planned toe contacts [T, 2] of bool, left then right: the toe stands still from this
+      frame to the next.
+
+    Raises:
+      ValueError: for an unknown style, or a length or rate that gives no frame.
+    """
+    parameters = style_parameters(style)
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps must be positive, got {fps}")
+    if not np.isfinite(seconds) or round(seconds * fps) < 1:
+        raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
+    frames = int(round(seconds * fps))
+    rng = _generator(style, seed)
+    path = _plan_path(parameters, frames / fps, rng)
+    plants, knots, strides = _plan_footfalls(parameters, path, rng)
+    drift = _wander(rng, len(path.time), 0.7, 12)
+    gesture_start = rng.uniform(0.0, 2.0 * np.pi)
+
+    # Everything below is evaluated on the clip's own frames, plus a margin for the filters.
+    margin = int(np.ceil(1.0 * fps))
+    time = np.arange(-margin, frames + margin) / fps
+    columns = [path.position, path.yaw[:, None], path.speed[:, None], path.turn[:, None]]
+    columns += [path.heading[:, None], drift]
+    sampled = CubicSpline(path.time, np.concatenate(columns, axis=-1))(time)
+    root_flat, yaw, speed, turn = sampled[:, :2], sampled[:, 2], sampled[:, 3], sampled[:, 4]
+    heading = sampled[:, 5]
+    drift = sampled[:, 6:] * (0.6 + 4.0 * parameters.unsteadiness)
+    phase = _smooth(
+        PchipInterpolator(knots, strides, extrapolate=True)(np.clip(time, knots[0], knots[-1])),
+        0.05,
+        fps,
+    )
+    cycle = 2.0 * np.pi * phase
+    stepping = np.gradient(phase, time) * 2.0 * parameters.step_length / parameters.speed
+    effort = _smooth(
+        np.clip(1.3 * stepping, 0.0, 1.0) * np.clip(speed / parameters.speed, 0.25, 1.1), 0.16, fps
+    )
+
+    feet = [
+        _move_foot(parameters, plants[foot], time, side, fps)
+        for foot, side in enumerate((1.0, -1.0))
+    ]
+
+    # Pelvis: sway, twist, roll and bounce ride on the gait phase (left footfall at whole strides).
+    accelerate = np.gradient(speed, time)
+    bank = np.degrees(np.arctan(speed * turn / 9.81))
+    spared = np.square(0.5 + 0.5 * np.sin(cycle) * np.sign(parameters.limp or 1.0)) * abs(
+        parameters.limp
+    )
+    spared = spared * effort
+    pelvis_yaw = np.degrees(yaw) - effort * parameters.hip_twist_deg * np.cos(cycle)
+    pelvis_roll = effort * parameters.hip_roll_deg * np.sin(cycle) * -1.0 + 0.5 * bank
+    pelvis_roll = pelvis_roll + 0.6 * drift[:, 0] * 0.5
+    pelvis_pitch = (
+        parameters.pelvis_pitch_deg + 1.5 * np.clip(accelerate, -2, 2) + 0.3 * drift[:, 1]
+    )
+    pelvis = _yaw_pitch_roll(pelvis_yaw, pelvis_pitch, pelvis_roll)
+    left = np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
+    ahead = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
+    # Weight is carried from foot to foot across the path, so hardly at all in a side step.
+    across = np.abs(np.cos(np.radians(heading + parameters.heading_deg)))
+    sway = effort * across * parameters.sway * np.sin(cycle) + 0.006 * drift[:, 2]
+    surge = 0.012 * effort * np.sin(2.0 * cycle) + 0.005 * drift[:, 3]
+    root_flat = root_flat + sway[:, None] * left + surge[:, None] * ahead
+
+    leg = _THIGH + _SHANK
+    stand = _TOE_HEIGHT - _TOE_OFFSET[1] + 0.988 * leg - _HIP_OFFSET[1]
+    raised = np.radians(parameters.heel_raise_deg)
+    tiptoe = _TOE_OFFSET[2] * np.sin(raised) - _TOE_OFFSET[1] * (np.cos(raised) - 1.0)
+    height = stand + tiptoe - parameters.crouch - effort * parameters.bounce * np.cos(2.0 * cycle)
+    flight = np.pi * (parameters.rhythm + parameters.duty + 1.0)
+    height = height + effort * parameters.hop * np.cos(cycle - flight)
+    height = height - 0.035 * spared + 0.002 * drift[:, 4]
+    ankles, foot_frames, toe_frames = [], [], []
+    for toe, foot_yaw, pitch, bend, _ in feet:
+        frame = matrix_from_yaw(foot_yaw) @ _about(0, pitch)
+        foot_frames.append(frame)
+        toe_frames.append(_about(0, bend))
+        ankles.append(toe - frame @ _TOE_OFFSET)
+    height = _lower_pelvis(height, root_flat, pelvis, ankles, 0.990 * leg, fps)
+    root = np.stack([root_flat[:, 0], height, root_flat[:, 1]], axis=-1)
+
+    count = len(time)
+    local = np.broadcast_to(np.eye(3), (count, SYNTHETIC_SKELETON.num_joints, 3, 3)).copy()
+    joint = SYNTHETIC_SKELETON.index
+    local[:, 0] = pelvis
+    transpose = np.swapaxes(pelvis, -1, -2)
+    for foot, (name, side) in enumerate((("Left", 1.0), ("Right", -1.0))):
+        hip = root + pelvis @ (_HIP_OFFSET * [side, 1.0, 1.0])
+        foot_yaw = feet[foot][1]
+        bearing = 0.5 * (foot_yaw + np.radians(pelvis_yaw)) + side * np.radians(
+            parameters.knee_out_deg
+        )
+        pole = np.stack([np.sin(bearing), np.zeros(count), np.cos(bearing)], axis=-1)
+        thigh, shank = _bend_leg(hip, ankles[foot], pole)
+        local[:, joint(f"{name}Hip")] = transpose @ thigh
+        local[:, joint(f"{name}Knee")] = np.swapaxes(thigh, -1, -2) @ shank
+        local[:, joint(f"{name}Ankle")] = np.swapaxes(shank, -1, -2) @ foot_frames[foot]
+        local[:, joint(f"{name}Toe")] = toe_frames[foot]
+
+    # Spine: posture, shoulders against hips, and a trunk that stays upright over a rolling pelvis.
+    spine_yaw = parameters.spine_twist_deg + effort * np.cos(cycle) * (
+        parameters.hip_twist_deg + parameters.chest_twist_deg
+    )
+    spine_pitch = parameters.spine_pitch_deg + 1.2 * np.clip(accelerate, -2, 2) + 0.8 * drift[:, 5]
+    spine_pitch = spine_pitch + 6.0 * spared + 0.8 * effort * np.cos(2.0 * cycle)
+    spine_roll = parameters.spine_roll_deg - 0.8 * pelvis_roll + 0.9 * bank + 0.8 * drift[:, 6]
+    spine_roll = spine_roll + effort * parameters.chest_roll_deg * np.sin(cycle)
+    spine_roll = spine_roll + 9.0 * spared * np.sign(parameters.limp)
+    each = _yaw_pitch_roll(spine_yaw / 4.0, spine_pitch / 4.0, spine_roll / 4.0)
+    chest = pelvis
+    for name in _SPINE:
+        local[:, joint(name)] = each
+        chest = chest @ each
+
+    # Head: looks where the path goes next, and stays steadier than the trunk that carries it.
+    look = np.degrees(_smooth(np.interp(time + 0.25, path.time, path.yaw), 0.12, fps))
+    look = look + 0.3 * parameters.spine_twist_deg + parameters.head_yaw_deg + 2.5 * drift[:, 7]
+    nod = parameters.head_pitch_deg + 0.35 * (
+        parameters.pelvis_pitch_deg + parameters.spine_pitch_deg
+    )
+    nod = nod + effort * parameters.head_bob_deg * np.cos(2.0 * cycle) + 1.2 * drift[:, 8]
+    tilt = parameters.head_roll_deg + 0.4 * parameters.spine_roll_deg + 0.4 * bank
+    head = np.swapaxes(chest, -1, -2) @ _yaw_pitch_roll(look, nod, tilt)
+    half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(head).as_rotvec()).as_matrix()
+    local[:, joint("Neck")] = local[:, joint("Head")] = half
+
+    # Arms swing against the legs; the trunk's lean is given back to gravity.
+    lean = pelvis_pitch + spine_pitch
+    roll = pelvis_roll + spine_roll
+    for name, side, pose in (
+        ("Left", 1.0, parameters.left_arm),
+        ("Right", -1.0, parameters.right_arm),
+    ):
+        swing = -side * effort * np.cos(cycle - 0.25)
+        turns = 2.0 * np.pi * pose.wave_hz * time + gesture_start + 0.25 * drift[:, 9]
+        if parameters.opposed_waves and side < 0:
+            turns = turns + np.pi
+        parts = _arm(pose, side, swing, turns, lean, roll, drift[:, 9:12])
+        for part, rotation in zip(("Shoulder", "Elbow", "Wrist"), parts, strict=True):
+            local[:, joint(f"{name}{part}")] = rotation
+        lift = parameters.shrug_deg + 0.12 * max(pose.side_deg - 60.0, 0.0)
+        local[:, joint(f"{name}Collar")] = _about(2, side * lift)
+
+    keep = slice(margin, margin + frames)
+    planted = np.stack([foot[4] for foot in feet], axis=-1)
+    contacts = (planted & np.roll(planted, -1, axis=0))[keep]
+    motion = Motion(
+        skeleton=SYNTHETIC_SKELETON,
+        root_position=root[keep],
+        rotations=local[keep],
+        fps=float(fps),
+        name=f"{style}_{int(seed)}",
+    )
+    return motion, contacts
+
+
+def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0) -> Motion:
+    """Make a clip of styled locomotion (see `synthesize_with_contacts`).
+
+    Args:
+      style: one of `STYLES`.
+      seconds: length of the clip, seconds.
+      seed: any integer; equal arguments give equal clips on every machine.
+      fps: frames per second.
+
+    Returns:
+      The motion: T = round(seconds * fps) frames of 23 joints, metres, floor at y = 0.
+
+    Raises:
+      ValueError: for an unknown style, or a length or rate that gives no frame.
+    """
+    return synthesize_with_contacts(style, seconds, seed, fps)[0]
