@@ -1,0 +1,406 @@
+"""The packed cache: a whole data set in one small file that loads in a moment.
+
+Parsing text takes seconds to minutes, so it is done once. The packed file holds root positions in
+float32 (float16 steps by 8 mm at 10 m) and rotations as 6D numbers in float16; it is a plain `.npz`
+without pickled objects, and small enough to carry to another machine.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import hashlib
+import json
+import multiprocessing
+import os
+import warnings
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pooch
+from tqdm.auto import tqdm
+
+from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Clip, Dataset
+from f3amd_lib.data.statistics import lowest_toe_height
+from f3amd_lib.files import whole_file
+from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+__all__ = [
+    "PackedMotion",
+    "pack",
+    "load_packed",
+    "save_packed",
+    "packed_dataset",
+    "cache_path",
+    "CACHE_DIR_VARIABLE",
+]
+
+CACHE_DIR_VARIABLE = "F3AMD_CACHE_DIR"
+
+_FORMAT = 1
+"""Raised whenever the file's layout or what is put into it changes, so that old caches retire."""
+
+_ARRAYS = {
+    "root_position": np.float32,
+    "rotation_6d": np.float16,
+    "clip_start": np.int32,
+    "clip_style": np.int32,
+    "clip_split": np.uint8,
+    "floor_shift": np.float32,
+    "offsets": np.float64,
+}
+
+
+# All that numpy and zipfile raise for files that are not what they should be; the TypeError stands
+# for a single array where an archive of them is wanted.
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    KeyError,
+    TypeError,
+    ValueError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMotion:
+    """All clips of a data set end to end: N frames, K clips, J joints, at 30 fps.
+
+    Attributes:
+      skeleton: the joints that all clips share.
+      styles: style labels; the index is the one-hot position.
+      root_position: [N, 3] float32, metres.
+      rotation_6d: [N, J, 6] float16, local rotations (the root's global).
+      clip_start: [K + 1] int32; clip k is frames clip_start[k] to clip_start[k + 1] (excluded).
+      clip_names, clip_contents: per clip, K strings.
+      clip_style: [K] int32, index into `styles`.
+      clip_split: [K] uint8; 0 train, 1 validation, 2 test.
+      floor_shift: [K] float32, height of the lowest toe of each clip, metres. Nothing has been
+        subtracted; contact rules that measure height subtract it.
+      primary_styles, mirror_styles: as in `Dataset`.
+      dataset, licence, credit, fingerprint: as in `Dataset` (its name, terms, credit, identity).
+      skipped: (clip name, reason) of clips that were left out.
+    """
+
+    skeleton: Skeleton
+    styles: tuple[str, ...]
+    root_position: np.ndarray
+    rotation_6d: np.ndarray
+    clip_start: np.ndarray
+    clip_names: tuple[str, ...]
+    clip_contents: tuple[str, ...]
+    clip_style: np.ndarray
+    clip_split: np.ndarray
+    floor_shift: np.ndarray
+    primary_styles: tuple[str, ...]
+    mirror_styles: frozenset[str]
+    dataset: str
+    licence: str
+    credit: str
+    fingerprint: str
+    skipped: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self):
+        problem = self._problem()
+        if problem:
+            raise ValueError(f"packed data set {self.dataset!r}: {problem}")
+
+    def _problem(self) -> str | None:
+        """Say what does not fit together, if anything."""
+        frames, clips = len(self.root_position), len(self.clip_names)
+        shapes = {
+            "root_position": (frames, 3),
+            "rotation_6d": (frames, self.skeleton.num_joints, 6),
+            "clip_start": (clips + 1,),
+            "clip_style": (clips,),
+            "clip_split": (clips,),
+            "floor_shift": (clips,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                return f"{name} has shape {getattr(self, name).shape} instead of {shape}"
+        if len(self.clip_contents) != clips:
+            return f"{len(self.clip_contents)} contents for {clips} clips"
+        start = self.clip_start
+        if clips == 0 or start[0] != 0 or start[-1] != frames or np.any(np.diff(start) <= 0):
+            return "clip_start does not cut the frames into clips"
+        if self.clip_style.min() < 0 or self.clip_style.max() >= len(self.styles):
+            return "clip_style points outside of the styles"
+        if self.clip_split.max() >= len(SPLITS):
+            return "clip_split must be 0, 1 or 2"
+        return None
+
+    @property
+    def name(self) -> str:
+        """Name of the data set, as `Dataset.name`."""
+        return self.dataset
+
+    @property
+    def num_clips(self) -> int:
+        """Number of clips, K."""
+        return len(self.clip_names)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames of all clips together, N."""
+        return len(self.root_position)
+
+    def motion(self, clip: int) -> Motion:
+        """Return a clip by number, float64 with true rotation matrices.
+
+        Raises:
+          ValueError: if there is no such clip.
+        """
+        if not 0 <= clip < self.num_clips:
+            raise ValueError(f"clip must be 0 to {self.num_clips - 1}, got {clip}")
+        start, stop = int(self.clip_start[clip]), int(self.clip_start[clip + 1])
+        return Motion(
+            skeleton=self.skeleton,
+            root_position=self.root_position[start:stop].astype(np.float64),
+            rotations=matrix_from_rotation_6d(self.rotation_6d[start:stop].astype(np.float64)),
+            fps=FPS,
+            name=self.clip_names[clip],
+        )
+
+
+def _compact(clip: Clip):
+    """Load one clip and return its skeleton, arrays and floor; runs in worker processes too."""
+    motion = clip.load()
+    return (
+        motion.skeleton,
+        motion.root_position.astype(np.float32),
+        rotation_6d_from_matrix(motion.rotations).astype(np.float16),
+        lowest_toe_height(motion),
+    )
+
+
+def _compact_all(clips: tuple[Clip, ...], workers: int):
+    """Yield `_compact` of every clip, in order."""
+    if workers <= 1:
+        yield from map(_compact, clips)
+        return
+    # Spawned, because a process that runs JAX must not be forked.
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        yield from pool.map(_compact, clips, chunksize=4)
+
+
+def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> PackedMotion:
+    """Read all clips of a data set into one packed set of arrays.
+
+    Clips shorter than one window (`MINIMUM_FRAMES`) are left out and listed in `skipped`. Any clip
+    that cannot be read or verified stops the whole: nothing is half-used.
+
+    Args:
+      dataset: from `open_dataset`.
+      progress: show a progress bar.
+      workers: processes that read; more than one pays off from some ten thousand frames on, and
+        needs the caller's script to be guarded by `if __name__ == "__main__"`.
+
+    Returns:
+      The packed arrays.
+
+    Raises:
+      ValueError: naming the first file that is broken, or whose skeleton differs from the others'.
+    """
+    kept, skipped = [], []
+    skeleton = None
+    parts = _compact_all(dataset.clips, workers)
+    bar = tqdm(
+        zip(dataset.clips, parts, strict=True),
+        total=len(dataset.clips),
+        desc=f"reading {dataset.name}",
+        unit="clip",
+        disable=not progress,
+    )
+    for clip, (clip_skeleton, root_position, rotation_6d, floor) in bar:
+        if len(root_position) < MINIMUM_FRAMES:
+            reason = f"{len(root_position)} frames, shorter than a window of {MINIMUM_FRAMES}"
+            skipped.append((clip.name, reason))
+            continue
+        if skeleton is None:
+            skeleton = clip_skeleton
+        elif skeleton != clip_skeleton:
+            raise ValueError(
+                f"{clip.name}: its skeleton differs from that of {kept[0][0].name} (names, parents "
+                "or bone lengths); a data set needs one skeleton: retarget or remove the file"
+            )
+        kept.append((clip, root_position, rotation_6d, floor))
+    if not kept:
+        raise ValueError(
+            f"data set {dataset.name!r} has no clip of at least {MINIMUM_FRAMES} frames; "
+            f"{len(skipped)} are shorter"
+        )
+    clips = [clip for clip, *_ in kept]
+    lengths = [len(root_position) for _, root_position, *_ in kept]
+    return PackedMotion(
+        skeleton=skeleton,
+        styles=dataset.styles,
+        root_position=np.concatenate([root_position for _, root_position, *_ in kept]),
+        rotation_6d=np.concatenate([rotation_6d for *_, rotation_6d, _ in kept]),
+        clip_start=np.cumsum([0, *lengths]).astype(np.int32),
+        clip_names=tuple(clip.name for clip in clips),
+        clip_contents=tuple(clip.content for clip in clips),
+        clip_style=np.array([dataset.styles.index(clip.style) for clip in clips], np.int32),
+        clip_split=np.array([SPLITS.index(clip.split) for clip in clips], np.uint8),
+        floor_shift=np.array([floor for *_, floor in kept], np.float32),
+        primary_styles=dataset.primary_styles,
+        mirror_styles=dataset.mirror_styles,
+        dataset=dataset.name,
+        licence=dataset.licence,
+        credit=dataset.credit,
+        fingerprint=dataset.fingerprint,
+        skipped=tuple(skipped),
+    )
+
+
+def _checksum(arrays: dict[str, np.ndarray], text: bytes) -> str:
+    """Hash arrays with their names, types and shapes, and the text beside them."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode("ascii"))
+        digest.update(array.data)
+    digest.update(text)
+    return digest.hexdigest()
+
+
+def save_packed(path, packed: PackedMotion, *, overwrite: bool = False) -> Path:
+    """Write a packed data set; the file appears whole or not at all.
+
+    Args:
+      path: where to; ".npz" is customary. Missing folders are made.
+      packed: what to write.
+      overwrite: an existing file is replaced only if this is true.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: if the file exists and `overwrite` is false.
+    """
+    skeleton = packed.skeleton
+    text = {
+        "format": _FORMAT,
+        "joint_names": skeleton.names,
+        "joint_parents": skeleton.parents,
+        "end_sites": skeleton.end_sites,
+        "styles": packed.styles,
+        "clip_names": packed.clip_names,
+        "clip_contents": packed.clip_contents,
+        "primary_styles": packed.primary_styles,
+        "mirror_styles": sorted(packed.mirror_styles),
+        "dataset": packed.dataset,
+        "licence": packed.licence,
+        "credit": packed.credit,
+        "fingerprint": packed.fingerprint,
+        "skipped": packed.skipped,
+    }
+    text = json.dumps(text, ensure_ascii=True).encode("ascii")
+    arrays = {
+        name: np.asarray(skeleton.offsets if name == "offsets" else getattr(packed, name), dtype)
+        for name, dtype in _ARRAYS.items()
+    }
+    checksum = _checksum(arrays, text)
+    with whole_file(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            text=np.frombuffer(text, np.uint8),
+            checksum=np.frombuffer(checksum.encode("ascii"), np.uint8),
+            **arrays,
+        )
+    return Path(path)
+
+
+def load_packed(path) -> PackedMotion:
+    """Read a packed data set and check it against the checksum inside.
+
+    Args:
+      path: a file written by `save_packed`.
+
+    Returns:
+      The packed data set.
+
+    Raises:
+      ValueError: naming the file, if it is absent, truncated, altered or of another version.
+    """
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in ("text", "checksum", *_ARRAYS)}
+        strange = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
+        if strange:  # numpy hands out other members of a zip as bytes
+            raise ValueError(f"{strange[0]} is not an array")
+    except _UNREADABLE as error:
+        raise ValueError(
+            f"{path}: cannot be read as a packed data set ({error}); delete it and pack again"
+        ) from error
+    text, checksum = arrays.pop("text").tobytes(), arrays.pop("checksum").tobytes()
+    if _checksum(arrays, text).encode("ascii") != checksum:
+        raise ValueError(f"{path}: checksum differs, the file was altered; delete it, pack again")
+    about = json.loads(text)
+    if about["format"] != _FORMAT:
+        raise ValueError(
+            f"{path}: is of format {about['format']}, this version reads {_FORMAT}; pack again"
+        )
+    offsets = arrays.pop("offsets")
+    skeleton = Skeleton(
+        names=tuple(about["joint_names"]),
+        parents=tuple(about["joint_parents"]),
+        offsets=offsets,
+        end_sites=tuple((joint, tuple(offset)) for joint, offset in about["end_sites"]),
+    )
+    return PackedMotion(
+        skeleton=skeleton,
+        styles=tuple(about["styles"]),
+        clip_names=tuple(about["clip_names"]),
+        clip_contents=tuple(about["clip_contents"]),
+        primary_styles=tuple(about["primary_styles"]),
+        mirror_styles=frozenset(about["mirror_styles"]),
+        dataset=about["dataset"],
+        licence=about["licence"],
+        credit=about["credit"],
+        fingerprint=about["fingerprint"],
+        skipped=tuple((name, reason) for name, reason in about["skipped"]),
+        **arrays,
+    )
+
+
+def cache_path(dataset: Dataset) -> Path:
+    """Return where the packed form of a data set is cached (F3AMD_CACHE_DIR overrides)."""
+    folder = os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed"
+    return Path(folder) / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.npz"
+
+
+def packed_dataset(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> PackedMotion:
+    """Return the packed form of a data set: from the cache if it is there, else packed and kept.
+
+    Args:
+      dataset: from `open_dataset`; its fingerprint is the cache's key.
+      progress, workers: as in `pack`.
+
+    Returns:
+      The packed arrays.
+
+    Raises:
+      ValueError: naming a data file that is broken. A damaged cache file is packed anew, with a
+        warning.
+    """
+    path = cache_path(dataset)
+    if path.exists():
+        try:
+            packed = load_packed(path)
+            if packed.fingerprint == dataset.fingerprint:
+                return packed
+            warnings.warn(f"{path}: belongs to another data set; packing anew", stacklevel=2)
+        except ValueError as error:
+            warnings.warn(f"{error} (packing anew)", stacklevel=2)
+    packed = pack(dataset, progress=progress, workers=workers)
+    save_packed(path, packed, overwrite=True)
+    return packed

@@ -1,0 +1,759 @@
+"""Data sets by name: find or download, verify, and list clips with style and split.
+
+| name | what | where from |
+|---|---|---|
+| `synthetic` | 100 styles of the procedural walker | made here, nothing to download |
+| `bandai` | Bandai-Namco-Research-Motiondataset 1 and 2 | public archive, pinned commit |
+| `100style` | 100STYLE, usable ranges only | Zenodo record 8127870 |
+| `folder` | any folder (or zip) of BVH files | yours |
+
+With the environment variable `F3AMD_DATA_DIR` set to a folder or a zip file, data is looked for
+there and the network is never touched. Without it, archives are downloaded once into pooch's cache
+folder. Archives are read in place. Every file is checked before it is parsed, so that a damaged one
+is refused by name and none of its numbers get used.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import hashlib
+import io
+import json
+import os
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path, PurePosixPath
+
+import pooch
+
+from f3amd_lib.motion.bvh import format_bvh, parse_bvh
+from f3amd_lib.motion.skeleton import Motion, resample
+
+__all__ = [
+    "NAMES",
+    "SPLITS",
+    "FPS",
+    "MINIMUM_FRAMES",
+    "DATA_DIR_VARIABLE",
+    "Clip",
+    "Dataset",
+    "open_dataset",
+    "assign_splits",
+]
+
+NAMES = ("synthetic", "bandai", "100style", "folder")
+SPLITS = ("train", "validation", "test")
+FPS = 30.0
+"""Frame rate of every clip, frames per second (paper section 4)."""
+
+MINIMUM_FRAMES = 42
+"""Shortest useful clip: 10 history and 32 future frames (paper section 3.2)."""
+
+DATA_DIR_VARIABLE = "F3AMD_DATA_DIR"
+
+_BANDAI_REPOSITORY = "BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
+_BANDAI_COMMIT = "74ead3ba1ae4696404e6086233779f60de8bf9ef"
+_BANDAI_LOCOMOTION = {
+    "dataset-1": ("walk", "run", "dash", "walk-back", "walk-left", "walk-right"),
+    "dataset-2": ("walk", "run", "walk-turn-left", "walk-turn-right"),
+}
+_100STYLE_DOI = "10.5281/zenodo.8127870"
+_100STYLE_MD5 = "3cf627852fd8192024c04a8d0ef49583"
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One take of one style.
+
+    Attributes:
+      name: unique within its data set.
+      style: style label, one of the data set's `styles`.
+      content: what is done in it, such as "walk" or "FW"; may be empty.
+      split: "train", "validation" or "test".
+      loader: picklable callable without arguments that returns the motion.
+    """
+
+    name: str
+    style: str
+    content: str
+    split: str
+    loader: Callable[[], Motion] = field(repr=False)
+
+    def load(self) -> Motion:
+        """Read, verify and return the motion at 30 fps in metres; ValueError names a bad file."""
+        motion = resample(self.loader(), FPS)
+        return motion.replace(name=self.name)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Clips with their styles and splits, and the terms under which they may be used.
+
+    Attributes:
+      name: one of `NAMES`.
+      licence, credit: terms of the motion data and the line that names its makers.
+      fingerprint: SHA-256 (hex) of everything that decides what the clips hold.
+      styles: labels in sorted order; the index is the one-hot position (paper section 3.3).
+      clips: all takes, sorted by name.
+      primary_styles: classes that carry evaluation per style.
+      mirror_styles: styles that stay themselves when left and right are swapped.
+      notes: what was missing or left aside on opening, one sentence each.
+    """
+
+    name: str
+    licence: str
+    credit: str
+    fingerprint: str
+    styles: tuple[str, ...]
+    clips: tuple[Clip, ...]
+    primary_styles: tuple[str, ...]
+    mirror_styles: frozenset[str]
+    notes: tuple[str, ...] = ()
+
+
+def open_dataset(
+    name: str,
+    *,
+    path=None,
+    locomotion_only: bool = True,
+    seconds_per_style: float = 60.0,
+    num_styles: int | None = None,
+) -> Dataset:
+    """Open a data set by name: find or download it, verify it and list its clips.
+
+    Args:
+      name: "synthetic", "bandai", "100style" or "folder".
+      path: a folder or zip to read from; it wins over `F3AMD_DATA_DIR` and the network.
+      locomotion_only: bandai only: leave out bows, waves, dances and the like.
+      seconds_per_style: synthetic only: motion per style, shared out over several takes.
+      num_styles: keep only so many styles (primary ones first, then by name); None keeps all.
+
+    Returns:
+      The data set. Numbers are read by `Clip.load`.
+
+    Raises:
+      ValueError: for an unknown name, or for data that is absent, broken, truncated or altered:
+        naming the file and what to do.
+    """
+    if name not in NAMES:
+        raise ValueError(f"unknown data set {name!r}: use one of {', '.join(NAMES)}")
+    if num_styles is not None and num_styles < 1:
+        raise ValueError(f"num_styles must be at least 1, got {num_styles}")
+    if name == "synthetic":
+        dataset = _open_synthetic(seconds_per_style, num_styles)
+    elif name == "bandai":
+        dataset = _open_bandai(path, locomotion_only)
+    elif name == "100style":
+        dataset = _open_100style(path)
+    else:
+        dataset = _open_folder(path)
+    return dataset if num_styles is None else _keep_styles(dataset, num_styles)
+
+
+def assign_splits(strata: Iterable[tuple[str, object]]) -> dict[str, str]:
+    """Share clips out over train, validation and test: 80, 10 and 10 % of each stratum.
+
+    A stratum's clips are ordered by the SHA-256 of their names, so that the answer depends on names
+    alone and is the same on every machine. Three clips or more give at least one to each split.
+
+    Args:
+      strata: (clip name, stratum) pairs; a stratum is a style or anything else hashable.
+
+    Returns:
+      Split by clip name.
+    """
+    members: dict[object, list[str]] = {}
+    for name, stratum in strata:
+        members.setdefault(stratum, []).append(name)
+    splits = {}
+    for names in members.values():
+        ranked = sorted(names, key=lambda name: hashlib.sha256(name.encode("utf-8")).digest())
+        held_out = max(1, (len(ranked) + 5) // 10) if len(ranked) >= 3 else 0
+        for rank, name in enumerate(ranked):
+            splits[name] = SPLITS[1 if rank < held_out else 2 if rank < 2 * held_out else 0]
+    return splits
+
+
+# --- archives -------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=4)
+def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
+    """Open a zip once per process; a changed file is opened anew."""
+    try:
+        return zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise ValueError(
+            f"{path}: broken or truncated zip archive ({error}); fetch it again"
+        ) from error
+
+
+@dataclass(frozen=True)
+class _Archive:
+    """A folder or a zip file, read alike. Holds only its path, so that it can be pickled."""
+
+    path: str
+
+    @property
+    def is_zip(self) -> bool:
+        return os.path.isfile(self.path)
+
+    def _zip(self) -> zipfile.ZipFile:
+        state = os.stat(self.path)
+        return _open_zip(self.path, state.st_size, state.st_mtime_ns)
+
+    def names(self) -> list[str]:
+        """Return the relative paths of all files, sorted, without macOS's companions."""
+        if self.is_zip:
+            names = [info.filename for info in self._zip().infolist() if not info.is_dir()]
+        else:
+            top = Path(self.path)
+            names = [
+                (Path(folder) / file).relative_to(top).as_posix()
+                for folder, _, files in os.walk(top)
+                for file in files
+            ]
+        return sorted(name for name in names if not _is_companion(name))
+
+    def read(self, name: str) -> bytes:
+        """Return a file's bytes; ValueError names archive and file if they cannot be had."""
+        try:
+            if self.is_zip:
+                return self._zip().read(name)
+            return (Path(self.path) / name).read_bytes()
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            OSError,
+            KeyError,
+            RuntimeError,
+            NotImplementedError,
+        ) as error:
+            raise ValueError(
+                f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again"
+            ) from error
+
+    def size_and_crc(self, name: str) -> tuple[int, int]:
+        """Return a file's size and CRC-32: from a zip's directory, or by reading a plain file."""
+        if self.is_zip:
+            info = self._zip().getinfo(name)
+            return info.file_size, info.CRC
+        data = self.read(name)
+        return len(data), zlib.crc32(data)
+
+    def label(self, name: str) -> str:
+        return f"{self.path}: {name}"
+
+
+def _is_companion(name: str) -> bool:
+    """Tell macOS's `._` resource forks and `__MACOSX` folders, which are no motion."""
+    parts = PurePosixPath(name).parts
+    return parts[-1].startswith("._") or "__MACOSX" in parts
+
+
+def _archive_at(path) -> _Archive:
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise ValueError(f"{path}: there is no such file or folder; check the path")
+    return _Archive(str(path))
+
+
+def _data_dir() -> str | None:
+    return os.environ.get(DATA_DIR_VARIABLE) or None
+
+
+def _find_archive(path, known: tuple[str, ...], word: str, download: Callable[[], str]) -> _Archive:
+    """Choose where a data set is read from: `path`, then F3AMD_DATA_DIR, then the download.
+
+    In a folder a zip of a known name wins, then the only zip with `word` in its name, then the
+    folder itself with unpacked files.
+    """
+    place = path if path is not None else _data_dir()
+    if place is None:
+        return _archive_at(download())
+    archive = _archive_at(place)
+    if archive.is_zip:
+        return archive
+    folder = Path(archive.path)
+    for name in known:
+        if (folder / name).is_file():
+            return _archive_at(folder / name)
+    zips = [
+        item
+        for item in sorted(folder.iterdir())
+        if item.suffix.lower() == ".zip"
+        and word in item.name.lower()
+        and not item.name.startswith("._")
+    ]
+    if len(zips) > 1:
+        raise ValueError(
+            f"{folder}: several archives may be meant ({', '.join(item.name for item in zips)}); "
+            f"point {DATA_DIR_VARIABLE} (or path=...) at one of them"
+        )
+    return _archive_at(zips[0]) if zips else archive
+
+
+def _download(url: str, known_hash: str | None, file_name: str, title: str) -> str:
+    """Fetch a file once into pooch's cache, with a progress bar; return where it lies."""
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        return pooch.retrieve(
+            url, known_hash, fname=file_name, path=pooch.os_cache("f3amd"), progressbar=True
+        )
+    except (OSError, ValueError) as error:  # requests' errors are OSErrors
+        raise ValueError(
+            f"{title} could not be downloaded from {url} ({type(error).__name__}: {error}); "
+            f"fetch it by other means and set the environment variable {DATA_DIR_VARIABLE} to the "
+            "zip file or to the folder that holds it"
+        ) from error
+
+
+def _fingerprint(name: str, clips: Iterable[Clip], content) -> str:
+    """Hash what decides a data set's numbers: clips with labels and splits, and file contents."""
+    labels = [(clip.name, clip.style, clip.content, clip.split) for clip in clips]
+    text = json.dumps([name, labels, content], ensure_ascii=True)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
+    """Return the data set cut down to its first styles, primary ones before others."""
+    others = [style for style in dataset.styles if style not in dataset.primary_styles]
+    kept = set([*dataset.primary_styles, *others][:num_styles])
+    clips = tuple(clip for clip in dataset.clips if clip.style in kept)
+    return Dataset(
+        name=dataset.name,
+        licence=dataset.licence,
+        credit=dataset.credit,
+        fingerprint=_fingerprint(dataset.name, clips, dataset.fingerprint),
+        styles=tuple(sorted(kept)),
+        clips=clips,
+        primary_styles=tuple(style for style in dataset.primary_styles if style in kept),
+        mirror_styles=dataset.mirror_styles & kept,
+        notes=dataset.notes,
+    )
+
+
+# --- loaders (plain data, so that a worker process can be handed them) ----------------------------
+
+
+@dataclass(frozen=True)
+class _BvhFile:
+    """Reads one file of an archive, checks its bytes, and cuts out a range of 30 fps frames."""
+
+    archive: _Archive
+    member: str
+    size: int
+    crc32: int
+    sha256_prefix: str = ""
+    start: int = 0
+    stop: int | None = None
+
+    def __call__(self) -> Motion:
+        data = self.archive.read(self.member)
+        label = self.archive.label(self.member)
+        if (
+            len(data) != self.size
+            or zlib.crc32(data) != self.crc32
+            or not hashlib.sha256(data).hexdigest().startswith(self.sha256_prefix)
+        ):
+            raise ValueError(
+                f"{label}: is not the file that it should be (size or checksum differs), nothing "
+                "of it is used; fetch it again"
+            )
+        motion = parse_bvh(data, label)
+        if self.stop is None:
+            return motion
+        motion = resample(motion, FPS)
+        if self.stop > motion.num_frames:
+            raise ValueError(
+                f"{label}: has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at "
+                f"{self.stop}; the file or the table is not the original: fetch both again"
+            )
+        return motion.slice(self.start, self.stop)
+
+
+@dataclass(frozen=True)
+class _SyntheticTake:
+    """Makes one take of the synthetic walker and sends it through BVH text, as all data."""
+
+    style: str
+    seconds: float
+    seed: int
+
+    def __call__(self) -> Motion:
+        from f3amd_lib.motion.synthetic import synthesize
+
+        name = f"synthetic {self.style}, seed {self.seed}"
+        motion = synthesize(self.style, seconds=self.seconds, seed=self.seed, fps=FPS)
+        return parse_bvh(format_bvh(motion), name)
+
+
+# --- the four data sets ---------------------------------------------------------------------------
+
+
+def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset:
+    """List takes of about ten seconds: one long take would leave nothing to split by clip."""
+    from f3amd_lib.motion import synthetic
+
+    shortest = 3 * MINIMUM_FRAMES / FPS
+    if not shortest <= seconds_per_style < float("inf"):
+        raise ValueError(
+            f"seconds_per_style must be at least {shortest:.1f} (three takes of {MINIMUM_FRAMES} "
+            f"frames), got {seconds_per_style}"
+        )
+    num_takes = max(3, round(seconds_per_style / 10.0))
+    seconds = seconds_per_style / num_takes
+    styles = tuple(sorted(synthetic.STYLES))[:num_styles]
+    takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
+    splits = assign_splits((name, style) for name, style, _ in takes)
+    clips = tuple(
+        Clip(name, style, "mixed", splits[name], _SyntheticTake(style, seconds, seed))
+        for name, style, seed in takes
+    )
+    # The walker's own source decides the numbers, so a changed walker is another data set.
+    source = Path(synthetic.__file__).read_text(encoding="utf-8")
+    return Dataset(
+        name="synthetic",
+        licence="Apache-2.0",
+        credit="Motion data: procedural walker of this repository.",
+        fingerprint=_fingerprint("synthetic", clips, [seconds, source]),
+        styles=styles,
+        clips=clips,
+        primary_styles=styles,
+        mirror_styles=frozenset(_synthetic_mirror_styles(synthetic, styles)),
+    )
+
+
+def _synthetic_mirror_styles(synthetic, styles: tuple[str, ...]) -> list[str]:
+    """Return the styles whose parameters treat left and right alike."""
+    return [style for style in styles if synthetic.style_parameters(style).symmetric]
+
+
+@dataclass(frozen=True)
+class _ListedFile:
+    """A row of `bandai_files.csv`: what a sound file of the Bandai archive is."""
+
+    name: str
+    frames: int
+    size: int
+    crc32: int
+    sha256_prefix: str
+
+    @property
+    def parts(self) -> list[str]:
+        """Data set, content, style and number; none of them holds an underscore."""
+        return self.name.split("_")
+
+    @property
+    def style(self) -> str:
+        return f"{self.parts[0].removeprefix('dataset-')}-{self.parts[2]}"
+
+    @property
+    def is_locomotion(self) -> bool:
+        return self.parts[1] in _BANDAI_LOCOMOTION[self.parts[0]]
+
+
+@functools.lru_cache(maxsize=1)
+def _bandai_list() -> tuple[_ListedFile, ...]:
+    """Return the committed list of files: sizes and checksums at the pinned commit."""
+    source = resources.files("f3amd_lib.data").joinpath("bandai_files.csv")
+    with source.open("r", encoding="utf-8", newline="") as file:
+        return tuple(
+            _ListedFile(
+                row["name"],
+                int(row["frames"]),
+                int(row["size"]),
+                int(row["crc32"], 16),
+                row["sha256_prefix"],
+            )
+            for row in csv.DictReader(file)
+        )
+
+
+def _open_bandai(path, locomotion_only: bool) -> Dataset:
+    """List the Bandai clips of an archive whose files agree with the committed list."""
+    # The archive that the code host packs on request has no stable hash of its own (the packer may
+    # change), so what is pinned is the commit, and every file is checked against the list.
+    archive = _find_archive(
+        path,
+        (
+            "bandai_namco.zip",
+            f"Bandai-Namco-Research-Motiondataset-{_BANDAI_COMMIT}.zip",
+            "Bandai-Namco-Research-Motiondataset.zip",
+        ),
+        "bandai",
+        lambda: _download(
+            f"https://github.com/{_BANDAI_REPOSITORY}/archive/{_BANDAI_COMMIT}.zip",
+            None,
+            f"Bandai-Namco-Research-Motiondataset-{_BANDAI_COMMIT}.zip",
+            "the Bandai Namco archive",
+        ),
+    )
+    listed = _bandai_list()
+    wanted = {item.name for item in listed if item.is_locomotion or not locomotion_only}
+    known = {item.name for item in listed}
+    members: dict[str, str] = {}
+    notes = []
+    for member in archive.names():
+        base = PurePosixPath(member)
+        if base.suffix.lower() != ".bvh":
+            continue
+        if base.stem in members:
+            raise ValueError(
+                f"{archive.path}: holds {base.name} twice ({members[base.stem]} and {member}); "
+                "leave one copy of the data set there"
+            )
+        if base.stem in wanted:
+            members[base.stem] = member
+        elif base.stem not in known:
+            notes.append(f"ignored {member}: not on the list of files")
+    missing = sorted(wanted - set(members))
+    if missing:
+        raise ValueError(
+            f"{archive.path}: {len(missing)} of the {len(wanted)} Bandai files needed are missing, "
+            f"the first is {missing[0]}.bvh; fetch the whole archive of "
+            f"{_BANDAI_REPOSITORY} again"
+        )
+    for item in listed:
+        if item.name in wanted:
+            found = archive.size_and_crc(members[item.name])
+            if found != (item.size, item.crc32):
+                raise ValueError(
+                    f"{archive.label(members[item.name])}: is not the published file (size or "
+                    "checksum differs), the archive is refused; fetch it again"
+                )
+    # Locomotion and other clips are split apart, so that a clip's split does not depend on
+    # `locomotion_only`. Clips too short for a window reach no split at all once packed, so they
+    # must not take a place in validation or test.
+    splits = {item.name: "train" for item in listed}
+    splits |= assign_splits(
+        (item.name, (item.style, item.is_locomotion))
+        for item in listed
+        if item.frames >= MINIMUM_FRAMES
+    )
+    clips = tuple(
+        Clip(
+            item.name,
+            item.style,
+            item.parts[1],
+            splits[item.name],
+            _BvhFile(archive, members[item.name], item.size, item.crc32, item.sha256_prefix),
+        )
+        for item in sorted(listed, key=lambda item: item.name)
+        if item.name in wanted
+    )
+    styles = tuple(sorted({clip.style for clip in clips}))
+    content = [(item.name, item.sha256_prefix) for item in listed if item.name in wanted]
+    return Dataset(
+        name="bandai",
+        licence="CC BY-NC 4.0",
+        credit=(
+            "Motion data: Bandai-Namco-Research-Motiondataset, © 2022 Bandai Namco Research Inc., "
+            "CC BY-NC 4.0; converted to arrays, otherwise unchanged."
+        ),
+        fingerprint=_fingerprint("bandai", clips, content),
+        styles=styles,
+        clips=clips,
+        primary_styles=tuple(style for style in styles if style.startswith("2-")),
+        mirror_styles=frozenset(styles),
+        notes=tuple(notes),
+    )
+
+
+_100STYLE_CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
+
+
+def _open_100style(path) -> Dataset:
+    """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
+    archive = _find_archive(
+        path,
+        ("100STYLE.zip",),
+        "100style",
+        lambda: _download(
+            f"doi:{_100STYLE_DOI}/100STYLE.zip",
+            f"md5:{_100STYLE_MD5}",
+            "100STYLE.zip",
+            "100STYLE",
+        ),
+    )
+    names = archive.names()
+    cuts = _read_frame_cuts(archive, _find_table(archive, names, "Frame_Cuts.csv"))
+    symmetric = _read_symmetric(archive, _find_table(archive, names, "Dataset_List.csv"))
+    members: dict[str, str] = {}
+    for member in names:
+        base = PurePosixPath(member)
+        if base.suffix.lower() == ".bvh":
+            if base.stem in members:
+                raise ValueError(
+                    f"{archive.path}: holds {base.name} twice ({members[base.stem]} and {member}); "
+                    "leave one copy of the data set there"
+                )
+            members[base.stem] = member
+    # A transition take may be called TR for TR1, as in the author's own exporter.
+    for style, _ in cuts:
+        if f"{style}_TR1" not in members and f"{style}_TR" in members:
+            members[f"{style}_TR1"] = members.pop(f"{style}_TR")
+    # Splits come from the table, not from what is there: a missing file moves no other clip.
+    splits = assign_splits((f"{style}_{code}", style) for style, code in cuts)
+    clips, missing, content = [], [], []
+    for (style, code), (start, stop) in cuts.items():
+        name = f"{style}_{code}"
+        if name not in members:
+            missing.append(f"{name}.bvh")
+            continue
+        size, crc32 = archive.size_and_crc(members[name])
+        # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
+        # the same as cutting at even frames of the original and then halving.
+        loader = _BvhFile(archive, members[name], size, crc32, start=start // 2, stop=stop // 2)
+        clips.append(Clip(name, style, code, splits[name], loader))
+        content.append((name, size, crc32, start, stop))
+    if not clips:
+        raise ValueError(
+            f"{archive.path}: none of the {len(missing)} files that Frame_Cuts.csv names is there, "
+            f"such as {missing[0]}; fetch the whole of 100STYLE (doi {_100STYLE_DOI})"
+        )
+    unknown = sorted(set(members) - {f"{style}_{code}" for style, code in cuts})
+    notes = [f"missing {name}" for name in missing]
+    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in unknown]
+    if missing:
+        warnings.warn(
+            f"{archive.path}: {len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as "
+            f"{missing[0]}; the data set goes without them (see its notes)",
+            stacklevel=3,
+        )
+    clips = tuple(sorted(clips, key=lambda clip: clip.name))
+    styles = tuple(sorted({clip.style for clip in clips}))
+    unlisted = [style for style in styles if style not in symmetric]
+    if unlisted:
+        raise ValueError(
+            f"{archive.path}: Dataset_List.csv has no row for style {unlisted[0]!r} of "
+            "Frame_Cuts.csv; take both tables from the same release"
+        )
+    return Dataset(
+        name="100style",
+        licence="CC BY 4.0",
+        credit=(
+            "Motion data: The 100STYLE Dataset - Ian Mason, CC BY 4.0; cut to the usable ranges, "
+            "resampled to 30 fps."
+        ),
+        fingerprint=_fingerprint("100style", clips, sorted(content)),
+        styles=styles,
+        clips=clips,
+        primary_styles=styles,
+        mirror_styles=frozenset(style for style in styles if symmetric[style]),
+        notes=tuple(notes),
+    )
+
+
+def _find_table(archive: _Archive, names: list[str], table: str) -> str:
+    found = [name for name in names if PurePosixPath(name).name == table]
+    if len(found) != 1:
+        how = "is missing" if not found else f"is there {len(found)} times ({', '.join(found)})"
+        raise ValueError(
+            f"{archive.path}: {table} of 100STYLE {how}; the folder or zip must hold one copy of "
+            f"the data set, with its tables (doi {_100STYLE_DOI})"
+        )
+    return found[0]
+
+
+def _read_table(archive: _Archive, member: str) -> list[dict[str, str]]:
+    data = archive.read(member)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{archive.label(member)}: is not UTF-8 text; fetch it again") from error
+    return list(csv.DictReader(io.StringIO(text, newline="")))
+
+
+def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tuple[int, int]]:
+    """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges are left out."""
+    label = archive.label(member)
+    cuts = {}
+    for line, row in enumerate(_read_table(archive, member), start=2):
+        style = (row.get("STYLE_NAME") or "").strip()
+        if not style:
+            raise ValueError(f"{label}, line {line}: no STYLE_NAME; fetch the table again")
+        for code in _100STYLE_CODES:
+            texts = [(row.get(f"{code}_{end}") or "N/A").strip() for end in ("START", "STOP")]
+            if texts == ["N/A", "N/A"]:
+                continue
+            if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
+                raise ValueError(
+                    f"{label}, line {line}: {code} of {style} has the range {texts[0]!r} to "
+                    f"{texts[1]!r}; it needs two whole numbers, the first one smaller, or N/A twice"
+                )
+            if (style, code) in cuts:
+                raise ValueError(f"{label}, line {line}: style {style} is listed twice")
+            cuts[style, code] = (int(texts[0]), int(texts[1]))
+    if not cuts:
+        raise ValueError(f"{label}: holds no frame range; fetch the table again")
+    return cuts
+
+
+def _read_symmetric(archive: _Archive, member: str) -> dict[str, bool]:
+    """Return, per style, whether its mirror image is the same style."""
+    label = archive.label(member)
+    symmetric = {}
+    for line, row in enumerate(_read_table(archive, member), start=2):
+        style = (row.get("Style Name") or "").strip()
+        answer = (row.get("Symmetric") or "").strip()
+        if not style or answer not in ("Yes", "No"):
+            raise ValueError(
+                f"{label}, line {line}: needs a Style Name, and Yes or No under Symmetric; found "
+                f"{style!r} and {answer!r}"
+            )
+        symmetric[style] = answer == "Yes"
+    return symmetric
+
+
+def _open_folder(path) -> Dataset:
+    """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
+    place = path if path is not None else _data_dir()
+    if place is None:
+        raise ValueError(
+            "the data set 'folder' needs to know which: pass path=... or set the environment "
+            f"variable {DATA_DIR_VARIABLE}"
+        )
+    archive = _archive_at(place)
+    members = [name for name in archive.names() if PurePosixPath(name).suffix.lower() == ".bvh"]
+    if not members:
+        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
+    labelled = {}
+    for member in members:
+        relative = PurePosixPath(member)
+        name = relative.with_suffix("").as_posix()
+        if name in labelled:
+            raise ValueError(
+                f"{archive.label(member)}: two files differ only in the case of their suffix; "
+                "rename one"
+            )
+        head, _, tail = relative.stem.partition("_")
+        style = relative.parent.name or head
+        content = relative.stem if relative.parent.name else tail
+        labelled[name] = (member, style, content)
+    splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
+    clips, content_ids = [], []
+    for name, (member, style, content) in sorted(labelled.items()):
+        size, crc32 = archive.size_and_crc(member)
+        clips.append(
+            Clip(name, style, content, splits[name], _BvhFile(archive, member, size, crc32))
+        )
+        content_ids.append((name, size, crc32))
+    styles = tuple(sorted({clip.style for clip in clips}))
+    return Dataset(
+        name="folder",
+        licence="as its owner says",
+        credit="Motion data: files of the user.",
+        fingerprint=_fingerprint("folder", clips, content_ids),
+        styles=styles,
+        clips=tuple(clips),
+        primary_styles=styles,
+        # Whether a style keeps its name when mirrored is not for us to guess.
+        mirror_styles=frozenset(),
+    )

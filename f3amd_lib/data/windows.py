@@ -1,0 +1,271 @@
+"""Windows of history and future, cut on the device (paper sections 3.2, 3.3, 4.5).
+
+The whole training set is one array of world frames plus the list of frames at which a window may
+start. A batch is a gather, a random turn and a subtraction, all inside the jitted step: there is no
+Python loop over samples.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from f3amd_lib.data.features import (
+    Normaliser,
+    center_window,
+    frame_yaw,
+    path_condition,
+    turn_frames,
+    world_frames,
+)
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.motion.rotations import wrap_angle
+from f3amd_lib.motion.skeleton import Skeleton, mirror
+
+__all__ = [
+    "WindowSet",
+    "Batch",
+    "build_windows",
+    "gather_windows",
+    "sample_windows",
+    "fit_normaliser",
+    "seed_histories",
+]
+
+_SMOOTHING = (0.0, 5.0, 10.0)
+"""Widths in frames of the Gaussians that smooth the path condition (0: as captured)."""
+
+
+class WindowSet(NamedTuple):
+    """All windows of one split, on the device.
+
+    Attributes:
+      frames: world frames of all clips end to end, [N, C].
+      paths: root x, z, sin(yaw), cos(yaw) per frame, raw and smoothed, [3, N, 4].
+      starts: first frame of each window, [W].
+      styles: style index of each window, [W].
+      one_hot: identity matrix of the styles, [S, S].
+    """
+
+    frames: jax.Array
+    paths: jax.Array
+    starts: jax.Array
+    styles: jax.Array
+    one_hot: jax.Array
+
+    @property
+    def num_windows(self) -> int:
+        """Number of windows, W."""
+        return self.starts.shape[0]
+
+
+class Batch(NamedTuple):
+    """What a training step sees, in metres and 6D numbers; x, z relative to the last history frame.
+
+    Attributes:
+      history: [B, H, C].
+      future: clean features x0, [B, T, C].
+      path: path condition, [B, T, 8].
+      style: one-hot, [B, S].
+    """
+
+    history: jax.Array
+    future: jax.Array
+    path: jax.Array
+    style: jax.Array
+
+
+def _smooth(signal: np.ndarray, width: float) -> np.ndarray:
+    """Smooth along axis 0; odd reflection at the ends lets a straight path stay straight."""
+    if width == 0.0 or len(signal) < 2:
+        return signal
+    pad = min(int(4 * width), len(signal) - 1)
+    padded = np.pad(signal, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
+    return gaussian_filter1d(padded, width, axis=0)[pad : pad + len(signal)]
+
+
+def _path_variants(skeleton: Skeleton, frames: np.ndarray) -> np.ndarray:
+    """Return x, z, sin yaw, cos yaw under each smoothing, [3, T, 4]."""
+    yaw = np.unwrap(frame_yaw(skeleton, frames))
+    line = np.concatenate([frames[:, [0, 2]], yaw[:, None]], axis=1)
+    variants = []
+    for width in _SMOOTHING:
+        smooth = _smooth(line, width)
+        angle = smooth[:, 2:]
+        variants.append(np.concatenate([smooth[:, :2], np.sin(angle), np.cos(angle)], axis=1))
+    return np.stack(variants)
+
+
+def build_windows(
+    packed: PackedMotion,
+    split: str,
+    *,
+    window: int = 32,
+    num_history: int = 10,
+    stride: int = 1,
+    mirrored: bool | None = None,
+) -> WindowSet:
+    """Lay all windows of a split out on the device.
+
+    Args:
+      packed: a packed data set.
+      split: "train", "validation" or "test".
+      window: future frames T.
+      num_history: history frames H.
+      stride: frames between window starts.
+      mirrored: add the mirror image of every clip whose style may be mirrored; by default in
+        training only.
+
+    Returns:
+      The window set.
+
+    Raises:
+      ValueError: for an unknown split, or if no clip is long enough.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
+    mirrored = split == "train" if mirrored is None else mirrored
+    frames, paths, starts, styles = [], [], [], []
+    offset = 0
+    for clip in np.flatnonzero(np.asarray(packed.clip_split) == SPLITS.index(split)):
+        motion = packed.motion(int(clip))
+        style = int(packed.clip_style[clip])
+        takes = [motion]
+        if mirrored and packed.styles[style] in packed.mirror_styles:
+            takes.append(mirror(motion))
+        for take in takes:
+            world = world_frames(take)
+            first = np.arange(0, len(world) - (num_history + window) + 1, stride)
+            starts.append(offset + first)
+            styles.append(np.full(len(first), style))
+            frames.append(world.astype(np.float32))
+            paths.append(_path_variants(take.skeleton, world).astype(np.float32))
+            offset += len(world)
+    if not sum(len(first) for first in starts):
+        raise ValueError(
+            f"data set {packed.dataset!r} has no {split} clip of at least "
+            f"{num_history + window} frames"
+        )
+    return WindowSet(
+        frames=jnp.asarray(np.concatenate(frames)),
+        paths=jnp.asarray(np.concatenate(paths, axis=1)),
+        starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
+        styles=jnp.asarray(np.concatenate(styles).astype(np.int32)),
+        one_hot=jnp.eye(len(packed.styles), dtype=jnp.float32),
+    )
+
+
+def gather_windows(
+    windows: WindowSet, index, yaw, smoothing, *, window: int = 32, num_history: int = 10
+) -> Batch:
+    """Cut chosen windows, turned and made relative.
+
+    Args:
+      windows: from `build_windows`, with the same window and num_history.
+      index: which windows, [B].
+      yaw: turn of each, [B], radians (the random facing of section 3.2).
+      smoothing: which path to show as condition, [B] of 0, 1, 2: as captured, or smoothed with a
+        Gaussian of 5 or 10 frames.
+
+    Returns:
+      The batch.
+    """
+    span = windows.starts[index][:, None] + jnp.arange(num_history + window)[None, :]
+    frames = windows.frames[span]
+    last = num_history - 1
+    frames = turn_frames(center_window(frames, frames[:, last, jnp.array([0, 2])]), yaw)
+    track = windows.paths[smoothing[:, None], span]
+    shift = track[..., :2] - track[:, last : last + 1, :2]
+    # (x, z) turned by yaw: x' = x cos + z sin, z' = z cos - x sin
+    cosine, sine = jnp.cos(yaw)[:, None], jnp.sin(yaw)[:, None]
+    position = jnp.stack(
+        [
+            shift[..., 0] * cosine + shift[..., 1] * sine,
+            shift[..., 1] * cosine - shift[..., 0] * sine,
+        ],
+        axis=-1,
+    )
+    facing = wrap_angle(jnp.arctan2(track[..., 2], track[..., 3]) + yaw[:, None])
+    path = path_condition(position, facing)[:, num_history:]
+    return Batch(
+        history=frames[:, :num_history],
+        future=frames[:, num_history:],
+        path=path,
+        style=windows.one_hot[windows.styles[index]],
+    )
+
+
+def sample_windows(
+    windows: WindowSet, key, batch_size: int, *, window: int = 32, num_history: int = 10
+) -> Batch:
+    """Draw random windows with random facing and random path smoothing.
+
+    Half of the paths are shown as captured, a quarter under each smoothing: a captured path sways
+    with every step and would give the gait away, while the paths that users draw are smooth.
+
+    Source: paper section 3.2 (facing); CAMDM's training recipe (smoothing).
+    """
+    key_index, key_yaw, key_smoothing = jax.random.split(key, 3)
+    index = jax.random.randint(key_index, (batch_size,), 0, windows.num_windows)
+    yaw = jax.random.uniform(key_yaw, (batch_size,), minval=-jnp.pi, maxval=jnp.pi)
+    smoothing = jnp.array([0, 0, 1, 2])[jax.random.randint(key_smoothing, (batch_size,), 0, 4)]
+    return gather_windows(windows, index, yaw, smoothing, window=window, num_history=num_history)
+
+
+def fit_normaliser(
+    windows: WindowSet, key, *, window: int = 32, num_history: int = 10, num_samples: int = 8192
+) -> Normaliser:
+    """Measure mean and deviation of each channel over randomly turned training windows.
+
+    Deviations are kept above 0.02, so that a joint which hardly moves does not turn rounding of the
+    packed rotations into signal.
+    """
+    num_samples = min(num_samples, 4 * windows.num_windows)
+    batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
+    flat = batch.future.reshape(-1, batch.future.shape[-1])
+    # A random turn makes x and z alike; measure them as one, around zero.
+    plane = jnp.sqrt(jnp.mean(flat[:, jnp.array([0, 2])] ** 2))
+    mean = flat.mean(axis=0).at[jnp.array([0, 2])].set(0.0)
+    deviation = flat.std(axis=0).at[jnp.array([0, 2])].set(plane)
+    return Normaliser(mean, jnp.maximum(deviation, 0.02), plane)
+
+
+def seed_histories(
+    packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 4, split: str = "train"
+) -> dict:
+    """Cut a few starting poses per style out of a packed data set.
+
+    Args:
+      packed: the data.
+      num_history: frames H of each.
+      num_seeds: most seeds per style; each comes from the middle of another clip.
+      split: where to look first; a style without a clip there is looked up in the others.
+
+    Returns:
+      Style name -> [K, H, C] world frames, the last one at x = z = 0 and facing +Z.
+    """
+    seeds = {}
+    for style, name in enumerate(packed.styles):
+        for where in (split, *SPLITS):
+            chosen = np.flatnonzero(
+                (np.asarray(packed.clip_style) == style)
+                & (np.asarray(packed.clip_split) == SPLITS.index(where))
+            )
+            if len(chosen):
+                break
+        else:
+            continue
+        cuts = []
+        for clip in chosen[np.linspace(0, len(chosen) - 1, min(num_seeds, len(chosen))).astype(int)]:
+            motion = packed.motion(int(clip))
+            start = max(0, motion.num_frames // 2 - num_history)
+            frames = world_frames(motion.slice(start, start + num_history))
+            frames = center_window(frames, frames[-1, [0, 2]])
+            cuts.append(turn_frames(frames, -frame_yaw(motion.skeleton, frames[-1])))
+        seeds[name] = np.stack(cuts).astype(np.float32)
+    return seeds
