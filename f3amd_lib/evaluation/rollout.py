@@ -1,0 +1,213 @@
+"""Autoregressive rollout of many characters at once (paper sections 3.1 and 4.4).
+
+Each round makes one window of frames for every character: encode the condition once, start from
+noise, denoise in a few steps, keep the last frames as the next history. All rounds run inside one
+jitted scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from f3amd_lib.data.features import (
+    center_window,
+    motion_from_frames,
+    orthonormalise,
+    path_condition,
+    turn_frames,
+)
+from f3amd_lib.diffusion.samplers import sample_ddim
+from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.evaluation.paths import RootPath
+from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.training.checkpoints import TrainedModel
+
+__all__ = ["MotionGenerator", "Rollout"]
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout made.
+
+    Attributes:
+      skeleton: of the characters.
+      frames: world frames, [B, R * T, C]; metres and 6D, orthonormal.
+      history: the frames before the first window, [B, H, C].
+      paths: what each character was asked to follow.
+      styles: what each character was asked to look like.
+      window: T; window k starts at frame k * T.
+    """
+
+    skeleton: Skeleton
+    frames: np.ndarray
+    history: np.ndarray
+    paths: tuple[RootPath, ...]
+    styles: tuple[str, ...]
+    window: int
+
+    def motion(self, character: int = 0, *, with_history: bool = False) -> Motion:
+        """Return one character's motion, from the first generated frame unless told."""
+        frames = self.frames[character]
+        if with_history:
+            frames = np.concatenate([self.history[character], frames])
+        return motion_from_frames(self.skeleton, frames, name=self.styles[character])
+
+
+class MotionGenerator:
+    """Style and path in, motion out.
+
+    Args:
+      trained: a trained model.
+      num_steps: network evaluations a round (the paper: 8, 4, 2 or 1).
+      schedule: noise levels; by default those the model was trained with.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedModel,
+        num_steps: int = 8,
+        *,
+        schedule: VarianceExploding | None = None,
+        spacing: str = "endpoints",
+    ):
+        self.trained = trained
+        self.num_steps = num_steps
+        if schedule is None:
+            training = trained.record.get("training", {})
+            schedule = VarianceExploding(
+                **{k: training[k] for k in ("sigma_max", "sigma_min", "rho") if k in training}
+            )
+        self.sigmas = schedule.grid(num_steps, spacing)
+        self._network = trained.network()
+        self._run = jax.jit(self._rounds)
+
+    def sample_window(self, key, condition: Condition):
+        """Sample one window, [B, T, C] in network units, for an already normalised condition."""
+        config = self.trained.config
+        context = self._network.encode(condition)
+        shape = (condition.history.shape[0], config.window, config.channels)
+        x_init = self.sigmas[0].astype(np.float32) * jax.random.normal(key, shape)
+        return sample_ddim(
+            lambda x_noisy, sigma: self._network(x_noisy, sigma, context), x_init, self.sigmas
+        )
+
+    def _rounds(self, history, positions, yaws, before, style, key):
+        normaliser = self.trained.normaliser
+        window = self.trained.config.window
+        # The path asked for in a round starts where the character is and bends back to the line:
+        # a smooth correction that a sudden jump of the target would not be.
+        ramp = jnp.arange(1, window + 1, dtype=jnp.float32)[None, :, None] / window
+
+        def one_round(history, inputs):
+            target, yaw, target_before, number = inputs
+            origin = history[:, -1, jnp.array([0, 2])]
+            drift = target_before - origin
+            position = target - target_before[:, None, :] + ramp * drift[:, None, :]
+            condition = Condition(
+                history=normaliser.normalise(center_window(history, origin)),
+                path=normaliser.normalise_path(path_condition(position, yaw)),
+                style=style,
+            )
+            x0_hat = self.sample_window(jax.random.fold_in(key, number), condition)
+            future = orthonormalise(normaliser.denormalise(x0_hat))
+            future = center_window(future, -origin)
+            history = jnp.concatenate([history, future], axis=1)[:, -history.shape[1] :]
+            return history, future
+
+        numbers = jnp.arange(positions.shape[0])
+        _, futures = jax.lax.scan(one_round, history, (positions, yaws, before, numbers))
+        rounds, batch, frames, channels = futures.shape
+        return jnp.moveaxis(futures, 0, 1).reshape(batch, rounds * frames, channels)
+
+    def rollout(
+        self,
+        paths: RootPath | Sequence[RootPath],
+        styles: str | Sequence[str],
+        *,
+        seed: int = 0,
+        history: np.ndarray | None = None,
+    ) -> Rollout:
+        """Animate one or many characters along their paths.
+
+        Args:
+          paths: one path for all, or one each; frame k of a path is the target of generated frame
+            k. The last round is cut to the path's length. All must have the same length.
+          styles: one style name for all, or one each.
+          seed: of the noise and of the choice among the starting poses.
+          history: world frames to start from, [B, H, C]; by default a stored starting pose of the
+            style, moved to the start of the path.
+
+        Returns:
+          The rollout, [B, frames of the path, C].
+
+        Raises:
+          ValueError: for an unknown style, unlike lengths or counts, or a wrong history.
+        """
+        trained, config = self.trained, self.trained.config
+        paths = [paths] if isinstance(paths, RootPath) else list(paths)
+        styles = [styles] if isinstance(styles, str) else list(styles)
+        batch = max(len(paths), len(styles))
+        paths = paths * batch if len(paths) == 1 else paths
+        styles = styles * batch if len(styles) == 1 else styles
+        if len(paths) != batch or len(styles) != batch:
+            raise ValueError(
+                f"got {len(paths)} paths and {len(styles)} styles; give one, or as many"
+            )
+        lengths = {len(path.yaw) for path in paths}
+        if len(lengths) != 1:
+            raise ValueError(f"paths must have the same length, got {sorted(lengths)} frames")
+        num_frames = lengths.pop()
+        if num_frames < 2:
+            raise ValueError("a path needs at least 2 frames")
+        indices = np.array([trained.style_index(style) for style in styles])
+        rounds = -(-num_frames // config.window)
+        position = np.stack([path.position for path in paths]).astype(np.float64)
+        yaw = np.stack([np.unwrap(path.yaw) for path in paths]).astype(np.float64)
+        missing = rounds * config.window - num_frames
+        if missing:
+            ahead = np.arange(1, missing + 1)[None, :, None]
+            pace = position[:, -1:] - position[:, -2:-1]
+            position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
+            yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
+        start = 2.0 * position[:, 0] - position[:, 1]
+        if history is None:
+            history = self._starting_poses(styles, start, yaw[:, 0], seed)
+        expected = (batch, config.num_history, config.channels)
+        if history.shape != expected:
+            raise ValueError(f"history must have shape {expected}, got {history.shape}")
+        shape = (batch, rounds, config.window)
+        targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
+        before = np.concatenate([start[None], targets[:-1, :, -1]])
+        frames = self._run(
+            jnp.asarray(history, jnp.float32),
+            jnp.asarray(targets, jnp.float32),
+            jnp.asarray(np.moveaxis(yaw.reshape(shape), 1, 0), jnp.float32),
+            jnp.asarray(before, jnp.float32),
+            jax.nn.one_hot(indices, len(trained.styles)),
+            jax.random.key(seed),
+        )
+        return Rollout(
+            skeleton=trained.skeleton,
+            frames=np.asarray(frames)[:, :num_frames],
+            history=np.asarray(history),
+            paths=tuple(paths),
+            styles=tuple(styles),
+            window=config.window,
+        )
+
+    def _starting_poses(self, styles, start, yaw, seed: int) -> np.ndarray:
+        generator = np.random.default_rng(seed)
+        poses = []
+        for character, style in enumerate(styles):
+            if style not in self.trained.seeds:
+                raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
+            choices = self.trained.seeds[style]
+            pose = turn_frames(choices[generator.integers(len(choices))], yaw[character])
+            poses.append(center_window(pose, -start[character]))
+        return np.stack(poses).astype(np.float32)

@@ -1,0 +1,198 @@
+"""Files of weights and training states: safetensors with a JSON header, never a pickle.
+
+A file holds named arrays plus a JSON description. Writing goes to a temporary file that then takes
+the name, so that a crash leaves the old file whole. Reading checks names, shapes and types.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError, safe_open
+from safetensors.flax import save_file
+
+from f3amd_lib.data.features import Normaliser
+from f3amd_lib.files import whole_file
+from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.models.zoo import build_from_config
+from f3amd_lib.motion.skeleton import Skeleton
+
+__all__ = ["save_tree", "load_tree", "TrainedModel", "save_model", "load_model"]
+
+FORMAT = "f3amd-1"
+
+
+def _named_leaves(tree) -> dict:
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+def save_tree(path: Path, tree: Any, metadata: dict) -> None:
+    """Write a tree of arrays with a JSON description, atomically.
+
+    Args:
+      path: file to write; replaced as a whole if it exists.
+      tree: any JAX tree of arrays.
+      metadata: JSON-ready values.
+    """
+    header = {"format": FORMAT, "description": json.dumps(metadata)}
+    arrays = {name: jnp.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    with whole_file(path, overwrite=True) as temporary:
+        save_file(arrays, temporary, header)
+
+
+def _read(path: Path) -> tuple[dict, dict]:
+    """Return (arrays, description) of a file; ValueError names a broken one."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such weights file")
+    try:
+        with safe_open(path, framework="flax") as file:
+            header = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, "
+            "delete it or restore a copy"
+        ) from None
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: not written by this project (format {header.get('format')!r})")
+    return arrays, json.loads(header["description"])
+
+
+def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
+    """Read a tree written by `save_tree`.
+
+    Args:
+      path: the file.
+      template: tree of arrays or shapes that says what must be there.
+
+    Returns:
+      (tree, metadata).
+
+    Raises:
+      ValueError: naming the file and what is missing, misshapen or too much.
+    """
+    arrays, metadata = _read(path)
+    wanted = _named_leaves(template)
+    if wanted.keys() != arrays.keys():
+        odd = sorted(wanted.keys() ^ arrays.keys())
+        raise ValueError(f"{path}: does not hold the expected arrays; first difference {odd[0]}")
+    for name, leaf in wanted.items():
+        if arrays[name].shape != leaf.shape:
+            raise ValueError(
+                f"{path}: {name} has shape {arrays[name].shape}, expected {leaf.shape}"
+            )
+    leaves = [arrays[name].astype(leaf.dtype) for name, leaf in wanted.items()]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A network ready to use: weights and all it needs to turn a path and a style into motion.
+
+    Attributes:
+      name: preset.
+      config: of the network.
+      params: weights (the moving average).
+      normaliser: of its features.
+      skeleton: of the data it was trained on.
+      styles: names, in the order of the one-hot vector.
+      seeds: per style name, seed histories as world frames, [K, H, C], metres and 6D; K may differ.
+      record: how it was trained, on what, under what terms.
+    """
+
+    name: str
+    config: F3AMDConfig
+    params: Any
+    normaliser: Normaliser
+    skeleton: Skeleton
+    styles: tuple[str, ...]
+    seeds: dict
+    record: dict
+
+    def network(self):
+        """Return the network with its weights."""
+        model = nnx.eval_shape(lambda: build_from_config(self.config, jax.random.key(0)))
+        return nnx.merge(nnx.graphdef(model), self.params)
+
+    def style_index(self, style: str) -> int:
+        """Return a style's place in the one-hot vector; ValueError lists the styles."""
+        if style not in self.styles:
+            raise ValueError(f"unknown style {style!r}; this model knows {', '.join(self.styles)}")
+        return self.styles.index(style)
+
+
+def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
+    """Write a trained model; weights as bfloat16 unless told, all else exactly."""
+    params = jax.tree.map(lambda leaf: leaf.astype(dtype), trained.params)
+    tree = {
+        "params": params,
+        "normaliser": trained.normaliser._asdict(),
+        "seeds": {name: jnp.asarray(seed, jnp.float32) for name, seed in trained.seeds.items()},
+        "offsets": jnp.asarray(trained.skeleton.offsets, jnp.float32),
+    }
+    metadata = {
+        "kind": "trained model",
+        "name": trained.name,
+        "model": trained.config.to_dict(),
+        "styles": list(trained.styles),
+        "joints": list(trained.skeleton.names),
+        "parents": list(trained.skeleton.parents),
+        "end_sites": [[joint, list(offset)] for joint, offset in trained.skeleton.end_sites],
+        "seed_shapes": {name: list(np.shape(seed)) for name, seed in trained.seeds.items()},
+        "record": trained.record,
+    }
+    save_tree(path, tree, metadata)
+
+
+def load_model(path: Path) -> TrainedModel:
+    """Read a model written by `save_model`.
+
+    Raises:
+      ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
+    """
+    _, metadata = _read(path)
+    if metadata.get("kind") != "trained model":
+        raise ValueError(f"{path}: holds a {metadata.get('kind')}, not a trained model")
+    config = F3AMDConfig.from_dict(metadata["model"])
+    params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
+    channels, joints = config.channels, len(metadata["joints"])
+    single = jax.ShapeDtypeStruct
+    template = {
+        "params": params,
+        "normaliser": {
+            "mean": single((channels,), jnp.float32),
+            "deviation": single((channels,), jnp.float32),
+            "path_scale": single((), jnp.float32),
+        },
+        "seeds": {
+            name: single(tuple(shape), jnp.float32)
+            for name, shape in metadata["seed_shapes"].items()
+        },
+        "offsets": single((joints, 3), jnp.float32),
+    }
+    tree, _ = load_tree(path, template)
+    skeleton = Skeleton(
+        tuple(metadata["joints"]),
+        tuple(metadata["parents"]),
+        np.asarray(tree["offsets"], np.float64),
+        tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
+    )
+    return TrainedModel(
+        name=metadata["name"],
+        config=config,
+        params=tree["params"],
+        normaliser=Normaliser(**tree["normaliser"]),
+        skeleton=skeleton,
+        styles=tuple(metadata["styles"]),
+        seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
+        record=metadata["record"],
+    )

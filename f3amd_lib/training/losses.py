@@ -1,0 +1,110 @@
+"""The training objective (paper section 4.1, Eq. 10; Appendix B, Eqs 11-14).
+
+Every term is a mean over batch, frames and entries. Positions are in metres, features in network
+units. Weights are fields of `LossWeights`; the paper sets them all to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from f3amd_lib.data.features import frame_positions
+from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
+
+__all__ = ["LossWeights", "LOSS_TERMS", "loss_terms", "total_loss"]
+
+LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "ird")
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms, and the form of the inter-round discontinuity.
+
+    Attributes:
+      sample: lambda of Eq. 11.
+      position: lambda of Eq. 12.
+      feature_velocity, joint_velocity: lambda of the two halves of Eq. 13 (the paper has one).
+      foot: lambda of the foot-contact term.
+      ird: lambda of Eq. 10.
+      ird_form: "literal" is Eq. 10, the distance between the last frame before the seam and the
+        first after it, which asks the character to stand still there; "excess" measures the step
+        across the seam against the step that the data takes.
+
+    Raises:
+      ValueError: for a negative weight or an unknown form.
+    """
+
+    sample: float = 1.0
+    position: float = 1.0
+    feature_velocity: float = 1.0
+    joint_velocity: float = 1.0
+    foot: float = 1.0
+    ird: float = 1.0
+    ird_form: str = "literal"
+
+    def __post_init__(self):
+        for term in LOSS_TERMS:
+            if not getattr(self, term) >= 0.0:
+                raise ValueError(f"loss weight {term} must be >= 0, got {getattr(self, term)!r}")
+        if self.ird_form not in ("literal", "excess"):
+            raise ValueError(f"ird_form must be 'literal' or 'excess', got {self.ird_form!r}")
+
+
+def _mean_square(difference):
+    return jnp.mean(difference * difference)
+
+
+def _norm(difference):
+    """Euclidean length over the last axis, with a finite gradient at zero."""
+    return jnp.sqrt(jnp.sum(difference * difference, axis=-1) + 1e-12)
+
+
+def loss_terms(
+    skeleton: Skeleton, x0_hat, x0, future_hat, future, last_history, ird_form: str = "literal"
+) -> dict:
+    """Return each term of the loss, unweighted.
+
+    Args:
+      skeleton: for forward kinematics.
+      x0_hat, x0: prediction and target in network units, [B, T, C].
+      future_hat, future: the same in metres and 6D numbers, [B, T, C].
+      last_history: the frame before the window, metres and 6D numbers, [B, C].
+      ird_form: see `LossWeights`.
+
+    Returns:
+      A dict of scalars, keyed by `LOSS_TERMS`:
+        sample            E |x0_hat - x0|^2                             (Eq. 11)
+        position          E |FK(x0_hat) - FK(x0)|^2                     (Eq. 12)
+        feature_velocity  E |d x0_hat - d x0|^2                         (Eq. 13, first half)
+        joint_velocity    E |d FK(x0_hat) - d FK(x0)|^2                 (Eq. 13, second half)
+        foot              E |contact * d FK(x0_hat)_toes|^2             (Appendix B; contact where
+                          the reference toe moves under 1 cm in a frame)
+        ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or its excess form
+    """
+    positions_hat = frame_positions(skeleton, future_hat)
+    positions = frame_positions(skeleton, future)
+    before = frame_positions(skeleton, last_history)
+    step_hat = positions_hat[:, 1:] - positions_hat[:, :-1]
+    step = positions[:, 1:] - positions[:, :-1]
+    toes = jnp.array(skeleton.toes)
+    contact = jnp.linalg.norm(step[:, :, toes], axis=-1) < CONTACT_SPEED
+    seam = positions_hat[:, 0] - before
+    if ird_form == "excess":
+        seam = seam - (positions[:, 0] - before)
+    return {
+        "sample": _mean_square(x0_hat - x0),
+        "position": _mean_square(positions_hat - positions),
+        "feature_velocity": _mean_square(
+            (x0_hat[:, 1:] - x0_hat[:, :-1]) - (x0[:, 1:] - x0[:, :-1])
+        ),
+        "joint_velocity": _mean_square(step_hat - step),
+        "foot": _mean_square(step_hat[:, :, toes] * contact[..., None]),
+        "ird": jnp.mean(_norm(seam)),
+    }
+
+
+def total_loss(terms: dict, weights: LossWeights):
+    """Return the weighted sum of the terms (Eq. 14 plus lambda_IRD of section 4.1)."""
+    return sum(getattr(weights, name) * terms[name] for name in LOSS_TERMS)

@@ -1,0 +1,317 @@
+"""From the name of a data set to a trained model: the road that notebooks and command line share.
+
+    data set -> packed cache -> windows on the device -> training -> TrainedModel
+
+Everything a run leaves lies in `runs/<data set>/<profile>/models/`: the model, its training state
+(a killed run goes on from there) and its loss history with a record. A model that ships with the
+project lies in `f3amd_lib/weights/<data set>/` in the same form.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.data.features import Normaliser, num_channels
+from f3amd_lib.data.packed import PackedMotion, packed_dataset
+from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
+from f3amd_lib.models import zoo
+from f3amd_lib.profiles import Profile, runs_dir
+from f3amd_lib.report.records import read_table, run_record, write_table
+from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
+from f3amd_lib.training.loop import Trainer, TrainingConfig, training_recipe
+
+__all__ = [
+    "PreparedData",
+    "prepare",
+    "ModelFiles",
+    "model_files",
+    "profile_recipe",
+    "train",
+    "obtain_model",
+    "find_model",
+]
+
+WEIGHTS_DIR = Path(__file__).resolve().parents[1] / "weights"
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedData:
+    """A data set ready to train on.
+
+    Attributes:
+      packed: all clips.
+      window, num_history: frames of the windows that are cut from it.
+    """
+
+    packed: PackedMotion
+    window: int = 32
+    num_history: int = 10
+
+    @functools.lru_cache(maxsize=3)  # noqa: B019  (one data set lives as long as the process)
+    def windows(self, split: str) -> WindowSet:
+        """Return the windows of a split; held-out splits take every fourth start."""
+        return build_windows(
+            self.packed,
+            split,
+            window=self.window,
+            num_history=self.num_history,
+            stride=1 if split == "train" else 4,
+        )
+
+    @functools.cached_property
+    def normaliser(self) -> Normaliser:
+        """Mean and deviation of the training windows, from a fixed key."""
+        return fit_normaliser(
+            self.windows("train"),
+            jax.random.key(0),
+            window=self.window,
+            num_history=self.num_history,
+        )
+
+    @functools.cached_property
+    def held_out_split(self) -> str:
+        """The split that losses are watched on: "validation", or what a tiny data set has."""
+        present = set(np.asarray(self.packed.clip_split).tolist())
+        return "validation" if 1 in present else "test" if 2 in present else "train"
+
+    def model_config(self, preset: str, **settings):
+        """Return a preset's config for this data set's channels and styles."""
+        return zoo.build_config(
+            preset,
+            channels=num_channels(self.packed.skeleton),
+            num_styles=len(self.packed.styles),
+            window=self.window,
+            num_history=self.num_history,
+            **settings,
+        )
+
+
+def prepare(profile: Profile, *, path=None) -> PreparedData:
+    """Open, pack and lay out the data set that a profile asks for.
+
+    Args:
+      profile: names the data set and how much of it.
+      path: folder or archive, where the data set needs one.
+    """
+    dataset = open_dataset(
+        profile.dataset,
+        path=path,
+        seconds_per_style=profile.seconds_per_style,
+        num_styles=profile.num_styles,
+    )
+    return PreparedData(packed_dataset(dataset), profile.window, profile.num_history)
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """Where one model lies.
+
+    Attributes:
+      model: weights and all that is needed to use them.
+      state: training state, to go on from.
+      history: losses against steps, a CSV with a record.
+    """
+
+    model: Path
+    state: Path
+    history: Path
+
+
+def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> ModelFiles:
+    """Return where a run on this profile keeps a preset's files.
+
+    Args:
+      profile: names data set and scale.
+      preset: by default the profile's own.
+      folder: instead of `runs/<data set>/<profile>/models`.
+    """
+    preset = preset or profile.preset
+    name = preset if profile.window == 32 else f"{preset}-{profile.window}frames"
+    if folder is None:
+        folder = runs_dir(profile.dataset, profile.name) / "models"
+    folder = Path(folder)
+    return ModelFiles(
+        folder / f"{name}.safetensors",
+        folder / f"{name}.state.safetensors",
+        folder / f"{name}.history.csv",
+    )
+
+
+def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
+    """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
+    preset = preset or profile.preset
+    settings = {"batch_size": profile.batch_size, "seed": profile.seed}
+    if profile.name == "gpu" and not preset.endswith("-plus"):
+        return TrainingConfig(profile.train_steps, learning_rate=profile.learning_rate, **settings)
+    return training_recipe(
+        preset, profile.train_steps, learning_rate=profile.learning_rate, **settings
+    )
+
+
+def train(
+    prepared: PreparedData,
+    profile: Profile,
+    *,
+    preset: str | None = None,
+    config: TrainingConfig | None = None,
+    folder=None,
+    progress: bool = True,
+) -> tuple[TrainedModel, pd.DataFrame]:
+    """Train a preset to the end, going on from its training state if there is one.
+
+    Args:
+      prepared: the data.
+      profile: says how long, and where files go.
+      preset: by default the profile's own.
+      config: by default `profile_recipe`.
+      folder: where files go instead of `runs/`.
+      progress: show a progress bar.
+
+    Returns:
+      (model, history): the history has a row per 50 steps, with held-out losses where measured.
+
+    Raises:
+      ValueError: if a training state lies there that was made with other settings.
+      TrainingDiverged: if the loss stops being a number.
+    """
+    preset = preset or profile.preset
+    files = model_files(profile, preset, folder=folder)
+    config = config or profile_recipe(profile, preset)
+    packed = prepared.packed
+    model_config = prepared.model_config(preset)
+    trainer = Trainer(
+        model_config, config, packed.skeleton, prepared.normaliser, prepared.windows("train")
+    )
+    held_out = prepared.windows(prepared.held_out_split)
+    record = run_record(
+        profile=profile,
+        dataset=packed,
+        seed=config.seed,
+        model=preset,
+        training=config.to_dict(),
+        held_out_split=prepared.held_out_split,
+        num_train_windows=int(prepared.windows("train").num_windows),
+    )
+    rows = []
+    if files.state.exists() and files.history.exists():
+        step = int(trainer.restore(files.state).step)
+        earlier, _ = read_table(files.history)
+        rows = earlier[earlier["step"] <= step].to_dict("records")
+
+    def keep(row: dict) -> None:
+        rows.append(row)
+        if "held_out_loss" in row:
+            write_table(files.history, pd.DataFrame(rows), record)
+
+    every = max(50, config.num_steps // 20)
+    state, _ = trainer.run(
+        checkpoint=files.state,
+        checkpoint_every=every - every % 50,
+        held_out=held_out,
+        on_chunk=keep,
+        progress=progress,
+    )
+    history = pd.DataFrame(rows)
+    trained = TrainedModel(
+        name=preset,
+        config=model_config,
+        params=state.ema,
+        normaliser=trainer.normaliser,
+        skeleton=packed.skeleton,
+        styles=packed.styles,
+        seeds=seed_histories(packed, num_history=prepared.num_history),
+        record=record,
+    )
+    save_model(files.model, trained)
+    return load_model(files.model), history
+
+
+def obtain_model(
+    prepared: PreparedData,
+    profile: Profile,
+    *,
+    preset: str | None = None,
+    allow_shipped: bool = True,
+    progress: bool = True,
+) -> tuple[TrainedModel, pd.DataFrame, str]:
+    """Return a trained model: shipped, finished earlier, or trained now.
+
+    A model counts only if it was made for the same skeleton, styles and training settings; weights
+    never cross over to another skeleton.
+
+    Args:
+      prepared: the data.
+      profile: `laptop` may use shipped weights, the others never do.
+      preset: by default the profile's own.
+      allow_shipped: whether shipped weights may be used.
+      progress: show a progress bar if training is needed.
+
+    Returns:
+      (model, history, origin), origin being "shipped", "earlier run" or "trained now".
+    """
+    preset = preset or profile.preset
+    wanted = prepared.model_config(preset)
+    if allow_shipped and profile.name == "laptop":
+        shipped = model_files(profile, preset, folder=WEIGHTS_DIR / profile.dataset)
+        if shipped.model.exists():
+            trained = load_model(shipped.model)
+            if (
+                trained.config == wanted
+                and trained.skeleton == prepared.packed.skeleton
+                and trained.styles == prepared.packed.styles
+            ):
+                return trained, read_table(shipped.history)[0], "shipped"
+    files = model_files(profile, preset)
+    if files.model.exists() and files.history.exists():
+        trained = load_model(files.model)
+        mine = {
+            "dataset_fingerprint": prepared.packed.fingerprint,
+            "training": profile_recipe(profile, preset).to_dict(),
+        }
+        if trained.config == wanted and all(trained.record.get(k) == v for k, v in mine.items()):
+            return trained, read_table(files.history)[0], "earlier run"
+        # Settings changed since: keep the old files under another name and start afresh.
+        for path in dataclasses.astuple(files):
+            _set_aside(path)
+    return *train(prepared, profile, preset=preset, progress=progress), "trained now"
+
+
+def find_model(dataset: str) -> Path:
+    """Return the weights to use for a data set: the user's newest laptop or gpu run, else shipped.
+
+    Raises:
+      ValueError: if there are none, saying how to train them.
+    """
+    own = [
+        path
+        for profile in ("gpu", "laptop")
+        for path in (runs_dir(dataset, profile) / "models").glob("*.safetensors")
+        if not path.name.endswith(".state.safetensors")
+    ]
+    if own:
+        return max(own, key=lambda path: path.stat().st_mtime)
+    shipped = sorted((WEIGHTS_DIR / dataset).glob("*.safetensors"))
+    if shipped:
+        return shipped[0]
+    raise ValueError(
+        f"no trained model for data set {dataset!r}: run `python -m f3amd_lib train --data "
+        f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
+    )
+
+
+def _set_aside(path: Path) -> None:
+    """Rename a file to the first free name with a number, so that nothing a user made is lost."""
+    if not path.exists():
+        return
+    number = 1
+    while (target := path.with_name(f"{path.name}.old{number}")).exists():
+        number += 1
+    path.rename(target)
