@@ -35,6 +35,7 @@ __all__ = [
     "turn_frames",
     "orthonormalise",
     "path_condition",
+    "bend_path",
 ]
 
 
@@ -140,6 +141,24 @@ def path_condition(position, yaw):
     """
     xp = array_module(position, yaw)
     return xp.concatenate([position, rotation_6d_from_yaw(yaw)], axis=-1)
+
+
+def bend_path(displacement, drift):
+    """Add a drift to a path little by little over the window, all of it at the last frame.
+
+    A target that jumped by the drift at once would ask for a jump.
+
+    Args:
+      displacement: [..., T, 2], metres.
+      drift: [..., 2], from where the character is to where the path wants it, metres.
+
+    Returns:
+      [..., T, 2].
+    """
+    xp = array_module(displacement, drift)
+    frames = displacement.shape[-2]
+    ramp = xp.arange(1, frames + 1, dtype=displacement.dtype)[:, None] / frames
+    return displacement + ramp * drift[..., None, :]
 
 
 class Normaliser(NamedTuple):

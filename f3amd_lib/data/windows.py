@@ -16,8 +16,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.data.features import (
     Normaliser,
+    bend_path,
     center_window,
     frame_yaw,
+    orthonormalise,
     path_condition,
     turn_frames,
     world_frames,
@@ -32,13 +34,18 @@ __all__ = [
     "Batch",
     "build_windows",
     "gather_windows",
+    "draw_windows",
     "sample_windows",
+    "continue_from",
     "fit_normaliser",
     "seed_histories",
 ]
 
 _SMOOTHING = (0.0, 5.0, 10.0)
 """Widths in frames of the Gaussians that smooth the path condition (0: as captured)."""
+
+_POSE_RECOVERY = 8
+"""Frames over which a training target leads from a generated pose back to the captured one."""
 
 
 class WindowSet(NamedTuple):
@@ -48,6 +55,7 @@ class WindowSet(NamedTuple):
       frames: world frames of all clips end to end, [N, C].
       paths: root x, z, sin(yaw), cos(yaw) per frame, raw and smoothed, [3, N, 4].
       starts: first frame of each window, [W].
+      room: frames of the same clip before each window, [W].
       styles: style index of each window, [W].
       one_hot: identity matrix of the styles, [S, S].
     """
@@ -55,6 +63,7 @@ class WindowSet(NamedTuple):
     frames: jax.Array
     paths: jax.Array
     starts: jax.Array
+    room: jax.Array
     styles: jax.Array
     one_hot: jax.Array
 
@@ -130,7 +139,7 @@ def build_windows(
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
     mirrored = split == "train" if mirrored is None else mirrored
-    frames, paths, starts, styles = [], [], [], []
+    frames, paths, starts, room, styles = [], [], [], [], []
     offset = 0
     for clip in np.flatnonzero(np.asarray(packed.clip_split) == SPLITS.index(split)):
         motion = packed.motion(int(clip))
@@ -142,6 +151,7 @@ def build_windows(
             world = world_frames(take)
             first = np.arange(0, len(world) - (num_history + window) + 1, stride)
             starts.append(offset + first)
+            room.append(first)
             styles.append(np.full(len(first), style))
             frames.append(world.astype(np.float32))
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
@@ -155,13 +165,21 @@ def build_windows(
         frames=jnp.asarray(np.concatenate(frames)),
         paths=jnp.asarray(np.concatenate(paths, axis=1)),
         starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
+        room=jnp.asarray(np.concatenate(room).astype(np.int32)),
         styles=jnp.asarray(np.concatenate(styles).astype(np.int32)),
         one_hot=jnp.eye(len(packed.styles), dtype=jnp.float32),
     )
 
 
 def gather_windows(
-    windows: WindowSet, index, yaw, smoothing, *, window: int = 32, num_history: int = 10
+    windows: WindowSet,
+    index,
+    yaw,
+    smoothing,
+    *,
+    window: int = 32,
+    num_history: int = 10,
+    earlier: int = 0,
 ) -> Batch:
     """Cut chosen windows, turned and made relative.
 
@@ -171,11 +189,14 @@ def gather_windows(
       yaw: turn of each, [B], radians (the random facing of section 3.2).
       smoothing: which path to show as condition, [B] of 0, 1, 2: as captured, or smoothed with a
         Gaussian of 5 or 10 frames.
+      earlier: cut the windows that start so many frames before; where `windows.room` has fewer,
+        the answer is a window of other frames and not to be used.
 
     Returns:
       The batch.
     """
-    span = windows.starts[index][:, None] + jnp.arange(num_history + window)[None, :]
+    start = jnp.maximum(windows.starts[index] - earlier, 0)
+    span = start[:, None] + jnp.arange(num_history + window)[None, :]
     frames = windows.frames[span]
     last = num_history - 1
     frames = turn_frames(center_window(frames, frames[:, last, jnp.array([0, 2])]), yaw)
@@ -200,21 +221,77 @@ def gather_windows(
     )
 
 
+def draw_windows(windows: WindowSet, key, batch_size: int, captured_path_share: float = 0.5):
+    """Draw which windows to cut, how far to turn them and which path to show.
+
+    A captured path sways with every step and gives the gait away, while the paths that users draw
+    are smooth: a share of the paths is shown as captured, the rest under one of two smoothings.
+
+    Args:
+      windows: from `build_windows`.
+      key: JAX random key.
+      batch_size: B.
+      captured_path_share: CAMDM's training takes 0.5; F3AMD's text does not mention smoothing.
+
+    Returns:
+      (index, yaw, smoothing), each [B], for `gather_windows`.
+    """
+    key_index, key_yaw, key_captured, key_width = jax.random.split(key, 4)
+    index = jax.random.randint(key_index, (batch_size,), 0, windows.num_windows)
+    yaw = jax.random.uniform(key_yaw, (batch_size,), minval=-jnp.pi, maxval=jnp.pi)
+    captured = jax.random.bernoulli(key_captured, captured_path_share, (batch_size,))
+    width = jax.random.randint(key_width, (batch_size,), 1, len(_SMOOTHING))
+    return index, yaw, jnp.where(captured, 0, width)
+
+
 def sample_windows(
     windows: WindowSet, key, batch_size: int, *, window: int = 32, num_history: int = 10
 ) -> Batch:
-    """Draw random windows with random facing and random path smoothing.
-
-    Half of the paths are shown as captured, a quarter under each smoothing: a captured path sways
-    with every step and would give the gait away, while the paths that users draw are smooth.
+    """Draw random windows with random facing and random path smoothing (see `draw_windows`).
 
     Source: paper section 3.2 (facing); CAMDM's training recipe (smoothing).
     """
-    key_index, key_yaw, key_smoothing = jax.random.split(key, 3)
-    index = jax.random.randint(key_index, (batch_size,), 0, windows.num_windows)
-    yaw = jax.random.uniform(key_yaw, (batch_size,), minval=-jnp.pi, maxval=jnp.pi)
-    smoothing = jnp.array([0, 0, 1, 2])[jax.random.randint(key_smoothing, (batch_size,), 0, 4)]
+    index, yaw, smoothing = draw_windows(windows, key, batch_size)
     return gather_windows(windows, index, yaw, smoothing, window=window, num_history=num_history)
+
+
+def continue_from(batch: Batch, made, real, chosen) -> Batch:
+    """Put generated frames in the place of captured histories, as a rollout would.
+
+    The character stands where its generated frames end, off the captured motion by some error. The
+    future is measured from there, and what is asked for leads back: the path bends to the captured
+    line over the window, exactly as in a rollout (`bend_path`), and the pose over a quarter second,
+    so that the target has no jump at the seam.
+
+    Args:
+      batch: captured windows, [B, ...].
+      made: generated frames of the window before, [B, T, C], in that window's coordinates.
+      real: captured frames of the window before, [B, T, C], in the same coordinates.
+      chosen: which samples to change, [B] of bool.
+
+    Returns:
+      The batch with `history`, `future` and `path` of the chosen samples replaced.
+    """
+    plane = jnp.array([0, 2])
+    error = made[:, -1] - real[:, -1]
+    drift = error[:, plane]
+    num_history, (num_frames, channels) = batch.history.shape[1], batch.future.shape[1:]
+    frame = jnp.arange(1, num_frames + 1)[:, None]
+    remains = jnp.maximum(1.0 - frame / _POSE_RECOVERY, 0.0) * jnp.ones(channels)
+    remains = remains.at[:, plane].set(1.0 - frame / num_frames)
+    future = center_window(batch.future, drift) + remains * error[:, None, :]
+    position = bend_path(batch.path[..., :2], -drift)
+    changed = batch._replace(
+        history=center_window(made[:, -num_history:], made[:, -1, plane]),
+        future=orthonormalise(future),
+        path=jnp.concatenate([position, batch.path[..., 2:]], axis=-1),
+    )
+    pick = chosen[:, None, None]
+    return batch._replace(
+        history=jnp.where(pick, changed.history, batch.history),
+        future=jnp.where(pick, changed.future, batch.future),
+        path=jnp.where(pick, changed.path, batch.path),
+    )
 
 
 def fit_normaliser(
@@ -261,7 +338,8 @@ def seed_histories(
         else:
             continue
         cuts = []
-        for clip in chosen[np.linspace(0, len(chosen) - 1, min(num_seeds, len(chosen))).astype(int)]:
+        spread = np.linspace(0, len(chosen) - 1, min(num_seeds, len(chosen))).astype(int)
+        for clip in chosen[spread]:
             motion = packed.motion(int(clip))
             start = max(0, motion.num_frames // 2 - num_history)
             frames = world_frames(motion.slice(start, start + num_history))

@@ -59,9 +59,20 @@ def ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next):
     Returns:
       VP state at `alpha_bar_next`: sqrt(ab') x0_hat + sqrt(1 - ab') eps_hat.
     """
-    xp = array_module(z, x0_hat, alpha_bar)
+    xp = array_module(z, x0_hat, alpha_bar, alpha_bar_next)
     eps_hat = (z - xp.sqrt(alpha_bar) * x0_hat) / xp.sqrt(1.0 - alpha_bar)
     return xp.sqrt(alpha_bar_next) * x0_hat + xp.sqrt(1.0 - alpha_bar_next) * eps_hat
+
+
+def _noise_levels(sigmas, x_init):
+    """Return the levels in the state's type; ValueError if they make no step."""
+    sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
+    if sigmas.ndim != 1 or len(sigmas) < 2:
+        raise ValueError(
+            f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}; "
+            "see VarianceExploding.grid"
+        )
+    return sigmas
 
 
 def sample_ddim(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
@@ -75,8 +86,11 @@ def sample_ddim(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
 
     Returns:
       State at sigmas[-1], [B, T, C].
+
+    Raises:
+      ValueError: if `sigmas` is not a list of at least two levels.
     """
-    sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
+    sigmas = _noise_levels(sigmas, x_init)
 
     def step(x_noisy, pair):
         sigma, sigma_next = pair
@@ -97,9 +111,12 @@ def sample_ddim_vp(denoise: Denoiser, x_init, sigmas):
     Returns:
       VE state at sigmas[-1]; equal to `sample_ddim` to rounding.
 
+    Raises:
+      ValueError: if `sigmas` is not a list of at least two levels.
+
     Source: paper Appendix F, with the rescaling that it leaves unsaid.
     """
-    sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
+    sigmas = _noise_levels(sigmas, x_init)
     alpha_bars = alpha_bar_from_sigma(sigmas)
 
     def step(z, pair):

@@ -32,7 +32,7 @@ class VarianceExploding:
       rho: curvature; larger values put more steps at low noise.
 
     Raises:
-      ValueError: unless 0 < sigma_min < sigma_max and rho > 0.
+      ValueError: unless 0 < sigma_min < sigma_max and rho > 0, all finite.
     """
 
     sigma_max: float = 128.0
@@ -40,10 +40,10 @@ class VarianceExploding:
     rho: float = 3.0
 
     def __post_init__(self):
-        if not (0.0 < self.sigma_min < self.sigma_max and self.rho > 0.0):
+        if not (0.0 < self.sigma_min < self.sigma_max < np.inf and 0.0 < self.rho < np.inf):
             raise ValueError(
-                "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0; got "
-                f"sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, rho={self.rho}"
+                "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, all "
+                f"finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, rho={self.rho}"
             )
 
     def sigma(self, t):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.data.features import (
+    bend_path,
     center_window,
     motion_from_frames,
     orthonormalise,
@@ -99,16 +100,12 @@ class MotionGenerator:
 
     def _rounds(self, history, positions, yaws, before, style, key):
         normaliser = self.trained.normaliser
-        window = self.trained.config.window
-        # The path asked for in a round starts where the character is and bends back to the line:
-        # a smooth correction that a sudden jump of the target would not be.
-        ramp = jnp.arange(1, window + 1, dtype=jnp.float32)[None, :, None] / window
 
         def one_round(history, inputs):
             target, yaw, target_before, number = inputs
             origin = history[:, -1, jnp.array([0, 2])]
-            drift = target_before - origin
-            position = target - target_before[:, None, :] + ramp * drift[:, None, :]
+            # Start where the character is and bend back to the line.
+            position = bend_path(target - target_before[:, None, :], target_before - origin)
             condition = Condition(
                 history=normaliser.normalise(center_window(history, origin)),
                 path=normaliser.normalise_path(path_condition(position, yaw)),

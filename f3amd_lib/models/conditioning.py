@@ -84,6 +84,7 @@ def position_code(first: int, last: int, width: int) -> np.ndarray:
     code = np.zeros((last - first, width))
     code[:, 0::2] = np.sin(frame * rate)
     code[:, 1::2] = np.cos(frame * rate)[:, : width // 2]
+    code.setflags(write=False)  # cached, and so shared by all callers
     return code
 
 

@@ -139,8 +139,11 @@ class F3AMD(nnx.Module):
             anchor = np.repeat(decay[:, None], config.channels, axis=1)
             self.anchor = nnx.Param(jnp.asarray(anchor, jnp.float32))
         if config.residual_prior:
-            shape = (config.window, config.channels)
-            self.log_residual_variance = nnx.Param(jnp.full(shape, 2.0 * np.log(0.1), jnp.float32))
+            # Slow modes are free, fast ones nearly fixed; a tenth of the logarithm is stored, so
+            # that it learns ten times as fast as a weight.
+            log_deviation = np.log(0.1) - 1.5 * np.log1p(np.arange(config.window))
+            start = np.repeat(0.1 * 2.0 * log_deviation[:, None], config.channels, axis=1)
+            self.residual_variance = nnx.Param(jnp.asarray(start, jnp.float32))
 
     def encode(self, condition: Condition) -> Context | tuple:
         """Encode a condition once a round.
@@ -197,7 +200,7 @@ class F3AMD(nnx.Module):
             x0_hat = x0_hat + self.anchor[...] * last_frame[:, None, :]
         if config.residual_prior:
             basis = jnp.asarray(cosine_basis(config.window), x_noisy.dtype)
-            variance = jnp.exp(self.log_residual_variance[...])
+            variance = jnp.exp(10.0 * self.residual_variance[...])
             gain = variance / (variance + level**2)
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)

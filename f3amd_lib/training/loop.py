@@ -21,8 +21,8 @@ import optax
 from flax import nnx
 from tqdm.auto import tqdm
 
-from f3amd_lib.data.features import Normaliser
-from f3amd_lib.data.windows import Batch, WindowSet, gather_windows, sample_windows
+from f3amd_lib.data.features import Normaliser, orthonormalise
+from f3amd_lib.data.windows import Batch, WindowSet, continue_from, draw_windows, gather_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.models.conditioning import Condition
@@ -66,6 +66,12 @@ class TrainingConfig:
         condition does not.
       history_noise: deviation, in network units, of noise added to the history in training (ours;
         0 in paper presets): rounds are started from generated frames, which are never quite real.
+      captured_path_share: share of samples whose path condition is the captured root, sway and all;
+        the rest see a smoothed one, as users draw them (CAMDM: 0.5).
+      own_history_share: share of samples that start from the network's own last frames of the
+        window before, made in one step without gradient, instead of captured ones (ours; 0 in
+        paper presets). Without it small losses of swing add up over rounds until nobody walks.
+        It rises from 0 between 10 and 40 % of the run, when there is something to learn from.
       loss: weights of the loss terms.
       sigma_max, sigma_min, rho: the noise schedule (section 4.5).
       seed: of initial weights and batches.
@@ -84,6 +90,8 @@ class TrainingConfig:
     gradient_clip: float = 0.0
     noise: str = "schedule"
     history_noise: float = 0.0
+    captured_path_share: float = 0.5
+    own_history_share: float = 0.0
     loss: LossWeights = field(default_factory=LossWeights)
     sigma_max: float = 128.0
     sigma_min: float = 0.01
@@ -101,6 +109,9 @@ class TrainingConfig:
         for name in ("num_steps", "batch_size", "learning_rate", "decay_steps"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
+        for name in ("captured_path_share", "own_history_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
         if not 0.0 <= self.ema_decay < 1.0:
             raise ValueError(f"ema_decay must be in [0, 1), got {self.ema_decay!r}")
         self.noise_schedule()
@@ -150,6 +161,8 @@ def training_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
     if preset.endswith("-plus"):
         values["noise"] = "mixed"
         values["history_noise"] = 0.02
+        values["captured_path_share"] = 0.25
+        values["own_history_share"] = 0.75
         values["loss"] = LossWeights(
             sample=1.0,
             position=20.0,
@@ -281,6 +294,27 @@ class Trainer:
         loss = total_loss(terms, self.config.loss)
         return loss, {"loss": loss, **terms}
 
+    def _training_batch(self, windows: WindowSet, state: TrainingState, key) -> Batch:
+        """Draw a batch; where asked, let the network make the histories itself."""
+        config, model_config = self.config, self.model_config
+        key_draw, key_noise, key_choice = jax.random.split(key, 3)
+        drawn = draw_windows(windows, key_draw, config.batch_size, config.captured_path_share)
+        frames = {"window": model_config.window, "num_history": model_config.num_history}
+        batch = gather_windows(windows, *drawn, **frames)
+        if config.own_history_share == 0:
+            return batch
+        before = gather_windows(windows, *drawn, **frames, earlier=model_config.window)
+        x0, condition = network_inputs(before, self.normaliser)
+        model = self.model(state.params)
+        x_noisy = config.sigma_max * jax.random.normal(key_noise, x0.shape)
+        x0_hat = model(x_noisy, config.sigma_max, model.encode(condition))
+        made = orthonormalise(self.normaliser.denormalise(jax.lax.stop_gradient(x0_hat)))
+        progress = state.step / config.num_steps
+        share = config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
+        chosen = jax.random.bernoulli(key_choice, share, (config.batch_size,))
+        chosen &= windows.room[drawn[0]] >= model_config.window
+        return continue_from(batch, made, before.future, chosen)
+
     def _run_chunk(self, state: TrainingState, windows: WindowSet, length: int):
         config = self.config
         base = jax.random.fold_in(jax.random.key(config.seed), 1)
@@ -289,13 +323,7 @@ class Trainer:
             key_batch, key_sigma, key_loss = jax.random.split(
                 jax.random.fold_in(base, state.step), 3
             )
-            batch = sample_windows(
-                windows,
-                key_batch,
-                config.batch_size,
-                window=self.model_config.window,
-                num_history=self.model_config.num_history,
-            )
+            batch = self._training_batch(windows, state, key_batch)
             sigma = _draw_sigma(key_sigma, config.batch_size, config)
             gradient, terms = jax.grad(self._loss, has_aux=True)(
                 state.params, batch, sigma, key_loss

@@ -6,6 +6,7 @@ units. Weights are fields of `LossWeights`; the paper sets them all to 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ class LossWeights:
         across the seam against the step that the data takes.
 
     Raises:
-      ValueError: for a negative weight or an unknown form.
+      ValueError: for a weight that is negative or not finite, or an unknown form.
     """
 
     sample: float = 1.0
@@ -46,10 +47,16 @@ class LossWeights:
 
     def __post_init__(self):
         for term in LOSS_TERMS:
-            if not getattr(self, term) >= 0.0:
-                raise ValueError(f"loss weight {term} must be >= 0, got {getattr(self, term)!r}")
-        if self.ird_form not in ("literal", "excess"):
-            raise ValueError(f"ird_form must be 'literal' or 'excess', got {self.ird_form!r}")
+            if not 0.0 <= getattr(self, term) < math.inf:
+                raise ValueError(
+                    f"loss weight {term} must be >= 0 and finite, got {getattr(self, term)!r}"
+                )
+        _check_ird_form(self.ird_form)
+
+
+def _check_ird_form(ird_form: str) -> None:
+    if ird_form not in ("literal", "excess"):
+        raise ValueError(f"ird_form must be 'literal' or 'excess', got {ird_form!r}")
 
 
 def _mean_square(difference):
@@ -82,7 +89,11 @@ def loss_terms(
         foot              E |contact * d FK(x0_hat)_toes|^2             (Appendix B; contact where
                           the reference toe moves under 1 cm in a frame)
         ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or its excess form
+
+    Raises:
+      ValueError: for an unknown `ird_form`.
     """
+    _check_ird_form(ird_form)
     positions_hat = frame_positions(skeleton, future_hat)
     positions = frame_positions(skeleton, future)
     before = frame_positions(skeleton, last_history)

@@ -1,0 +1,171 @@
+"""Command line: `python -m f3amd_lib rollout --style ... --path figure-eight --out out/`.
+
+data      open a data set, build its packed cache, say what is in it
+presets   list the models
+train     train a model (goes on where an earlier run stopped)
+rollout   animate one character: BVH, film strip PNG and GIF
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from pathlib import Path
+
+log = logging.getLogger("f3amd")
+
+
+def _profile(arguments, **overrides):
+    from f3amd_lib.profiles import load_profile
+
+    given = {name: value for name, value in overrides.items() if value is not None}
+    return load_profile(arguments.profile, arguments.data, **given)
+
+
+def _data(arguments) -> None:
+    import numpy as np
+
+    from f3amd_lib.data.sources import SPLITS
+    from f3amd_lib.training.pipeline import prepare
+
+    prepared = prepare(_profile(arguments), path=arguments.source)
+    packed = prepared.packed
+    log.info("data set     %s", packed.dataset)
+    log.info("terms        %s", packed.licence)
+    log.info("credit       %s", packed.credit)
+    log.info("clips        %d (%d left out)", packed.num_clips, len(packed.skipped))
+    log.info("frames       %d at 30 fps", packed.num_frames)
+    log.info("joints       %d", packed.skeleton.num_joints)
+    log.info("styles       %s", ", ".join(packed.styles))
+    counts = np.bincount(np.asarray(packed.clip_split), minlength=3)
+    log.info("split        %s", ", ".join(f"{n} {s}" for n, s in zip(counts, SPLITS, strict=True)))
+
+
+def _presets(arguments) -> None:
+    from f3amd_lib.models import zoo
+    from f3amd_lib.report.tables import markdown_table
+
+    table = zoo.table(channels=arguments.channels, num_styles=arguments.styles)
+    log.info("%s", markdown_table(table))
+
+
+def _train(arguments) -> None:
+    from f3amd_lib.training.pipeline import model_files, prepare, train
+
+    profile = _profile(
+        arguments,
+        preset=arguments.preset,
+        train_steps=arguments.steps,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+        window=arguments.window,
+    )
+    files = model_files(profile, folder=arguments.out)
+    _, history = train(prepare(profile, path=arguments.source), profile, folder=arguments.out)
+    log.info("model        %s", files.model)
+    log.info("held-out     %.4f", history["held_out_loss"].dropna().iloc[-1])
+
+
+def _path(text: str, num_frames: int, speed: float, seed: int):
+    from f3amd_lib.evaluation.paths import named_path, read_path_csv
+
+    if text.lower().endswith(".csv"):
+        return read_path_csv(text)
+    return named_path(text, num_frames, speed=speed, seed=seed)
+
+
+def _rollout(arguments) -> None:
+    from f3amd_lib.evaluation.rollout import MotionGenerator
+    from f3amd_lib.motion.bvh import write_bvh
+    from f3amd_lib.report.figures import save_figure
+    from f3amd_lib.report.pictures import film_strip, write_gif
+    from f3amd_lib.training.checkpoints import load_model
+    from f3amd_lib.training.pipeline import find_model
+
+    weights = Path(arguments.weights) if arguments.weights else find_model(arguments.data)
+    trained = load_model(weights)
+    log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
+    log.info("terms        %s", trained.record.get("dataset_licence"))
+    num_frames = max(2, round(arguments.seconds * 30))
+    path = _path(arguments.path, num_frames, arguments.speed, arguments.seed)
+    out = Path(arguments.out)
+    name = f"{arguments.style}_{Path(arguments.path).stem}_seed{arguments.seed}"
+    targets = [out / f"{name}{ending}" for ending in (".bvh", ".png", ".gif")]
+    taken = [str(target) for target in targets if target.exists()]
+    if taken and not arguments.overwrite:
+        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
+    generator = MotionGenerator(trained, arguments.steps)
+    motion = generator.rollout(path, arguments.style, seed=arguments.seed).motion()
+    out.mkdir(parents=True, exist_ok=True)
+    write_bvh(targets[0], motion, overwrite=arguments.overwrite)
+    title = f"{trained.name}, {arguments.style}"
+    save_figure(film_strip(motion, paths=path, titles=[title]), targets[1])
+    write_gif(targets[2], motion, target_paths=path, titles=[title], max_seconds=12.0)
+    for target in targets:
+        log.info("wrote        %s", target)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="f3amd", description=__doc__.split("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    def add(name, action, text):
+        command = commands.add_parser(name, help=text, description=text)
+        command.set_defaults(action=action)
+        return command
+
+    def with_data(command):
+        from f3amd_lib.profiles import DATASETS, PROFILES
+
+        command.add_argument("--data", default="synthetic", choices=DATASETS)
+        command.add_argument("--profile", default="laptop", choices=PROFILES)
+        command.add_argument("--source", help="folder or archive, for data sets that need one")
+
+    with_data(add("data", _data, "open a data set, build its cache, say what is in it"))
+
+    presets = add("presets", _presets, "list the models with their sizes")
+    presets.add_argument("--channels", type=int, default=141, help="features a frame, 6 J + 3")
+    presets.add_argument("--styles", type=int, default=100)
+
+    train = add("train", _train, "train a model; a killed run goes on where it stopped")
+    with_data(train)
+    train.add_argument("--preset", help="such as F3AMD-FNO-96; by default the profile's")
+    train.add_argument("--steps", type=int, help="optimiser steps; by default the profile's")
+    train.add_argument("--batch-size", type=int, help="windows a step")
+    train.add_argument("--window", type=int, help="future frames, 32 or 64")
+    train.add_argument("--seed", type=int)
+    train.add_argument("--out", help="folder for the model instead of runs/DATA/PROFILE/models")
+
+    rollout = add("rollout", _rollout, "animate one character: BVH, film strip and GIF")
+    rollout.add_argument("--style", required=True)
+    rollout.add_argument("--path", default="figure-eight", help="a named path, or a CSV file")
+    rollout.add_argument("--seed", type=int, default=0)
+    rollout.add_argument("--seconds", type=float, default=20.0, help="length of a named path")
+    rollout.add_argument("--speed", type=float, default=1.2, help="of a named path, m/s")
+    rollout.add_argument("--steps", type=int, default=8, help="denoising steps a round")
+    rollout.add_argument("--data", default="synthetic", help="use the model of this data set")
+    rollout.add_argument("--weights", help="a weights file, instead of the data set's own")
+    rollout.add_argument("--out", default="out", help="folder to write to")
+    rollout.add_argument("--overwrite", action="store_true", help="replace files of the same name")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; errors of the user's making end with one line and status 2."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    for noisy in ("jax", "absl", "matplotlib", "PIL"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    arguments = _parser().parse_args(argv)
+    try:
+        arguments.action(arguments)
+    except (ValueError, OSError, ArithmeticError) as error:
+        print(f"f3amd {arguments.command}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
