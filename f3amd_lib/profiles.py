@@ -138,9 +138,9 @@ _DATASET_DEFAULTS = {
     ("laptop", "bandai"): {
         "preset": "F3AMD-FNO-96-plus",
         "compare_preset": "F3AMD-FNO-96",
-        "train_steps": 6_000,
+        "train_steps": 4_000,
     },
-    ("laptop", "100style"): {"train_steps": 6_000},
+    ("laptop", "100style"): {"train_steps": 4_000},
 }
 
 _POSITIVE = (

@@ -36,7 +36,8 @@ __all__ = [
     "gather_windows",
     "draw_windows",
     "sample_windows",
-    "continue_from",
+    "restart_from",
+    "mean_poses",
     "fit_normaliser",
     "seed_histories",
 ]
@@ -255,43 +256,44 @@ def sample_windows(
     return gather_windows(windows, index, yaw, smoothing, window=window, num_history=num_history)
 
 
-def continue_from(batch: Batch, made, real, chosen) -> Batch:
-    """Put generated frames in the place of captured histories, as a rollout would.
+def restart_from(batch: Batch, history) -> Batch:
+    """Put other histories in the place of captured ones, as a rollout meets them.
 
-    The character stands where its generated frames end, off the captured motion by some error. The
-    future is measured from there, and what is asked for leads back: the path bends to the captured
-    line over the window, exactly as in a rollout (`bend_path`), and the pose over a quarter second,
-    so that the target has no jump at the seam.
+    The character stands and is posed a little off the captured motion. The future is measured from
+    where it stands, and what is asked for leads back without a jump: the path bends to the captured
+    line over the window, exactly as in a rollout (`bend_path`), and the pose over a quarter second.
 
     Args:
       batch: captured windows, [B, ...].
-      made: generated frames of the window before, [B, T, C], in that window's coordinates.
-      real: captured frames of the window before, [B, T, C], in the same coordinates.
-      chosen: which samples to change, [B] of bool.
+      history: other frames to start from, [B, H, C], in the batch's coordinates; where they are the
+        captured ones, nothing changes.
 
     Returns:
-      The batch with `history`, `future` and `path` of the chosen samples replaced.
+      The batch with new `history`, `future` and `path`.
     """
     plane = jnp.array([0, 2])
-    error = made[:, -1] - real[:, -1]
-    drift = error[:, plane]
-    num_history, (num_frames, channels) = batch.history.shape[1], batch.future.shape[1:]
+    error = history[:, -1] - batch.history[:, -1]
+    num_frames, channels = batch.future.shape[1:]
     frame = jnp.arange(1, num_frames + 1)[:, None]
     remains = jnp.maximum(1.0 - frame / _POSE_RECOVERY, 0.0) * jnp.ones(channels)
     remains = remains.at[:, plane].set(1.0 - frame / num_frames)
+    drift = error[:, plane]
     future = center_window(batch.future, drift) + remains * error[:, None, :]
     position = bend_path(batch.path[..., :2], -drift)
-    changed = batch._replace(
-        history=center_window(made[:, -num_history:], made[:, -1, plane]),
+    return batch._replace(
+        history=center_window(history, history[:, -1, plane]),
         future=orthonormalise(future),
         path=jnp.concatenate([position, batch.path[..., 2:]], axis=-1),
     )
-    pick = chosen[:, None, None]
-    return batch._replace(
-        history=jnp.where(pick, changed.history, batch.history),
-        future=jnp.where(pick, changed.future, batch.future),
-        path=jnp.where(pick, changed.path, batch.path),
-    )
+
+
+def mean_poses(windows: WindowSet) -> jax.Array:
+    """Return the mean pose of each style, [S, C - 9]: 6D local rotations without the root's."""
+    num_styles = windows.one_hot.shape[0]
+    poses = windows.frames[windows.starts, 9:]
+    total = jax.ops.segment_sum(poses, windows.styles, num_styles)
+    count = jax.ops.segment_sum(jnp.ones(len(poses)), windows.styles, num_styles)
+    return total / jnp.maximum(count, 1.0)[:, None]
 
 
 def fit_normaliser(
@@ -313,7 +315,7 @@ def fit_normaliser(
 
 
 def seed_histories(
-    packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 4, split: str = "train"
+    packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 8, split: str = "train"
 ) -> dict:
     """Cut a few starting poses per style out of a packed data set.
 

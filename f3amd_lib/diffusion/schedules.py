@@ -43,7 +43,8 @@ class VarianceExploding:
         if not (0.0 < self.sigma_min < self.sigma_max < np.inf and 0.0 < self.rho < np.inf):
             raise ValueError(
                 "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, all "
-                f"finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, rho={self.rho}"
+                f"finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, "
+                f"rho={self.rho}"
             )
 
     def sigma(self, t):

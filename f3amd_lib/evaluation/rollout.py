@@ -174,7 +174,8 @@ class MotionGenerator:
             yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
         start = 2.0 * position[:, 0] - position[:, 1]
         if history is None:
-            history = self._starting_poses(styles, start, yaw[:, 0], seed)
+            speed = np.linalg.norm(position[:, 0] - start, axis=-1)
+            history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
         expected = (batch, config.num_history, config.channels)
         if history.shape != expected:
             raise ValueError(f"history must have shape {expected}, got {history.shape}")
@@ -198,13 +199,21 @@ class MotionGenerator:
             window=config.window,
         )
 
-    def _starting_poses(self, styles, start, yaw, seed: int) -> np.ndarray:
+    def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
         generator = np.random.default_rng(seed)
         poses = []
         for character, style in enumerate(styles):
             if style not in self.trained.seeds:
                 raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
             choices = self.trained.seeds[style]
+            choices = choices[_as_fast_as(choices, speed[character])]
             pose = turn_frames(choices[generator.integers(len(choices))], yaw[character])
             poses.append(center_window(pose, -start[character]))
         return np.stack(poses).astype(np.float32)
+
+
+def _as_fast_as(poses: np.ndarray, speed: float) -> np.ndarray:
+    """Return which starting poses [K, H, C] move about as fast as a path, metres a frame."""
+    travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
+    gap = np.abs(travelled / (poses.shape[1] - 1) - speed)
+    return np.flatnonzero(gap <= gap.min() + 0.1 / 30.0)

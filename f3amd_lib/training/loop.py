@@ -21,8 +21,15 @@ import optax
 from flax import nnx
 from tqdm.auto import tqdm
 
-from f3amd_lib.data.features import Normaliser, orthonormalise
-from f3amd_lib.data.windows import Batch, WindowSet, continue_from, draw_windows, gather_windows
+from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
+from f3amd_lib.data.windows import (
+    Batch,
+    WindowSet,
+    draw_windows,
+    gather_windows,
+    mean_poses,
+    restart_from,
+)
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.models.conditioning import Condition
@@ -72,6 +79,9 @@ class TrainingConfig:
         window before, made in one step without gradient, instead of captured ones (ours; 0 in
         paper presets). Without it small losses of swing add up over rounds until nobody walks.
         It rises from 0 between 10 and 40 % of the run, when there is something to learn from.
+      history_damping: share of samples whose history is pulled towards the mean pose of its style,
+        by a random amount, while the target stays as captured (ours; 0 in paper presets): the same
+        remedy, for histories that have lost more than one round's worth of swing.
       loss: weights of the loss terms.
       sigma_max, sigma_min, rho: the noise schedule (section 4.5).
       seed: of initial weights and batches.
@@ -92,6 +102,7 @@ class TrainingConfig:
     history_noise: float = 0.0
     captured_path_share: float = 0.5
     own_history_share: float = 0.0
+    history_damping: float = 0.0
     loss: LossWeights = field(default_factory=LossWeights)
     sigma_max: float = 128.0
     sigma_min: float = 0.01
@@ -109,7 +120,7 @@ class TrainingConfig:
         for name in ("num_steps", "batch_size", "learning_rate", "decay_steps"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
-        for name in ("captured_path_share", "own_history_share"):
+        for name in ("captured_path_share", "own_history_share", "history_damping"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
         if not 0.0 <= self.ema_decay < 1.0:
@@ -163,6 +174,7 @@ def training_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
         values["history_noise"] = 0.02
         values["captured_path_share"] = 0.25
         values["own_history_share"] = 0.75
+        values["history_damping"] = 0.5
         values["loss"] = LossWeights(
             sample=1.0,
             position=20.0,
@@ -251,6 +263,7 @@ class Trainer:
         if not model_config.normalise:
             normaliser = Normaliser.identity(model_config.channels)
         self.normaliser, self.windows = normaliser, windows
+        self.mean_poses = mean_poses(windows)
         model = nnx.eval_shape(lambda: build_from_config(model_config, jax.random.key(0)))
         self.graph = nnx.graphdef(model)
         steps = [optax.adam(learning_rate_schedule(config))]
@@ -295,25 +308,50 @@ class Trainer:
         return loss, {"loss": loss, **terms}
 
     def _training_batch(self, windows: WindowSet, state: TrainingState, key) -> Batch:
-        """Draw a batch; where asked, let the network make the histories itself."""
+        """Draw a batch; where the recipe asks, start it from histories as a rollout meets them."""
         config, model_config = self.config, self.model_config
-        key_draw, key_noise, key_choice = jax.random.split(key, 3)
+        key_draw, key_own, key_damping = jax.random.split(key, 3)
         drawn = draw_windows(windows, key_draw, config.batch_size, config.captured_path_share)
         frames = {"window": model_config.window, "num_history": model_config.num_history}
         batch = gather_windows(windows, *drawn, **frames)
-        if config.own_history_share == 0:
-            return batch
-        before = gather_windows(windows, *drawn, **frames, earlier=model_config.window)
+        history = batch.history
+        if config.own_history_share > 0:
+            before = gather_windows(windows, *drawn, **frames, earlier=model_config.window)
+            room = windows.room[drawn[0]] >= model_config.window
+            history = self._own_history(state, batch, before, room, key_own)
+        if config.history_damping > 0:
+            history = self._damped(history, batch.style, key_damping)
+        return batch if history is batch.history else restart_from(batch, history)
+
+    def _own_history(self, state: TrainingState, batch: Batch, before: Batch, room, key):
+        """Replace a share of the histories by the last frames of the network's own window before.
+
+        That window is made in one step from pure noise, and no gradient flows through it.
+        """
+        config = self.config
+        key_noise, key_choice = jax.random.split(key)
         x0, condition = network_inputs(before, self.normaliser)
         model = self.model(state.params)
         x_noisy = config.sigma_max * jax.random.normal(key_noise, x0.shape)
-        x0_hat = model(x_noisy, config.sigma_max, model.encode(condition))
-        made = orthonormalise(self.normaliser.denormalise(jax.lax.stop_gradient(x0_hat)))
+        x0_hat = jax.lax.stop_gradient(model(x_noisy, config.sigma_max, model.encode(condition)))
+        made = orthonormalise(self.normaliser.denormalise(x0_hat))
+        made = made[:, -self.model_config.num_history :]
+        # From the coordinates of the window before to those of this one.
+        made = center_window(made, before.future[:, -1, jnp.array([0, 2])])
         progress = state.step / config.num_steps
         share = config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
-        chosen = jax.random.bernoulli(key_choice, share, (config.batch_size,))
-        chosen &= windows.room[drawn[0]] >= model_config.window
-        return continue_from(batch, made, before.future, chosen)
+        chosen = room & jax.random.bernoulli(key_choice, share, room.shape)
+        return jnp.where(chosen[:, None, None], made, batch.history)
+
+    def _damped(self, history, style, key):
+        """Pull a share of the histories towards the mean pose of their style."""
+        key_choice, key_amount = jax.random.split(key)
+        size = (history.shape[0], 1, 1)
+        chosen = jax.random.bernoulli(key_choice, self.config.history_damping, size)
+        amount = jnp.where(chosen, jax.random.uniform(key_amount, size, maxval=0.8), 0.0)
+        mean = (style @ self.mean_poses)[:, None, :]
+        pose = history[..., 9:] + amount * (mean - history[..., 9:])
+        return orthonormalise(jnp.concatenate([history[..., :9], pose], axis=-1))
 
     def _run_chunk(self, state: TrainingState, windows: WindowSet, length: int):
         config = self.config

@@ -1,1 +1,0 @@
-"""Timing and the hardware it was done on; nothing here speaks about quality."""
