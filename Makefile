@@ -35,10 +35,14 @@ figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DA
 smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
 	$(PYTHON) -m f3amd_lib.reproduce --data $(DATA) --profile smoke
 
-# Tests run on the CPU, and their results go nowhere near paper_figures/.
+# Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
+# their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
+PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durations=5
+
 test: lint ## Lint, run the tests and check the notebooks' committed outputs
-	env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest tests $(NOTEBOOKS) \
-	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 --durations=10 $(PYTEST_OPTIONS)
+	$(PYTEST) tests $(PYTEST_OPTIONS)
+	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) \
+	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff
 	$(PYTHON) -m ruff check .

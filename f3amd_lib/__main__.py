@@ -88,6 +88,8 @@ def _rollout(arguments) -> None:
     trained = load_model(weights)
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
     log.info("terms        %s", trained.record.get("dataset_licence"))
+    if not 0.1 <= arguments.seconds <= 3600.0:
+        raise ValueError(f"--seconds must be between 0.1 and 3600, got {arguments.seconds}")
     num_frames = max(2, round(arguments.seconds * 30))
     path = _path(arguments.path, num_frames, arguments.speed, arguments.seed)
     out = Path(arguments.out)
@@ -138,12 +140,18 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=int)
     train.add_argument("--out", help="folder for the model instead of runs/DATA/PROFILE/models")
 
-    rollout = add("rollout", _rollout, "animate one character: BVH, film strip and GIF")
+    rollout = add(
+        "rollout", _rollout, "animate one character: BVH, film strip and GIF (its first 12 s)"
+    )
     rollout.add_argument("--style", required=True)
     rollout.add_argument("--path", default="figure-eight", help="a named path, or a CSV file")
     rollout.add_argument("--seed", type=int, default=0)
-    rollout.add_argument("--seconds", type=float, default=20.0, help="length of a named path")
-    rollout.add_argument("--speed", type=float, default=1.2, help="of a named path, m/s")
+    rollout.add_argument(
+        "--seconds", type=float, default=20.0, help="length of a named path; a CSV has its own"
+    )
+    rollout.add_argument(
+        "--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own"
+    )
     rollout.add_argument("--steps", type=int, default=8, help="denoising steps a round")
     rollout.add_argument("--data", default="synthetic", help="use the model of this data set")
     rollout.add_argument("--weights", help="a weights file, instead of the data set's own")

@@ -1,4 +1,4 @@
-"""Profiles: how much is done. `smoke` in seconds, `laptop` in minutes, `gpu` at the paper's scale.
+"""Profiles: how much is done. `smoke` in seconds, `laptop` in minutes, `gpu` in hours.
 
 A profile says how much, a data set says on what; every notebook takes both as parameters and asks
 `load_profile` for the numbers. Papermill accepts a misspelt parameter without a word, so that
@@ -108,7 +108,7 @@ _PROFILE_DEFAULTS = {
     "laptop": {
         "preset": "F3AMD-FNO-32-plus",
         "compare_preset": "F3AMD-FNO-32",
-        "train_steps": 1_800,
+        "train_steps": 3_000,
         "batch_size": 128,
         "learning_rate": 2e-3,
         "num_characters": 8,

@@ -25,9 +25,11 @@ import pandas as pd
 import papermill
 from nbclient.exceptions import DeadKernelError
 from papermill.exceptions import PapermillExecutionError
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from f3amd_lib import profiles
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.data.sources import DATA_DIR_VARIABLE
 from f3amd_lib.profiles import load_profile, nearest_hint, results_dir, runs_dir
 from f3amd_lib.report.records import run_record, write_table
 
@@ -328,6 +330,10 @@ def main(arguments: list[str] | None = None) -> int:
         help="a parameter of every notebook that runs; repeatable",
     )
     options = parser.parse_args(arguments)
+    # Notebooks run in their own folder, where a relative path would lead elsewhere.
+    for variable in (profiles.RESULTS_DIR_VARIABLE, DATA_DIR_VARIABLE, CACHE_DIR_VARIABLE):
+        if os.environ.get(variable):
+            os.environ[variable] = str(Path(os.environ[variable]).resolve())
     # Papermill names each notebook twice at INFO; warnings are news.
     logging.getLogger("papermill").setLevel(logging.WARNING)
     try:

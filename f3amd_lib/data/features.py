@@ -111,7 +111,7 @@ def orthonormalise(frames):
 def center_window(frames, origin):
     """Move frames [..., T, C] so that `origin` [..., 2] (x, z) becomes the plane's origin.
 
-    Height stays absolute (section 3.2; decisions: the origin is the last history frame).
+    Height stays absolute (section 3.2; our origin is the last history frame).
     """
     xp = array_module(frames)
     x = frames[..., 0:1] - origin[..., None, 0:1]

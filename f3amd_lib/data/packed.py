@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pooch
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Clip, Dataset
 from f3amd_lib.data.statistics import lowest_toe_height

@@ -7,6 +7,8 @@ Python loop over samples.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -49,10 +51,17 @@ _POSE_RECOVERY = 8
 """Frames over which a training target leads from a generated pose back to the captured one."""
 
 
-class WindowSet(NamedTuple):
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("frames", "paths", "starts", "room", "styles", "one_hot"),
+    meta_fields=("window", "num_history"),
+)
+@dataclass(frozen=True, eq=False)
+class WindowSet:
     """All windows of one split, on the device.
 
     Attributes:
+      window, num_history: the frames T and H that every start has room for.
       frames: world frames of all clips end to end, [N, C].
       paths: root x, z, sin(yaw), cos(yaw) per frame, raw and smoothed, [3, N, 4].
       starts: first frame of each window, [W].
@@ -61,6 +70,8 @@ class WindowSet(NamedTuple):
       one_hot: identity matrix of the styles, [S, S].
     """
 
+    window: int
+    num_history: int
     frames: jax.Array
     paths: jax.Array
     starts: jax.Array
@@ -94,7 +105,8 @@ def _smooth(signal: np.ndarray, width: float) -> np.ndarray:
     """Smooth along axis 0; odd reflection at the ends lets a straight path stay straight."""
     if width == 0.0 or len(signal) < 2:
         return signal
-    pad = min(int(4 * width), len(signal) - 1)
+    pad = int(4 * width) + 1
+    # numpy reflects as often as it takes where a clip is shorter than the kernel.
     padded = np.pad(signal, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
     return gaussian_filter1d(padded, width, axis=0)[pad : pad + len(signal)]
 
@@ -163,6 +175,8 @@ def build_windows(
             f"{num_history + window} frames"
         )
     return WindowSet(
+        window=window,
+        num_history=num_history,
         frames=jnp.asarray(np.concatenate(frames)),
         paths=jnp.asarray(np.concatenate(paths, axis=1)),
         starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
@@ -195,7 +209,15 @@ def gather_windows(
 
     Returns:
       The batch.
+
+    Raises:
+      ValueError: if the windows were built for other numbers of frames.
     """
+    if (window, num_history) != (windows.window, windows.num_history):
+        raise ValueError(
+            f"these windows were built for {windows.num_history} + {windows.window} frames, not "
+            f"{num_history} + {window}: build them anew with `build_windows`"
+        )
     start = jnp.maximum(windows.starts[index] - earlier, 0)
     span = start[:, None] + jnp.arange(num_history + window)[None, :]
     frames = windows.frames[span]
@@ -305,13 +327,18 @@ def fit_normaliser(
     packed rotations into signal.
     """
     num_samples = min(num_samples, 4 * windows.num_windows)
-    batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
-    flat = batch.future.reshape(-1, batch.future.shape[-1])
-    # A random turn makes x and z alike; measure them as one, around zero.
-    plane = jnp.sqrt(jnp.mean(flat[:, jnp.array([0, 2])] ** 2))
-    mean = flat.mean(axis=0).at[jnp.array([0, 2])].set(0.0)
-    deviation = flat.std(axis=0).at[jnp.array([0, 2])].set(plane)
-    return Normaliser(mean, jnp.maximum(deviation, 0.02), plane)
+
+    @jax.jit
+    def measure(windows, key):
+        batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
+        flat = batch.future.reshape(-1, batch.future.shape[-1])
+        # A random turn makes x and z alike; measure them as one, around zero.
+        plane = jnp.sqrt(jnp.mean(flat[:, jnp.array([0, 2])] ** 2))
+        mean = flat.mean(axis=0).at[jnp.array([0, 2])].set(0.0)
+        deviation = flat.std(axis=0).at[jnp.array([0, 2])].set(plane)
+        return Normaliser(mean, jnp.maximum(deviation, 0.02), jnp.maximum(plane, 0.02))
+
+    return measure(windows, key)
 
 
 def seed_histories(

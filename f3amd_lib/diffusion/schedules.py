@@ -42,8 +42,8 @@ class VarianceExploding:
     def __post_init__(self):
         if not (0.0 < self.sigma_min < self.sigma_max < np.inf and 0.0 < self.rho < np.inf):
             raise ValueError(
-                "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, all "
-                f"finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, "
+                "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, "
+                f"all finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, "
                 f"rho={self.rho}"
             )
 

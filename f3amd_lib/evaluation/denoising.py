@@ -2,7 +2,7 @@
 
 A network that predicts clean motion can lower its loss by ignoring the noisy input and answering
 with the mean of what history, path and style allow. Such a network gives the same answer at every
-noise level and for every seed; these functions tell (decisions: "noise use").
+noise level and for every seed; these functions tell.
 """
 
 from __future__ import annotations
@@ -124,11 +124,12 @@ def seed_spread(
     num_seeds: int = 10,
     seed: int = 0,
 ) -> float:
-    """Return how far samples of one condition differ, in cm (the Diversity of Appendix C).
+    """Return how far samples of one condition differ, in cm, after the Diversity of Appendix C.
 
     Square root of the variance, over noise seeds, of joint positions relative to the root, averaged
-    over conditions, frames and joints before the root is taken. The paper prints cm under the name
-    of a variance; the root is our reading.
+    over conditions, frames and joints before the root is taken. Our readings: the root of the
+    variance, since the paper prints cm; positions from which the root's place is subtracted but not
+    its facing, which the path fixes; and a mean over several conditions, for a steadier figure.
     """
     trained = generator.trained
     batch = held_out_batch(windows, trained, num_conditions)

@@ -19,7 +19,15 @@ from scipy.special import jn_zeros
 
 from f3amd_lib.motion.skeleton import Motion
 
-__all__ = ["RootPath", "NAMES", "MAX_STEP", "named_path", "read_path_csv", "path_from_motion"]
+__all__ = [
+    "RootPath",
+    "NAMES",
+    "MAX_STEP",
+    "named_path",
+    "read_path_csv",
+    "tangent_yaw",
+    "path_from_motion",
+]
 
 NAMES = ("straight", "circle", "figure-eight", "slalom", "square", "spiral", "complex")
 """The paths that `named_path` knows."""
@@ -348,11 +356,18 @@ def read_path_csv(path) -> RootPath:
     position = table[:, [header.index("x"), header.index("z")]]
     if "yaw_deg" in header:
         return RootPath(position, np.deg2rad(table[:, header.index("yaw_deg")]))
-    return RootPath(position, _tangent_yaw(position))
+    return RootPath(position, tangent_yaw(position))
 
 
-def _tangent_yaw(position: np.ndarray) -> np.ndarray:
-    """Yaw of the direction of travel, [T]; frames that stand keep the last direction."""
+def tangent_yaw(position: np.ndarray) -> np.ndarray:
+    """Return the yaw of the direction of travel; frames that stand keep the last direction.
+
+    Args:
+      position: [T, 2], x and z in metres.
+
+    Returns:
+      [T], radians.
+    """
     velocity = np.gradient(position, axis=0)
     moving = np.linalg.norm(velocity, axis=-1) > 1e-4  # 3 mm/s at 30 fps
     if not moving.any():

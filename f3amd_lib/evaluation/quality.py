@@ -2,7 +2,7 @@
 
 No figure of motion quality means much alone. Everything that is measured on a rollout is therefore
 measured on real held-out clips too, in the same way and as if they had window seams where a rollout
-has them (decisions: "IRD is not zero for real motion"; "a walking person is a number").
+has them: the IRD of a real walker is a step, not zero, and "a walking person" is a set of numbers.
 
 Dicts of measures have one number a character or clip, [B]; tables are tidy (`report.tables`).
 """
@@ -10,6 +10,7 @@ Dicts of measures have one number a character or clip, [B]; tables are tidy (`re
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -25,9 +26,9 @@ from f3amd_lib.evaluation.metrics import (
     joint_acceleration,
     tidy_metrics,
 )
-from f3amd_lib.evaluation.paths import RootPath, path_from_motion
+from f3amd_lib.evaluation.paths import RootPath, path_from_motion, tangent_yaw
 from f3amd_lib.evaluation.rollout import Rollout
-from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, facing_yaw
 from f3amd_lib.report.papers import load_paper_table
 from f3amd_lib.report.tables import metric_heading
@@ -35,6 +36,9 @@ from f3amd_lib.report.tables import metric_heading
 __all__ = [
     "WALKING",
     "row_label",
+    "training_clips",
+    "sideways_share",
+    "facing_ahead",
     "style_pace",
     "style_floor",
     "own_path",
@@ -63,6 +67,8 @@ WALKING = {
 """For each key of `walking_measures`: name, unit, and the factor within which a generated walker
 must come to the real one, above and below, to count as a walking person (our choice)."""
 
+_STANDING = 0.1  # m/s
+
 _STEADY = 3
 """Frames that a foot must carry alone to count as a support phase (0.1 s at 30 fps)."""
 
@@ -72,8 +78,12 @@ def row_label(model: str, steps: int) -> str:
     return f"{model}, {steps} step{'s' if steps > 1 else ''}"
 
 
-def _style_clips(packed: PackedMotion, style: str) -> np.ndarray:
-    """Clip numbers of a style's training split, or of all splits if that has none."""
+def training_clips(packed: PackedMotion, style: str) -> np.ndarray:
+    """Return the clip numbers of a style's training split, or of all splits if that has none.
+
+    Raises:
+      ValueError: for an unknown style.
+    """
     if style not in packed.styles:
         raise ValueError(f"unknown style {style!r}; this data has {', '.join(packed.styles)}")
     mine = np.asarray(packed.clip_style) == packed.styles.index(style)
@@ -81,15 +91,15 @@ def _style_clips(packed: PackedMotion, style: str) -> np.ndarray:
     return np.flatnonzero(training if training.any() else mine)
 
 
-def _mean_speed(packed: PackedMotion, clip: int) -> float:
-    """Mean ground speed of a clip's root, m/s."""
+def _speeds(packed: PackedMotion, clip: int) -> np.ndarray:
+    """Ground speed of a clip's root from frame to frame, [T - 1], m/s."""
     start, stop = packed.clip_start[clip], packed.clip_start[clip + 1]
     ground = np.asarray(packed.root_position[start:stop, [0, 2]], np.float64)
-    return 30.0 * float(np.linalg.norm(np.diff(ground, axis=0), axis=-1).mean())
+    return 30.0 * np.linalg.norm(np.diff(ground, axis=0), axis=-1)
 
 
 def style_pace(packed: PackedMotion, style: str) -> float:
-    """Return how fast a style usually moves: median of its training clips' mean speeds, m/s.
+    """Return how fast a style usually moves: median speed of its moving training frames, m/s.
 
     A path that asks an exhausted walker to run asks for what no data shows.
 
@@ -97,10 +107,40 @@ def style_pace(packed: PackedMotion, style: str) -> float:
       packed: the data set.
       style: a label of it.
 
+    Returns:
+      Metres a second, at least 0.1: slower frames count as standing.
+
     Raises:
       ValueError: for an unknown style.
     """
-    return float(np.median([_mean_speed(packed, clip) for clip in _style_clips(packed, style)]))
+    speeds = np.concatenate([_speeds(packed, clip) for clip in training_clips(packed, style)])
+    moving = speeds[speeds > _STANDING]
+    return float(np.median(moving)) if len(moving) else _STANDING
+
+
+def sideways_share(path: RootPath) -> float:
+    """Return the share of moving frames that go more than 45 degrees off the facing, in [0, 1].
+
+    A path that asks for sideways steps where the data has none asks for what nobody has shown.
+
+    Args:
+      path: of a target or, from `path_from_motion`, of a clip.
+    """
+    step = np.diff(path.position, axis=0)
+    moving = np.linalg.norm(step, axis=-1) * path.fps > _STANDING
+    if not moving.any():
+        return 0.0
+    off = wrap_angle(np.arctan2(step[:, 0], step[:, 1]) - path.yaw[:-1])
+    return float(np.mean(np.abs(off[moving]) > np.pi / 4))
+
+
+def facing_ahead(path: RootPath) -> RootPath:
+    """Return the same line, walked facing where it goes.
+
+    Args:
+      path: any path; while it stands still it keeps the last direction.
+    """
+    return replace(path, yaw=tangent_yaw(path.position))
 
 
 def style_floor(packed: PackedMotion, style: str) -> float:
@@ -113,7 +153,7 @@ def style_floor(packed: PackedMotion, style: str) -> float:
     Raises:
       ValueError: for an unknown style.
     """
-    return float(np.mean(packed.floor_shift[_style_clips(packed, style)]))
+    return float(np.mean(packed.floor_shift[training_clips(packed, style)]))
 
 
 def own_path(motion: Motion, frames: int = 41) -> RootPath:
@@ -157,7 +197,8 @@ def reference_clips(
       window: clips that hold no boundary between windows of this many frames are left out.
       split: "test", or another.
       slowest, fastest: mean speeds to take, in units of `style_pace`; by default those between
-        which `named_path("complex", speed=pace)` varies. A run would be no yardstick for a walk.
+        which `named_path("complex", speed=pace)` varies. A run would be no yardstick for a walk. A
+        style with no clip in between gives the one that comes nearest.
 
     Returns:
       Clip numbers, by style and then in the order of the data.
@@ -173,13 +214,16 @@ def reference_clips(
     for style in styles:
         pace = style_pace(packed, style)
         mine = np.asarray(packed.clip_style) == packed.styles.index(style)
-        for clip in np.flatnonzero(mine & held_out & long_enough):
-            if slowest * pace <= _mean_speed(packed, clip) <= fastest * pace:
-                clips.append(int(clip))
+        available = np.flatnonzero(mine & held_out & long_enough)
+        ratio = np.array([_speeds(packed, clip).mean() / pace for clip in available])
+        fitting = available[(slowest <= ratio) & (ratio <= fastest)]
+        if len(available) and not len(fitting):
+            fitting = available[[np.argmin(np.abs(ratio - 1.0))]]
+        clips += fitting.tolist()
     if not clips:
         raise ValueError(
             f"data set {packed.dataset!r} has no {split} clip of {', '.join(styles)} with more "
-            f"than {window + 1} frames and {slowest:g} to {fastest:g} times the usual speed"
+            f"than {window + 1} frames"
         )
     return clips
 
@@ -252,7 +296,7 @@ def foot_alternation(positions, skeleton: Skeleton, fps: float = 30.0):
     Returns:
       Passings per second, one a character.
 
-    Source: ours (decisions: contact alternation).
+    Source: ours.
     """
     contact = np.asarray(contact_labels(skeleton, np.asarray(positions, np.float64), fps))
     alone = contact[..., 0].astype(int) - contact[..., 1].astype(int)
@@ -280,7 +324,7 @@ def bone_swing(positions, skeleton: Skeleton):
     Returns:
       Degrees, one a character.
 
-    Source: ours (decisions: bone-direction range).
+    Source: ours.
     """
     positions = np.asarray(positions, np.float64)
     child = np.arange(1, skeleton.num_joints)

@@ -38,7 +38,7 @@ class Rollout:
 
     Attributes:
       skeleton: of the characters.
-      frames: world frames, [B, R * T, C]; metres and 6D, orthonormal.
+      frames: world frames, [B, F, C], F frames as in the path; metres and 6D, orthonormal.
       history: the frames before the first window, [B, H, C].
       paths: what each character was asked to follow.
       styles: what each character was asked to look like.
@@ -67,6 +67,7 @@ class MotionGenerator:
       trained: a trained model.
       num_steps: network evaluations a round (the paper: 8, 4, 2 or 1).
       schedule: noise levels; by default those the model was trained with.
+      spacing: where the steps lie, see `VarianceExploding.grid`.
     """
 
     def __init__(
@@ -150,6 +151,8 @@ class MotionGenerator:
         paths = [paths] if isinstance(paths, RootPath) else list(paths)
         styles = [styles] if isinstance(styles, str) else list(styles)
         batch = max(len(paths), len(styles))
+        if not paths or not styles:
+            raise ValueError("a rollout needs at least one path and one style")
         paths = paths * batch if len(paths) == 1 else paths
         styles = styles * batch if len(styles) == 1 else styles
         if len(paths) != batch or len(styles) != batch:
@@ -159,6 +162,8 @@ class MotionGenerator:
         lengths = {len(path.yaw) for path in paths}
         if len(lengths) != 1:
             raise ValueError(f"paths must have the same length, got {sorted(lengths)} frames")
+        if any(abs(path.fps - 30.0) > 1e-3 for path in paths):
+            raise ValueError("paths must be at 30 frames per second, as the models are")
         num_frames = lengths.pop()
         if num_frames < 2:
             raise ValueError("a path needs at least 2 frames")
@@ -176,9 +181,12 @@ class MotionGenerator:
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
             history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
+        history = np.asarray(history, np.float32)
         expected = (batch, config.num_history, config.channels)
         if history.shape != expected:
             raise ValueError(f"history must have shape {expected}, got {history.shape}")
+        if not np.isfinite(history).all():
+            raise ValueError("history holds a number that is not finite")
         shape = (batch, rounds, config.window)
         targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
         before = np.concatenate([start[None], targets[:-1, :, -1]])
@@ -215,5 +223,5 @@ class MotionGenerator:
 def _as_fast_as(poses: np.ndarray, speed: float) -> np.ndarray:
     """Return which starting poses [K, H, C] move about as fast as a path, metres a frame."""
     travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
-    gap = np.abs(travelled / (poses.shape[1] - 1) - speed)
+    gap = np.abs(travelled / max(1, poses.shape[1] - 1) - speed)
     return np.flatnonzero(gap <= gap.min() + 0.1 / 30.0)

@@ -19,7 +19,7 @@ from flax import nnx
 from f3amd_lib.models.conditioning import Condition, ConditionEncoder, Context, FiLM
 from f3amd_lib.models.spectral import FNOBlock
 
-__all__ = ["F3AMDConfig", "F3AMD"]
+__all__ = ["F3AMDConfig", "F3AMD", "refuse_unknown"]
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,10 @@ class F3AMDConfig:
                 object.__setattr__(self, field.name, float(value))
             elif type(value) is not wanted:
                 raise ValueError(f"{field.name} must be of type {field.type}, got {value!r}")
-            if wanted is not bool and value <= 0:
-                raise ValueError(f"{field.name} must be positive, got {value!r}")
+            if wanted is not bool and not 0 < value < float("inf"):
+                raise ValueError(f"{field.name} must be positive and finite, got {value!r}")
+        if self.window < 2:
+            raise ValueError(f"window must be at least 2 frames, got {self.window}")
         if self.num_kept_modes > self.window // 2 + 1:
             raise ValueError(
                 f"num_kept_modes must be at most {self.window // 2 + 1} for a window of "
@@ -89,13 +91,21 @@ class F3AMDConfig:
     @classmethod
     def from_dict(cls, values: dict) -> F3AMDConfig:
         """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
-        known = {field.name for field in dataclasses.fields(cls)}
-        for key in values:
-            if key not in known:
-                near = get_close_matches(key, known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise ValueError(f"unknown model setting {key!r}{hint}")
+        refuse_unknown(values, cls, "model setting")
+        missing = {"channels", "num_styles"} - values.keys()
+        if missing:
+            raise ValueError(f"model settings lack {', '.join(sorted(missing))}")
         return cls(**values)
+
+
+def refuse_unknown(values: dict, config_class: type, what: str) -> None:
+    """Raise ValueError, with the nearest name, for a key that is no field of a config class."""
+    known = [field.name for field in dataclasses.fields(config_class)]
+    for key in values:
+        if key not in known:
+            near = get_close_matches(key, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"unknown {what} {key!r}{hint}")
 
 
 def cosine_basis(num_frames: int) -> np.ndarray:

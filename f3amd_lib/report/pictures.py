@@ -202,6 +202,7 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend
         view = _view(facing[place], around, np.deg2rad(6.0))
         base = points[place, 0] * np.array([1.0, 0.0, 1.0])
         seen = (points[place] - base) @ view.T
+        top = max(top, seen[:, 1].max() + 0.05)
         left = place * slot
         shadow = np.linspace(0, 2 * np.pi, 40)
         axis.fill(left + 0.26 * np.cos(shadow), 0.03 * np.sin(shadow), color="#E9E9E9", zorder=1)

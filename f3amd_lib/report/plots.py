@@ -89,7 +89,9 @@ def keep_figure(figure, results, name: str):
     save_figure(figure, Path(results) / "figures" / f"{name}.png")
     shown = show_figure(figure, dpi=76)
     light, buffer = Image.open(io.BytesIO(shown.data)).convert("RGB"), io.BytesIO()
-    light.quantize(64, dither=Image.Dither.NONE).save(buffer, "png", optimize=True)
+    light.quantize(64, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        buffer, "png", optimize=True
+    )
     shown.data = buffer.getvalue()
     return shown
 
@@ -790,7 +792,7 @@ def film_gate(gamma, gate, z_base, z_tilde, gammas: Sequence[float]):
     right.set_title("a channel behind the gate (β = 0)")
     right.set_xlabel("frame")
     right.legend(fontsize=8, loc="upper right", ncols=2)
-    right.set_ylim(top=1.45 * right.get_ylim()[1])
+    right.set_ylim(top=1.75 * right.get_ylim()[1])
     return figure
 
 

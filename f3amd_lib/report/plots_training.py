@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
 from f3amd_lib.profiles import repository_root
 from f3amd_lib.report.figures import PALETTE, model_style, new_figure, plot_style
@@ -32,14 +33,17 @@ __all__ = [
     "stored_result",
 ]
 
-_REAL = model_style("real").line | {"linewidth": 1.4}
+_REAL = model_style("real").line | {"linewidth": 1.4, "zorder": 4}
 
 
 def _line(label: str) -> dict:
-    """Style of a model's line; fewer denoising steps are drawn thinner, open and dotted."""
-    name, _, steps = label.partition(",")
+    """Style of a label's line; ours apart from the paper's presets, one step dotted and open."""
+    name, _, steps = label.partition(", ")
     line = model_style(name).line
-    if steps.strip() in ("1 step", "1 steps"):
+    if name.endswith("-plus"):
+        # One family, but here they stand side by side, and a dash alone does not keep them apart.
+        line |= {"color": PALETTE["vermilion"], "linestyle": "-"}
+    if steps == "1 step":
         line |= {"linestyle": ":", "markerfacecolor": "white"}
     return line
 
@@ -208,11 +212,11 @@ def loss_curves(history: pd.DataFrame, terms=("sample", "position")):
     with plot_style():
         for axis, term in zip(axes[0], terms, strict=True):
             for model, rows in history.groupby("model", sort=False):
-                style = model_style(model)
+                style = _line(model)
                 axis.plot(
                     rows["step"],
                     rows[term],
-                    color=style.color,
+                    color=style["color"],
                     marker="." if len(rows) < 8 else "",
                     lw=0.9,
                     alpha=0.8,
@@ -222,7 +226,7 @@ def loss_curves(history: pd.DataFrame, terms=("sample", "position")):
                 axis.plot(
                     held["step"],
                     held[f"held_out_{term}"],
-                    **style.line | {"linewidth": 2.2},
+                    **style | {"linewidth": 2.2},
                     label=f"{model}, held out",
                 )
             axis.set(title=f"{term} loss", xlabel="step", ylabel=units.get(term, ""), yscale="log")
@@ -247,10 +251,8 @@ def error_against_sigma(table: pd.DataFrame):
         top = 2.0 * table["x0_error"].max()
         axes[0].plot(first["sigma"], first["input_error"], **_REAL, label="the noisy input itself")
         for model, rows in table.groupby("model", sort=False):
-            axes[0].plot(rows["sigma"], rows["x0_error"], **model_style(model).line, label=model)
-            axes[1].plot(
-                rows["sigma"], rows["joint_error_cm"], **model_style(model).line, label=model
-            )
+            axes[0].plot(rows["sigma"], rows["x0_error"], **_line(model), label=model)
+            axes[1].plot(rows["sigma"], rows["joint_error_cm"], **_line(model), label=model)
         low = min(0.7 * first["sigma"].min(), 0.5 * table["x0_error"].min())
         axes[0].set(xscale="log", yscale="log", ylim=(low, top))
         axes[0].set(xlabel="noise level sigma", ylabel="x0 error (network units)")
@@ -277,7 +279,7 @@ def windows_beside_real(table: pd.DataFrame):
     )
     figure, axes = new_figure(9.0, 1.1 + 0.36 * len(table), 1, 3, sharey=True)
     names = table["label"].tolist()
-    colors = [model_style(name).color for name in names]
+    colors = [_line(name)["color"] for name in names]
     shades = [0.55 if name.endswith(" 1 step") else 1.0 for name in names]
     with plot_style():
         for axis, (column, real, title) in zip(axes, panels, strict=True):
@@ -412,9 +414,10 @@ def _two_panels(table: pd.DataFrame, across: str, panels, xlabel: str):
             for label, rows in table.groupby("label", sort=False):
                 if rows[column].isna().all():
                     continue
-                line = _REAL if label == "real" else _line(label) | {"markersize": 3.5}
+                line = _REAL if label == "real" else _line(label) | {"marker": ""}
                 axis.plot(rows[across], rows[column], **line, label=label)
             axis.set(xlabel=xlabel, ylabel=title, ylim=(0, None))
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         handles, labels = axes[1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure

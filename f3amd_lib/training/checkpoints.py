@@ -6,6 +6,7 @@ the name, so that a crash leaves the old file whole. Reading checks names, shape
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.skeleton import Skeleton
 
-__all__ = ["save_tree", "load_tree", "TrainedModel", "save_model", "load_model"]
+__all__ = ["save_tree", "describe", "load_tree", "TrainedModel", "save_model", "load_model"]
 
 FORMAT = "f3amd-1"
 
@@ -42,10 +43,21 @@ def save_tree(path: Path, tree: Any, metadata: dict) -> None:
       tree: any JAX tree of arrays.
       metadata: JSON-ready values.
     """
-    header = {"format": FORMAT, "description": json.dumps(metadata)}
     arrays = {name: jnp.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    description = json.dumps(metadata)
+    checksum = _checksum(arrays, description)
+    header = {"format": FORMAT, "description": description, "sha256": checksum}
     with whole_file(path, overwrite=True) as temporary:
         save_file(arrays, temporary, header)
+
+
+def _checksum(arrays: dict, description: str) -> str:
+    """Return the sha256 of a description and of all arrays in the order of their names."""
+    digest = hashlib.sha256(description.encode())
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(np.asarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> tuple[dict, dict]:
@@ -64,7 +76,14 @@ def _read(path: Path) -> tuple[dict, dict]:
         ) from None
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: not written by this project (format {header.get('format')!r})")
+    if header.get("sha256") != _checksum(arrays, header["description"]):
+        raise ValueError(f"{path}: content does not match its checksum; restore a whole copy")
     return arrays, json.loads(header["description"])
+
+
+def describe(path: Path) -> dict:
+    """Return the description of a file written by this project; ValueError names a broken one."""
+    return _read(path)[1]
 
 
 def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
@@ -121,7 +140,8 @@ class TrainedModel:
     def network(self):
         """Return the network with its weights."""
         model = nnx.eval_shape(lambda: build_from_config(self.config, jax.random.key(0)))
-        return nnx.merge(nnx.graphdef(model), self.params)
+        # A fresh tree, so that editing one network leaves the next alone.
+        return nnx.merge(nnx.graphdef(model), jax.tree.map(lambda leaf: leaf, self.params))
 
     def style_index(self, style: str) -> int:
         """Return a style's place in the one-hot vector; ValueError lists the styles."""
@@ -162,6 +182,17 @@ def load_model(path: Path) -> TrainedModel:
     _, metadata = _read(path)
     if metadata.get("kind") != "trained model":
         raise ValueError(f"{path}: holds a {metadata.get('kind')}, not a trained model")
+    try:
+        return _assemble(path, metadata)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: description lacks or garbles {error}") from None
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _assemble(path: Path, metadata: dict) -> TrainedModel:
+    """Read the arrays that a trained model's description speaks of."""
     config = F3AMDConfig.from_dict(metadata["model"])
     params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
     channels, joints = config.channels, len(metadata["joints"])

@@ -8,9 +8,9 @@ killed and resumed gives the same weights as one that was not.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
 from f3amd_lib.data.windows import (
@@ -33,10 +33,10 @@ from f3amd_lib.data.windows import (
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.models.f3amd import F3AMDConfig, refuse_unknown
 from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.training.checkpoints import load_tree, save_tree
+from f3amd_lib.training.checkpoints import describe, load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "TrainingState",
     "TrainingDiverged",
     "Trainer",
+    "draw_sigma",
     "learning_rate_schedule",
     "network_inputs",
     "training_recipe",
@@ -80,8 +81,8 @@ class TrainingConfig:
         paper presets). Without it small losses of swing add up over rounds until nobody walks.
         It rises from 0 between 10 and 40 % of the run, when there is something to learn from.
       history_damping: share of samples whose history is pulled towards the mean pose of its style,
-        by a random amount, while the target stays as captured (ours; 0 in paper presets): the same
-        remedy, for histories that have lost more than one round's worth of swing.
+        by a random amount, while the target soon returns to what was captured (ours; 0 in paper
+        presets): the same remedy, for histories that have lost the swing of more than one round.
       loss: weights of the loss terms.
       sigma_max, sigma_min, rho: the noise schedule (section 4.5).
       seed: of initial weights and batches.
@@ -117,9 +118,17 @@ class TrainingConfig:
             )
         if self.noise not in ("schedule", "mixed"):
             raise ValueError(f"unknown training noise {self.noise!r}: use 'schedule' or 'mixed'")
-        for name in ("num_steps", "batch_size", "learning_rate", "decay_steps"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
+        for name in ("num_steps", "batch_size", "warmup_steps"):
+            if type(getattr(self, name)) is not int or getattr(self, name) < 1:
+                raise ValueError(f"{name} must be positive and whole: {getattr(self, name)!r}")
+        for name in ("learning_rate", "decay_steps"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
+        for name in ("gradient_clip", "history_noise"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name)!r}")
+        if self.noise == "mixed" and self.sigma_min >= 1.0:
+            raise ValueError(f"mixed noise needs sigma_min below 1, got {self.sigma_min!r}")
         for name in ("captured_path_share", "own_history_share", "history_damping"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
@@ -138,14 +147,10 @@ class TrainingConfig:
     @classmethod
     def from_dict(cls, values: dict) -> TrainingConfig:
         """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
-        known = [item.name for item in dataclasses.fields(cls)]
-        for key in values:
-            if key not in known:
-                near = get_close_matches(key, known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise ValueError(f"unknown training setting {key!r}{hint}")
+        refuse_unknown(values, cls, "training setting")
         values = dict(values)
         if isinstance(values.get("loss"), dict):
+            refuse_unknown(values["loss"], LossWeights, "loss setting")
             values["loss"] = LossWeights(**values["loss"])
         return cls(**values)
 
@@ -227,8 +232,8 @@ def network_inputs(batch: Batch, normaliser: Normaliser) -> tuple[jax.Array, Con
     return normaliser.normalise(batch.future), condition
 
 
-def _draw_sigma(key, batch_size: int, config: TrainingConfig):
-    """Draw the noise level of each sample, [B]."""
+def draw_sigma(key, batch_size: int, config: TrainingConfig):
+    """Draw the noise level of each sample, [B], as `config.noise` says (Eqs 8 and 9)."""
     key_time, key_low, key_choice = jax.random.split(key, 3)
     sigma = config.noise_schedule().sigma(jax.random.uniform(key_time, (batch_size,)))
     if config.noise == "mixed":
@@ -249,6 +254,7 @@ class Trainer:
       skeleton: for the kinematic losses.
       normaliser: of the training windows (replaced by the identity if the model wants none).
       windows: training windows on the device.
+      dataset_fingerprint: of the data they come from; a state of other data is not resumed.
     """
 
     def __init__(
@@ -258,7 +264,10 @@ class Trainer:
         skeleton: Skeleton,
         normaliser: Normaliser,
         windows: WindowSet,
+        *,
+        dataset_fingerprint: str = "",
     ):
+        self.dataset_fingerprint = dataset_fingerprint
         self.model_config, self.config, self.skeleton = model_config, config, skeleton
         if not model_config.normalise:
             normaliser = Normaliser.identity(model_config.channels)
@@ -276,20 +285,27 @@ class Trainer:
     def initial_state(self) -> TrainingState:
         """Return the state before the first step."""
         key = jax.random.fold_in(jax.random.key(self.config.seed), 0)
-        params = nnx.state(build_from_config(self.model_config, key))
+
+        @jax.jit
+        def build(key):
+            params = nnx.state(build_from_config(self.model_config, key))
+            return params, self.optimiser.init(params)
+
+        params, optimiser = build(key)
         ema = jax.tree.map(jnp.copy, params)
-        return TrainingState(params, ema, self.optimiser.init(params), jnp.zeros((), jnp.int32))
+        return TrainingState(params, ema, optimiser, jnp.zeros((), jnp.int32))
 
     def model(self, params):
         """Return a network with the given weights (use the state's `ema`)."""
-        return nnx.merge(self.graph, params)
+        # A fresh tree, so that editing the network leaves the given weights alone.
+        return nnx.merge(self.graph, jax.tree.map(lambda leaf: leaf, params))
 
-    def _loss(self, params, batch: Batch, sigma, key):
+    def _loss(self, params, batch: Batch, sigma, key, history_noise: float = 0.0):
         key_noise, key_history = jax.random.split(key)
         x0, condition = network_inputs(batch, self.normaliser)
-        if self.config.history_noise > 0:
+        if history_noise > 0:
             noise = jax.random.normal(key_history, condition.history.shape)
-            history = condition.history + self.config.history_noise * noise
+            history = condition.history + history_noise * noise
             condition = condition._replace(history=history)
         noise = jax.random.normal(key_noise, x0.shape)
         model = self.model(params)
@@ -335,7 +351,8 @@ class Trainer:
         x_noisy = config.sigma_max * jax.random.normal(key_noise, x0.shape)
         x0_hat = jax.lax.stop_gradient(model(x_noisy, config.sigma_max, model.encode(condition)))
         made = orthonormalise(self.normaliser.denormalise(x0_hat))
-        made = made[:, -self.model_config.num_history :]
+        # Short windows leave some captured frames at the front, as they would in a rollout.
+        made = jnp.concatenate([before.history, made], axis=1)[:, -batch.history.shape[1] :]
         # From the coordinates of the window before to those of this one.
         made = center_window(made, before.future[:, -1, jnp.array([0, 2])])
         progress = state.step / config.num_steps
@@ -362,9 +379,9 @@ class Trainer:
                 jax.random.fold_in(base, state.step), 3
             )
             batch = self._training_batch(windows, state, key_batch)
-            sigma = _draw_sigma(key_sigma, config.batch_size, config)
+            sigma = draw_sigma(key_sigma, config.batch_size, config)
             gradient, terms = jax.grad(self._loss, has_aux=True)(
-                state.params, batch, sigma, key_loss
+                state.params, batch, sigma, key_loss, config.history_noise
             )
             updates, optimiser = self.optimiser.update(gradient, state.optimiser, state.params)
             params = optax.apply_updates(state.params, updates)
@@ -402,15 +419,15 @@ class Trainer:
 
     def save(self, path: Path, state: TrainingState) -> None:
         """Write the whole training state; an interrupted write leaves the old file whole."""
-        save_tree(
-            path,
-            state,
-            {
-                "kind": "training state",
-                "model": self.model_config.to_dict(),
-                "training": self.config.to_dict(),
-            },
-        )
+        save_tree(path, state, {"kind": "training state", **self._identity()})
+
+    def _identity(self) -> dict:
+        """All that decides the weights, so that a state is only resumed where it belongs."""
+        return {
+            "model": self.model_config.to_dict(),
+            "training": self.config.to_dict(),
+            "dataset_fingerprint": self.dataset_fingerprint,
+        }
 
     def restore(self, path: Path) -> TrainingState:
         """Read a state written by `save`.
@@ -418,18 +435,20 @@ class Trainer:
         Raises:
           ValueError: if the file is broken, or was made with other settings.
         """
-        template = jax.eval_shape(self.initial_state)
-        state, metadata = load_tree(path, template)
-        mine = {"model": self.model_config.to_dict(), "training": self.config.to_dict()}
-        for part, values in mine.items():
+        metadata, mine = describe(path), self._identity()
+        for part in ("model", "training"):
             theirs = metadata.get(part, {})
-            changed = sorted(name for name in values if values[name] != theirs.get(name))
+            changed = sorted(
+                name for name, value in mine[part].items() if value != theirs.get(name)
+            )
             if changed:
                 raise ValueError(
                     f"{path}: checkpoint was made with other {part} settings "
                     f"({', '.join(changed)}); choose another file or the old settings"
                 )
-        return state
+        if metadata.get("dataset_fingerprint") != self.dataset_fingerprint:
+            raise ValueError(f"{path}: checkpoint was made on other data; choose another file")
+        return load_tree(path, jax.eval_shape(self.initial_state))[0]
 
     def run(
         self,
@@ -460,7 +479,8 @@ class Trainer:
           loss where it was measured.
 
         Raises:
-          TrainingDiverged: at the first loss that is not finite. The checkpoint on disk is older.
+          TrainingDiverged: at the first loss or weight that is not finite; the checkpoint on disk
+            is from before.
         """
         if state is None:
             found = checkpoint is not None and Path(checkpoint).exists()
@@ -468,7 +488,10 @@ class Trainer:
         else:
             # The chunk donates its input; what the caller holds must stay alive.
             state = jax.tree.map(jnp.copy, state)
-        total = min(self.config.num_steps, stop_after or self.config.num_steps)
+        total = self.config.num_steps if stop_after is None else stop_after
+        total = min(self.config.num_steps, total)
+        if chunk < 1 or checkpoint_every < 1:
+            raise ValueError("chunk and checkpoint_every must be at least 1")
         done = int(state.step)
         history = []
         with tqdm(total=total, initial=done, unit="step", disable=not progress) as bar:
@@ -477,10 +500,11 @@ class Trainer:
                 length = min(chunk - done % chunk, total - done)
                 state, terms = self._chunk(state, self.windows, length)
                 terms = {name: np.asarray(value) for name, value in terms.items()}
-                self._check_finite(done, terms, checkpoint)
+                self._check_finite(done, terms, state, checkpoint)
+                passed = (done + length) // checkpoint_every > done // checkpoint_every
                 done += length
                 row = {"step": done, **{name: float(v.mean()) for name, v in terms.items()}}
-                due = done % checkpoint_every == 0 or done == total
+                due = passed or done == total
                 if due and held_out is not None:
                     measured = self.held_out_terms(state.ema, held_out)
                     row.update({f"held_out_{name}": value for name, value in measured.items()})
@@ -493,14 +517,21 @@ class Trainer:
                 bar.set_postfix(loss=f"{row['loss']:.4f}")
         return state, history
 
-    def _check_finite(self, done: int, terms: dict, checkpoint) -> None:
+    def _check_finite(self, done: int, terms: dict, state: TrainingState, checkpoint) -> None:
+        """Raise TrainingDiverged for a chunk of steps that broke the loss or the weights."""
         bad = ~np.isfinite(terms["loss"])
-        if not bad.any():
-            return
-        first = int(np.argmax(bad))
-        guilty = [name for name in terms if name != "loss" and not np.isfinite(terms[name][first])]
-        kept = f"; the last good state is in {checkpoint}" if checkpoint is not None else ""
+        if bad.any():
+            first = int(np.argmax(bad))
+            guilty = [n for n in terms if n != "loss" and not np.isfinite(terms[n][first])]
+            names = ", ".join(guilty) or "sum"
+            what = f"loss is not finite at step {done + first + 1} (terms: {names})"
+        else:
+            finite = [bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)]
+            if all(finite):
+                return
+            what = f"weights are not finite after step {done + len(bad)}"
+        kept = checkpoint is not None and Path(checkpoint).exists()
+        advice = f"; the last good state is in {checkpoint}" if kept else ""
         raise TrainingDiverged(
-            f"loss is not finite at step {done + first + 1} (terms: {', '.join(guilty) or 'sum'}): "
-            f"lower the learning rate or check the data for broken frames{kept}"
+            f"{what}: lower the learning rate or check the data for broken frames{advice}"
         )

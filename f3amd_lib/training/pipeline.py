@@ -20,12 +20,13 @@ import pandas as pd
 
 from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
-from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
 from f3amd_lib.models import zoo
-from f3amd_lib.profiles import Profile, runs_dir
+from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.report.records import read_table, run_record, write_table
-from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
+from f3amd_lib.training.checkpoints import TrainedModel, describe, load_model, save_model
 from f3amd_lib.training.loop import Trainer, TrainingConfig, training_recipe
 
 __all__ = [
@@ -80,7 +81,8 @@ class PreparedData:
     def held_out_split(self) -> str:
         """The split that losses are watched on: "validation", or what a tiny data set has."""
         present = set(np.asarray(self.packed.clip_split).tolist())
-        return "validation" if 1 in present else "test" if 2 in present else "train"
+        wanted = ("validation", "test", "train")
+        return next(split for split in wanted if SPLITS.index(split) in present)
 
     def model_config(self, preset: str, **settings):
         """Return a preset's config for this data set's channels and styles."""
@@ -176,7 +178,8 @@ def train(
       progress: show a progress bar.
 
     Returns:
-      (model, history): the history has a row per 50 steps, with held-out losses where measured.
+      (model, history): the history has a row per 50 steps or fewer, with held-out losses
+      where they were measured.
 
     Raises:
       ValueError: if a training state lies there that was made with other settings.
@@ -188,7 +191,12 @@ def train(
     packed = prepared.packed
     model_config = prepared.model_config(preset)
     trainer = Trainer(
-        model_config, config, packed.skeleton, prepared.normaliser, prepared.windows("train")
+        model_config,
+        config,
+        packed.skeleton,
+        prepared.normaliser,
+        prepared.windows("train"),
+        dataset_fingerprint=packed.fingerprint,
     )
     held_out = prepared.windows(prepared.held_out_split)
     record = run_record(
@@ -201,7 +209,12 @@ def train(
         num_train_windows=int(prepared.windows("train").num_windows),
     )
     rows = []
-    if files.state.exists() and files.history.exists():
+    if files.state.exists():
+        if not files.history.exists():
+            raise ValueError(
+                f"{files.state}: its loss history {files.history.name} is missing; put it back "
+                "beside it, or move the state away to start anew"
+            )
         step = int(trainer.restore(files.state).step)
         earlier, _ = read_table(files.history)
         rows = earlier[earlier["step"] <= step].to_dict("records")
@@ -211,11 +224,11 @@ def train(
         if "held_out_loss" in row:
             write_table(files.history, pd.DataFrame(rows), record)
 
-    every = max(50, config.num_steps // 20)
     state, _ = trainer.run(
         checkpoint=files.state,
-        checkpoint_every=every - every % 50,
+        checkpoint_every=max(1, config.num_steps // 20),
         held_out=held_out,
+        chunk=max(1, min(50, config.num_steps // 20)),
         on_chunk=keep,
         progress=progress,
     )
@@ -244,8 +257,9 @@ def obtain_model(
 ) -> tuple[TrainedModel, pd.DataFrame, str]:
     """Return a trained model: shipped, finished earlier, or trained now.
 
-    A model counts only if it was made for the same skeleton, styles and training settings; weights
-    never cross over to another skeleton.
+    A model counts only if it was made for the same skeleton and styles; weights never cross over.
+    One of an earlier run must also come from the same data and training settings; a shipped one
+    keeps its own, which its record tells.
 
     Args:
       prepared: the data.
@@ -270,37 +284,51 @@ def obtain_model(
             ):
                 return trained, read_table(shipped.history)[0], "shipped"
     files = model_files(profile, preset)
+    mine = _identity(prepared, wanted, profile_recipe(profile, preset))
     if files.model.exists() and files.history.exists():
         trained = load_model(files.model)
-        mine = {
-            "dataset_fingerprint": prepared.packed.fingerprint,
-            "training": profile_recipe(profile, preset).to_dict(),
+        record = trained.record
+        theirs = {"model": trained.config.to_dict()} | {
+            "training": record.get("training"),
+            "dataset_fingerprint": record.get("dataset_fingerprint"),
         }
-        if trained.config == wanted and all(trained.record.get(k) == v for k, v in mine.items()):
+        if theirs == mine:
             return trained, read_table(files.history)[0], "earlier run"
-        # Settings changed since: keep the old files under another name and start afresh.
+    # A killed run goes on if nothing has changed since; else its files are kept under other names.
+    state = describe(files.state) if files.state.exists() else {}
+    unfinished = files.history.exists() and not files.model.exists()
+    if not unfinished or any(state.get(name) != value for name, value in mine.items()):
         for path in dataclasses.astuple(files):
             _set_aside(path)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
+def _identity(prepared: PreparedData, model: F3AMDConfig, config: TrainingConfig) -> dict:
+    """Return all that decides a model's weights, as a state or record tells it."""
+    return {
+        "model": model.to_dict(),
+        "training": config.to_dict(),
+        "dataset_fingerprint": prepared.packed.fingerprint,
+    }
+
+
 def find_model(dataset: str) -> Path:
-    """Return the weights to use for a data set: the user's newest laptop or gpu run, else shipped.
+    """Return the weights to use for a data set: the user's own gpu or laptop run, else shipped.
+
+    Of several presets the profile's own comes first, then the newest.
 
     Raises:
       ValueError: if there are none, saying how to train them.
     """
-    own = [
-        path
-        for profile in ("gpu", "laptop")
-        for path in (runs_dir(dataset, profile) / "models").glob("*.safetensors")
-        if not path.name.endswith(".state.safetensors")
-    ]
-    if own:
-        return max(own, key=lambda path: path.stat().st_mtime)
-    shipped = sorted((WEIGHTS_DIR / dataset).glob("*.safetensors"))
-    if shipped:
-        return shipped[0]
+    for profile, folder in (
+        ("gpu", runs_dir(dataset, "gpu") / "models"),
+        ("laptop", runs_dir(dataset, "laptop") / "models"),
+        ("laptop", WEIGHTS_DIR / dataset),
+    ):
+        first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
+        found = [path for path in folder.glob("*.safetensors") if ".state." not in path.name]
+        if found:
+            return first if first in found else max(found, key=lambda path: path.stat().st_mtime)
     raise ValueError(
         f"no trained model for data set {dataset!r}: run `python -m f3amd_lib train --data "
         f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
