@@ -1,0 +1,196 @@
+"""Small skeletons, motions, data sets and networks that several test files share."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+from flax import nnx
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.data.features import num_channels
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import build_windows, fit_normaliser, seed_histories
+from f3amd_lib.models.f3amd import F3AMD, F3AMDConfig
+from f3amd_lib.models.zoo import build_from_config
+from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.loop import Trainer, TrainingConfig
+
+WINDOW = 8
+HISTORY = 4
+
+SKELETON = Skeleton(
+    names=("Hips", "Spine", "LeftUpLeg", "LeftToeBase", "RightUpLeg", "RightToeBase"),
+    parents=(-1, 0, 0, 2, 0, 4),
+    offsets=np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [0.0, 0.5, 0.0],
+            [0.1, -0.05, 0.0],
+            [0.0, -0.8, 0.1],
+            [-0.1, -0.05, 0.0],
+            [0.0, -0.8, 0.1],
+        ]
+    ),
+    end_sites=((1, (0.0, 0.2, 0.0)),),
+)
+CHANNELS = num_channels(SKELETON)
+
+
+def wandering_motion(num_frames: int = 40, seed: int = 0, speed: float = 0.04) -> Motion:
+    """A walk of sorts that turns, sways and swings every joint; no two seeds alike."""
+    rng = np.random.default_rng(seed)
+    frame = np.arange(num_frames)
+    yaw = rng.uniform(-3, 3) + rng.uniform(-0.05, 0.05) * frame
+    heading = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
+    plane = rng.uniform(-2, 2, 2) + np.cumsum(speed * heading, axis=0)
+    height = 0.9 + 0.02 * np.sin(0.5 * frame + rng.uniform(0, 6))
+    root = np.stack([plane[:, 0], height, plane[:, 1]], axis=-1)
+    phase = rng.uniform(0, 6, (SKELETON.num_joints, 3))
+    angles = 0.4 * np.sin(0.4 * frame[:, None, None] + phase)
+    rotations = Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix()
+    rotations = rotations.reshape(num_frames, SKELETON.num_joints, 3, 3)
+    rotations[:, 0] = matrix_from_yaw(yaw) @ rotations[:, 0]
+    return Motion(SKELETON, root, rotations, name=f"wandering {seed}")
+
+
+def straight_motion(num_frames: int = 120, step=(0.03, 0.0, 0.04)) -> Motion:
+    """A stiff figure that slides along a line, facing +Z."""
+    root = np.array([0.3, 0.9, -0.2]) + np.arange(num_frames)[:, None] * np.array(step)
+    rotations = np.broadcast_to(np.eye(3), (num_frames, SKELETON.num_joints, 3, 3))
+    return Motion(SKELETON, root, rotations, name="straight")
+
+
+def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedMotion:
+    """Pack (motion, style index, split number) triples."""
+    motions = [motion for motion, _, _ in clips]
+    lengths = [motion.num_frames for motion in motions]
+    names = tuple(f"clip {k}" for k in range(len(clips)))
+    return PackedMotion(
+        skeleton=motions[0].skeleton,
+        styles=tuple(styles),
+        root_position=np.concatenate([m.root_position for m in motions]).astype(np.float32),
+        rotation_6d=np.concatenate([rotation_6d_from_matrix(m.rotations) for m in motions]).astype(
+            np.float16
+        ),
+        clip_start=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
+        clip_names=names,
+        clip_contents=("walk",) * len(clips),
+        clip_style=np.array([style for _, style, _ in clips], np.int32),
+        clip_split=np.array([split for _, _, split in clips], np.uint8),
+        floor_shift=np.zeros(len(clips), np.float32),
+        primary_styles=tuple(styles),
+        mirror_styles=frozenset(mirror_styles),
+        dataset="tiny",
+        licence="none",
+        credit="nobody",
+        fingerprint="0" * 64,
+    )
+
+
+def tiny_packed(mirror_styles=("calm",)) -> PackedMotion:
+    """Five clips of two styles: three for training, one each to validate and to test."""
+    return packed_from(
+        [
+            (wandering_motion(30, 0), 0, 0),
+            (wandering_motion(21, 1), 1, 0),
+            (wandering_motion(26, 2), 0, 1),
+            (wandering_motion(17, 3), 1, 0),
+            (wandering_motion(24, 4), 1, 2),
+        ],
+        mirror_styles=mirror_styles,
+    )
+
+
+def tiny_config(**changes) -> F3AMDConfig:
+    """The smallest network that still has every part."""
+    values = {
+        "channels": CHANNELS,
+        "num_styles": 2,
+        "window": WINDOW,
+        "num_history": HISTORY,
+        "latent_width": 8,
+        "depth": 1,
+        "num_kept_modes": WINDOW // 2 + 1,
+    }
+    return F3AMDConfig(**{**values, **changes})
+
+
+@functools.cache
+def _built(config: F3AMDConfig):
+    return nnx.split(build_from_config(config, jax.random.key(0)))
+
+
+def network_of(config: F3AMDConfig) -> F3AMD:
+    """A network of its own, always with the same initial weights; built once per config."""
+    graph, state = _built(config)
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, state))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _evaluate(graph, state, x_noisy, sigma, condition):
+    network = nnx.merge(graph, state)
+    return network(x_noisy, sigma, network.encode(condition))
+
+
+def evaluate(network: F3AMD, x_noisy, sigma, condition):
+    """Encode and denoise under jit, which is compiled once per config and shape."""
+    graph, state = nnx.split(network)
+    return _evaluate(graph, state, x_noisy, sigma, condition)
+
+
+def tiny_windows(split: str = "train", packed: PackedMotion | None = None):
+    """Windows of the tiny data set, of the tiny network's length."""
+    packed = tiny_packed() if packed is None else packed
+    return build_windows(packed, split, window=WINDOW, num_history=HISTORY)
+
+
+@functools.cache
+def tiny_normaliser():
+    """The normaliser of the tiny training windows."""
+    fit = functools.partial(fit_normaliser, window=WINDOW, num_history=HISTORY)
+    return jax.jit(fit)(tiny_windows(), jax.random.key(5))
+
+
+def tiny_trainer(model=None, *, windows=None, **settings) -> Trainer:
+    """A trainer of the tiny network on the tiny data set."""
+    windows = tiny_windows() if windows is None else windows
+    normaliser = tiny_normaliser()
+    config = TrainingConfig(**{"num_steps": 12, "batch_size": 8, **settings})
+    return Trainer(model or tiny_config(), config, SKELETON, normaliser, windows)
+
+
+def random_frames(shape, seed: int = 0) -> np.ndarray:
+    """World frames [*shape, C] of random true rotations and root positions within a few metres."""
+    rng = np.random.default_rng(seed)
+    count = int(np.prod(shape, dtype=int))
+    rotations = Rotation.random(count * SKELETON.num_joints, random_state=seed).as_matrix()
+    sixes = rotation_6d_from_matrix(rotations).reshape(*shape, 6 * SKELETON.num_joints)
+    return np.concatenate([rng.normal(size=(*shape, 3)), sixes], axis=-1)
+
+
+def same_tree(first, second) -> bool:
+    """Whether two trees hold exactly the same numbers."""
+    one, two = jax.tree.leaves(first), jax.tree.leaves(second)
+    return len(one) == len(two) and all(
+        np.array_equal(np.asarray(a), np.asarray(b)) for a, b in zip(one, two, strict=True)
+    )
+
+
+def tiny_trained(record=None, **changes) -> TrainedModel:
+    """A trained model in form only: initial weights, real normaliser, real seed histories."""
+    config = tiny_config(**changes)
+    packed = tiny_packed()
+    return TrainedModel(
+        name="F3AMD-FNO-8",
+        config=config,
+        params=nnx.state(network_of(config)),
+        normaliser=tiny_normaliser(),
+        skeleton=SKELETON,
+        styles=packed.styles,
+        seeds=seed_histories(packed, num_history=HISTORY),
+        record={"note": "made by hand"} if record is None else record,
+    )

@@ -1,0 +1,74 @@
+"""Shared fixtures. Tests run on the CPU and never touch the network or the user's own cache."""
+
+import csv
+import os
+
+# Before anything imports JAX or matplotlib.
+os.environ["JAX_PLATFORMS"] = "cpu"
+# Tests compile much and run little.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ["MPLBACKEND"] = "Agg"
+
+from pathlib import Path
+
+import pytest
+
+from f3amd_lib.data import sources
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+
+
+@pytest.fixture
+def cache_dir(tmp_path, monkeypatch) -> Path:
+    """An empty folder that stands for the user's cache of packed data sets."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv(CACHE_DIR_VARIABLE, str(folder))
+    return folder
+
+
+@pytest.fixture
+def no_network(monkeypatch):
+    """Make any download a failure of the test."""
+    import pooch
+
+    def refuse(*args, **kwargs):
+        pytest.fail("the network was touched")
+
+    monkeypatch.setattr(pooch, "retrieve", refuse)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder or zip of F3AMD_DATA_DIR; skips where the variable is not set."""
+    place = os.environ.get(sources.DATA_DIR_VARIABLE)
+    if not place:
+        pytest.skip(f"{sources.DATA_DIR_VARIABLE} is not set: no real data to test on")
+    return Path(place)
+
+
+@pytest.fixture(scope="session")
+def bandai_archive(data_dir) -> Path:
+    """Where the Bandai archive lies; skips if F3AMD_DATA_DIR does not hold it.
+
+    Only its absence skips. An archive that is there but broken fails the tests that use it.
+    """
+    zipped = [item for item in data_dir.glob("*.zip") if "bandai" in item.name.lower()]
+    if data_dir.is_file() or zipped or next(data_dir.rglob("dataset-1_*.bvh"), None):
+        return data_dir
+    pytest.skip(f"{sources.DATA_DIR_VARIABLE}={data_dir} holds no Bandai Namco clips")
+
+
+@pytest.fixture(scope="session")
+def bandai_dataset(bandai_archive) -> sources.Dataset:
+    """The locomotion part of the Bandai archive."""
+    return sources.open_dataset("bandai", path=bandai_archive)
+
+
+@pytest.fixture(scope="session")
+def bandai_manifest(data_dir, bandai_archive) -> list[dict[str, str]]:
+    """Rows of the manifest that another parser made of the same files; skips if it is absent."""
+    folder = data_dir if data_dir.is_dir() else data_dir.parent
+    path = folder / "bandai_namco_manifest.csv"
+    if not path.is_file():
+        pytest.skip(f"no {path.name} beside the Bandai archive")
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,406 @@
+"""The BVH reader and writer: hand-made files with known positions, broken files, round trips."""
+
+import io
+import warnings
+
+import numpy as np
+import pytest
+
+from f3amd_lib.motion.bvh import format_bvh, parse_bvh, read_bvh, write_bvh
+from f3amd_lib.motion.rotations import matrix_from_euler
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+# A two-bone arm. Line numbers matter: MOTION is line 22, the two frames are lines 25 and 26.
+ARM = """HIERARCHY
+ROOT Base
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Elbow
+  {
+    OFFSET 0 10 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT Wrist
+    {
+      OFFSET 0 20 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 0 5 0
+      }
+    }
+  }
+}
+
+MOTION
+Frames: 2
+Frame Time: 0.05
+100 50 0 0 0 0 0 0 0 0 0 0
+100 50 0 90 0 0 -90 0 0 0 0 0
+"""
+
+ARM_POSITIONS = np.array(
+    [
+        [[1.0, 0.5, 0.0], [1.0, 0.6, 0.0], [1.0, 0.8, 0.0]],
+        # The base turns +Y to -X; the elbow turns it back.
+        [[1.0, 0.5, 0.0], [0.9, 0.5, 0.0], [0.9, 0.7, 0.0]],
+    ]
+)
+
+
+def body(*joints: str, rows: list[str], frame_time: str = "0.05") -> str:
+    """Return a BVH text: joint blocks inside one ROOT, then rows."""
+    return (
+        "HIERARCHY\n"
+        + "\n".join(joints)
+        + f"\nMOTION\nFrames: {len(rows)}\nFrame Time: {frame_time}\n"
+        + "\n".join(rows)
+        + "\n"
+    )
+
+
+def test_two_bone_arm_by_hand():
+    motion = parse_bvh(ARM, "arm.bvh")
+    assert motion.skeleton.names == ("Base", "Elbow", "Wrist")
+    assert motion.skeleton.parents == (-1, 0, 1)
+    assert motion.skeleton.end_sites == ((2, (0.0, 0.05, 0.0)),)
+    assert motion.fps == pytest.approx(20.0)
+    assert motion.name == "arm.bvh"
+    np.testing.assert_allclose(motion.positions, ARM_POSITIONS, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "order, expected",
+    [
+        ("XYZ", (0.0, 0.0, 1.0)),  # z: x -> y, y: y stays, x: y -> z
+        ("ZYX", (0.0, 0.0, -1.0)),  # x: x stays, y: x -> -z, z: -z stays
+        ("YXZ", (1.0, 0.0, 0.0)),  # z: x -> y, x: y -> z, y: z -> x
+    ],
+)
+def test_rotations_act_in_the_order_of_the_channels(order, expected):
+    channels = " ".join(f"{axis}rotation" for axis in order)
+    text = body(
+        f"ROOT A {{ OFFSET 0 0 0 CHANNELS 3 {channels}",
+        "JOINT B { OFFSET 100 0 0 CHANNELS 0 } }",
+        rows=["90 90 90"],
+    )
+    np.testing.assert_allclose(parse_bvh(text, "order").positions[0, 1], expected, atol=1e-12)
+
+
+def test_each_joint_has_its_own_order_and_channels_may_be_mixed():
+    text = body(
+        "ROOT A { OFFSET 1 2 3 CHANNELS 4 Yrotation Zposition Xrotation Xposition",
+        "JOINT B { OFFSET 0 100 0 CHANNELS 2 Xrotation Zrotation",
+        "JOINT C { OFFSET 0 0 100 CHANNELS 1 Yrotation } }",
+        "JOINT D { OFFSET 7 0 0 CHANNELS 0 } }",
+        rows=["30 50 40 60 50 60 70"],
+    )
+    motion = parse_bvh(text, "mixed")
+    # An axis without a position channel keeps the OFFSET.
+    np.testing.assert_allclose(motion.root_position, [[0.6, 0.02, 0.5]], atol=1e-12)
+    expected = [
+        matrix_from_euler("YX", [30, 40]),
+        matrix_from_euler("XZ", [50, 60]),
+        matrix_from_euler("Y", [70]),
+        np.eye(3),
+    ]
+    np.testing.assert_allclose(motion.rotations[0], expected, atol=1e-12)
+
+
+def test_scale_is_metres_per_unit():
+    np.testing.assert_allclose(parse_bvh(ARM, "arm", scale=1.0).positions, 100 * ARM_POSITIONS)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda text: text.replace("\n", "\r\n"), id="CRLF"),
+        pytest.param(lambda text: text.replace("\n", "\r"), id="CR"),
+        pytest.param(lambda text: text.replace(" ", "\t"), id="tabs"),
+        pytest.param(lambda text: text.replace("Frames: ", "Frames:\t"), id="tab after Frames:"),
+        pytest.param(lambda text: text.replace("0 10 0", "0e0 1.0E+1 -0"), id="exponent in OFFSET"),
+        pytest.param(
+            lambda text: text.replace("100 50 0", "+1.0e+2 5000E-2 -9.88446e-17"), id="exponents"
+        ),
+        pytest.param(
+            lambda text: text.replace("\n100", "\n\n 100").rstrip() + " \n\n", id="blanks"
+        ),
+        pytest.param(lambda text: text.rstrip("\n"), id="no last line end"),
+        pytest.param(lambda text: text.lower().replace("base", "Base"), id="lower case"),
+        pytest.param(lambda text: text.upper(), id="upper case"),
+        pytest.param(lambda text: text.replace("\n{", " {").replace("\n  {", "{"), id="braces"),
+        pytest.param(lambda text: "\ufeff" + text, id="byte order mark"),
+        pytest.param(lambda text: text.encode("ascii"), id="bytes"),
+        pytest.param(lambda text: text.replace("End Site", "End Site wrist_tip"), id="named tip"),
+    ],
+)
+def test_same_motion_however_it_is_typed(change):
+    motion = parse_bvh(change(ARM), "arm")
+    np.testing.assert_allclose(motion.positions, ARM_POSITIONS, atol=1e-12)
+    assert motion.fps == pytest.approx(20.0)
+    assert motion.skeleton.end_sites == ((2, (0.0, 0.05, 0.0)),)
+
+
+def test_joint_names_may_hold_blanks():
+    assert (
+        parse_bvh(ARM.replace("Elbow", "Left Fore Arm"), "a").skeleton.names[1] == "Left Fore Arm"
+    )
+
+
+SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+
+
+def test_position_channels_replace_the_offset():
+    text = body(
+        f"ROOT Hips {{ OFFSET 900 900 900 {SIX}",
+        f"JOINT Left {{ OFFSET 0 777 0 {SIX} }}",
+        f"JOINT Right {{ OFFSET -10 0 0 {SIX} }} }}",
+        rows=[
+            "1 90 2 0 0 0  10 0 0 0 0 0  -10 0 0 0 0 0",
+            "3 91 4 0 0 90  10 0 0 5 6 7  -10 0 0 0 0 0",
+        ],
+    )
+    motion = parse_bvh(text, "six")
+    assert motion.skeleton.names == ("Hips", "Left", "Right")
+    np.testing.assert_allclose(motion.skeleton.offsets, [[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]])
+    expected = [
+        [[0.01, 0.90, 0.02], [0.11, 0.90, 0.02], [-0.09, 0.90, 0.02]],
+        [[0.03, 0.91, 0.04], [0.03, 0.91, -0.06], [0.03, 0.91, 0.14]],  # yaw 90: +X -> -Z
+    ]
+    np.testing.assert_allclose(motion.positions, expected, atol=1e-12)
+
+
+def folded_text(root_row_0: str, root_row_1: str) -> str:
+    return body(
+        f"ROOT joint_Root {{ OFFSET 0 0 0 {SIX}",
+        f"JOINT Hips {{ OFFSET 0 450 0 {SIX}",
+        f"JOINT Left {{ OFFSET 10 0 0 {SIX} }}",
+        f"JOINT Right {{ OFFSET -10 0 0 {SIX} }} }} }}",
+        rows=[
+            f"{root_row_0}  1 90 2 0 0 0  10 0 0 0 0 0  -10 0 0 0 0 0",
+            f"{root_row_1}  3 91 4 0 0 90  10 0 0 0 0 0  -10 0 0 0 0 0",
+        ],
+    )
+
+
+def test_a_root_that_only_carries_the_hips_is_folded():
+    motion = parse_bvh(folded_text("0 0 0 0 0 0", "0 0 -50 0 0 0"), "bandai-like")
+    assert motion.skeleton.names == ("Hips", "Left", "Right")
+    assert motion.skeleton.parents == (-1, 0, 0)
+    np.testing.assert_allclose(motion.root_position, [[0.01, 0.90, 0.02], [0.03, 0.91, -0.46]])
+    np.testing.assert_allclose(motion.positions[1, 1], [0.03, 0.91, -0.56], atol=1e-12)
+
+
+def test_a_folded_root_that_turns_is_composed():
+    motion = parse_bvh(folded_text("0 0 0 0 0 0", "100 0 0 0 0 -90"), "turning")
+    # Yaw -90 carries (3, 91, 4) to (-4, 91, 3); with the hips' +90 the facing is back at 0.
+    np.testing.assert_allclose(motion.root_position[1], [0.96, 0.91, 0.03], atol=1e-12)
+    np.testing.assert_allclose(motion.positions[1, 1], [1.06, 0.91, 0.03], atol=1e-12)
+
+
+def stretching_bone(second: str) -> str:
+    return body(
+        f"ROOT Hips {{ OFFSET 0 0 0 {SIX}",
+        "JOINT Left { OFFSET 10 0 0 CHANNELS 3 Xposition Yposition Zposition }",
+        "JOINT Right { OFFSET -10 0 0 CHANNELS 0 } }",
+        rows=["0 90 0 0 0 0 10 0 0", f"0 90 0 0 0 0 {second} 0 0"],
+    )
+
+
+def test_bones_must_be_rigid():
+    assert parse_bvh(stretching_bone("10.1"), "jitter").skeleton.offsets[1, 0] == pytest.approx(
+        0.1005
+    )
+    with pytest.raises(
+        ValueError, match=r"rubber\.bvh, line (8|9): .*'Left' move.* 2\.0 mm .*rigid"
+    ):
+        parse_bvh(stretching_bone("10.4"), "rubber.bvh")
+
+
+def swap(old: str, new: str, count: int = 1):
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, count)
+
+    return change
+
+
+BROKEN = {
+    "empty file": (lambda text: "", 1, "is empty"),
+    "blank file": (lambda text: " \n\t\n", 1, "is empty"),
+    "truncated last frame": (lambda text: text[:-9], 26, "frame 1 has 8 numbers .* 12 .* cut off"),
+    "row too long": (swap("50 0 0 0 0 0", "50 0 0 0 0 0 0"), 25, "frame 0 has 13 .* too long"),
+    "letter among numbers": (swap("90 0", "9O 0"), 26, "'9O' .number 4 of frame 1, Zrotation of B"),
+    "two numbers in one": (swap("100 50", "1.0.0 50"), 25, "'1.0.0' .number 1 of frame 0"),
+    "underscore in a number": (swap("100 50", "1_00 50"), 25, "'1_00'"),
+    "NaN": (swap("-90", "nan"), 26, "'nan' .number 7 of frame 1, Zrotation of Elbow"),
+    "infinity": (swap("-90", "-inf"), 26, "'-inf'"),
+    "overflow": (swap("-90", "1e999"), 26, "'1e999'"),
+    "too few frames": (swap("Frames: 2", "Frames: 3"), 23, "says 3, but 2 rows"),
+    "too many frames": (swap("Frames: 2", "Frames: 1"), 23, "says 1, but 2 rows"),
+    "no frame rows": (lambda text: text[: text.index("100 50")], 23, "says 2, but 0 rows"),
+    "zero frames": (swap("Frames: 2", "Frames: 0"), 23, "above 0, found '0'"),
+    "fractional frames": (swap("Frames: 2", "Frames: 2.5"), 23, "whole number .* '2.5'"),
+    "negative frame time": (swap("0.05", "-0.05"), 24, "positive .* '-0.05'"),
+    "zero frame time": (swap("0.05", "0"), 24, "positive .* '0'"),
+    "frame time not a number": (swap("0.05", "fast"), 24, "positive .* 'fast'"),
+    "no Frames line": (swap("Frames: 2\n", ""), 23, "expected a line like 'Frames: 120'"),
+    "no Frame Time line": (swap("Frame Time: 0.05\n", ""), 24, "like 'Frame Time: 0.0333333'"),
+    "ends after MOTION": (lambda text: text[: text.index("Frames")], 22, "the file ends"),
+    "two ROOTs": (
+        swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"),
+        21,
+        "second ROOT .*'Base' in l",
+    ),
+    "ROOT inside ROOT": (swap("JOINT Wrist", "ROOT Wrist"), 10, "second ROOT"),
+    "missing brace": (swap("}\n\nMOTION", "\n\nMOTION"), 22, "'{' of 'Base' .line 2. is still"),
+    "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' too many"),
+    "joint without brace": (swap("Elbow\n  {", "Elbow\n"), 8, "expected '{' after JOINT Elbow"),
+    "unknown channel": (swap("Xrotation", "Wrotation"), 5, "unknown channel 'Wrotation' of .*Base"),
+    "too few channels": (swap("CHANNELS 3", "CHANNELS 4"), 10, "unknown channel 'JOINT'.* has 4"),
+    "too many channels": (swap("CHANNELS 3", "CHANNELS 2"), 9, "says it has 2 .* 'Yrotation' too"),
+    "channel twice": (swap("Yrotation\n  J", "Xrotation\n  J"), 5, "'Xrotation' twice"),
+    "channel count missing": (swap("CHANNELS 3", "CHANNELS"), 9, "count first, found 'Zrotation'"),
+    "duplicate names": (swap("JOINT Wrist", "JOINT Elbow"), 10, "'Elbow' is taken .line 6"),
+    "joint without name": (swap("JOINT Wrist", "JOINT"), 10, "needs a name"),
+    "joint without OFFSET": (swap("    OFFSET 0 10 0\n", ""), 18, "'Elbow' ends without OFFSET"),
+    "second OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 10 0 OFFSET 0 1 0"), 8, "second OFFSET"),
+    "short OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 10"), 9, "OFFSET needs 3 .* 'CHANNELS'"),
+    "NaN in OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 nan 0"), 8, "OFFSET needs 3 finite .* 'nan'"),
+    "no MOTION": (swap("MOTION", "MOTIONS"), 27, "without a MOTION line"),
+    "cut inside the hierarchy": (lambda text: text[:120], 6, "without a MOTION line"),
+    "no HIERARCHY": (swap("HIERARCHY", "HELLO"), 1, "starts with HIERARCHY, .*'HELLO'"),
+    "no ROOT": (lambda text: "HIERARCHY\n" + text[text.index("MOTION") :], 2, "there is no ROOT"),
+    "stray word": (swap("OFFSET 0 10 0", "OFFSETS 0 10 0"), 8, "unexpected 'OFFSETS'"),
+    "zero bytes": (swap("OFFSET 0 10 0", "OFFSET \x00"), 8, "not text"),
+    "latin-1 bytes": (lambda text: text.replace("Elbow", "Élbow").encode("latin-1"), 6, "UTF-8"),
+    "odd bytes in a row": (lambda text: text.encode().replace(b"-90", b"\xff\xfe"), 26, "number 7"),
+    "UTF-16": (lambda text: text.encode("utf-16"), 1, "UTF-16"),
+    "a picture": (lambda text: b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR", 3, "not text"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_files_are_refused_with_file_and_line(case):
+    change, line, message = BROKEN[case]
+    with pytest.raises(ValueError, match=rf"(?s)^clips/arm\.bvh, line {line}: .*{message}"):
+        parse_bvh(change(ARM), "clips/arm.bvh")
+
+
+def test_errors_keep_their_line_in_crlf_files():
+    with pytest.raises(ValueError, match=r"arm, line 26: 'nan'"):
+        parse_bvh(ARM.replace("-90", "nan").replace("\n", "\r\n"), "arm")
+
+
+def test_content_of_another_type_is_refused():
+    with pytest.raises(ValueError, match="odd: BVH content must be str or bytes, not int"):
+        parse_bvh(3, "odd")
+
+
+def test_read_from_path_and_open_files(tmp_path):
+    path = tmp_path / "arm.bvh"
+    path.write_text(ARM)
+    for source in (path, str(path), io.StringIO(ARM), io.BytesIO(ARM.encode())):
+        np.testing.assert_allclose(read_bvh(source).positions, ARM_POSITIONS, atol=1e-12)
+    assert read_bvh(text=ARM, name="mine").name == "mine"
+    with path.open("rb") as file:
+        assert read_bvh(file).name == str(path)
+    path.write_text(ARM.replace("-90", "x"))
+    with pytest.raises(ValueError, match=r"arm\.bvh, line 26: 'x'"):
+        read_bvh(path)
+    with pytest.raises(ValueError, match=r"absent\.bvh: cannot be read"):
+        read_bvh(tmp_path / "absent.bvh")
+    with pytest.raises(ValueError, match="needs a path"):
+        read_bvh()
+
+
+def random_motion(seed: int = 0, frames: int = 7) -> Motion:
+    """A tree whose joints are not listed depth first, in any rotation at all."""
+    random = np.random.default_rng(seed)
+    skeleton = Skeleton(
+        names=("Hips", "Left", "Right", "Left Foot", "RightFoot"),
+        parents=(-1, 0, 0, 1, 2),
+        offsets=np.concatenate([np.zeros((1, 3)), random.normal(size=(4, 3))]),
+        end_sites=((3, (0.0, -0.1, 0.2)),),
+    )
+    angles = random.uniform(-180, 180, size=(frames, 5, 3))
+    return Motion(
+        skeleton, 20 * random.normal(size=(frames, 3)), matrix_from_euler("XYZ", angles), 30.0
+    )
+
+
+def positions_by_name(motion: Motion) -> dict[str, np.ndarray]:
+    return {name: motion.positions[:, j] for j, name in enumerate(motion.skeleton.names)}
+
+
+@pytest.mark.parametrize("order", ["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"])
+def test_write_and_read_again(tmp_path, order):
+    motion = random_motion()
+    again = read_bvh(write_bvh(tmp_path / "new" / "walk.bvh", motion, order=order))
+    assert again.fps == pytest.approx(30.0, rel=1e-8)
+    assert again.skeleton.names == ("Hips", "Left", "Left Foot", "Right", "RightFoot")
+    assert (2, (0.0, -0.1, 0.2)) in again.skeleton.end_sites
+    before, after = positions_by_name(motion), positions_by_name(again)
+    for name in before:
+        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+    assert sorted(item.name for item in (tmp_path / "new").iterdir()) == ["walk.bvh"]
+
+
+def test_gimbal_lock_survives_the_round_trip_in_silence():
+    motion = random_motion()
+    locked = matrix_from_euler("ZXY", np.array([30.0, 90.0, -50.0]))
+    motion = motion.replace(rotations=np.broadcast_to(locked, motion.rotations.shape))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = parse_bvh(format_bvh(motion, order="ZXY"), "locked")
+    before, after = positions_by_name(motion), positions_by_name(again)
+    for name in before:
+        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+
+
+def test_format_is_plain_bvh():
+    lines = format_bvh(parse_bvh(ARM, "arm")).splitlines()
+    assert lines[:2] == ["HIERARCHY", "ROOT Base"]
+    assert "\tCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in lines
+    assert lines[lines.index("MOTION") + 1 :][:2] == ["Frames: 2", "Frame Time: 0.0500000000"]
+    assert [float(word) for word in lines[-1].split()] == pytest.approx(
+        [100, 50, 0, 90, 0, 0, -90, 0, 0, 0, 0, 0], abs=1e-6
+    )
+
+
+def test_no_file_is_overwritten_unasked(tmp_path):
+    path = tmp_path / "mine.bvh"
+    path.write_text("precious")
+    with pytest.raises(ValueError, match=r"mine\.bvh: exists already; .*overwrite=True"):
+        write_bvh(path, random_motion())
+    assert path.read_text() == "precious"
+    write_bvh(path, random_motion(), overwrite=True)
+    assert read_bvh(path).num_frames == 7
+    assert [item.name for item in tmp_path.iterdir()] == ["mine.bvh"]
+
+
+@pytest.mark.parametrize("order", ["ZXZ", "XY", "zxy", ""])
+def test_a_bad_order_is_refused(tmp_path, order):
+    with pytest.raises(ValueError, match="must name X, Y and Z once each"):
+        write_bvh(tmp_path / "a.bvh", random_motion(), order=order)
+    assert not list(tmp_path.iterdir())
+
+
+def largest_round_trip_error(motion: Motion) -> float:
+    again = parse_bvh(format_bvh(motion), "again")
+    assert again.skeleton == motion.skeleton
+    return float(np.abs(again.positions - motion.positions).max())
+
+
+def test_ten_synthetic_clips_survive_the_round_trip():
+    from f3amd_lib.motion.synthetic import STYLES, synthesize
+
+    for seed, style in enumerate(STYLES[::10]):
+        assert largest_round_trip_error(synthesize(style, seconds=3.0, seed=seed)) < 1e-4
+
+
+def test_fifty_real_clips_survive_the_round_trip(bandai_dataset):
+    clips = bandai_dataset.clips[:: len(bandai_dataset.clips) // 50][:50]
+    assert len({clip.name for clip in clips}) == 50
+    for clip in clips:
+        assert largest_round_trip_error(clip.load()) < 1e-4

@@ -1,0 +1,230 @@
+"""Files of weights: exact round trips, and a plain word about every broken file."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import (
+    CHANNELS,
+    HISTORY,
+    SKELETON,
+    WINDOW,
+    evaluate,
+    random_frames,
+    same_tree,
+    tiny_trained,
+)
+from safetensors.numpy import save_file
+
+from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.training import checkpoints
+from f3amd_lib.training.checkpoints import load_model, load_tree, save_model, save_tree
+
+TREE = {
+    "a": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
+    "b": {"c": jnp.asarray(7, jnp.int32), "d": jnp.asarray([1.5, -2.0], jnp.bfloat16)},
+    "an odd 'name' / ü": jnp.zeros(0),
+}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return tiny_trained()
+
+
+@pytest.fixture(scope="module")
+def saved(trained, tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "model.safetensors"
+    save_model(path, trained)
+    return path
+
+
+@pytest.fixture
+def copied(saved, tmp_path):
+    return shutil.copy(saved, tmp_path / "copy.safetensors")
+
+
+def test_trees_come_back_exactly_with_their_description(tmp_path):
+    path = tmp_path / "new folder" / "tree.safetensors"
+    save_tree(path, TREE, {"kind": "test", "numbers": [1, 2.5, None]})
+    tree, metadata = load_tree(path, TREE)
+    assert same_tree(tree, TREE)
+    assert jax.tree.map(lambda a: a.dtype, tree) == jax.tree.map(lambda a: a.dtype, TREE)
+    assert metadata == {"kind": "test", "numbers": [1, 2.5, None]}
+    assert [item.name for item in path.parent.iterdir()] == ["tree.safetensors"]
+
+
+def test_a_failed_write_leaves_the_old_file_whole(tmp_path, monkeypatch):
+    path = tmp_path / "tree.safetensors"
+    save_tree(path, TREE, {})
+    content = path.read_bytes()
+
+    def half_write(arrays, file, header):
+        file.write_bytes(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(checkpoints, "save_file", half_write)
+    with pytest.raises(OSError, match="no space"):
+        save_tree(path, {"other": jnp.ones(3)}, {})
+    assert path.read_bytes() == content
+    assert [item.name for item in tmp_path.iterdir()] == ["tree.safetensors"]
+
+
+def test_trees_of_another_make_are_refused_by_name(tmp_path):
+    path = tmp_path / "tree.safetensors"
+    save_tree(path, TREE, {})
+    with pytest.raises(ValueError, match=r"tree\.safetensors: .*\['a'\] has shape \(2, 3\)"):
+        load_tree(path, {**TREE, "a": jnp.zeros((3, 2))})
+    with pytest.raises(ValueError, match=r"tree\.safetensors: .*first difference \['more'\]"):
+        load_tree(path, {**TREE, "more": jnp.zeros(1)})
+    with pytest.raises(ValueError, match=r"tree\.safetensors: .*first difference \['b'\]"):
+        load_tree(path, {k: v for k, v in TREE.items() if k != "b"})
+
+
+def test_model_comes_back_with_bfloat16_weights(trained, saved):
+    loaded = load_model(saved)
+    rounded = jax.tree.map(lambda a: a.astype(jnp.bfloat16).astype(jnp.float32), trained.params)
+    assert same_tree(loaded.params, rounded)
+    assert not same_tree(loaded.params, trained.params)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(loaded.params))
+
+
+def test_everything_but_the_weights_comes_back_exactly(trained, saved):
+    loaded = load_model(saved)
+    for field in ("name", "config", "styles", "record"):
+        assert getattr(loaded, field) == getattr(trained, field)
+    assert same_tree(loaded.normaliser, trained.normaliser)
+    assert loaded.seeds.keys() == trained.seeds.keys()
+    assert same_tree(loaded.seeds, trained.seeds)
+    assert loaded.skeleton == SKELETON and loaded.skeleton.end_sites == SKELETON.end_sites
+    np.testing.assert_allclose(loaded.skeleton.offsets, SKELETON.offsets, atol=1e-7)
+
+
+def test_model_can_be_kept_in_full_precision(trained, tmp_path):
+    save_model(tmp_path / "model.safetensors", trained, dtype=jnp.float32)
+    loaded = load_model(tmp_path / "model.safetensors")
+    assert same_tree(loaded.params, trained.params)
+    frames = jnp.asarray(random_frames((1, WINDOW)), jnp.float32)
+    condition = Condition(
+        jnp.asarray(random_frames((1, HISTORY)), jnp.float32),
+        jnp.zeros((1, WINDOW, 8)),
+        jnp.eye(2)[:1],
+    )
+    np.testing.assert_array_equal(
+        evaluate(loaded.network(), frames, 2.0, condition),
+        evaluate(trained.network(), frames, 2.0, condition),
+    )
+
+
+def test_half_precision_halves_the_file(trained, saved, tmp_path):
+    save_model(tmp_path / "full.safetensors", trained, dtype=jnp.float32)
+    weights = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
+    # Headers may differ by the padding and the digits of offsets.
+    saving = (tmp_path / "full.safetensors").stat().st_size - saved.stat().st_size
+    assert saving == pytest.approx(2 * weights, abs=400)
+
+
+def test_styles_are_found_by_name(trained):
+    assert trained.style_index("proud") == 1
+    with pytest.raises(ValueError, match="'prowd'.*calm, proud"):
+        trained.style_index("prowd")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0005, 0.3, 0.9, 0.999])
+def test_truncated_files_are_refused_by_name(copied, share):
+    content = copied.read_bytes()
+    copied.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=r"copy\.safetensors: .*cut short or damaged"):
+        load_model(copied)
+
+
+def test_garbled_headers_are_refused_by_name(copied):
+    content = bytearray(copied.read_bytes())
+    for place in (0, 8, 60):
+        garbled = bytearray(content)
+        garbled[place : place + 8] = b"\xff\x00garble"
+        copied.write_bytes(bytes(garbled))
+        with pytest.raises(ValueError, match=r"copy\.safetensors"):
+            load_model(copied)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"HIERARCHY\nROOT Hips\n", b"\x80\x04\x95pickle", bytes(1000)]
+)
+def test_foreign_files_are_refused_by_name(tmp_path, content):
+    path = tmp_path / "foreign.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"foreign\.safetensors"):
+        load_model(path)
+
+
+def test_safetensors_of_another_project_are_refused_by_name(tmp_path):
+    path = tmp_path / "theirs.safetensors"
+    save_file({"weight": np.zeros(3, np.float32)}, path)
+    with pytest.raises(ValueError, match=r"theirs\.safetensors: not written by this project"):
+        load_model(path)
+
+
+def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):
+    path = tmp_path / "state.safetensors"
+    save_tree(path, TREE, {"kind": "training state"})
+    with pytest.raises(ValueError, match=r"state\.safetensors: holds a training state"):
+        load_model(path)
+    with pytest.raises(ValueError, match=r"absent\.safetensors: no such"):
+        load_model(tmp_path / "absent.safetensors")
+    with pytest.raises(ValueError, match="no such"):
+        load_model(tmp_path)
+
+
+def rewritten(saved, path, change):
+    """Copy a model file with its description changed."""
+    arrays, metadata = checkpoints._read(saved)
+    change(metadata)
+    description = json.dumps(metadata)
+    header = {
+        "format": checkpoints.FORMAT,
+        "description": description,
+        "sha256": checkpoints._checksum(arrays, description),
+    }
+    checkpoints.save_file(arrays, path, header)
+    return path
+
+
+def test_weights_that_do_not_fit_their_config_are_refused_by_name(saved, tmp_path):
+    path = tmp_path / "odd.safetensors"
+    with pytest.raises(ValueError, match=r"odd\.safetensors: .*has shape"):
+        load_model(rewritten(saved, path, lambda m: m["model"].update(latent_width=16)))
+    with pytest.raises(ValueError, match=r"odd\.safetensors: .*expected arrays"):
+        load_model(rewritten(saved, path, lambda m: m["model"].update(depth=2)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m["model"].update(latent_widht=8),
+        lambda m: m["model"].pop("channels"),
+        lambda m: m.pop("styles"),
+    ],
+)
+def test_odd_descriptions_are_refused_by_name(saved, tmp_path, change):
+    with pytest.raises(ValueError, match=r"odd\.safetensors: .*(latent_widht|channels|styles)"):
+        load_model(rewritten(saved, tmp_path / "odd.safetensors", change))
+
+
+def test_flipped_bytes_among_the_weights_are_noticed(copied):
+    content = bytearray(copied.read_bytes())
+    content[-2000:-1990] = b"\x3f" * 10
+    copied.write_bytes(bytes(content))
+    with pytest.raises(ValueError, match=r"copy\.safetensors"):
+        load_model(copied)
+
+
+def test_networks_of_a_model_share_nothing():
+    trained = tiny_trained()
+    first, second = trained.network(), trained.network()
+    first.encoder.local_first.bias[...] = jnp.ones(CHANNELS)
+    for network in (second, trained.network()):
+        assert float(jnp.abs(network.encoder.local_first.bias[...]).max()) == 0.0

@@ -1,0 +1,99 @@
+"""Figures about one window, on denoisers whose answers are known."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from builders import tiny_trained, tiny_windows
+
+from f3amd_lib.evaluation import denoising
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.loop import network_inputs
+
+
+class Fake:
+    """A network that answers by a rule: `answer(x_noisy)`."""
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def encode(self, condition):
+        return condition
+
+    def __call__(self, x_noisy, sigma, context):
+        return self.answer(x_noisy)
+
+
+@pytest.fixture
+def model_that(monkeypatch):
+    def make(answer):
+        monkeypatch.setattr(TrainedModel, "network", lambda self: Fake(answer))
+        return tiny_trained()
+
+    return make
+
+
+SIGMAS = (0.1, 1.0, 10.0)
+
+
+def test_a_network_that_returns_its_input_errs_by_the_noise(model_that):
+    trained = model_that(lambda x_noisy: x_noisy)
+    table = denoising.x0_error_by_sigma(trained, tiny_windows(), SIGMAS)
+    np.testing.assert_allclose(table["x0_error"], SIGMAS, rtol=0.1)
+    np.testing.assert_allclose(table["input_error"], SIGMAS)
+    # One draw of noise at every level: errors are exact multiples of each other.
+    np.testing.assert_allclose(table["x0_error"] / table["x0_error"][0], np.divide(SIGMAS, 0.1))
+
+
+def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
+    trained = model_that(lambda x_noisy: 0.0 * x_noisy)
+    windows = tiny_windows()
+    table = denoising.x0_error_by_sigma(trained, windows, SIGMAS)
+    batch = denoising.held_out_batch(windows, trained)
+    x0, _ = network_inputs(batch, trained.normaliser)
+    np.testing.assert_allclose(table["x0_error"], float(np.sqrt(np.mean(x0**2))), rtol=1e-5)
+    use = denoising.noise_use(MotionGenerator(trained, 1), windows)
+    assert use["x0_error_ratio"] == pytest.approx(1.0)
+    assert use["seed_spread_cm"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
+    trained = model_that(lambda x_noisy: x_noisy)
+    generator = MotionGenerator(trained, 1)
+    batch = denoising.held_out_batch(tiny_windows(), trained, 4)
+    x0, _ = network_inputs(batch, trained.normaliser)
+
+    def shifted(key, condition):
+        # Only the root moves from seed to seed: relative to it nothing does.
+        return x0.at[..., :3].add(jax.random.normal(key))
+
+    monkeypatch.setattr(generator, "sample_window", shifted)
+    spread = denoising.seed_spread(generator, tiny_windows(), num_conditions=4)
+    assert spread == pytest.approx(0.0, abs=1e-3)
+    monkeypatch.setattr(
+        generator, "sample_window", lambda key, c: x0 + 0.3 * jax.random.normal(key, x0.shape)
+    )
+    assert denoising.seed_spread(generator, tiny_windows(), num_conditions=4) > 1.0
+
+
+def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch):
+    windows = tiny_windows()
+    trained = model_that(lambda x_noisy: x_noisy)
+    generator = MotionGenerator(trained, 1)
+    batch = denoising.held_out_batch(windows, trained)
+    x0, _ = network_inputs(batch, trained.normaliser)
+    monkeypatch.setattr(generator, "sample_window", lambda key, condition: x0)
+    quality = denoising.window_quality(generator, windows)
+    assert quality["joint_error_cm"] == pytest.approx(0.0, abs=1e-3)
+    for name in ("seam_cm", "joint_acceleration_cm"):
+        assert quality[name] == pytest.approx(quality[f"real_{name}"], rel=1e-3)
+    assert quality["real_seam_cm"] > 1.0
+
+
+def test_windows_of_other_sizes_are_refused():
+    trained = tiny_trained()
+    longer = dataclasses.replace(trained.config, window=trained.config.window + 2)
+    with pytest.raises(ValueError, match="built for"):
+        denoising.held_out_batch(tiny_windows(), dataclasses.replace(trained, config=longer))

@@ -1,0 +1,226 @@
+"""pyproject.toml, environment.yml and requirements.lock name the same direct dependencies.
+
+pyproject.toml is the original. environment.yml repeats its ranges under conda's names;
+requirements.lock pins one version inside each range for every supported Python and processor.
+"""
+
+import ast
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+import f3amd_lib
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHONS = ("3.11.2", "3.12.3", "3.13.5", "3.14.0")
+MACHINES = ("x86_64", "aarch64")
+
+CONDA_NAMES = {"matplotlib": "matplotlib-base"}
+"""What conda-forge calls a package that PyPI calls otherwise."""
+
+IMPORT_NAMES = {"ipython": "IPython", "pillow": "PIL", "pot": "ot", "pyyaml": "yaml"}
+"""What Python imports where it is not the package's name."""
+
+
+def read_pyproject() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def direct_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
+    """Every direct dependency, of whatever part, with its range."""
+    lines = [
+        *pyproject["project"]["dependencies"],
+        *pyproject["build-system"]["requires"],
+        *(
+            line
+            for extra in pyproject["project"]["optional-dependencies"].values()
+            for line in extra
+        ),
+    ]
+    requirements = [Requirement(line) for line in lines]
+    return {canonicalize_name(item.name): item.specifier for item in requirements}
+
+
+def read_environment(text: str) -> dict[str, SpecifierSet]:
+    """The conda packages of an environment file with their ranges."""
+    ranges = {}
+    for entry in yaml.safe_load(text)["dependencies"]:
+        name, _, specifier = entry.partition(" ")
+        ranges[name] = SpecifierSet(specifier)
+    return ranges
+
+
+def read_lock(text: str) -> list[tuple[Requirement, list[str], str]]:
+    """The lock's entries: pinned requirement, hashes, and who asked for it."""
+    entries = []
+    for block in re.split(r"\n(?=[a-z0-9])", text.strip()):
+        head, comment = (block.split("    # via", 1) + [""])[:2]
+        words = head.replace("\\\n", "\n").split("\n")
+        hashes = [word.strip().removeprefix("--hash=") for word in words[1:] if word.strip()]
+        entries.append((Requirement(words[0].strip()), hashes, comment))
+    return entries
+
+
+PYPROJECT = read_pyproject()
+DIRECT = direct_requirements(PYPROJECT)
+ENVIRONMENT_TEXT = (ROOT / "environment.yml").read_text(encoding="utf-8")
+LOCK_TEXT = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+LOCK = read_lock(LOCK_TEXT)
+
+
+def test_every_range_has_both_ends():
+    open_ended = [
+        name
+        for name, specifier in DIRECT.items()
+        if sorted(item.operator for item in specifier) != ["<", ">="]
+    ]
+    assert open_ended == []
+
+
+def test_no_dependency_is_listed_twice():
+    parts = [
+        PYPROJECT["project"]["dependencies"],
+        PYPROJECT["build-system"]["requires"],
+        *PYPROJECT["project"]["optional-dependencies"].values(),
+    ]
+    assert sum(map(len, parts)) == len(DIRECT)
+
+
+def test_the_lock_sees_what_builds_the_package():
+    assert PYPROJECT["dependency-groups"]["build"] == PYPROJECT["build-system"]["requires"]
+
+
+def test_environment_yml_has_the_same_names_and_ranges():
+    environment = read_environment(ENVIRONMENT_TEXT)
+    del environment["python"]
+    assert environment == {CONDA_NAMES.get(name, name): item for name, item in DIRECT.items()}
+
+
+def test_environment_yml_comments_every_package():
+    uncommented = [
+        line
+        for line in ENVIRONMENT_TEXT.split("\ndependencies:\n")[1].splitlines()
+        if line.startswith("  - ") and not re.search(r" # \S.{5,}", line)
+    ]
+    assert uncommented == []
+
+
+def test_environment_yml_asks_for_a_python_that_the_package_takes():
+    in_conda = read_environment(ENVIRONMENT_TEXT)["python"]
+    in_pyproject = SpecifierSet(PYPROJECT["project"]["requires-python"])
+    minors = [f"3.{minor}" for minor in range(6, 20)]
+    taken = [minor for minor in minors if minor in in_conda]
+    assert taken == [".".join(version.split(".")[:2]) for version in PYTHONS]
+    assert all(minor in in_pyproject for minor in taken)
+
+
+def test_bootstrap_takes_the_same_pythons():
+    script = (ROOT / "scripts" / "bootstrap.sh").read_text(encoding="utf-8")
+    oldest, newest = (
+        re.search(rf"^{word}=(\d+)", script, re.M)[1] for word in ("oldest", "newest")
+    )
+    taken = read_environment(ENVIRONMENT_TEXT)["python"]
+    assert f"3.{oldest}" in taken and f"3.{int(oldest) - 1}" not in taken
+    assert f"3.{newest}" in taken and f"3.{int(newest) + 1}" not in taken
+
+
+def test_the_lock_was_asked_for_exactly_the_direct_dependencies():
+    asked_for = {
+        canonicalize_name(entry.name) for entry, _, comment in LOCK if "(pyproject.toml" in comment
+    }
+    assert asked_for == set(DIRECT)
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("python", PYTHONS)
+def test_the_lock_pins_one_version_inside_each_range(python, machine):
+    system = {
+        "python_version": ".".join(python.split(".")[:2]),
+        "python_full_version": python,
+        "platform_machine": machine,
+        "sys_platform": "linux",
+        "platform_system": "Linux",
+        "os_name": "posix",
+        "implementation_name": "cpython",
+        "platform_python_implementation": "CPython",
+    }
+    pins = {}
+    for entry, _, _ in LOCK:
+        if entry.marker is None or entry.marker.evaluate(system):
+            name = canonicalize_name(entry.name)
+            assert name not in pins, f"{name} is pinned twice for Python {python}"
+            (pin,) = entry.specifier
+            assert pin.operator == "=="
+            pins[name] = Version(pin.version)
+    outside = {name: str(pins.get(name)) for name in DIRECT if pins.get(name) not in DIRECT[name]}
+    assert outside == {}
+
+
+def test_every_lock_entry_is_hashed():
+    assert len(LOCK) > len(DIRECT)
+    bad = [
+        entry.name
+        for entry, hashes, _ in LOCK
+        if not hashes or not all(re.fullmatch(r"sha256:[0-9a-f]{64}", item) for item in hashes)
+    ]
+    assert bad == []
+
+
+def test_the_lock_says_nothing_of_where_packages_came_from():
+    assert "://" not in LOCK_TEXT
+    assert "--find" not in LOCK_TEXT
+    assert "index" not in LOCK_TEXT.replace("--hash", "")
+
+
+def test_readers_notice_differences():
+    """The readers above must not lose what they compare."""
+    environment = ENVIRONMENT_TEXT.replace("jax >=0.10,<0.12", "jax >=0.9,<0.12")
+    assert read_environment(environment)["jax"] != DIRECT["jax"]
+    first, second = read_lock(
+        "jax==0.10.2 ; python_full_version < '3.12' \\\n    --hash=sha256:aa \\\n"
+        "    --hash=sha256:bb\n    # via\n    #   x (pyproject.toml)\nzipp==4.1.2 \\\n"
+        "    --hash=sha256:cc\n    # via etils\n"
+    )
+    assert (str(first[0].specifier), first[1]) == ("==0.10.2", ["sha256:aa", "sha256:bb"])
+    assert "(pyproject.toml" in first[2]
+    assert (second[0].name, second[1], "(pyproject.toml" in second[2]) == (
+        "zipp",
+        ["sha256:cc"],
+        False,
+    )
+
+
+def imported_packages(paths) -> set[str]:
+    """Top-level names that Python files import, anywhere in them."""
+    names = set()
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names.add(node.module)
+    return {name.split(".")[0] for name in names}
+
+
+def test_what_is_imported_is_declared():
+    own = {"f3amd_lib", "tests", "conftest"}
+    own |= {path.stem for path in (ROOT / "tests").glob("*.py")}
+    declared = {IMPORT_NAMES.get(name, name) for name in DIRECT}
+    files = [*(ROOT / "f3amd_lib").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    undeclared = imported_packages(files) - own - declared - set(sys.stdlib_module_names)
+    assert undeclared == set()
+
+
+def test_the_version_is_the_same_everywhere():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert str(citation["version"]) == f3amd_lib.__version__
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## \[{re.escape(f3amd_lib.__version__)}\]", changelog, re.M)

@@ -1,0 +1,210 @@
+"""Motion to frames and back; turning, centring and facing of frames (sections 3.2, 3.3)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import CHANNELS, SKELETON, random_frames, straight_motion, wandering_motion
+
+from f3amd_lib.data.features import (
+    Normaliser,
+    center_window,
+    frame_positions,
+    frame_yaw,
+    motion_from_frames,
+    num_channels,
+    orthonormalise,
+    path_condition,
+    split_frames,
+    turn_frames,
+    world_frames,
+)
+from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, wrap_angle
+from f3amd_lib.motion.skeleton import Skeleton, facing_yaw, turn
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+
+
+def test_section_3_2_channel_count():
+    assert num_channels(SKELETON) == CHANNELS == 6 * 6 + 3
+    assert num_channels(SYNTHETIC_SKELETON) == 141
+
+
+def test_section_3_2_layout_is_root_then_two_columns_a_joint():
+    motion = wandering_motion(5)
+    frames = world_frames(motion)
+    assert frames.shape == (5, CHANNELS) and frames.dtype == np.float64
+    np.testing.assert_array_equal(frames[:, :3], motion.root_position)
+    for joint in range(SKELETON.num_joints):
+        block = frames[:, 3 + 6 * joint : 9 + 6 * joint]
+        np.testing.assert_array_equal(block[:, :3], motion.rotations[:, joint, :, 0])
+        np.testing.assert_array_equal(block[:, 3:], motion.rotations[:, joint, :, 1])
+
+
+def test_motion_to_frames_and_back_is_exact():
+    motion = wandering_motion(30)
+    again = motion_from_frames(SKELETON, world_frames(motion), name="again")
+    np.testing.assert_array_equal(again.root_position, motion.root_position)
+    np.testing.assert_allclose(again.rotations, motion.rotations, atol=1e-14)
+    assert (again.fps, again.name) == (30.0, "again")
+    np.testing.assert_allclose(world_frames(again), world_frames(motion), atol=1e-14)
+
+
+def test_frames_of_another_skeleton_are_refused():
+    with pytest.raises(ValueError, match=rf"\[T, {CHANNELS}\] for this skeleton of 6 joints"):
+        motion_from_frames(SKELETON, np.zeros((4, CHANNELS + 6)))
+    with pytest.raises(ValueError, match=r"got \(39,\)"):
+        motion_from_frames(SKELETON, np.zeros(CHANNELS))
+
+
+def test_broken_frames_are_refused_by_number():
+    frames = random_frames((6,))
+    frames[4, 20] = np.nan
+    with pytest.raises(ValueError, match="frame 4"):
+        motion_from_frames(SKELETON, frames)
+
+
+def test_split_frames_keeps_leading_axes():
+    frames = random_frames((2, 5))
+    root, sixes = split_frames(frames)
+    assert root.shape == (2, 5, 3) and sixes.shape == (2, 5, 6, 6)
+    np.testing.assert_array_equal(sixes[1, 2, 3], frames[1, 2, 3 + 18 : 3 + 24])
+
+
+def test_frame_positions_are_the_motions():
+    motion = wandering_motion(12)
+    frames = world_frames(motion)
+    np.testing.assert_allclose(frame_positions(SKELETON, frames), motion.positions, atol=1e-12)
+    on_device = frame_positions(SKELETON, jnp.asarray(frames, jnp.float32)[None])
+    np.testing.assert_allclose(on_device[0], motion.positions, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frame_yaw_equals_facing_of_the_full_kinematics(seed):
+    frames = random_frames((40,), seed)
+    expected = facing_yaw(SKELETON, frame_positions(SKELETON, frames))
+    np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, frames) - expected), 0, atol=1e-12)
+    on_device = frame_yaw(SKELETON, jnp.asarray(frames, jnp.float32))
+    np.testing.assert_allclose(wrap_angle(on_device - expected), 0, atol=1e-3)
+
+
+def test_frame_yaw_by_hand():
+    frames = world_frames(straight_motion(3))
+    for yaw in (0.0, 1.0, -2.5):
+        np.testing.assert_allclose(frame_yaw(SKELETON, turn_frames(frames, yaw)), yaw, atol=1e-12)
+
+
+def test_frame_yaw_needs_hips_below_the_root():
+    skeleton = Skeleton(("Root", "Pelvis", "LeftHip", "RightHip"), (-1, 0, 1, 1), np.eye(4, 3), ())
+    with pytest.raises(ValueError, match="children of the root"):
+        frame_yaw(skeleton, np.zeros((2, 27)))
+
+
+def test_centring_by_hand():
+    frames = random_frames((2, 5))
+    origin = np.array([[1.0, -2.0], [0.5, 3.0]])
+    moved = center_window(frames, origin)
+    np.testing.assert_allclose(moved[0, :, 0], frames[0, :, 0] - 1.0)
+    np.testing.assert_allclose(moved[1, :, 2], frames[1, :, 2] - 3.0)
+    # Height stays absolute, and rotations do not care.
+    np.testing.assert_array_equal(moved[..., 1], frames[..., 1])
+    np.testing.assert_array_equal(moved[..., 3:], frames[..., 3:])
+    np.testing.assert_allclose(center_window(moved, -origin), frames, atol=1e-14)
+
+
+def test_turns_add_up_and_undo_each_other():
+    frames, a, b = random_frames((2, 5)), np.array([0.4, -2.0]), np.array([1.1, 2.9])
+    np.testing.assert_allclose(
+        turn_frames(turn_frames(frames, a), b), turn_frames(frames, a + b), atol=1e-12
+    )
+    np.testing.assert_allclose(turn_frames(turn_frames(frames, a), -a), frames, atol=1e-12)
+    np.testing.assert_allclose(turn_frames(frames, np.full(2, 2 * np.pi)), frames, atol=1e-12)
+
+
+def test_turning_frames_is_turning_the_motion():
+    motion = wandering_motion(10)
+    np.testing.assert_allclose(
+        turn_frames(world_frames(motion), 0.8), world_frames(turn(motion, 0.8)), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("yaw", [-3.0, 0.7, 2.0])
+def test_kinematics_of_turned_frames_is_turned_kinematics(yaw):
+    frames = random_frames((7,))
+    turned = frame_positions(SKELETON, turn_frames(frames, yaw))
+    expected = frame_positions(SKELETON, frames) @ matrix_from_yaw(yaw).T
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_turning_by_a_quarter_by_hand():
+    frames = np.zeros((1, CHANNELS))
+    frames[0, :3] = [1.0, 2.0, 3.0]
+    frames[0, 3:9] = [0.0, 0.0, 1.0, 0.0, 1.0, 0.0]
+    # A quarter to the left takes +Z to +X and +X to -Z.
+    got = turn_frames(frames, np.pi / 2)[0, :9]
+    np.testing.assert_allclose(got, [3.0, 2.0, -1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0], atol=1e-15)
+
+
+def test_facing_turns_with_the_frames():
+    frames = random_frames((40,))
+    moved = frame_yaw(SKELETON, turn_frames(frames, 1.3)) - frame_yaw(SKELETON, frames)
+    np.testing.assert_allclose(wrap_angle(moved - 1.3), 0, atol=1e-12)
+
+
+def test_orthonormalise_leaves_rotations_and_mends_the_rest():
+    frames = random_frames((6,))
+    np.testing.assert_allclose(orthonormalise(frames), frames, atol=1e-14)
+    noisy = frames + 0.2 * np.random.default_rng(0).standard_normal(frames.shape)
+    mended = orthonormalise(noisy)
+    np.testing.assert_array_equal(mended[:, :3], noisy[:, :3])
+    first, second = np.split(split_frames(mended)[1], 2, axis=-1)
+    for vector in (first, second):
+        np.testing.assert_allclose(np.linalg.norm(vector, axis=-1), 1.0, atol=1e-12)
+    np.testing.assert_allclose((first * second).sum(-1), 0.0, atol=1e-12)
+    # The pose that kinematics sees does not change.
+    np.testing.assert_allclose(
+        frame_positions(SKELETON, mended), frame_positions(SKELETON, noisy), atol=1e-12
+    )
+    np.testing.assert_allclose(orthonormalise(mended), mended, atol=1e-12)
+
+
+def test_section_3_3_path_condition_by_hand():
+    position = np.array([[0.5, -1.0], [2.0, 3.0]])
+    got = path_condition(position, np.array([0.0, np.pi / 2]))
+    expected = [[0.5, -1, 1, 0, 0, 0, 1, 0], [2, 3, 0, 0, -1, 0, 1, 0]]
+    np.testing.assert_allclose(got, expected, atol=1e-15)
+    assert np.linalg.det(matrix_from_rotation_6d(got[1, 2:])) == pytest.approx(1.0)
+    assert isinstance(path_condition(jnp.zeros((1, 2)), jnp.zeros(1)), jax.Array)
+
+
+def test_functions_answer_in_kind():
+    frames = random_frames((2, 3))
+    for function in (
+        lambda x: turn_frames(x, 0.3),
+        lambda x: center_window(x, x[..., 0, :2]),
+        orthonormalise,
+        lambda x: frame_yaw(SKELETON, x),
+        lambda x: frame_positions(SKELETON, x),
+    ):
+        here, there = function(frames), function(jnp.asarray(frames, jnp.float32))
+        assert isinstance(here, np.ndarray) and here.dtype == np.float64
+        assert isinstance(there, jax.Array) and there.dtype == jnp.float32
+        np.testing.assert_allclose(there, here, atol=1e-4)
+
+
+def test_normaliser_by_hand():
+    normaliser = Normaliser(jnp.array([1.0, 0.0]), jnp.array([2.0, 0.5]), jnp.asarray(4.0))
+    x = jnp.array([[3.0, 1.0]])
+    np.testing.assert_allclose(normaliser.normalise(x), [[1.0, 2.0]])
+    np.testing.assert_allclose(normaliser.denormalise(normaliser.normalise(x)), x)
+    path = path_condition(jnp.array([[2.0, -4.0]]), jnp.array([0.6]))
+    scaled = normaliser.normalise_path(path)
+    np.testing.assert_allclose(scaled[0, :2], [0.5, -1.0])
+    np.testing.assert_array_equal(scaled[0, 2:], path[0, 2:])
+
+
+def test_identity_normaliser_changes_nothing():
+    x, path = jnp.asarray(random_frames((3,)), jnp.float32), jnp.ones((3, 8)) * 0.3
+    normaliser = Normaliser.identity(CHANNELS)
+    np.testing.assert_array_equal(normaliser.normalise(x), x)
+    np.testing.assert_array_equal(normaliser.denormalise(x), x)
+    np.testing.assert_array_equal(normaliser.normalise_path(path), path)

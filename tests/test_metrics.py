@@ -1,0 +1,376 @@
+"""Metrics against answers worked out by hand."""
+
+import numpy as np
+import pytest
+
+from f3amd_lib.evaluation import metrics
+from f3amd_lib.evaluation.paths import RootPath, named_path
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Skeleton
+
+WINDOW = 32
+SKELETON = Skeleton(
+    ("Hips", "LeftHip", "RightHip", "LeftToe", "RightToe"),
+    (-1, 0, 0, 1, 2),
+    np.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0], [0, -0.9, 0.1], [0, -0.9, 0.1]]),
+)
+POSE = np.array(
+    [[0, 0.9, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1]], dtype=float
+)
+
+
+def glide(num_frames=4 * WINDOW, step=0.04, direction=0.0):
+    """A rigid figure that glides `step` metres a frame, [T, 5, 3]."""
+    along = step * np.arange(num_frames)
+    ground = np.stack([along * np.sin(direction), 0 * along, along * np.cos(direction)], axis=-1)
+    return POSE + ground[:, None, :]
+
+
+def wobble(num_frames=4 * WINDOW, seed=0):
+    """A walker's worth of irregular motion, [T, 5, 3]."""
+    noise = np.random.default_rng(seed).normal(size=(num_frames, 5, 3)) * 0.01
+    return glide(num_frames) + noise
+
+
+# ------------------------------------------------------------------------------------- seams
+
+
+def test_seams_of_a_paper_rollout():
+    seams = metrics.seam_frames(2560, 32)
+    assert len(seams) == 79 and seams[0] == 32 and seams[-1] == 2528
+    np.testing.assert_array_equal(metrics.seam_frames(10 + 96, 32, history=10), [42, 74])
+
+
+def test_seam_of_three_centimetres_reads_three():
+    """A figure that stands still but is moved 3 cm between windows."""
+    positions = np.tile(POSE, (3 * WINDOW, 1, 1))
+    positions[WINDOW:] += [0.03, 0.0, 0.0]
+    positions[2 * WINDOW :] += [0.0, 0.0, 0.03]
+    assert metrics.ird(positions, WINDOW) == pytest.approx(3.0)
+    assert metrics.ird_excess(positions, WINDOW) == pytest.approx(3.0)
+    # The same jumps lie inside windows of another length.
+    assert metrics.ird(positions, WINDOW - 2) == pytest.approx(0.0)
+
+
+def test_seam_across_the_direction_of_travel():
+    """4 cm steps and a 3 cm jump to the side: the literal figure reads the hypotenuse."""
+    positions = glide(2 * WINDOW, step=0.04)
+    positions[WINDOW:] += [0.03, 0.0, 0.0]
+    assert metrics.ird(positions, WINDOW) == pytest.approx(5.0)
+    assert metrics.ird_excess(positions, WINDOW) == pytest.approx(3.0)
+
+
+def test_steady_walk_has_no_excess_and_its_step_as_ird():
+    positions = glide(step=0.045)
+    assert metrics.ird(positions, WINDOW) == pytest.approx(4.5)
+    assert metrics.inter_frame_step(positions) == pytest.approx(4.5)
+    assert metrics.ird_excess(positions, WINDOW) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sticking_at_the_seam_has_low_ird_and_high_excess():
+    """What the literal loss rewards: the first frame of a window repeats the last of the former."""
+    positions = glide(2 * WINDOW, step=0.045)
+    positions[WINDOW:] -= [0.0, 0.0, 0.045]
+    assert metrics.ird(positions, WINDOW) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.ird_excess(positions, WINDOW) == pytest.approx(4.5)
+
+
+def test_inter_frame_step_at_the_spacing_of_seams_is_ird():
+    positions = wobble()
+    assert metrics.inter_frame_step(positions, WINDOW) == metrics.ird(positions, WINDOW)
+    assert metrics.inter_frame_step(positions) == pytest.approx(
+        100 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).mean()
+    )
+
+
+def test_excess_at_every_frame_is_the_joint_acceleration():
+    positions = wobble()
+    everywhere = np.mean(
+        [metrics.ird_excess(positions[start : start + 3], 2) for start in range(len(positions) - 2)]
+    )
+    assert metrics.joint_acceleration(positions) == pytest.approx(everywhere)
+
+
+# ------------------------------------------------------------------------------------- path
+
+
+def test_walking_the_path_reads_zero():
+    path = named_path("complex", 4 * WINDOW, seed=1)
+    positions = np.tile(POSE, (4 * WINDOW, 1, 1))
+    positions[:, :, [0, 2]] += path.position[:, None]
+    assert metrics.trajectory_error(positions, path, WINDOW) == pytest.approx(0.0, abs=1e-12)
+    assert metrics.direction_error(path.yaw, path, WINDOW) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.path_drift(positions, path) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_ten_degrees_off():
+    """After i frames the two are 2 sin(5 deg) apart for each metre walked."""
+    path = named_path("straight", 4 * WINDOW, speed=1.2)
+    positions = glide(step=0.04, direction=np.deg2rad(10.0))
+    apart = 2 * np.sin(np.deg2rad(5.0))
+    assert metrics.trajectory_error(positions, path, WINDOW) == pytest.approx(
+        apart * 0.04 * (WINDOW - 1) / 2
+    )
+    assert metrics.path_drift(positions, path) == pytest.approx(apart)
+
+
+def test_constant_wrong_facing_is_no_direction_error():
+    yaw = np.full(4 * WINDOW, np.deg2rad(10.0))
+    assert metrics.direction_error(yaw, np.zeros(4 * WINDOW), WINDOW) == pytest.approx(0.0)
+
+
+def test_turning_too_fast_by_a_tenth_of_a_degree_a_frame():
+    wanted = np.deg2rad(3.0) * np.arange(4 * WINDOW)  # more than a whole turn in all
+    yaw = np.deg2rad(3.1) * np.arange(4 * WINDOW)
+    expected = 0.1 * (WINDOW - 1) / 2
+    assert metrics.direction_error(yaw, wanted, WINDOW) == pytest.approx(expected)
+    # Angles given in one turn or in many are the same angles.
+    wrapped = (yaw + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(np.diff(wrapped)).max() > np.pi
+    assert metrics.direction_error(wrapped, wanted, WINDOW) == pytest.approx(expected)
+
+
+def test_a_jump_between_windows_is_left_to_ird():
+    path = named_path("straight", 4 * WINDOW, speed=1.2)
+    positions = glide(step=0.04)
+    positions[2 * WINDOW :] += [0.5, 0.0, 0.0]
+    assert metrics.trajectory_error(positions, path, WINDOW) == pytest.approx(0.0, abs=1e-12)
+    assert metrics.ird_excess(positions, WINDOW) == pytest.approx(50.0 / 3)
+    assert metrics.path_drift(positions, path) == pytest.approx(0.5 / path.length)
+
+
+def test_remainder_after_the_last_window_is_left_out_of_window_errors():
+    path = named_path("straight", 4 * WINDOW, speed=1.2)
+    positions = glide(step=0.04, direction=0.3)
+    whole = metrics.trajectory_error(positions, path, WINDOW)
+    cut = slice(0, 3 * WINDOW + 7)
+    assert metrics.trajectory_error(positions[cut], path.position[cut], WINDOW) == pytest.approx(
+        whole
+    )
+
+
+# ------------------------------------------------------------------------------------- smoothness
+
+
+def test_constant_acceleration():
+    """All joints accelerate like the root: the ratio is 1, and the acceleration is known."""
+    time = np.arange(60.0)
+    positions = np.tile(POSE, (60, 1, 1))
+    positions[:, :, 2] += 0.5 * 0.002 * time[:, None] ** 2  # 2 mm a frame squared
+    assert metrics.smoothness(positions) == pytest.approx(1.0)
+    assert metrics.joint_acceleration(positions) == pytest.approx(0.2)
+    assert metrics.joint_acceleration(positions, fps=60.0) == pytest.approx(0.8)
+    # One of five joints bobs up and down with a second difference of 4 cm.
+    positions[1::2, 4, 1] += 0.01
+    expected = (4 * 0.002 + np.hypot(0.002, 0.02)) / 5 / 0.002
+    assert metrics.smoothness(positions) == pytest.approx(expected)
+
+
+def test_coherence_of_a_glide_is_one():
+    positions = glide()
+    assert metrics.coherence(positions) == pytest.approx(1.0)
+    positions[1::2, 4, 0] += 0.03  # one toe moves 5 cm where the others move 4
+    assert metrics.coherence(positions) == pytest.approx((4 * 4 + 5) / 5 / 4)
+
+
+def test_bouncing_root_counts_only_on_the_ground():
+    """A whole body that bobs moves more, but its root's ground step and acceleration do not."""
+    positions = wobble()
+    before = np.linalg.norm(np.diff(positions[:, 0, [0, 2]], n=2, axis=0), axis=-1).mean()
+    positions[1::2, :, 1] += 0.05
+    joints = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1).mean()
+    assert metrics.smoothness(positions) == pytest.approx(joints / before)
+    steady = glide(step=0.04)
+    steady[1::2, :, 1] += 0.03
+    assert metrics.coherence(steady) == pytest.approx(5.0 / 4.0)
+
+
+def test_undefined_ratios_are_nan_not_errors():
+    still = np.tile(POSE, (2 * WINDOW, 1, 1))
+    assert np.isnan(metrics.smoothness(still))
+    assert np.isnan(metrics.coherence(still))
+    assert np.isnan(metrics.foot_sliding(still, (3, 4))[0])
+    assert np.isnan(metrics.smoothness(glide()))  # steady: the root does not accelerate
+    assert metrics.joint_acceleration(still) == 0.0
+
+
+# ------------------------------------------------------------------------------------- feet
+
+
+def slider(num_frames=90, slide=0.02, rest=0.0):
+    """Root at 1 m/s; the left toe stays low and slides, the right one flies at 10 cm."""
+    positions = glide(num_frames, step=1.0 / 30.0)
+    positions[:, 3, 2] = slide * np.arange(num_frames)
+    positions[:, 3, 1] = rest
+    positions[:, 4, 1] = rest + 0.1
+    return positions
+
+
+def test_two_centimetres_a_frame_at_one_metre_a_second():
+    value, share = metrics.foot_sliding(slider(), SKELETON)
+    assert value == pytest.approx(0.6)
+    assert share == pytest.approx(0.5)
+
+
+def test_floor_is_the_lowest_toe_unless_given():
+    resting_high = slider(rest=0.0425)  # Bandai's toe joint
+    assert metrics.foot_sliding(resting_high, (3, 4)) == pytest.approx((0.6, 0.5))
+    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0425) == pytest.approx(
+        (0.6, 0.5)
+    )
+    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0) == (0.0, 0.0)
+
+
+def test_one_dip_lifts_the_reference_unless_the_floor_is_given():
+    positions = slider()
+    positions[45, 3, 1] = -0.05
+    assert metrics.foot_sliding(positions, (3, 4))[1] == pytest.approx(0.5 / 89)
+    assert metrics.foot_sliding(positions, (3, 4), floor_shift=0.0)[1] == pytest.approx(0.5)
+
+
+def test_lifting_a_foot_is_no_sliding():
+    positions = slider()
+    positions[1::2, 3, 1] = 0.005  # rolls up and down by 5 mm, still in contact
+    positions[1::2, 0, 1] += 0.05  # and the hips bounce
+    assert metrics.foot_sliding(positions, (3, 4)) == pytest.approx((0.6, 0.5))
+
+
+def test_planted_foot_does_not_slide():
+    value, share = metrics.foot_sliding(slider(slide=0.0), (3, 4))
+    assert value == 0.0 and share == pytest.approx(0.5)
+
+
+# ------------------------------------------------------------------------------------- all together
+
+
+def test_batch_equals_one_by_one_and_order_does_not_matter():
+    batch = np.stack([wobble(seed=seed) for seed in range(3)])
+    path = named_path("slalom", batch.shape[1])
+    together = metrics.first_metrics(batch, None, path, WINDOW, SKELETON)
+    backwards = metrics.first_metrics(batch[::-1], None, path, WINDOW, SKELETON)
+    assert set(together) == set(metrics.METRICS)
+    for index in range(3):
+        alone = metrics.first_metrics(batch[index], None, path, WINDOW, SKELETON)
+        for key, value in alone.items():
+            assert isinstance(value, float)
+            assert together[key][index] == pytest.approx(value), key
+            assert backwards[key][2 - index] == pytest.approx(value), key
+
+
+def test_one_path_a_character():
+    paths = [named_path("straight", 4 * WINDOW), named_path("circle", 4 * WINDOW)]
+    batch = np.tile(POSE, (2, 4 * WINDOW, 1, 1))
+    for character, path in zip(batch, paths, strict=True):
+        character[:, :, [0, 2]] += path.position[:, None]
+    yaw = np.stack([path.yaw for path in paths])
+    values = metrics.first_metrics(batch, yaw, paths, WINDOW, SKELETON)
+    np.testing.assert_allclose(values["trajectory_error_m"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(values["direction_error_deg"], 0.0, atol=1e-9)
+    swapped = metrics.first_metrics(batch, yaw, paths[::-1], WINDOW, SKELETON)
+    assert np.all(swapped["trajectory_error_m"] > 0.05)
+
+
+def test_turning_and_moving_the_world_changes_nothing():
+    positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
+    path = named_path("slalom", len(positions))
+    moved = positions @ matrix_from_yaw(np.float64(angle)).T + shift
+    target = path.placed(shift[[0, 2]], angle)
+    before = metrics.first_metrics(positions, None, path, WINDOW, SKELETON)
+    after = metrics.first_metrics(moved, None, target, WINDOW, SKELETON)
+    for key, value in before.items():
+        assert after[key] == pytest.approx(value, rel=1e-9, abs=1e-9), key
+
+
+def test_history_is_left_out_of_every_figure():
+    history = 10
+    generated = wobble()
+    before = np.random.default_rng(9).normal(size=(history, 5, 3))
+    positions = np.concatenate([before, generated])
+    path = named_path("slalom", len(generated))
+    alone = metrics.first_metrics(generated, None, path, WINDOW, SKELETON)
+    after = metrics.first_metrics(positions, None, path, WINDOW, SKELETON, history=history)
+    assert after == alone
+    longer = RootPath(
+        np.concatenate([np.zeros((history, 2)), path.position]),
+        np.concatenate([np.zeros(history), path.yaw]),
+    )
+    again = metrics.first_metrics(positions, None, longer, WINDOW, SKELETON, history=history)
+    assert again == pytest.approx(alone)
+
+
+def test_real_motion_needs_no_path():
+    values = metrics.first_metrics(wobble(), None, None, WINDOW, SKELETON)
+    assert set(metrics.METRICS) - set(values) == {
+        "trajectory_error_m",
+        "direction_error_deg",
+        "path_drift",
+    }
+
+
+def test_tidy_rows_average_and_count():
+    rows = metrics.tidy_metrics({"ird_cm": np.array([1.0, 3.0, np.nan])}, model="CAMDM", steps=8)
+    assert rows == [
+        {
+            "model": "CAMDM",
+            "steps": 8,
+            "metric": "IRD",
+            "unit": "cm",
+            "better": "near real",
+            "value": 2.0,
+            "spread": pytest.approx(np.sqrt(2.0)),
+            "characters": 2,
+        }
+    ]
+    with pytest.raises(ValueError, match="unknown metric 'ird'"):
+        metrics.tidy_metrics({"ird": 1.0})
+
+
+# ------------------------------------------------------------------------------------- errors
+
+POSITION_METRICS = [
+    lambda positions: metrics.trajectory_error(positions, np.zeros((128, 2)), WINDOW),
+    metrics.smoothness,
+    metrics.coherence,
+    lambda positions: metrics.foot_sliding(positions, (3, 4)),
+    lambda positions: metrics.ird(positions, WINDOW),
+    lambda positions: metrics.ird_excess(positions, WINDOW),
+    metrics.inter_frame_step,
+    metrics.joint_acceleration,
+    lambda positions: metrics.path_drift(positions, np.zeros((128, 2))),
+]
+
+
+@pytest.mark.parametrize("metric", POSITION_METRICS)
+def test_nan_and_wrong_shape_are_refused(metric):
+    broken = glide()
+    broken[7, 2, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite at frame 7, joint 2"):
+        metric(broken)
+    with pytest.raises(ValueError, match=r"\[..., T, J, 3\]"):
+        metric(np.zeros((128, 15)))
+
+
+@pytest.mark.parametrize("metric", [metrics.ird, metrics.ird_excess])
+def test_one_window_has_no_boundary(metric):
+    with pytest.raises(ValueError, match="no boundary .* at least 33 frames"):
+        metric(glide(WINDOW), WINDOW)
+    metric(glide(WINDOW + 1), WINDOW)
+
+
+def test_paths_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="path has 100 frames; it needs 128"):
+        metrics.trajectory_error(glide(), np.zeros((100, 2)), WINDOW)
+    with pytest.raises(ValueError, match="RootPath or"):
+        metrics.trajectory_error(glide(), np.zeros((128, 3)), WINDOW)
+    with pytest.raises(ValueError, match="do not fill a window"):
+        metrics.trajectory_error(glide(20), np.zeros((20, 2)), WINDOW)
+    with pytest.raises(ValueError, match="not finite"):
+        metrics.direction_error(np.full(64, np.nan), np.zeros(64), WINDOW)
+    with pytest.raises(ValueError, match="does not fit a batch"):
+        metrics.trajectory_error(glide()[None].repeat(3, 0), np.zeros((2, 128, 2)), WINDOW)
+    with pytest.raises(ValueError, match="window must be"):
+        metrics.ird_excess(glide(), 1)
+    with pytest.raises(ValueError, match="toes must be"):
+        metrics.foot_sliding(glide(), (3, 9))
+    with pytest.raises(ValueError, match="for this skeleton"):
+        metrics.first_metrics(glide()[:, :4], None, None, WINDOW, SKELETON)

@@ -1,0 +1,256 @@
+"""What is committed is fit to be read: notebooks are whole, and no file tells of a machine.
+
+nbval checks that the notebooks still compute what they show; here is what it cannot see.
+"""
+
+import ast
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LARGEST_NOTEBOOK = 250_000  # bytes
+LARGEST_FILE = 5_000_000  # bytes
+ALL_WEIGHTS = 20_000_000  # bytes of f3amd_lib/weights/ together
+
+# Folders that stand for somebody's computer; a slash before, so that web addresses do not match.
+# The names are put together here, so that this file does not hold what it looks for.
+_FOLDERS = "|".join(("root", "work", "tmp", r"home/[\w.-]+", r"Users/[\w.-]+", "opt", "mnt"))
+MACHINE_PATH = re.compile(rf"(?<![\w.\-/:<>])/(?:{_FOLDERS})/|\b[A-Z]:\\\\?(?:Users|Temp)\b")
+
+BINARY = {".png", ".gif", ".npz", ".safetensors", ".jpg", ".pdf"}
+
+
+def notebook_faults(path: Path) -> list[str]:
+    """Everything about a notebook file that should not be committed, one sentence each."""
+    faults = []
+    text = path.read_text(encoding="utf-8")
+    if len(text.encode()) >= LARGEST_NOTEBOOK:
+        faults.append(f"{len(text.encode())} bytes, limit {LARGEST_NOTEBOOK}")
+    if not re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name):
+        faults.append("name is not NN_words.ipynb")
+    if MACHINE_PATH.search(text):
+        faults.append(f"absolute path {MACHINE_PATH.search(text)[0]!r}")
+    notebook = nbformat.reads(text, as_version=4)
+    if notebook.metadata.get("kernelspec", {}).get("name") != "python3":
+        faults.append("kernel is not python3")
+    if "papermill" in notebook.metadata or any("papermill" in c.metadata for c in notebook.cells):
+        faults.append("papermill metadata")
+    if "widgets" in notebook.metadata or "application/vnd.jupyter.widget" in text:
+        faults.append("widget state")
+
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    if any(not cell.source.strip() for cell in code):
+        faults.append("empty code cell")
+    counts = [cell.execution_count for cell in code]
+    if counts != list(range(1, len(code) + 1)):
+        faults.append(f"execution counts {counts} are not those of one run from top to bottom")
+    if any(output.output_type == "error" for cell in code for output in cell.outputs):
+        faults.append("error output")
+    if not any("nbval-check-output" in tags_of(cell) for cell in code):
+        faults.append("no cell is tagged nbval-check-output")
+    if not all(cell.outputs for cell in code if "nbval-check-output" in tags_of(cell)):
+        faults.append("a cell tagged nbval-check-output has no output to check")
+    return faults + parameter_faults(code)
+
+
+def parameter_faults(code_cells) -> list[str]:
+    """What is wrong with the cell that papermill reads parameters from."""
+    tagged = [cell for cell in code_cells if "parameters" in tags_of(cell)]
+    if len(tagged) != 1:
+        return [f"{len(tagged)} cells are tagged parameters"]
+    values = {}
+    faults = []
+    for statement in ast.parse(tagged[0].source).body:
+        try:
+            (target,) = statement.targets
+            values[target.id] = ast.literal_eval(statement.value)
+        except (AttributeError, ValueError):
+            # Papermill puts new values after this cell: what is derived in it would be stale.
+            faults.append(f"parameters cell holds more than literals: {ast.unparse(statement)!r}")
+    if values.get("profile") != "smoke":
+        faults.append("profile is not 'smoke' by default")
+    if values.get("data") != "synthetic":
+        faults.append("data is not 'synthetic' by default")
+    return faults
+
+
+def tags_of(cell) -> list[str]:
+    return cell.metadata.get("tags", [])
+
+
+def tracked_files() -> list[Path]:
+    """Files that git tracks, or would if everything were added."""
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    if listing.returncode:
+        pytest.skip("not a git checkout: nothing says which files belong to it")
+    paths = [ROOT / name for name in listing.stdout.split("\0") if name]
+    return [path for path in paths if path.is_file()]  # one may be deleted, not yet committed
+
+
+def repository_faults(paths, root: Path) -> list[str]:
+    """Files that should not be committed, one sentence each."""
+    faults = []
+    weights = [path for path in paths if path.suffix == ".safetensors"]
+    size = sum(path.stat().st_size for path in weights)
+    if size > ALL_WEIGHTS:
+        faults.append(f"weights: {size} bytes together, limit {ALL_WEIGHTS}")
+    for path in paths:
+        name = path.relative_to(root).as_posix()
+        shipped = re.fullmatch(r"f3amd_lib/weights/[^/]+/[^/]+\.safetensors", name)
+        if path.stat().st_size > LARGEST_FILE and not shipped:
+            faults.append(f"{name}: {path.stat().st_size} bytes, limit {LARGEST_FILE}")
+        if path.suffix in (".bvh", ".zip") and not re.fullmatch(
+            r"paper_figures/[^/]+/[^/]+/media/[^/]+\.bvh", name
+        ):
+            faults.append(f"{name}: motion data does not belong in the repository")
+        if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/[^/]+", name):
+            faults.append(f"{name}: notebooks lie in notebooks/")
+        if path.suffix not in BINARY:
+            found = MACHINE_PATH.search(path.read_text(encoding="utf-8", errors="replace"))
+            if found:
+                faults.append(f"{name}: path of a machine, {found[0]!r}")
+    return faults
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_is_fit_to_be_read(path):
+    assert notebook_faults(path) == []
+
+
+def test_notebooks_are_numbered_without_gaps():
+    assert NOTEBOOKS, "there are no notebooks"
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{i:02d}" for i in range(len(NOTEBOOKS))]
+
+
+def test_repository_holds_nothing_it_should_not():
+    assert repository_faults(tracked_files(), ROOT) == []
+
+
+# The checks themselves, on a notebook that is right and on ones that are wrong in one way.
+
+
+def good_notebook() -> dict:
+    """A notebook that passes, as the JSON of its file."""
+    parameters = nbformat.v4.new_code_cell('profile = "smoke"\ndata = "synthetic"\nseed = 0')
+    parameters.metadata["tags"] = ["parameters"]
+    parameters.execution_count = 1
+    verdict = nbformat.v4.new_code_cell("print('agrees')")
+    verdict.metadata["tags"] = ["nbval-check-output"]
+    verdict.execution_count = 2
+    verdict.outputs = [nbformat.v4.new_output("stream", text="agrees\n")]
+    notebook = nbformat.v4.new_notebook(cells=[parameters, verdict])
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3"}
+    return json.loads(nbformat.writes(notebook))
+
+
+def save(folder: Path, notebook: dict, name: str = "00_good.ipynb") -> Path:
+    path = folder / name
+    path.write_text(json.dumps(notebook), encoding="utf-8")
+    return path
+
+
+def test_a_good_notebook_has_no_faults(tmp_path):
+    assert notebook_faults(save(tmp_path, good_notebook())) == []
+
+
+def set_parameters(source):
+    return lambda notebook: notebook["cells"][0].update(source=source)
+
+
+def set_verdict(**changes):
+    return lambda notebook: notebook["cells"][1].update(changes)
+
+
+ERROR_OUTPUT = {"output_type": "error", "ename": "E", "evalue": "", "traceback": []}
+ELSEWHERE = "/" + "home/somebody/motion.bvh"
+
+
+@pytest.mark.parametrize(
+    "spoil, fault",
+    [
+        (set_verdict(execution_count=None), "execution counts"),
+        (set_verdict(execution_count=3), "execution counts"),
+        (set_verdict(outputs=[ERROR_OUTPUT]), "error output"),
+        (set_verdict(outputs=[]), "has no output to check"),
+        (set_verdict(metadata={}), "no cell is tagged nbval-check-output"),
+        (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
+        (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
+        (set_verdict(source="  "), "empty code cell"),
+        (set_verdict(metadata={"papermill": {}}), "papermill metadata"),
+        (lambda notebook: notebook["metadata"].update(papermill={}), "papermill metadata"),
+        (lambda notebook: notebook["metadata"].update(widgets={}), "widget state"),
+        (
+            lambda notebook: notebook["metadata"]["kernelspec"].update(name="my-env"),
+            "kernel is not python3",
+        ),
+        (set_parameters('profile = "laptop"\ndata = "synthetic"'), "profile is not 'smoke'"),
+        (set_parameters('profile = "smoke"\ndata = "bandai"'), "data is not 'synthetic'"),
+        (
+            set_parameters('profile = "smoke"\ndata = "synthetic"\nrounds = 2 * 40'),
+            "more than literals: 'rounds = 2 * 40'",
+        ),
+        (
+            set_parameters('import os\nprofile = "smoke"\ndata = "synthetic"'),
+            "more than literals: 'import os'",
+        ),
+        (
+            lambda notebook: notebook["cells"][0]["metadata"].update(tags=[]),
+            "0 cells are tagged parameters",
+        ),
+    ],
+)
+def test_each_fault_of_a_notebook_is_found(tmp_path, spoil, fault):
+    notebook = good_notebook()
+    spoil(notebook)
+    assert any(fault in found for found in notebook_faults(save(tmp_path, notebook)))
+
+
+def test_a_notebook_without_number_is_found(tmp_path):
+    path = save(tmp_path, good_notebook(), "Untitled1.ipynb")
+    assert notebook_faults(path) == ["name is not NN_words.ipynb"]
+
+
+@pytest.mark.parametrize(
+    "name, content, fault",
+    [
+        ("walk.bvh", "HIERARCHY", "motion data"),
+        ("paper_figures/bandai/laptop/tables/walk.bvh", "HIERARCHY", "motion data"),
+        ("paper_figures/bandai/laptop/media/walk.zip", "", "motion data"),
+        ("paper_figures/copy.ipynb", "{}", "notebooks lie in"),
+        ("notes.md", f"see {ELSEWHERE}", "path of a machine"),
+        ("large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
+        ("f3amd_lib/weights/large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
+    ],
+)
+def test_each_fault_of_the_repository_is_found(tmp_path, name, content, fault):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+    (found,) = repository_faults([path], tmp_path)
+    assert found.startswith(name) and fault in found
+
+
+@pytest.mark.parametrize(
+    "name, content",
+    [
+        ("paper_figures/bandai/laptop/media/walk.bvh", "HIERARCHY"),
+        ("README.md", "https://example.org/home/page/ and data/root/x and ../work/x"),
+        ("run.sh", "#!/usr/bin/env bash"),
+    ],
+)
+def test_what_belongs_in_the_repository_passes(tmp_path, name, content):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+    assert repository_faults([path], tmp_path) == []

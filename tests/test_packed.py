@@ -1,0 +1,310 @@
+"""The packed cache: what goes in comes out, and a damaged file is refused."""
+
+import dataclasses
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from f3amd_lib.data import packed as packed_module
+from f3amd_lib.data.packed import (
+    PackedMotion,
+    cache_path,
+    load_packed,
+    pack,
+    packed_dataset,
+    save_packed,
+)
+from f3amd_lib.data.sources import SPLITS, Clip, Dataset, open_dataset
+from f3amd_lib.motion.rotations import matrix_from_euler
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+LEGS = Skeleton(
+    names=("Hips", "LeftHip", "LeftToe", "RightHip", "RightToe"),
+    parents=(-1, 0, 1, 0, 3),
+    offsets=np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.88, 0], [-0.1, 0, 0], [0, -0.88, 0]]),
+    end_sites=((2, (0.0, 0.0, 0.1)),),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ready:
+    """A loader that hands out a motion made before."""
+
+    motion: Motion
+
+    def __call__(self) -> Motion:
+        return self.motion
+
+
+def legs_motion(frames: int, seed: int, skeleton: Skeleton = LEGS) -> Motion:
+    random = np.random.default_rng(seed)
+    angles = random.uniform(-30, 30, size=(frames, skeleton.num_joints, 3))
+    angles[:, 0] = 0.0
+    root = np.array([10.0, 0.95, -10.0]) + random.normal(size=(frames, 3)) * [1.0, 0.01, 1.0]
+    return Motion(skeleton, root, matrix_from_euler("ZXY", angles), 30.0)
+
+
+def make_dataset(motions: dict[str, Motion], fingerprint: str = "ab" * 32) -> Dataset:
+    clips = tuple(
+        Clip(name, name.split("_")[0], "walk", SPLITS[k % 3], Ready(motion))
+        for k, (name, motion) in enumerate(motions.items())
+    )
+    styles = tuple(sorted({clip.style for clip in clips}))
+    return Dataset(
+        name="handmade",
+        licence="CC0",
+        credit="Motion data: nobody.",
+        fingerprint=fingerprint,
+        styles=styles,
+        clips=clips,
+        primary_styles=styles[:1],
+        mirror_styles=frozenset(styles[-1:]),
+    )
+
+
+@pytest.fixture
+def motions() -> dict[str, Motion]:
+    return {
+        "sad_1": legs_motion(42, 0),
+        "happy_1": legs_motion(60, 1),
+        "sad_2": legs_motion(41, 2),
+        "sad_é": legs_motion(50, 3),
+    }
+
+
+@pytest.fixture
+def packed(motions) -> PackedMotion:
+    return pack(make_dataset(motions), progress=False)
+
+
+def assert_same(first: PackedMotion, second: PackedMotion):
+    for field in dataclasses.fields(PackedMotion):
+        before, after = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype, field.name
+            np.testing.assert_array_equal(before, after, err_msg=field.name)
+        else:
+            assert before == after, field.name
+    np.testing.assert_array_equal(first.skeleton.offsets, second.skeleton.offsets)
+    assert first.skeleton.end_sites == second.skeleton.end_sites
+
+
+def test_pack_keeps_clips_labels_and_order(packed, motions):
+    assert packed.clip_names == ("sad_1", "happy_1", "sad_é")
+    assert packed.clip_contents == ("walk",) * 3
+    assert packed.styles == ("happy", "sad")
+    np.testing.assert_array_equal(packed.clip_start, [0, 42, 102, 152])
+    np.testing.assert_array_equal(packed.clip_style, [1, 0, 1])
+    np.testing.assert_array_equal(packed.clip_split, [0, 1, 0])
+    assert packed.skipped == (("sad_2", "41 frames, shorter than a window of 42"),)
+    assert (packed.primary_styles, packed.mirror_styles) == (("happy",), {"sad"})
+    assert (packed.num_clips, packed.num_frames) == (3, 152)
+    assert packed.root_position.dtype == np.float32
+    assert packed.rotation_6d.dtype == np.float16 and packed.rotation_6d.shape == (152, 5, 6)
+
+
+def test_packed_motion_is_the_motion(packed, motions):
+    for clip, name in enumerate(packed.clip_names):
+        motion, original = packed.motion(clip), motions[name]
+        assert (motion.name, motion.fps) == (name, 30.0)
+        np.testing.assert_allclose(motion.root_position, original.root_position, atol=1e-6)
+        # A float16 below 1 is good to 2.5e-4; bones are under 1 m long.
+        np.testing.assert_allclose(motion.positions, original.positions, atol=2e-3)
+        square = motion.rotations @ np.swapaxes(motion.rotations, -1, -2)
+        np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), square.shape), atol=1e-7)
+        lowest = original.positions[:, [2, 4], 1].min()
+        assert packed.floor_shift[clip] == pytest.approx(lowest, abs=1e-6)
+    for clip in (-1, 3):
+        with pytest.raises(ValueError, match=f"clip must be 0 to 2, got {clip}"):
+            packed.motion(clip)
+
+
+def test_save_and_load(packed, tmp_path):
+    path = save_packed(tmp_path / "deep" / "handmade.npz", packed)
+    assert_same(packed, load_packed(path))
+    assert [item.name for item in path.parent.iterdir()] == ["handmade.npz"]
+    with pytest.raises(ValueError, match=r"handmade\.npz: exists already"):
+        save_packed(path, packed)
+    save_packed(path, packed, overwrite=True)
+    # No pickle anywhere: numpy itself would refuse one.
+    with np.load(path, allow_pickle=False) as file:
+        assert all(file[name].dtype != object for name in file.files)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.9, 0.999])
+def test_truncated_files_are_refused(packed, tmp_path, share):
+    path = save_packed(tmp_path / "a.npz", packed)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read as a packed data set"):
+        load_packed(path)
+
+
+def test_flipped_bits_are_refused(packed, tmp_path):
+    path = save_packed(tmp_path / "a.npz", packed)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x55
+    path.write_bytes(bytes(data))
+    with pytest.raises(ValueError, match=r"a\.npz: "):
+        load_packed(path)
+
+
+def rewrite(path, **changes):
+    """Write the file anew with some arrays changed and sound zip checksums."""
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    for name, change in changes.items():
+        arrays[name] = change(arrays[name])
+    np.savez_compressed(path, **{k: v for k, v in arrays.items() if v is not None})
+
+
+@pytest.mark.parametrize(
+    "name, change",
+    [
+        ("root_position", lambda array: array + np.float32(0.001)),
+        ("clip_split", lambda array: np.uint8(2) - array),
+        ("rotation_6d", lambda array: array.reshape(-1, 1, 6)),
+        ("offsets", lambda array: array.astype(np.float32)),
+        ("text", lambda array: np.frombuffer(array.tobytes().replace(b"CC0", b"CC1"), np.uint8)),
+    ],
+)
+def test_altered_content_is_refused(packed, tmp_path, name, change):
+    path = save_packed(tmp_path / "a.npz", packed)
+    rewrite(path, **{name: change})
+    with pytest.raises(ValueError, match=r"a\.npz: checksum differs"):
+        load_packed(path)
+
+
+def test_other_files_are_refused(packed, tmp_path):
+    path = tmp_path / "a.npz"
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+    path.write_text("not a packed data set")
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+    np.savez(path, root_position=np.zeros(3))
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("text.npy", b"nonsense")
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+    path.unlink()
+    save_packed(path, packed)
+    rewrite(path, floor_shift=lambda array: np.array(array.tolist(), dtype=object))
+    with pytest.raises(ValueError, match=r"a\.npz: cannot be read"):
+        load_packed(path)
+
+
+def test_another_format_is_refused(packed, tmp_path, monkeypatch):
+    monkeypatch.setattr(packed_module, "_FORMAT", 99)
+    path = save_packed(tmp_path / "a.npz", packed)
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"a\.npz: is of format 99, this version reads \d+"):
+        load_packed(path)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"clip_start": np.array([0, 42, 42, 152], np.int32)}, "clip_start does not cut"),
+        ({"clip_start": np.array([0, 42, 102, 151], np.int32)}, "clip_start does not cut"),
+        ({"clip_style": np.array([0, 1, 2], np.int32)}, "clip_style points outside"),
+        ({"clip_split": np.array([0, 1, 3], np.uint8)}, "clip_split must be 0, 1 or 2"),
+        ({"floor_shift": np.zeros(2, np.float32)}, r"floor_shift has shape \(2,\)"),
+        ({"clip_contents": ("walk",)}, "1 contents for 3 clips"),
+    ],
+)
+def test_parts_must_fit_together(packed, changes, message):
+    with pytest.raises(ValueError, match=f"'handmade': {message}"):
+        dataclasses.replace(packed, **changes)
+
+
+def test_one_skeleton_for_all(motions):
+    longer = dataclasses.replace(LEGS, offsets=LEGS.offsets * 1.1)
+    motions["sad_long"] = legs_motion(50, 4, longer)
+    with pytest.raises(ValueError, match="sad_long: its skeleton differs from that of sad_1"):
+        pack(make_dataset(motions), progress=False)
+
+
+def test_nothing_but_short_clips_is_an_error():
+    with pytest.raises(ValueError, match="'handmade' has no clip of at least 42 frames; 1 are"):
+        pack(make_dataset({"sad_1": legs_motion(41, 0)}), progress=False)
+
+
+def test_the_cache_is_used_and_keyed_by_content(motions, cache_dir, monkeypatch):
+    dataset = make_dataset(motions)
+    first = packed_dataset(dataset, progress=False)
+    assert [item.name for item in cache_dir.iterdir()] == [cache_path(dataset).name]
+    with monkeypatch.context() as patch:
+        patch.setattr(packed_module, "pack", lambda *a, **k: pytest.fail("packed again"))
+        assert_same(first, packed_dataset(dataset, progress=False))
+    packed_dataset(make_dataset(motions, fingerprint="cd" * 32), progress=False)
+    assert len(list(cache_dir.iterdir())) == 2
+
+
+def test_a_damaged_cache_is_packed_anew(motions, cache_dir):
+    dataset = make_dataset(motions)
+    first = packed_dataset(dataset, progress=False)
+    path = cache_path(dataset)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.warns(UserWarning, match=r"cannot be read .* \(packing anew\)"):
+        again = packed_dataset(dataset, progress=False)
+    assert_same(first, again)
+    assert_same(first, load_packed(path))
+    save_packed(path, dataclasses.replace(first, fingerprint="ef" * 32), overwrite=True)
+    with pytest.warns(UserWarning, match="belongs to another data set"):
+        assert packed_dataset(dataset, progress=False).fingerprint == dataset.fingerprint
+
+
+def test_a_broken_clip_leaves_no_cache(motions, cache_dir, tmp_path):
+    folder = tmp_path / "files"
+    folder.mkdir()
+    from f3amd_lib.motion.bvh import write_bvh
+
+    for name, motion in motions.items():
+        write_bvh(folder / f"{name}.bvh", motion)
+    text = (folder / "sad_2.bvh").read_text()
+    (folder / "sad_2.bvh").write_text(text[:-30])
+    with pytest.raises(ValueError, match=r"sad_2\.bvh, line \d+: .* cut off"):
+        packed_dataset(open_dataset("folder", path=folder), progress=False)
+    assert not cache_dir.exists()
+    (folder / "sad_2.bvh").write_text(text)
+    packed = packed_dataset(open_dataset("folder", path=folder), progress=False)
+    assert packed.clip_names == ("happy_1", "sad_1", "sad_é")
+
+
+def test_worker_processes_give_the_same():
+    dataset = open_dataset("synthetic", seconds_per_style=6.0, num_styles=2)
+    assert_same(pack(dataset, progress=False), pack(dataset, progress=False, workers=2))
+
+
+def test_real_bandai_packs_small(bandai_dataset, tmp_path):
+    packed = pack(bandai_dataset, progress=False)
+    assert (packed.num_clips, packed.num_frames) == (1063, 167_423 - 20 - 24 - 31 - 31)
+    assert [name for name, _ in packed.skipped] == [
+        "dataset-1_dash_normal_001",
+        "dataset-1_run_normal_001",
+        "dataset-1_walk-back_normal_001",
+        "dataset-1_walk_normal_002",
+    ]
+    path = save_packed(tmp_path / "bandai.npz", packed)
+    assert path.stat().st_size < 50_000_000
+    again = load_packed(path)
+    assert_same(packed, again)
+    about = json.loads(np.load(path)["text"].tobytes())
+    assert "CC BY-NC 4.0" in about["licence"]
+    for style in range(len(packed.styles)):
+        found = {int(split) for split in packed.clip_split[packed.clip_style == style]}
+        assert found == {0, 1, 2}, packed.styles[style]
+    clips = {clip.name: clip for clip in bandai_dataset.clips}
+    for number in range(0, again.num_clips, 100):
+        original = clips[again.clip_names[number]].load()
+        error = np.linalg.norm(again.motion(number).positions - original.positions, axis=-1)
+        assert error.max() < 2e-3 and error.mean() < 5e-4

@@ -1,0 +1,224 @@
+"""Root paths: geometry, speed, and strict reading of files."""
+
+import numpy as np
+import pytest
+
+from f3amd_lib.evaluation.paths import (
+    NAMES,
+    RootPath,
+    named_path,
+    path_from_motion,
+    read_path_csv,
+)
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+
+def tangent_gap(path):
+    """Largest angle between the facing and the direction of travel, degrees."""
+    step = np.diff(path.position, axis=0)
+    heading = np.arctan2(step[:, 0], step[:, 1])
+    middle = 0.5 * (path.yaw[1:] + path.yaw[:-1])
+    return np.rad2deg(np.abs((heading - middle + np.pi) % (2 * np.pi) - np.pi)).max()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_starts_at_the_origin_facing_z(name):
+    path = named_path(name, 300, seed=5)
+    assert path.position.shape == (300, 2) and path.yaw.shape == (300,)
+    np.testing.assert_array_equal(path.position[0], 0.0)
+    assert path.yaw[0] == 0.0
+    # Curvature moves the first step aside by a small angle, at most half of what it turns.
+    assert abs(np.arctan2(*path.position[1])) < np.deg2rad(1.5)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "complex"])
+@pytest.mark.parametrize("speed", [0.6, 2.0])
+def test_constant_speed_along_the_tangent(name, speed):
+    path = named_path(name, 900, speed=speed)
+    step = np.linalg.norm(np.diff(path.position, axis=0), axis=-1)
+    # A chord is a little shorter than its arc: 0.2 % at the tightest curve.
+    np.testing.assert_allclose(step * 30.0, speed, rtol=2e-3)
+    assert tangent_gap(path) < 0.2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_heading_has_no_corner(name):
+    path = named_path(name, 1500, speed=1.2, seed=2)
+    turn = np.abs(np.diff(path.yaw))
+    assert np.rad2deg(turn).max() < 8.0  # a corner would show as tens of degrees in one frame
+    assert np.rad2deg(np.abs(np.diff(path.yaw, n=2))).max() < 1.5
+
+
+def test_straight_goes_its_distance():
+    path = named_path("straight", 91, speed=1.5)
+    np.testing.assert_allclose(path.position[-1], [0.0, 4.5], atol=1e-9)
+    assert path.length == pytest.approx(4.5)
+
+
+def test_circle_has_its_radius_and_turns_left():
+    path = named_path("circle", 600)
+    np.testing.assert_allclose(np.linalg.norm(path.position - [2.5, 0.0], axis=-1), 2.5, atol=1e-3)
+    assert path.yaw[-1] > 0
+
+
+def test_figure_eight_closes_and_crosses_its_start():
+    lap = 2 * np.pi * 2.404825557695773 * 1.5
+    frames = 1201
+    path = named_path("figure-eight", frames, speed=lap / ((frames - 1) / 30.0))
+    np.testing.assert_allclose(path.position[[600, 1200]], 0.0, atol=1e-3)
+    assert np.ptp(path.yaw) == pytest.approx(2 * 2.404825557695773, rel=1e-4)
+
+
+def test_slalom_returns_to_its_axis():
+    path = named_path("slalom", 1201, speed=0.8)  # 0.8 m/s for 40 s = 4 periods of 8 m
+    np.testing.assert_allclose(path.position[[300, 600, 900, 1200], 0], 0.0, atol=1e-3)
+    assert np.rad2deg(np.abs(path.yaw)).max() == pytest.approx(50.0, abs=0.1)
+
+
+def test_square_closes_after_four_corners():
+    path = named_path("square", 1201, speed=24.0 / 40.0)
+    np.testing.assert_allclose(path.position[-1], 0.0, atol=1e-3)
+    assert path.yaw[-1] == pytest.approx(2 * np.pi)
+    on_sides = np.isclose(np.mod(path.yaw, np.pi / 2), 0.0, atol=1e-12)
+    assert 0.4 < on_sides.mean() < 0.6  # half of the way is straight
+
+
+def test_spiral_arms_lie_a_metre_apart():
+    path = named_path("spiral", 3000)
+    whole_turns = [np.argmin(np.abs(path.yaw - 2 * np.pi * turn)) for turn in (1, 2, 3, 4)]
+    apart = np.linalg.norm(np.diff(path.position[whole_turns], axis=0), axis=-1)
+    np.testing.assert_allclose(apart, 1.0, atol=0.06)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_longer_path_begins_with_the_shorter(name):
+    short, long = named_path(name, 200, seed=3), named_path(name, 1000, seed=3)
+    np.testing.assert_allclose(long.position[:200], short.position, atol=1e-9)
+    np.testing.assert_allclose(long.yaw[:200], short.yaw, atol=1e-9)
+
+
+def test_complex_has_speeds_turns_stops_and_directions():
+    for seed in range(4):
+        path = named_path("complex", 2560, seed=seed)
+        step = np.diff(path.position, axis=0)
+        speed = 30.0 * np.linalg.norm(step, axis=-1)
+        assert speed.max() > 1.5 and speed.max() < 1.2 * 1.6 + 1e-6
+        assert (speed < 0.1).any()
+        assert np.ptp(path.yaw) > np.pi
+        moving = speed > 0.3
+        heading = np.arctan2(step[:, 0], step[:, 1])
+        apart = np.abs((path.yaw[1:] - heading + np.pi) % (2 * np.pi) - np.pi)[moving]
+        assert (apart > np.deg2rad(60)).mean() > 0.03  # sideways or backwards at times
+        assert (apart < np.deg2rad(5)).mean() > 0.5  # and straight on for the most part
+
+
+def test_complex_is_chosen_by_its_seed():
+    one, again, other = (named_path("complex", 600, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.position, again.position)
+    assert np.abs(one.position - other.position).max() > 0.5
+
+
+def test_ramp_starts_from_rest():
+    path = named_path("straight", 200, speed=1.2, ramp_seconds=1.0)
+    speed = 30.0 * np.diff(path.position[:, 1])
+    assert speed[0] < 0.02
+    np.testing.assert_allclose(speed[31:], 1.2, atol=1e-9)
+    assert np.all(np.diff(speed) > -1e-12)
+
+
+def test_unknown_name_names_the_nearest():
+    with pytest.raises(ValueError, match="did you mean spiral"):
+        named_path("spirale", 10)
+    with pytest.raises(ValueError, match="known paths are straight, circle"):
+        named_path("zzz", 10)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"num_frames": 1}, {"speed": 0.0}, {"speed": np.nan}, {"fps": 0}, {"ramp_seconds": -1}]
+)
+def test_bad_numbers_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0]):
+        named_path("circle", **({"num_frames": 10} | bad))
+
+
+def test_placed_moves_and_turns():
+    path = named_path("straight", 31, speed=1.0).placed([2.0, 3.0], np.pi / 2)
+    np.testing.assert_allclose(path.position[[0, -1]], [[2.0, 3.0], [3.0, 3.0]], atol=1e-9)
+    np.testing.assert_allclose(path.yaw, np.pi / 2)
+
+
+def test_root_path_refuses_nonsense():
+    with pytest.raises(ValueError, match="position"):
+        RootPath(np.zeros((4, 3)), np.zeros(4))
+    with pytest.raises(ValueError, match="not finite at frame 2"):
+        RootPath(np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))
+
+
+# ------------------------------------------------------------------------------------- CSV files
+
+
+def write(tmp_path, text):
+    file = tmp_path / "walk.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_csv_with_yaw(tmp_path):
+    file = write(tmp_path, "x,z,yaw_deg\r\n0,0,350\r\n0.1,0.2,5\r\n\r\n0.2,0.4,20\r\n")
+    path = read_path_csv(file)
+    np.testing.assert_allclose(path.position, [[0, 0], [0.1, 0.2], [0.2, 0.4]])
+    np.testing.assert_allclose(np.rad2deg(np.diff(path.yaw)), [15.0, 15.0])
+
+
+def test_csv_columns_in_any_order_and_yaw_from_the_tangent(tmp_path):
+    rows = "\n".join(f"0,{0.1 * frame}" for frame in range(4))
+    path = read_path_csv(write(tmp_path, f"z, x\n{rows}\n"))
+    np.testing.assert_allclose(path.yaw, np.pi / 2)  # along +X
+
+
+def test_csv_keeps_its_facing_while_standing(tmp_path):
+    rows = ["0,0", "0.1,0", "0.2,0", "0.2,0", "0.2,0", "0.2,0"]
+    path = read_path_csv(write(tmp_path, "x,z\n" + "\n".join(rows) + "\n"))
+    np.testing.assert_allclose(path.yaw, np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1: column 'x' is missing"),
+        ("x,y\n0,0\n0,0\n", "line 1: column 'z' is missing"),
+        ("x,z,yaw\n0,0,0\n", "line 1: unknown column 'yaw'"),
+        ("x,z,x\n0,0,0\n", "line 1: a column is named twice"),
+        ("x,z\n0,0\n0,nan\n", "line 3: z is nan, not finite"),
+        ("x,z\n0,0\n\n0,far\n", "line 4: z is 'far', not a number"),
+        ("x,z\n0,0\n0,0.1\n0,0.7\n", "line 4: jumps 0.60 m"),
+        ("x,z\n0,0\n0\n", "line 3: 1 cells where the header has 2"),
+        ("x,z\n0,0\n", "at least 2 rows"),
+    ],
+)
+def test_csv_errors_name_file_and_line(tmp_path, text, message):
+    file = write(tmp_path, text)
+    with pytest.raises(ValueError, match="walk.csv") as error:
+        read_path_csv(file)
+    assert message in str(error.value)
+
+
+def test_csv_that_is_no_text(tmp_path):
+    file = tmp_path / "walk.csv"
+    file.write_bytes(b"x,z\n\xff\xfe")
+    with pytest.raises(ValueError, match="not a text file"):
+        read_path_csv(file)
+
+
+def test_path_from_motion():
+    skeleton = Skeleton(
+        ("Hips", "LeftHip", "RightHip"),
+        (-1, 0, 0),
+        np.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]]),
+    )
+    root = np.array([[1.0, 0.9, 2.0], [1.0, 0.9, 2.1]])
+    motion = Motion(skeleton, root, np.tile(np.eye(3), (2, 3, 1, 1)), fps=60.0)
+    path = path_from_motion(motion)
+    np.testing.assert_allclose(path.position, [[1.0, 2.0], [1.0, 2.1]])
+    np.testing.assert_allclose(path.yaw, 0.0, atol=1e-12)
+    assert path.fps == 60.0

@@ -1,0 +1,133 @@
+"""The road from a data set's name to a trained model, and the command line on top of it."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import f3amd_lib.training.pipeline as pipeline
+from f3amd_lib.__main__ import main
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.motion.bvh import read_bvh
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.records import read_table
+
+
+@pytest.fixture(scope="module")
+def trained_once(tmp_path_factory):
+    """A model trained for four steps in a folder of its own; (folder, prepared, profile, model)."""
+    folder = tmp_path_factory.mktemp("pipeline")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_DIR_VARIABLE, str(folder / "cache"))
+        patch.setattr(pipeline, "runs_dir", lambda dataset, profile: folder / dataset / profile)
+        profile = load_profile("smoke", "synthetic", train_steps=4, num_styles=2)
+        prepared = pipeline.prepare(profile)
+        model, history, origin = pipeline.obtain_model(prepared, profile, progress=False)
+        assert origin == "trained now"
+        assert history["step"].iloc[-1] == 4
+        yield folder, prepared, profile, model
+
+
+@pytest.fixture
+def same_runs(trained_once, monkeypatch):
+    folder = trained_once[0]
+    monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: folder / dataset / profile)
+
+
+def test_finished_model_is_found_again(trained_once, same_runs):
+    _, prepared, profile, model = trained_once
+    again, history, origin = pipeline.obtain_model(prepared, profile, progress=False)
+    assert origin == "earlier run"
+    assert again.record == model.record
+    assert history["held_out_loss"].notna().any()
+
+
+def test_record_names_data_terms_and_recipe(trained_once, same_runs):
+    _, prepared, profile, model = trained_once
+    _, record = read_table(pipeline.model_files(profile).history)
+    assert record["model"] == profile.preset
+    assert model.record["dataset_fingerprint"] == prepared.packed.fingerprint
+    assert model.record["dataset_licence"] == prepared.packed.licence
+    assert model.record["training"]["num_steps"] == profile.train_steps
+    assert model.styles == prepared.packed.styles
+
+
+def test_changed_settings_set_the_old_files_aside(trained_once, same_runs, monkeypatch):
+    folder, prepared, profile, _ = trained_once
+    files = pipeline.model_files(profile)
+    before = files.model.read_bytes()
+    asked = {}
+    monkeypatch.setattr(
+        pipeline, "train", lambda *args, **kwargs: asked.setdefault("yes", (None, None))
+    )
+    pipeline.obtain_model(prepared, dataclasses.replace(profile, seed=5), progress=False)
+    assert asked
+    kept = files.model.with_name(files.model.name + ".old1")
+    assert kept.read_bytes() == before
+    for path in dataclasses.astuple(files):
+        path.with_name(path.name + ".old1").rename(path)
+
+
+def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs, monkeypatch):
+    folder, prepared, profile, model = trained_once
+    laptop = dataclasses.replace(profile, name="laptop")
+    shipped = folder / "weights" / "synthetic"
+    other = dataclasses.replace(
+        model,
+        skeleton=dataclasses.replace(model.skeleton, offsets=1.5 * model.skeleton.offsets),
+    )
+    files = pipeline.model_files(laptop, folder=shipped)
+    pipeline.save_model(files.model, other)
+    monkeypatch.setattr(pipeline, "WEIGHTS_DIR", folder / "weights")
+    monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
+    *_, origin = pipeline.obtain_model(prepared, laptop, progress=False)
+    assert origin == "trained now"
+
+
+def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: tmp_path / profile)
+    monkeypatch.setattr(pipeline, "WEIGHTS_DIR", tmp_path / "weights")
+    with pytest.raises(ValueError, match="f3amd_lib train --data bandai"):
+        pipeline.find_model("bandai")
+
+
+def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path, capsys):
+    _, _, profile, model = trained_once
+    weights = pipeline.model_files(profile).model
+    command = ["rollout", "--style", model.styles[0], "--path", "circle", "--seconds", "1.5"]
+    command += ["--steps", "1", "--weights", str(weights), "--out", str(tmp_path)]
+    assert main(command) == 0
+    stem = tmp_path / f"{model.styles[0]}_circle_seed0"
+    motion = read_bvh(stem.with_suffix(".bvh"))
+    assert motion.num_frames == 45
+    assert motion.skeleton.names == model.skeleton.names
+    assert np.isfinite(world_frames(motion)).all()
+    assert stem.with_suffix(".png").stat().st_size > 1000
+    assert stem.with_suffix(".gif").read_bytes()[:4] == b"GIF8"
+    assert main(command) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0
+
+
+def test_command_refuses_unknown_style_in_one_line(trained_once, same_runs, tmp_path, capsys):
+    profile = trained_once[2]
+    weights = pipeline.model_files(profile).model
+    out = tmp_path / "out"
+    assert main(["rollout", "--style", "Nobody", "--weights", str(weights), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "unknown style 'Nobody'" in error
+    assert not out.exists()
+
+
+def test_command_runs_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "f3amd_lib", "presets", "--channels", "129", "--styles", "22"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "F3AMD-FNO-96-plus" in done.stdout

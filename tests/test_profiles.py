@@ -1,0 +1,152 @@
+"""Profiles give the right numbers, refuse what they do not know, and keep results apart."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from f3amd_lib import profiles
+from f3amd_lib.data import sources
+from f3amd_lib.models import zoo
+from f3amd_lib.profiles import Profile, load_profile, results_dir, runs_dir
+
+
+@pytest.mark.parametrize(
+    "name, dataset", list(itertools.product(profiles.PROFILES, profiles.DATASETS))
+)
+def test_every_pair_gives_a_profile_of_a_known_network(name, dataset):
+    profile = load_profile(name, dataset)
+    assert (profile.name, profile.dataset) == (name, dataset)
+    assert profile.preset in zoo.PRESETS
+    # Defaults must pass what overrides must pass.
+    values = dataclasses.asdict(profile)
+    del values["name"], values["dataset"]
+    assert load_profile(name, dataset, **values) == profile
+
+
+def test_data_sets_are_those_that_can_be_opened():
+    assert profiles.DATASETS == sources.NAMES
+
+
+def test_smoke_is_tiny():
+    profile = load_profile("smoke", "synthetic")
+    assert profile.train_steps == 20
+    assert profile.batch_size == 16
+    assert profile.num_styles == 3
+    assert profile.seconds_per_style == 8.0
+    assert profile.rollout_rounds == 3
+
+
+def test_gpu_is_the_papers_scale():
+    profile = load_profile("gpu", "100style")
+    assert profile.preset == "F3AMD-FNO-96"
+    assert profile.batch_size == 512
+    assert profile.learning_rate == 5e-4
+    assert (profile.num_history, profile.window, profile.rollout_rounds) == (10, 32, 80)
+    assert profile.window * profile.rollout_rounds == 2560
+
+
+def test_overrides_replace_and_nothing_else_changes():
+    plain = load_profile("laptop", "bandai")
+    changed = load_profile("laptop", "bandai", num_steps=1, seed=7)
+    assert (changed.num_steps, changed.seed) == (1, 7)
+    assert dataclasses.replace(changed, num_steps=plain.num_steps, seed=plain.seed) == plain
+
+
+@pytest.mark.parametrize(
+    "key, given, kept",
+    [
+        ("seconds_per_style", 2, 2.0),
+        ("num_steps", np.int64(4), 4),
+        ("learning_rate", np.float32(0.5), 0.5),
+        ("num_styles", None, None),
+        ("evaluation_styles", ["a", "b"], ("a", "b")),
+        ("preset", "F3AMD-FNO-48", "F3AMD-FNO-48"),
+        ("compare_preset", None, None),
+    ],
+)
+def test_sensible_values_become_the_fields_type(key, given, kept):
+    value = getattr(load_profile("smoke", "synthetic", **{key: given}), key)
+    assert value == kept
+    assert type(value) is type(kept)
+
+
+@pytest.mark.parametrize(
+    "key, value, complaint",
+    [
+        ("num_steps", True, "num_steps must be a whole number, got True"),
+        ("num_steps", 8.0, "num_steps must be a whole number, got 8.0"),
+        ("num_steps", "8", "num_steps must be a whole number, got '8'"),
+        ("num_steps", None, "num_steps must be a whole number, got None"),
+        ("num_steps", 0, "num_steps must be above 0"),
+        ("num_styles", -1, "num_styles must be above 0"),
+        ("num_styles", "all", "num_styles must be a whole number or None"),
+        ("seconds_per_style", float("nan"), "seconds_per_style must be a finite number"),
+        ("seconds_per_style", False, "seconds_per_style must be a finite number"),
+        ("seconds_per_style", -1, "seconds_per_style must be above 0"),
+        ("seed", -1, "seed must be 0 or more"),
+        ("preset", 96, "preset must be a name"),
+        ("evaluation_styles", "proud", "evaluation_styles must be a list of names"),
+        ("evaluation_styles", [1], "evaluation_styles must be a list of names"),
+    ],
+)
+def test_wrong_values_are_refused(key, value, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        load_profile("smoke", "synthetic", **{key: value})
+
+
+@pytest.mark.parametrize(
+    "arguments, complaint",
+    [
+        ({"name": "labtop"}, "unknown profile 'labtop'; did you mean 'laptop'"),
+        ({"dataset": "Bandei"}, "unknown data set 'Bandei'; did you mean 'bandai'"),
+        ({"dataset": 100}, "unknown data set 100"),
+        ({"num_step": 4}, "unknown profile field 'num_step'; did you mean 'num_steps'"),
+        ({"sede": 4}, "unknown profile field 'sede'; did you mean 'seed'"),
+        ({"zzz": 4}, r"unknown profile field 'zzz' \(one of preset"),
+    ],
+)
+def test_unknown_names_are_refused_with_the_nearest(arguments, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        load_profile(**{"name": "smoke", "dataset": "synthetic", **arguments})
+
+
+def test_a_profile_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        load_profile("smoke", "synthetic").seed = 1
+    assert not hasattr(Profile, "seed")  # no defaults outside the tables of profiles.py
+
+
+def test_results_go_to_the_ignored_runs_folder(tmp_path, monkeypatch):
+    monkeypatch.delenv(profiles.RESULTS_DIR_VARIABLE, raising=False)
+    monkeypatch.setattr(profiles, "repository_root", lambda: tmp_path)
+    folder = results_dir("synthetic", "laptop")
+    assert folder == tmp_path / "runs" / "synthetic" / "laptop"
+    assert folder == runs_dir("synthetic", "laptop")
+    assert sorted(path.name for path in folder.iterdir()) == sorted(profiles.RESULT_FOLDERS)
+
+
+def test_results_dir_follows_the_variable_and_an_explicit_root_wins(tmp_path, monkeypatch):
+    monkeypatch.setenv(profiles.RESULTS_DIR_VARIABLE, str(tmp_path / "asked"))
+    assert results_dir("bandai", "gpu") == tmp_path / "asked" / "bandai" / "gpu"
+    folder = results_dir("bandai", "gpu", root=tmp_path / "explicit")
+    assert folder == tmp_path / "explicit" / "bandai" / "gpu"
+
+
+def test_results_dir_keeps_what_is_there(tmp_path):
+    table = results_dir("bandai", "smoke", root=tmp_path) / "tables" / "mine.csv"
+    table.write_text("a\n1\n")
+    results_dir("bandai", "smoke", root=tmp_path)
+    assert table.read_text() == "a\n1\n"
+
+
+@pytest.mark.parametrize("dataset, profile", [("../elsewhere", "smoke"), ("bandai", "smok")])
+def test_results_dir_refuses_unknown_names(dataset, profile, tmp_path):
+    with pytest.raises(ValueError, match="unknown"):
+        results_dir(dataset, profile, root=tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_repository_root_is_this_checkout():
+    assert (profiles.repository_root() / "f3amd_lib" / "profiles.py").is_file()

@@ -1,0 +1,215 @@
+"""The main job runs notebooks in order, passes parameters, stops where one stops and says where."""
+
+import json
+import os
+from pathlib import Path
+
+import nbformat
+import pandas as pd
+import pytest
+
+from f3amd_lib import profiles, reproduce
+from f3amd_lib.report.records import read_table
+
+PARAMETERS = 'profile = "smoke"\ndata = "synthetic"\nnum_steps = 2'
+WRITE_WHAT_I_SAW = """
+import json, os, pathlib
+from f3amd_lib.profiles import results_dir
+seen = dict(profile=profile, data=data, num_steps=num_steps, cwd=pathlib.Path.cwd().name)
+(results_dir(data, profile) / "tables" / "seen.json").write_text(json.dumps(seen))
+"""
+
+
+def write_notebook(folder, name, *sources):
+    """Write a notebook whose first cell is tagged as the parameters cell."""
+    cells = [nbformat.v4.new_code_cell(source) for source in sources]
+    cells[0].metadata["tags"] = ["parameters"]
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    notebook.metadata["kernelspec"] = {
+        "name": "python3",
+        "display_name": "Python 3",
+        "language": "python",
+    }
+    folder.mkdir(exist_ok=True)
+    nbformat.write(notebook, folder / f"{name}.ipynb")
+    return folder / f"{name}.ipynb"
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """An empty folder that stands for the repository, with notebooks/ to be filled."""
+    monkeypatch.setattr(profiles, "repository_root", lambda: tmp_path)
+    # The kernels import the library anew: tell them where it is, and where results go.
+    monkeypatch.setenv("PYTHONPATH", str(Path(reproduce.__file__).parents[1]))
+    monkeypatch.setenv(profiles.RESULTS_DIR_VARIABLE, str(tmp_path / "results"))
+    return tmp_path
+
+
+def test_notebooks_run_in_order_with_their_parameters(checkout):
+    folder = checkout / "notebooks"
+    # The second leans on what the first wrote, and was written to disk before it.
+    write_notebook(folder, "01_second", PARAMETERS, "assert open('note.txt').read() == 'first'")
+    write_notebook(
+        folder, "00_first", PARAMETERS, "open('note.txt', 'w').write('first')", WRITE_WHAT_I_SAW
+    )
+    write_notebook(folder, "scratch", PARAMETERS, "raise SystemError('not numbered: must not run')")
+    news = []
+
+    summary = reproduce.reproduce("bandai", "smoke", parameters={"num_steps": 5}, say=news.append)
+
+    assert list(summary["notebook"]) == ["00_first.ipynb", "01_second.ipynb"]
+    assert list(summary["cells"]) == [3, 2]
+    assert summary["finished"].all()
+    results = checkout / "results" / "bandai" / "smoke"
+    seen = json.loads((results / "tables" / "seen.json").read_text())
+    assert seen == {"profile": "smoke", "data": "bandai", "num_steps": 5, "cwd": "notebooks"}
+    table, record = read_table(results / "tables" / "run_summary.csv")
+    pd.testing.assert_frame_equal(table, summary)
+    assert (record["profile"], record["dataset"]) == ("smoke", "bandai")
+    assert record["parameters"]["num_steps"] == 5
+    copies = checkout / "runs" / "bandai" / "smoke" / "notebooks"
+    assert sorted(path.name for path in copies.iterdir()) == ["00_first.ipynb", "01_second.ipynb"]
+    assert any("01_second.ipynb" in line for line in news)
+
+
+def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):
+    folder = checkout / "notebooks"
+    write_notebook(folder, "00_fine", PARAMETERS, "1 + 1")
+    broken = write_notebook(folder, "01_broken", PARAMETERS, "\nspeed = 3\nspeed / 0", "2 + 2")
+    write_notebook(folder, "02_never", PARAMETERS, "open('never.txt', 'w')")
+    before = broken.read_bytes()
+
+    status = reproduce.main(["--profile", "smoke"])
+
+    assert status == 1
+    message = capsys.readouterr().err
+    # In [1] parameters, In [2] the injected ones, In [3] the culprit.
+    assert "01_broken.ipynb stopped in cell In [3], 'speed = 3'" in message
+    assert "ZeroDivisionError: division by zero" in message
+    own_folder = checkout / "runs" / "synthetic" / "smoke"
+    log = own_folder / "notebooks" / "01_broken.log"
+    assert str(log.relative_to(checkout)) in message
+    assert "ZeroDivisionError" in log.read_text()
+    assert not (folder / "never.txt").exists()
+    assert broken.read_bytes() == before
+    summary, _ = read_table(own_folder / "run_summary.csv")
+    assert list(summary["finished"]) == [True, False]
+    # An incomplete run leaves no summary among the results.
+    assert not list((checkout / "results").rglob("run_summary.csv"))
+
+
+def test_a_killed_kernel_is_told_with_its_cell(checkout):
+    write_notebook(
+        checkout / "notebooks", "00_hungry", PARAMETERS, "import os\nos._exit(9)", "1 + 1"
+    )
+    with pytest.raises(reproduce.NotebookFailed, match=r"cell In \[3\], 'import os'") as caught:
+        reproduce.reproduce("synthetic", "smoke")
+    assert "Kernel died" in str(caught.value)
+
+
+def test_one_notebook_alone_leaves_the_whole_runs_summary(checkout):
+    folder = checkout / "notebooks"
+    write_notebook(folder, "00_first", PARAMETERS, "raise RuntimeError('not asked for')")
+    write_notebook(folder, "01_second", PARAMETERS, "1 + 1")
+    assert reproduce.main(["--profile", "smoke", "--only", "1"]) == 0
+    summary, record = read_table(checkout / "runs" / "synthetic" / "smoke" / "run_summary.csv")
+    assert list(summary["notebook"]) == record["notebooks"] == ["01_second.ipynb"]
+    assert not list((checkout / "results").rglob("run_summary.csv"))
+
+
+@pytest.mark.parametrize(
+    "arguments, complaint",
+    [
+        (["--set", "num_step=4"], "00_first.ipynb has no parameter 'num_step'; did you mean"),
+        (["--profile", "labtop"], "unknown profile 'labtop'; did you mean 'laptop'"),
+        (["--data", "bandia"], "unknown data set 'bandia'; did you mean 'bandai'"),
+        (["--only", "7"], "no notebook '7' (one of 00_first, 01_second)"),
+        (["--only", "01_secnd"], "no notebook '01_secnd'; did you mean '01_second'"),
+    ],
+)
+def test_unknown_names_are_refused_before_anything_runs(checkout, capsys, arguments, complaint):
+    folder = checkout / "notebooks"
+    write_notebook(folder, "00_first", PARAMETERS, "open('ran.txt', 'w')")
+    write_notebook(folder, "01_second", PARAMETERS)
+    assert reproduce.main(["--profile", "smoke", *arguments]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (folder / "ran.txt").exists()
+    assert not (checkout / "runs").exists()
+
+
+def test_a_parameter_must_be_known_to_every_notebook_that_runs(checkout):
+    folder = checkout / "notebooks"
+    paths = [
+        write_notebook(folder, "00_first", PARAMETERS),
+        write_notebook(folder, "01_second", PARAMETERS.replace("num_steps = 2", "seed = 0")),
+    ]
+    with pytest.raises(ValueError, match="01_second.ipynb has no parameter 'num_steps'"):
+        reproduce.check_parameters(paths, ["num_steps"])
+    reproduce.check_parameters(paths[:1], ["num_steps", "profile", "data"])
+
+
+def test_a_notebook_without_parameters_is_refused(checkout):
+    path = write_notebook(checkout / "notebooks", "00_bare", "pass")
+    with pytest.raises(ValueError, match="no parameter 'profile'; there is none to choose from"):
+        reproduce.check_parameters([path], ["profile"])
+
+
+def test_a_folder_without_notebooks_is_refused(checkout):
+    with pytest.raises(ValueError, match="no numbered notebooks"):
+        reproduce.reproduce("synthetic", "smoke")
+
+
+@pytest.mark.parametrize(
+    "profile, already_set, expected",
+    [
+        ("laptop", None, "paper_figures"),
+        ("gpu", None, "paper_figures"),
+        ("smoke", None, "runs"),
+        ("laptop", "elsewhere", "elsewhere"),
+        ("smoke", "elsewhere", "elsewhere"),
+    ],
+)
+def test_only_real_runs_write_into_the_committed_folder(
+    checkout, monkeypatch, profile, already_set, expected
+):
+    name = profiles.RESULTS_DIR_VARIABLE
+    if already_set is None:
+        monkeypatch.delenv(name)
+    else:
+        monkeypatch.setenv(name, str(checkout / already_set))
+    before = os.environ.get(name)
+    with reproduce._results_root(profile):
+        folder = profiles.results_dir("synthetic", profile)
+    assert folder == checkout / expected / "synthetic" / profile
+    assert os.environ.get(name) == before
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("num_steps=4", ("num_steps", 4)),
+        ("learning_rate=1e-3", ("learning_rate", 0.001)),
+        ("preset=F3AMD-FNO-48", ("preset", "F3AMD-FNO-48")),
+        ("evaluation_styles=['a']", ("evaluation_styles", ["a"])),
+    ],
+)
+def test_assignments_on_the_command_line(text, expected):
+    assert reproduce._assignment(text) == expected
+
+
+@pytest.mark.parametrize("text", ["num_steps", "=4", "two words=4", "profile=gpu"])
+def test_broken_assignments_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as caught:
+        reproduce.main(["--set", text])
+    assert caught.value.code == 2
+    assert text.partition("=")[0] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "number, parameters",
+    [("05", ["num_steps"]), ("04", ["train_steps"]), ("04", ["compare_preset"])],
+)
+def test_parameters_that_the_documents_name_exist(number, parameters):
+    notebooks = reproduce.find_notebooks(profiles.repository_root() / "notebooks")
+    chosen = reproduce.select_notebooks(notebooks, [number])
+    reproduce.check_parameters(chosen, ["profile", "data", *parameters])

@@ -1,0 +1,242 @@
+"""Rollouts with networks whose answers are known: seams, paths, histories, errors (section 3.1)."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_trained
+
+from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
+from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.evaluation.paths import RootPath, named_path
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.motion.rotations import wrap_angle
+
+POSE = np.tile(np.float32([1, 0, 0, 0, 1, 0]), SKELETON.num_joints)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return tiny_trained()
+
+
+@pytest.fixture(scope="module")
+def network_generator(trained):
+    """The real thing, with the initial weights."""
+    return MotionGenerator(trained, num_steps=2)
+
+
+def obedient(trained, window=WINDOW):
+    """A generator whose network goes exactly where the path says, and counts frames in the height.
+
+    The height of each frame is that of the last history frame plus 1, 2, .. T metres, so that the
+    height says which history a round was given.
+    """
+    generator = MotionGenerator(trained, num_steps=1)
+    normaliser = trained.normaliser
+
+    def sample_window(key, condition):
+        displacement = condition.path[..., :2] * normaliser.path_scale
+        history = normaliser.denormalise(condition.history)
+        count = jnp.arange(1, window + 1)[None, :, None]
+        height = history[:, -1:, 1:2] + count
+        pose = jnp.broadcast_to(jnp.asarray(POSE[6:]), (*height.shape[:2], len(POSE) - 6))
+        frames = [
+            displacement[..., :1],
+            height,
+            displacement[..., 1:],
+            condition.path[..., 2:],
+            pose,
+        ]
+        return normaliser.normalise(jnp.concatenate(frames, axis=-1))
+
+    generator.sample_window = sample_window
+    return generator
+
+
+@pytest.mark.parametrize("name", ["straight", "circle", "slalom"])
+def test_a_perfect_network_walks_exactly_on_the_path(trained, name):
+    path = named_path(name, 3 * WINDOW)
+    rollout = obedient(trained).rollout(path, "calm")
+    frames = rollout.frames[0]
+    assert frames.shape == (3 * WINDOW, CHANNELS)
+    np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=1e-5)
+    np.testing.assert_allclose(
+        wrap_angle(frame_yaw(SKELETON, frames.astype(float)) - path.yaw), 0.0, atol=1e-4
+    )
+
+
+def test_paths_anywhere_facing_anywhere_are_followed(trained):
+    path = named_path("circle", 3 * WINDOW).placed((30.0, -20.0), 2.0)
+    frames = obedient(trained).rollout(path, "calm").frames[0]
+    np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=5e-5)
+
+
+def test_seams_of_a_perfect_network_are_steps_like_any_other(trained):
+    path = named_path("straight", 4 * WINDOW)
+    rollout = obedient(trained).rollout(path, "calm")
+    track = np.concatenate([rollout.history[0, -1:], rollout.frames[0]])[:, [0, 2]]
+    steps = np.linalg.norm(np.diff(track, axis=0), axis=-1)
+    np.testing.assert_allclose(steps, 1.2 / 30, atol=1e-5)
+
+
+def test_each_round_starts_from_the_frames_made_before(trained):
+    rollout = obedient(trained).rollout(named_path("straight", 4 * WINDOW), "calm")
+    height = rollout.history[0, -1, 1] + np.arange(1, 4 * WINDOW + 1)
+    np.testing.assert_allclose(rollout.frames[0, :, 1], height, rtol=1e-5)
+
+
+def test_histories_may_be_longer_than_windows():
+    window, history = 3, 5
+    trained = tiny_trained(window=window, num_history=history, num_kept_modes=2)
+    start = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, history, 1))
+    rollout = obedient(trained, window=window).rollout(
+        named_path("straight", 4 * window), "calm", history=start
+    )
+    np.testing.assert_allclose(rollout.frames[0, :, 1], 0.9 + np.arange(1, 13), rtol=1e-5)
+
+
+def test_rollouts_start_one_step_before_the_path_and_face_along_it(trained):
+    path = named_path("circle", 2 * WINDOW).placed((3.0, 4.0), -2.0)
+    history = obedient(trained).rollout(path, "proud").history[0]
+    start = 2 * path.position[0] - path.position[1]
+    np.testing.assert_allclose(history[-1, [0, 2]], start, atol=1e-5)
+    facing = frame_yaw(SKELETON, history[-1].astype(float))
+    np.testing.assert_allclose(wrap_angle(facing - path.yaw[0]), 0.0, atol=1e-5)
+    # It is one of the style's stored poses, turned and moved.
+    back = turn_frames(history.astype(float), -path.yaw[0])
+    back[:, [0, 2]] -= back[-1, [0, 2]]
+    assert min(np.abs(back - seed).max() for seed in trained.seeds["proud"]) < 1e-5
+
+
+def test_a_history_off_the_path_is_led_back_within_one_window(trained):
+    path = named_path("straight", 2 * WINDOW)
+    history = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, HISTORY, 1))
+    history[..., 0], history[..., 2] = 0.8, -0.04
+    rollout = obedient(trained).rollout(path, "calm", history=history)
+    off = rollout.frames[0][:, [0, 2]] - path.position
+    remains = np.maximum(1.0 - np.arange(1, 2 * WINDOW + 1) / WINDOW, 0.0)
+    np.testing.assert_allclose(off[:, 0], 0.8 * remains, atol=1e-5)
+    np.testing.assert_allclose(off[:, 1], 0.0, atol=1e-5)
+    np.testing.assert_allclose(rollout.history, history, atol=1e-6)
+
+
+@pytest.mark.parametrize("num_frames", [2, WINDOW - 1, WINDOW + 1, 3 * WINDOW - 3])
+def test_paths_that_are_no_multiple_of_the_window_are_cut(trained, num_frames):
+    path = named_path("slalom", 40).slice(0, num_frames)
+    rollout = obedient(trained).rollout(path, "calm")
+    assert rollout.frames.shape == (1, num_frames, CHANNELS)
+    np.testing.assert_allclose(rollout.frames[0][:, [0, 2]], path.position, atol=1e-5)
+    assert rollout.motion().num_frames == num_frames
+
+
+def test_characters_follow_their_own_paths(trained):
+    paths = [named_path(name, 20) for name in ("straight", "circle", "slalom")]
+    rollout = obedient(trained).rollout(paths, ["calm", "proud", "calm"])
+    assert rollout.frames.shape == (3, 20, CHANNELS)
+    assert rollout.styles == ("calm", "proud", "calm") and len(rollout.paths) == 3
+    for frames, path in zip(rollout.frames, paths, strict=True):
+        np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=1e-5)
+
+
+def test_the_path_of_one_character_is_nothing_to_another(network_generator):
+    straight, circle = named_path("straight", 20), named_path("circle", 20)
+    first = network_generator.rollout([straight, straight], ["calm", "proud"]).frames
+    second = network_generator.rollout([straight, circle], ["calm", "proud"]).frames
+    np.testing.assert_allclose(first[0], second[0], atol=1e-5)
+    assert np.abs(first[1] - second[1]).max() > 1e-3
+
+
+def test_the_first_character_of_a_crowd_is_the_one_alone(network_generator):
+    path = named_path("circle", 20)
+    alone = network_generator.rollout(path, "calm").frames
+    crowd = network_generator.rollout([path] * 3, ["calm", "proud", "proud"]).frames
+    np.testing.assert_allclose(crowd[:1], alone, atol=1e-4)
+
+
+def test_one_path_or_one_style_serves_all(network_generator):
+    path = named_path("straight", 10)
+    many = network_generator.rollout([path, path], ["calm", "calm"])
+    for paths, styles in ((path, ["calm", "calm"]), ([path, path], "calm")):
+        np.testing.assert_array_equal(network_generator.rollout(paths, styles).frames, many.frames)
+
+
+def test_noise_comes_from_the_seed_alone(network_generator):
+    path = named_path("straight", 20)
+    first, again, other = (
+        network_generator.rollout(path, "calm", seed=seed).frames for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-4
+
+
+def test_frames_are_true_rotations_and_make_a_motion(network_generator):
+    rollout = network_generator.rollout(named_path("circle", 20), "calm")
+    first, second = np.split(split_frames(rollout.frames)[1], 2, axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(first, axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(second, axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose((first * second).sum(-1), 0.0, atol=1e-5)
+    motion, longer = rollout.motion(), rollout.motion(with_history=True)
+    assert (motion.num_frames, longer.num_frames) == (20, 20 + HISTORY)
+    assert motion.fps == 30.0 and motion.name == "calm"
+    np.testing.assert_array_equal(longer.root_position[HISTORY:], motion.root_position)
+    np.testing.assert_allclose(longer.root_position[:HISTORY], rollout.history[0, :, :3])
+
+
+def test_noise_levels_are_those_of_training_unless_told(trained):
+    levels = {"sigma_max": 80.0, "sigma_min": 0.1, "rho": 7.0}
+    record = {"training": {**levels, "seed": 0}}
+    generator = MotionGenerator(tiny_trained(record=record), num_steps=3)
+    np.testing.assert_array_equal(generator.sigmas, VarianceExploding(**levels).grid(3))
+    np.testing.assert_array_equal(MotionGenerator(trained, 4).sigmas, VarianceExploding().grid(4))
+    chosen = MotionGenerator(trained, 4, schedule=VarianceExploding(8.0, 1.0), spacing="uniform")
+    np.testing.assert_array_equal(chosen.sigmas, VarianceExploding(8.0, 1.0).grid(4, "uniform"))
+    with pytest.raises(ValueError, match="num_steps=0"):
+        MotionGenerator(trained, 0)
+
+
+def test_unknown_styles_are_refused_with_the_known(network_generator):
+    with pytest.raises(ValueError, match="'prowd'.*calm, proud"):
+        network_generator.rollout(named_path("straight", 10), "prowd")
+
+
+def test_counts_and_lengths_that_do_not_fit_are_refused(network_generator):
+    ten, twelve = named_path("straight", 10), named_path("straight", 12)
+    with pytest.raises(ValueError, match="2 paths and 3 styles"):
+        network_generator.rollout([ten, ten], ["calm"] * 3)
+    with pytest.raises(ValueError, match=r"same length, got \[10, 12\]"):
+        network_generator.rollout([ten, twelve], "calm")
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        network_generator.rollout(ten.slice(0, 1), "calm")
+    for nothing in ([], ()):
+        with pytest.raises(ValueError):
+            network_generator.rollout(nothing, "calm")
+
+
+def test_wrong_histories_are_refused(network_generator):
+    with pytest.raises(ValueError, match=rf"\(1, {HISTORY}, {CHANNELS}\), got \(1, 3, "):
+        network_generator.rollout(
+            named_path("straight", 10), "calm", history=np.zeros((1, 3, CHANNELS))
+        )
+
+
+def test_styles_without_a_starting_pose_need_a_history():
+    generator = obedient(tiny_trained())
+    generator.trained.seeds.pop("proud")
+    path = named_path("straight", 10)
+    with pytest.raises(ValueError, match="'proud': pass `history`"):
+        generator.rollout(path, "proud")
+    history = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, HISTORY, 1))
+    assert generator.rollout(path, "proud", history=history).frames.shape == (1, 10, CHANNELS)
+
+
+def test_paths_at_another_frame_rate_are_refused(network_generator):
+    path = named_path("straight", 10)
+    with pytest.raises(ValueError, match="30"):
+        network_generator.rollout(RootPath(path.position, path.yaw, fps=60.0), "calm")
+
+
+def test_histories_that_are_not_finite_are_refused(network_generator):
+    history = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, HISTORY, 1))
+    history[0, 2, 5] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        network_generator.rollout(named_path("straight", 10), "calm", history=history)

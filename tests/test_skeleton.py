@@ -1,0 +1,370 @@
+"""Skeletons and motions: kinematics, facing, contacts, mirroring and resampling."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from f3amd_lib.motion import rotations, skeleton
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+
+# Offsets in cm of the Bandai rig without joint_Root: bones along +X on the left, along -X on the
+# right; the tiny numbers are the rig's own.
+_BANDAI = [
+    ("Hips", -1, (0, 0, 0)),
+    ("Spine", 0, (15.7357, 0, 0)),
+    ("Chest", 1, (8.98455, -0.406207, 0)),
+    ("Neck", 2, (16.3773, 0, 0)),
+    ("Head", 3, (6.45672, 0, 0)),
+    ("Shoulder_L", 2, (12.9942, -0.242716, 4.98039)),
+    ("UpperArm_L", 5, (5.34809, 0, 0)),
+    ("LowerArm_L", 6, (24.3286, 0, 0)),
+    ("Hand_L", 7, (22.2916, 0, 0)),
+    ("Shoulder_R", 2, (12.9945, -0.242716, -4.98039)),
+    ("UpperArm_R", 9, (-5.34813, 0, 0)),
+    ("LowerArm_R", 10, (-24.3289, 0.000322, 0)),
+    ("Hand_R", 11, (-22.2915, -0.000108, 0)),
+    ("UpperLeg_L", 0, (-2.19248, -6.46944, 0)),
+    ("LowerLeg_L", 13, (39.0811, 0, 0)),
+    ("Foot_L", 14, (40.9854, 0, 0)),
+    ("Toes_L", 15, (11.7543, 0, 0)),
+    ("UpperLeg_R", 0, (-2.19251, 6.46944, 0)),
+    ("LowerLeg_R", 17, (-39.0811, -0.002282, -0.040193)),
+    ("Foot_R", 18, (-40.9854, 0, 0)),
+    ("Toes_R", 19, (-11.7543, 0, 0)),
+]
+BANDAI = Skeleton(
+    names=tuple(name for name, _, _ in _BANDAI),
+    parents=tuple(parent for _, parent, _ in _BANDAI),
+    offsets=np.array([offset for _, _, offset in _BANDAI]) / 100.0,
+)
+
+
+def random_motion(rig: Skeleton, frames: int = 12, seed: int = 0, fps: float = 30.0) -> Motion:
+    """Rotations with no pattern: every joint is tested away from its rest pose."""
+    rng = np.random.default_rng(seed)
+    turned = rotations.matrix_from_rotation_6d(rng.standard_normal((frames, rig.num_joints, 6)))
+    return Motion(rig, rng.standard_normal((frames, 3)), turned, fps=fps, name="random")
+
+
+def legs(**changes) -> Skeleton:
+    """The smallest skeleton that has hips and toes."""
+    values = {
+        "names": ("Hips", "LeftHip", "LeftToe", "RightHip", "RightToe"),
+        "parents": (-1, 0, 1, 0, 3),
+        "offsets": np.array(
+            [[0, 0, 0], [0.1, 0, 0], [0, -0.9, 0.1], [-0.1, 0, 0], [0, -0.9, 0.1]], dtype=float
+        ),
+    }
+    return Skeleton(**(values | changes))
+
+
+def standing(rig: Skeleton, root: np.ndarray, fps: float = 30.0) -> Motion:
+    """No rotation at all, on a given root path."""
+    eye = np.broadcast_to(np.eye(3), (len(root), rig.num_joints, 3, 3))
+    return Motion(rig, root, eye, fps=fps, name="standing")
+
+
+# ------------------------------------------------------------------------------- kinematics
+
+
+def joint_by_joint(motion: Motion):
+    """Forward kinematics as a textbook would write it."""
+    rig = motion.skeleton
+    positions = np.zeros((motion.num_frames, rig.num_joints, 3))
+    turned = np.zeros((motion.num_frames, rig.num_joints, 3, 3))
+    for frame in range(motion.num_frames):
+        for joint, parent in enumerate(rig.parents):
+            local = motion.rotations[frame, joint]
+            if parent < 0:
+                positions[frame, joint] = motion.root_position[frame]
+                turned[frame, joint] = local
+            else:
+                above = turned[frame, parent]
+                positions[frame, joint] = positions[frame, parent] + above @ rig.offsets[joint]
+                turned[frame, joint] = above @ local
+    return positions, turned
+
+
+@pytest.mark.parametrize("rig", [SYNTHETIC_SKELETON, BANDAI], ids=["100style-like", "bandai"])
+def test_kinematics_by_level_equal_those_by_joint(rig):
+    motion = random_motion(rig)
+    positions, turned = joint_by_joint(motion)
+    np.testing.assert_allclose(motion.positions, positions, atol=1e-12)
+    np.testing.assert_allclose(skeleton.global_rotations(rig, motion.rotations), turned, atol=1e-12)
+
+
+def test_two_bone_arm_by_hand():
+    # Upper arm 2 m and forearm 1 m along +X; shoulder turned 90 degrees about Z, elbow -90.
+    arm = Skeleton(("Shoulder", "Elbow", "Hand"), (-1, 0, 1), [[0, 0, 0], [2, 0, 0], [1, 0, 0]])
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = np.stack([quarter, quarter.T, np.eye(3)])[None]
+    positions = skeleton.forward_kinematics(arm, np.array([[1.0, 0.0, 5.0]]), turned)
+    np.testing.assert_allclose(positions[0], [[1, 0, 5], [1, 2, 5], [2, 2, 5]], atol=1e-12)
+
+
+def test_kinematics_in_jax_equal_those_in_numpy():
+    motion = random_motion(SYNTHETIC_SKELETON)
+    root = motion.root_position.astype(np.float32)
+    local = motion.rotations.astype(np.float32)
+
+    def walk(root, local):
+        return skeleton.forward_kinematics(SYNTHETIC_SKELETON, root, local)
+
+    in_jax = jax.jit(walk)(jnp.asarray(root), jnp.asarray(local))
+    assert isinstance(in_jax, jax.Array)
+    assert isinstance(walk(root, local), np.ndarray)
+    assert walk(root, local).dtype == np.float32
+    np.testing.assert_allclose(np.asarray(in_jax), walk(root, local), atol=1e-5)
+
+
+def test_kinematics_take_leading_batch_axes():
+    motion = random_motion(SYNTHETIC_SKELETON, frames=6)
+    positions = skeleton.forward_kinematics(
+        SYNTHETIC_SKELETON,
+        motion.root_position.reshape(2, 3, 3),
+        motion.rotations.reshape(2, 3, -1, 3, 3),
+    )
+    np.testing.assert_allclose(positions.reshape(6, -1, 3), motion.positions, atol=1e-12)
+
+
+def test_levels_hold_every_joint_once_and_parents_one_level_up():
+    levels = BANDAI.levels
+    assert sorted(joint for level in levels for joint in level) == list(range(21))
+    for depth, level in enumerate(levels[1:], start=1):
+        assert {BANDAI.parents[joint] for joint in level} <= set(levels[depth - 1])
+
+
+def test_turn_swings_the_whole_motion_about_the_vertical():
+    motion = random_motion(SYNTHETIC_SKELETON)
+    turned = skeleton.turn(motion, np.pi / 2)
+    x, y, z = np.moveaxis(motion.positions, -1, 0)
+    np.testing.assert_allclose(turned.positions, np.stack([z, y, -x], axis=-1), atol=1e-12)
+
+
+# --------------------------------------------------------------------- facing and contacts
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, -2.0, 3.0])
+def test_facing_is_that_of_the_hips(yaw):
+    motion = skeleton.turn(standing(legs(), np.zeros((2, 3))), yaw)
+    np.testing.assert_allclose(motion.yaw, yaw, atol=1e-12)
+
+
+def test_facing_ignores_a_bow():
+    bow = np.broadcast_to(np.eye(3), (1, 5, 3, 3)).copy()
+    bow[0, 0] = rotations.matrix_from_euler("YX", np.array([30.0, 60.0]))
+    motion = Motion(legs(), np.zeros((1, 3)), bow)
+    np.testing.assert_allclose(np.degrees(motion.yaw), 30.0, atol=1e-9)
+
+
+def test_contacts_by_hand():
+    # The whole body moves by these steps in metres; 1 cm a frame is no contact any more.
+    steps = np.array([0.0, 0.0099, 0.0101, 0.05, 0.0])
+    root = np.zeros((6, 3))
+    root[1:, 2] = np.cumsum(steps)
+    motion = standing(legs(), root)
+    expected = np.array([True, True, False, False, True, True])
+    np.testing.assert_array_equal(motion.contacts, np.stack([expected, expected], axis=-1))
+
+
+def test_contacts_see_height_and_tell_left_from_right():
+    positions = np.zeros((3, 5, 3))
+    positions[:, 4, 1] = [0.0, 0.02, 0.04]
+    np.testing.assert_array_equal(skeleton.contact_labels(legs(), positions), [[True, False]] * 3)
+
+
+def test_contacts_do_not_depend_on_the_frame_rate():
+    # 0.24 m/s is 8 mm a frame at 30 fps; 0.36 m/s is 12 mm. At 60 fps both steps are halved.
+    for fps in (30.0, 60.0):
+        for speed, touching in ((0.24, True), (0.36, False)):
+            root = np.zeros((4, 3))
+            root[:, 0] = np.arange(4) * speed / fps
+            assert np.all(standing(legs(), root, fps).contacts == touching)
+
+
+def test_a_single_frame_counts_as_contact():
+    assert standing(legs(), np.zeros((1, 3))).contacts.tolist() == [[True, True]]
+
+
+# -------------------------------------------------------------------------------- mirroring
+
+
+@pytest.mark.parametrize(
+    ("rig", "tolerance"),
+    [(SYNTHETIC_SKELETON, 1e-12), (BANDAI, 6e-4)],
+    ids=["100style-like", "bandai"],
+)
+def test_mirror_shows_the_mirrored_positions(rig, tolerance):
+    motion = random_motion(rig)
+    twin = [rig.index(_twin(name)) for name in rig.names]
+    expected = motion.positions[:, twin] * [-1.0, 1.0, 1.0]
+    np.testing.assert_allclose(skeleton.mirror(motion).positions, expected, atol=tolerance)
+
+
+def _twin(name: str) -> str:
+    swap = {"Left": "Right", "Right": "Left", "_L": "_R", "_R": "_L"}
+    for side, other in swap.items():
+        if name.startswith(side) or name.endswith(side):
+            return name.replace(side, other)
+    return name
+
+
+@pytest.mark.parametrize("rig", [SYNTHETIC_SKELETON, BANDAI], ids=["100style-like", "bandai"])
+def test_mirroring_twice_changes_nothing(rig):
+    motion = random_motion(rig, seed=5)
+    again = skeleton.mirror(skeleton.mirror(motion))
+    np.testing.assert_allclose(again.rotations, motion.rotations, atol=1e-12)
+    np.testing.assert_allclose(again.root_position, motion.root_position, atol=1e-12)
+
+
+@pytest.mark.parametrize("rig", [SYNTHETIC_SKELETON, BANDAI], ids=["100style-like", "bandai"])
+def test_mirror_gives_proper_rotations(rig):
+    mirrored = skeleton.mirror(random_motion(rig)).rotations
+    np.testing.assert_allclose(np.linalg.det(mirrored), 1.0, atol=1e-9)
+
+
+def test_mirror_frames_of_the_bandai_rig_are_those_of_its_recipe():
+    for joint, name in enumerate(BANDAI.names):
+        if name.endswith(("_L", "_R")):
+            expected = (-1, -1, -1)
+        elif name == "Hips":
+            expected = (1, -1, 1)
+        else:
+            expected = (1, 1, -1)
+        assert tuple(BANDAI.mirror_frames[joint]) == expected, name
+
+
+def test_mirror_frames_of_an_axis_aligned_rig_are_plain_reflections():
+    expected = np.tile([-1.0, 1.0, 1.0], (SYNTHETIC_SKELETON.num_joints, 1))
+    np.testing.assert_array_equal(SYNTHETIC_SKELETON.mirror_frames, expected)
+
+
+def test_mirror_of_an_axis_aligned_rig_negates_two_quaternion_components():
+    # For such rigs (w, x, y, z) becomes (w, x, -y, -z): conjugation by the reflection.
+    motion = random_motion(SYNTHETIC_SKELETON, frames=2)
+    mirrored = skeleton.mirror(motion)
+    reflect = np.diag([-1.0, 1.0, 1.0])
+    left, right = SYNTHETIC_SKELETON.index("LeftElbow"), SYNTHETIC_SKELETON.index("RightElbow")
+    np.testing.assert_allclose(
+        mirrored.rotations[:, left], reflect @ motion.rotations[:, right] @ reflect, atol=1e-12
+    )
+
+
+def test_mirror_turns_a_left_turn_into_a_right_turn():
+    motion = skeleton.turn(standing(legs(), np.zeros((1, 3))), 0.7)
+    np.testing.assert_allclose(skeleton.mirror(motion).yaw, -0.7, atol=1e-12)
+
+
+def test_mirror_refuses_a_joint_without_a_twin():
+    rig = Skeleton(("Hips", "LeftHip"), (-1, 0), [[0, 0, 0], [0.1, 0, 0]])
+    with pytest.raises(ValueError, match="'LeftHip' has no twin 'RightHip'"):
+        skeleton.mirror(standing(rig, np.zeros((1, 3))))
+
+
+def test_mirror_refuses_an_uneven_skeleton():
+    offsets = legs().offsets.copy()
+    offsets[4, 1] = -0.8
+    with pytest.raises(ValueError, match=r"bones below 'LeftHip'.*off by 100\.0 mm"):
+        skeleton.mirror(standing(legs(offsets=offsets), np.zeros((1, 3))))
+
+
+# ------------------------------------------------------------------------------- resampling
+
+
+def test_60_to_30_fps_takes_every_second_frame():
+    motion = random_motion(SYNTHETIC_SKELETON, frames=7, fps=60.0)
+    half = skeleton.resample(motion, 30.0)
+    assert (half.num_frames, half.fps) == (4, 30.0)
+    np.testing.assert_array_equal(half.root_position, motion.root_position[::2])
+    np.testing.assert_array_equal(half.rotations, motion.rotations[::2])
+
+
+def test_a_rounded_frame_time_of_60_fps_still_halves():
+    motion = random_motion(SYNTHETIC_SKELETON, frames=7, fps=1.0 / 0.016667)
+    half = skeleton.resample(motion)
+    assert (half.num_frames, half.fps) == (4, 30.0)
+    np.testing.assert_array_equal(half.rotations, motion.rotations[::2])
+
+
+@pytest.mark.parametrize("fps", [50.0, 24.0])
+def test_other_ratios_interpolate(fps):
+    # A steady walk with a steady turn: the answer is known at every time.
+    frames = int(2 * fps) + 1
+    time = np.arange(frames) / fps
+    root = np.stack([1.5 * time, np.ones(frames), -0.5 * time], axis=-1)
+    local = np.broadcast_to(np.eye(3), (frames, 5, 3, 3)).copy()
+    local[:, 0] = rotations.matrix_from_yaw(2.0 * time)
+    out = skeleton.resample(Motion(legs(), root, local, fps=fps), 30.0)
+    assert (out.num_frames, out.fps) == (61, 30.0)
+    time = np.arange(61) / 30.0
+    np.testing.assert_allclose(out.root_position[:, 0], 1.5 * time, atol=1e-9)
+    np.testing.assert_allclose(out.root_position[:, 2], -0.5 * time, atol=1e-9)
+    np.testing.assert_allclose(
+        out.rotations[:, 0], rotations.matrix_from_yaw(2.0 * time), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("fps", [0.0, -30.0, np.nan, np.inf])
+def test_resample_refuses_a_bad_rate(fps):
+    with pytest.raises(ValueError, match="fps must be positive"):
+        skeleton.resample(standing(legs(), np.zeros((3, 3))), fps)
+
+
+# ------------------------------------------------------------------- what cannot be, is said
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"names": ("Hips", "LeftHip")}, "got 2 names, 5 parents"),
+        ({"names": ("Hips", "A", "A", "B", "C")}, "names must be unique"),
+        ({"parents": (-1, 2, 0, 0, 3)}, "every parent before its children"),
+        ({"parents": (0, 0, 1, 0, 3)}, "the root first"),
+        ({"offsets": np.full((5, 3), np.nan)}, "offsets must be finite"),
+    ],
+)
+def test_broken_skeletons_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        legs(**changes)
+
+
+def test_unknown_joints_and_roles_list_what_there_is():
+    with pytest.raises(ValueError, match="no joint 'Tail'; it has Hips, LeftHip"):
+        legs().index("Tail")
+    rig = Skeleton(("Base",), (-1,), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=r"known as its left_toe; looked for .* among Base"):
+        _ = rig.toes
+
+
+def test_broken_motions_are_refused_by_name_and_frame():
+    root = np.zeros((4, 3))
+    eye = np.broadcast_to(np.eye(3), (4, 5, 3, 3)).copy()
+    with pytest.raises(ValueError, match=r"motion 'clip': root_position must be \[T, 3\]"):
+        Motion(legs(), root[:3], eye, name="clip")
+    with pytest.raises(ValueError, match="with T > 0"):
+        Motion(legs(), root[:0], eye[:0])
+    with pytest.raises(ValueError, match="fps must be positive, got 0"):
+        Motion(legs(), root, eye, fps=0)
+    root[2, 1] = np.nan
+    with pytest.raises(ValueError, match="motion 'clip': root_position is not finite at frame 2"):
+        Motion(legs(), root, eye, name="clip")
+    eye[3, 1, 0, 0] = np.inf
+    with pytest.raises(ValueError, match="rotations is not finite at frame 3"):
+        Motion(legs(), np.zeros((4, 3)), eye)
+
+
+def test_slice_and_replace_keep_the_rest():
+    motion = random_motion(SYNTHETIC_SKELETON, frames=9)
+    part = motion.slice(2, 5)
+    np.testing.assert_allclose(part.positions, motion.positions[2:5], atol=1e-12)
+    assert part.name == "random"
+    assert motion.replace(name="other").name == "other"
+
+
+def test_skeletons_compare_by_value():
+    assert legs() == legs()
+    longer = legs().offsets.copy()
+    longer[2, 1] -= 0.05
+    assert legs() != legs(offsets=longer)

@@ -1,0 +1,571 @@
+"""Data sets by name: finding, verifying, refusing, splitting."""
+
+import collections
+import shutil
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pooch
+import pytest
+
+from f3amd_lib.data import sources
+from f3amd_lib.data.sources import DATA_DIR_VARIABLE, assign_splits, open_dataset
+
+
+def line_bvh(frames: int, *, step_cm: float = 1.0, frame_time: str = "0.016667") -> str:
+    """A pelvis with two legs that glides along +X by `step_cm` a frame, from 0."""
+    rows = "\n".join(f"{step_cm * frame:g} 90 0 0 0 0" for frame in range(frames))
+    return (
+        "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\n"
+        "CHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation\n"
+        "JOINT LeftHip { OFFSET 10 0 0 CHANNELS 0 JOINT LeftToe { OFFSET 0 -88 0 CHANNELS 0 } }\n"
+        "JOINT RightHip { OFFSET -10 0 0 CHANNELS 0\nJOINT RightToe { OFFSET 0 -88 0 CHANNELS 0 }"
+        "}\n"
+        f"}}\nMOTION\nFrames: {frames}\nFrame Time: {frame_time}\n{rows}\n"
+    )
+
+
+def zip_folder(folder: Path, target: Path, prefix: str = "") -> Path:
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for item in sorted(folder.rglob("*")):
+            if item.is_file():
+                archive.write(item, prefix + item.relative_to(folder).as_posix())
+    return target
+
+
+# --- names and splits -----------------------------------------------------------------------------
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ValueError, match="unknown data set 'bandia': use one of synthetic, bandai"):
+        open_dataset("bandia")
+    with pytest.raises(ValueError, match="num_styles must be at least 1"):
+        open_dataset("synthetic", num_styles=0)
+
+
+def test_splits_are_the_same_everywhere():
+    names = [f"walk_{number:03d}" for number in range(20)]
+    splits = assign_splits((name, "walk") for name in names)
+    # Fixed by SHA-256 of the names; written down so that no later change moves a clip unnoticed.
+    assert [n for n in names if splits[n] == "validation"] == ["walk_011", "walk_014"]
+    assert [n for n in names if splits[n] == "test"] == ["walk_015", "walk_019"]
+    assert assign_splits((name, "walk") for name in reversed(names)) == splits
+
+
+@pytest.mark.parametrize(
+    "count, held_out", [(1, 0), (2, 0), (3, 1), (7, 1), (14, 1), (15, 2), (25, 3), (100, 10)]
+)
+def test_splits_are_stratified(count, held_out):
+    pairs = [(f"{style}_{number}", style) for style in "ab" for number in range(count)]
+    splits = assign_splits(pairs)
+    for style in "ab":
+        found = collections.Counter(splits[name] for name, label in pairs if label == style)
+        assert found["validation"] == found["test"] == held_out
+        assert found["train"] == count - 2 * held_out
+
+
+# --- synthetic ------------------------------------------------------------------------------------
+
+
+def test_synthetic_takes(no_network):
+    from f3amd_lib.motion.synthetic import STYLES, synthesize
+
+    dataset = open_dataset("synthetic")
+    assert dataset.styles == tuple(sorted(STYLES)) and len(dataset.styles) == 100
+    assert dataset.primary_styles == dataset.styles
+    assert len(dataset.clips) == 600
+    by_style = collections.defaultdict(list)
+    for clip in dataset.clips:
+        by_style[clip.style].append(clip.split)
+    for splits in by_style.values():
+        assert sorted(splits) == ["test", "train", "train", "train", "train", "validation"]
+    assert "Neutral" in dataset.mirror_styles and "LimpLeft" not in dataset.mirror_styles
+    clip = next(clip for clip in dataset.clips if clip.name == "LongStrides_003")
+    motion = clip.load()
+    assert (motion.name, motion.fps, motion.num_frames) == ("LongStrides_003", 30.0, 300)
+    direct = synthesize("LongStrides", seconds=10.0, seed=3)
+    assert np.abs(motion.positions - direct.positions).max() < 1e-4
+
+
+def test_synthetic_options():
+    dataset = open_dataset("synthetic", seconds_per_style=6.0, num_styles=2)
+    assert len(dataset.styles) == 2 and len(dataset.clips) == 6
+    assert dataset.clips[0].load().num_frames == 60
+    assert (
+        dataset.fingerprint
+        == open_dataset("synthetic", seconds_per_style=6, num_styles=2).fingerprint
+    )
+    others = [
+        open_dataset("synthetic", seconds_per_style=7.0, num_styles=2),
+        open_dataset("synthetic", seconds_per_style=6.0, num_styles=3),
+    ]
+    assert len({dataset.fingerprint, *(other.fingerprint for other in others)}) == 3
+    with pytest.raises(ValueError, match=r"at least 4\.2 .*got 4\.0"):
+        open_dataset("synthetic", seconds_per_style=4.0)
+    with pytest.raises(ValueError, match="at least"):
+        open_dataset("synthetic", seconds_per_style=float("nan"))
+
+
+# --- folder ---------------------------------------------------------------------------------------
+
+
+def test_folder_of_bvh(tmp_path, monkeypatch, no_network):
+    for name, frames in [("happy/a.bvh", 50), ("happy/b.BVH", 51), ("sad_walk_01.bvh", 52)]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(line_bvh(frames, frame_time="0.0333333"))
+    (tmp_path / "happy" / "._a.bvh").write_bytes(b"\x00\x05\x16\x07")
+    (tmp_path / "notes.txt").write_text("not motion")
+    dataset = open_dataset("folder", path=tmp_path)
+    found = [(clip.name, clip.style, clip.content) for clip in dataset.clips]
+    assert found == [
+        ("happy/a", "happy", "a"),
+        ("happy/b", "happy", "b"),
+        ("sad_walk_01", "sad", "walk_01"),
+    ]
+    assert dataset.styles == ("happy", "sad")
+    assert dataset.mirror_styles == frozenset()
+    assert [clip.load().num_frames for clip in dataset.clips] == [50, 51, 52]
+
+    zipped = zip_folder(tmp_path / "happy", tmp_path / "mine.zip", prefix="happy/")
+    from_zip = open_dataset("folder", path=zipped)
+    assert [clip.name for clip in from_zip.clips] == ["happy/a", "happy/b"]
+
+    monkeypatch.setenv(DATA_DIR_VARIABLE, str(tmp_path))
+    again = open_dataset("folder")
+    assert again.fingerprint == dataset.fingerprint
+    (tmp_path / "happy" / "a.bvh").write_text(line_bvh(50, step_cm=2.0, frame_time="0.0333333"))
+    assert open_dataset("folder").fingerprint != dataset.fingerprint
+    # The data set opened before knows that its file is no longer the same.
+    with pytest.raises(ValueError, match=r"a\.bvh: is not the file that it should be"):
+        again.clips[0].load()
+
+
+def test_folder_needs_a_place_and_files(tmp_path, monkeypatch):
+    monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
+    with pytest.raises(ValueError, match=f"set the environment variable {DATA_DIR_VARIABLE}"):
+        open_dataset("folder")
+    with pytest.raises(ValueError, match="holds no .bvh file"):
+        open_dataset("folder", path=tmp_path)
+    with pytest.raises(ValueError, match="absent: there is no such file or folder"):
+        open_dataset("folder", path=tmp_path / "absent")
+
+
+def test_a_broken_file_is_named_on_loading(tmp_path):
+    (tmp_path / "x_1.bvh").write_text(line_bvh(50).replace("\n7 90", "\nseven 90"))
+    (clip,) = open_dataset("folder", path=tmp_path).clips
+    with pytest.raises(ValueError, match=r"x_1\.bvh, line 20: 'seven'"):
+        clip.load()
+
+
+# --- 100STYLE, on a tiny tree ---------------------------------------------------------------------
+
+CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
+
+
+def write_100style(top: Path, *, dash: str = "–") -> Path:
+    """Two styles with three takes each, as the release lays them out, macOS's debris included.
+
+    Frame f of a file stands at x = f cm, so that a clip shows which frames were cut out.
+    """
+    folder = top / "100STYLE"
+    ranges = {"FW": (21, 181), "ID": (20, 120), "TR1": (0, 200)}
+    header = ",".join(
+        ["STYLE_NAME", *(f"{code}_{end}" for code in CODES for end in ("START", "STOP"))]
+    )
+    rows = [header]
+    for style in ("Aeroplane", "LimpLeft"):
+        cells = [str(value) for code in CODES for value in ranges.get(code, ("N/A", "N/A"))]
+        rows.append(",".join([style, *cells]))
+        (folder / style).mkdir(parents=True)
+        for code in ranges:
+            (folder / style / f"{style}_{code}.bvh").write_text(line_bvh(200))
+            (folder / style / f"._{style}_{code}.bvh").write_bytes(b"\x00\x05\x16\x07\x00")
+    (folder / "Frame_Cuts.csv").write_text("\n".join(rows) + "\n")
+    (folder / "Dataset_List.csv").write_text(
+        "Style Name,Description,Stochastic,Symmetric,Notes\n"
+        f"Aeroplane,Both arms raised as wings {dash} tilting,No,Yes,\n"
+        "LimpLeft,Limping on the left leg,No,No,Shorter script\n",
+        encoding="utf-8",
+    )
+    debris = top / "__MACOSX" / "100STYLE"
+    debris.mkdir(parents=True)
+    shutil.copy(folder / "Frame_Cuts.csv", debris / "Frame_Cuts.csv")
+    (debris / "LimpLeft_FW.bvh").write_bytes(b"\x00\x05\x16\x07")
+    return folder
+
+
+@pytest.mark.parametrize("packing", ["folder", "zip in a folder", "zip itself"])
+def test_100style_tree(tmp_path, monkeypatch, no_network, packing):
+    write_100style(tmp_path / "tree")
+    place = tmp_path / "tree"
+    if packing != "folder":
+        (tmp_path / "zips").mkdir()
+        zipped = zip_folder(tmp_path / "tree", tmp_path / "zips" / "100STYLE.zip")
+        place = zipped if packing == "zip itself" else zipped.parent
+    monkeypatch.setenv(DATA_DIR_VARIABLE, str(place))
+    dataset = open_dataset("100style")
+    assert dataset.styles == ("Aeroplane", "LimpLeft")
+    assert dataset.mirror_styles == {"Aeroplane"}
+    assert (dataset.licence, dataset.notes) == ("CC BY 4.0", ())
+    assert [(clip.name, clip.style, clip.content) for clip in dataset.clips] == [
+        (f"{style}_{code}", style, code)
+        for style in ("Aeroplane", "LimpLeft")
+        for code in ("FW", "ID", "TR1")
+    ]
+    for style in dataset.styles:
+        splits = sorted(clip.split for clip in dataset.clips if clip.style == style)
+        assert splits == ["test", "train", "validation"]
+    walk, idle, transition = (clip.load() for clip in dataset.clips[:3])
+    assert (walk.fps, walk.name) == (30.0, "Aeroplane_FW")
+    # 60 fps frames 20, 22, ... 178: START//2 to STOP//2 of every second frame.
+    np.testing.assert_allclose(walk.root_position[:, 0], np.arange(20, 180, 2) / 100)
+    np.testing.assert_allclose(idle.root_position[:, 0], np.arange(20, 120, 2) / 100)
+    assert transition.num_frames == 100
+    assert dataset.fingerprint == open_dataset("100style", path=tmp_path / "tree").fingerprint
+
+
+def test_cutting_at_60_fps_and_then_halving_is_the_same():
+    motion = sources.parse_bvh(line_bvh(200), "line")
+    for start, stop in [(20, 180), (21, 180), (20, 181), (21, 181)]:
+        halved = sources.resample(motion, 30.0).slice(start // 2, stop // 2)
+        cut = sources.resample(motion.slice(2 * (start // 2), 2 * (stop // 2)), 30.0)
+        np.testing.assert_array_equal(halved.root_position, cut.root_position)
+
+
+def test_100style_missing_files_are_reported(tmp_path):
+    folder = write_100style(tmp_path)
+    before = {clip.name: clip.split for clip in open_dataset("100style", path=tmp_path).clips}
+    (folder / "LimpLeft" / "LimpLeft_ID.bvh").unlink()
+    (folder / "LimpLeft" / "LimpLeft_XX.bvh").write_text(line_bvh(50))
+    with pytest.warns(UserWarning, match=r"1 of 6 takes .* such as LimpLeft_ID\.bvh"):
+        dataset = open_dataset("100style", path=tmp_path)
+    assert dataset.notes[0] == "missing LimpLeft_ID.bvh"
+    assert dataset.notes[1].startswith("ignored ") and "LimpLeft_XX.bvh" in dataset.notes[1]
+    assert len(dataset.clips) == 5
+    assert all(before[clip.name] == clip.split for clip in dataset.clips)
+    shutil.rmtree(folder / "LimpLeft")
+    shutil.rmtree(folder / "Aeroplane")
+    with pytest.raises(ValueError, match="none of the 6 files"):
+        open_dataset("100style", path=tmp_path)
+
+
+def test_100style_first_transition_may_be_called_tr(tmp_path):
+    folder = write_100style(tmp_path)
+    (folder / "Aeroplane" / "Aeroplane_TR1.bvh").rename(folder / "Aeroplane" / "Aeroplane_TR.bvh")
+    dataset = open_dataset("100style", path=tmp_path)
+    assert "Aeroplane_TR1" in {clip.name for clip in dataset.clips} and dataset.notes == ()
+
+
+def test_100style_file_shorter_than_its_cut(tmp_path):
+    folder = write_100style(tmp_path)
+    (folder / "Aeroplane" / "Aeroplane_FW.bvh").write_text(line_bvh(150))
+    (clip, *_) = open_dataset("100style", path=tmp_path).clips
+    with pytest.raises(ValueError, match=r"Aeroplane_FW\.bvh: has 75 frames .* cuts it at 90"):
+        clip.load()
+
+
+@pytest.mark.parametrize(
+    "table, old, new, message",
+    [
+        (
+            "Frame_Cuts.csv",
+            "21,181",
+            "181,21",
+            r"line 2: FW of Aeroplane has the range '181' to '21'",
+        ),
+        (
+            "Frame_Cuts.csv",
+            "21,181",
+            "21,N/A",
+            r"line 2: FW of Aeroplane has the range '21' to 'N/A'",
+        ),
+        ("Frame_Cuts.csv", "LimpLeft", "Aeroplane", "line 3: style Aeroplane is listed twice"),
+        ("Frame_Cuts.csv", "\nLimpLeft", "\n", "line 3: no STYLE_NAME"),
+        ("Dataset_List.csv", "No,Yes", "No,Maybe", "line 2: .* Yes or No .* 'Maybe'"),
+        ("Dataset_List.csv", "\nLimpLeft", "\nLimpRight", "no row for style 'LimpLeft'"),
+    ],
+)
+def test_100style_broken_tables(tmp_path, table, old, new, message):
+    path = write_100style(tmp_path) / table
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"{table}.*{message}"):
+        open_dataset("100style", path=tmp_path)
+
+
+def test_100style_tables_must_be_there_once(tmp_path):
+    folder = write_100style(tmp_path)
+    shutil.copy(folder / "Frame_Cuts.csv", tmp_path / "Frame_Cuts.csv")
+    with pytest.raises(ValueError, match=r"Frame_Cuts\.csv of 100STYLE is there 2 times"):
+        open_dataset("100style", path=tmp_path)
+    (folder / "Dataset_List.csv").write_bytes(b"Style Name\xff")
+    with pytest.raises(ValueError, match=r"Dataset_List\.csv: is not UTF-8"):
+        open_dataset("100style", path=folder)
+    (folder / "Dataset_List.csv").unlink()
+    with pytest.raises(ValueError, match=r"Dataset_List\.csv of 100STYLE is missing"):
+        open_dataset("100style", path=folder)
+
+
+def test_100style_own_tables(data_dir):
+    """The release's real tables, where someone put them beside the data."""
+    folder = data_dir if data_dir.is_dir() else data_dir.parent
+    if not (folder / "100style_Frame_Cuts.csv").is_file():
+        pytest.skip("no 100style_Frame_Cuts.csv in the data folder")
+    archive = sources._Archive(str(folder))
+    cuts = sources._read_frame_cuts(archive, "100style_Frame_Cuts.csv")
+    assert len(cuts) == 810 and len({style for style, _ in cuts}) == 100
+    assert sum(stop - start for start, stop in cuts.values()) == 4_055_978
+    assert cuts["Aeroplane", "BR"] == (318, 5593)
+    symmetric = sources._read_symmetric(archive, "100style_Dataset_List.csv")
+    assert len(symmetric) == 100 and sum(symmetric.values()) == 70
+    assert not symmetric["LimpLeft"] and symmetric["Zombie"]
+
+
+# --- Bandai: the committed list -------------------------------------------------------------------
+
+
+def test_bandai_list_agrees_with_what_is_published():
+    listed = sources._bandai_list()
+    assert len(listed) == len({item.name for item in listed}) == 3076
+    assert sum(item.frames for item in listed) == 416_845
+    walking = [item for item in listed if item.is_locomotion]
+    assert len(walking) == 1067 and sum(item.frames for item in walking) == 167_423
+    assert len({item.style for item in walking}) == 22
+    assert [item.frames for item in walking if item.frames < 42] == [20, 24, 31, 31]
+
+
+# --- Bandai: a small stand-in archive, so that damage can be done to it ---------------------------
+
+
+@pytest.fixture
+def small_bandai(tmp_path, monkeypatch) -> Path:
+    """A folder laid out like the archive, with a list of files to match."""
+    top = tmp_path / "bandai"
+    listed = []
+    for part, style in ((1, "angry"), (2, "normal")):
+        folder = top / f"dataset/Bandai-Namco-Research-Motiondataset-{part}/data"
+        folder.mkdir(parents=True)
+        for number in range(1, 5):
+            content = "bow" if number == 4 and part == 1 else "walk"
+            name = f"dataset-{part}_{content}_{style}_{number:03d}"
+            text = line_bvh(40 + 5 * number, step_cm=part, frame_time="0.0333333")
+            (folder / f"{name}.bvh").write_text(text)
+            data = text.encode()
+            listed.append(
+                sources._ListedFile(
+                    name,
+                    40 + 5 * number,
+                    len(data),
+                    zlib.crc32(data),
+                    sources.hashlib.sha256(data).hexdigest()[:16],
+                )
+            )
+    monkeypatch.setattr(sources, "_bandai_list", lambda: tuple(listed))
+    return top
+
+
+def data_file(top: Path, name: str) -> Path:
+    (path,) = top.rglob(name)
+    return path
+
+
+@pytest.mark.parametrize("packing", ["folder", "zip in a folder", "zip itself", "code host's zip"])
+def test_bandai_from_folder_and_zip(small_bandai, tmp_path, monkeypatch, no_network, packing):
+    place = small_bandai
+    if packing != "folder":
+        (tmp_path / "zips").mkdir()
+        prefix = "Bandai-Namco-Research-Motiondataset-74ead3b/" if "host" in packing else ""
+        name = "Bandai-archive.zip" if prefix else "bandai_namco.zip"
+        zipped = zip_folder(small_bandai, tmp_path / "zips" / name, prefix)
+        place = zipped if packing == "zip itself" else zipped.parent
+    monkeypatch.setenv(DATA_DIR_VARIABLE, str(place))
+    dataset = open_dataset("bandai")
+    assert dataset.styles == ("1-angry", "2-normal")
+    assert dataset.primary_styles == ("2-normal",)
+    assert dataset.mirror_styles == {"1-angry", "2-normal"}
+    assert dataset.licence == "CC BY-NC 4.0" and "Bandai Namco Research" in dataset.credit
+    assert [clip.name for clip in dataset.clips] == [
+        *(f"dataset-1_walk_angry_00{number}" for number in (1, 2, 3)),
+        *(f"dataset-2_walk_normal_00{number}" for number in (1, 2, 3, 4)),
+    ]
+    clip = dataset.clips[1]
+    assert (clip.style, clip.content) == ("1-angry", "walk")
+    motion = clip.load()
+    assert (motion.fps, motion.num_frames) == (30.0, 50)
+    np.testing.assert_allclose(motion.root_position[-1], [0.49, 0.9, 0.0])
+
+    whole = open_dataset("bandai", locomotion_only=False)
+    assert len(whole.clips) == 8 and whole.fingerprint != dataset.fingerprint
+    splits = {clip.name: clip.split for clip in whole.clips}
+    assert all(splits[clip.name] == clip.split for clip in dataset.clips)
+    assert dataset.fingerprint == open_dataset("bandai", path=small_bandai).fingerprint
+
+    primary = open_dataset("bandai", num_styles=1)
+    assert primary.styles == ("2-normal",) and len(primary.clips) == 4
+
+
+def test_bandai_ignores_a_file_that_is_not_listed(small_bandai):
+    walk = data_file(small_bandai, "dataset-1_walk_angry_001.bvh")
+    (walk.parent / "dataset-1_dance-long_normal_001.bvh").write_text("never read")
+    (walk.parent / "._dataset-1_walk_angry_001.bvh").write_bytes(b"\x00\x05\x16\x07")
+    dataset = open_dataset("bandai", path=small_bandai)
+    assert len(dataset.clips) == 7
+    assert len(dataset.notes) == 1 and "dance-long_normal_001.bvh" in dataset.notes[0]
+
+
+def test_bandai_refuses_missing_and_doubled_files(small_bandai):
+    walk = data_file(small_bandai, "dataset-1_walk_angry_001.bvh")
+    shutil.copy(walk, small_bandai / walk.name)
+    with pytest.raises(ValueError, match=r"holds dataset-1_walk_angry_001\.bvh twice"):
+        open_dataset("bandai", path=small_bandai)
+    (small_bandai / walk.name).unlink()
+    walk.unlink()
+    with pytest.raises(
+        ValueError, match=r"1 of the 7 .* missing, the first is dataset-1_walk_angry"
+    ):
+        open_dataset("bandai", path=small_bandai)
+
+
+def test_bandai_refuses_a_tampered_file_by_name(small_bandai, tmp_path):
+    walk = data_file(small_bandai, "dataset-2_walk_normal_002.bvh")
+    text = walk.read_text()
+    walk.write_text(text.replace("\n20 90", "\n21 90"))  # the same size, another number
+    zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
+    for place in (small_bandai, zipped):
+        with pytest.raises(ValueError, match=r"normal_002\.bvh: is not the published file"):
+            open_dataset("bandai", path=place)
+    walk.write_text(text)
+    dataset = open_dataset("bandai", path=small_bandai)
+    walk.write_text(text[:-10])  # cut off after the data set was opened
+    with pytest.raises(ValueError, match=r"normal_002\.bvh: is not the file that it should be"):
+        next(clip for clip in dataset.clips if clip.name.endswith("normal_002")).load()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+def test_bandai_refuses_a_truncated_zip_by_name(small_bandai, tmp_path, share):
+    zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
+    data = zipped.read_bytes()
+    zipped.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=r"bandai_namco\.zip: broken or truncated zip archive"):
+        open_dataset("bandai", path=tmp_path)
+
+
+def test_bandai_refuses_flipped_bits_inside_a_zip(small_bandai, tmp_path):
+    zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
+    with zipfile.ZipFile(zipped) as archive:
+        (info,) = [item for item in archive.infolist() if "angry_002" in item.filename]
+    data = bytearray(zipped.read_bytes())
+    data[info.header_offset + 200] ^= 0xFF  # inside the compressed text
+    zipped.write_bytes(bytes(data))
+    dataset = open_dataset("bandai", path=zipped)
+    (clip,) = [clip for clip in dataset.clips if "angry_002" in clip.name]
+    with pytest.raises(ValueError, match=r"bandai_namco\.zip: .*angry_002\.bvh: damaged"):
+        clip.load()
+
+
+def test_several_archives_are_not_guessed_between(small_bandai, tmp_path):
+    zip_folder(small_bandai, tmp_path / "bandai-a.zip")
+    zip_folder(small_bandai, tmp_path / "bandai-b.zip")
+    with pytest.raises(
+        ValueError, match=r"several archives may be meant \(bandai-a\.zip, bandai-b"
+    ):
+        open_dataset("bandai", path=tmp_path)
+
+
+# --- the network ----------------------------------------------------------------------------------
+
+
+def test_data_dir_without_the_data_is_an_error_and_no_download(tmp_path, monkeypatch, no_network):
+    monkeypatch.setenv(DATA_DIR_VARIABLE, str(tmp_path))
+    with pytest.raises(ValueError, match=r"1067 of the 1067 Bandai files needed are missing"):
+        open_dataset("bandai")
+    with pytest.raises(ValueError, match=r"Frame_Cuts\.csv of 100STYLE is missing"):
+        open_dataset("100style")
+    monkeypatch.setenv(DATA_DIR_VARIABLE, str(tmp_path / "absent"))
+    with pytest.raises(ValueError, match="absent: there is no such file or folder"):
+        open_dataset("bandai")
+
+
+def test_downloads_are_pinned(small_bandai, tmp_path, monkeypatch):
+    monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
+    write_100style(tmp_path / "tree")
+    archives = {
+        "bandai": zip_folder(small_bandai, tmp_path / "b.zip"),
+        "100style": zip_folder(tmp_path / "tree", tmp_path / "s.zip"),
+    }
+    calls = []
+
+    def retrieve(url, known_hash, *, fname, path, progressbar):
+        assert progressbar is True
+        calls.append((url, known_hash, fname))
+        return str(archives["100style" if "100STYLE" in fname else "bandai"])
+
+    monkeypatch.setattr(pooch, "retrieve", retrieve)
+    assert len(open_dataset("bandai").clips) == 7
+    assert len(open_dataset("100style").clips) == 6
+    commit = "74ead3ba1ae4696404e6086233779f60de8bf9ef"
+    repository = "BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
+    assert calls == [
+        (
+            f"https://github.com/{repository}/archive/{commit}.zip",
+            None,
+            f"Bandai-Namco-Research-Motiondataset-{commit}.zip",
+        ),
+        (
+            "doi:10.5281/zenodo.8127870/100STYLE.zip",
+            "md5:3cf627852fd8192024c04a8d0ef49583",
+            "100STYLE.zip",
+        ),
+    ]
+
+
+@pytest.mark.parametrize("name", ["bandai", "100style"])
+@pytest.mark.parametrize("error", [ConnectionError("no route"), ValueError("hash does not match")])
+def test_a_failed_download_says_what_to_set(monkeypatch, name, error):
+    monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
+
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(pooch, "retrieve", fail)
+    with pytest.raises(ValueError, match=f"(?s){error}.* environment variable {DATA_DIR_VARIABLE}"):
+        open_dataset(name)
+
+
+# --- the real archive -----------------------------------------------------------------------------
+
+
+def test_real_bandai_archive(bandai_dataset):
+    assert len(bandai_dataset.clips) == 1067
+    assert len(bandai_dataset.styles) == 22
+    assert bandai_dataset.primary_styles == (
+        "2-active",
+        "2-elderly",
+        "2-exhausted",
+        "2-feminine",
+        "2-masculine",
+        "2-normal",
+        "2-youthful",
+    )
+    by_style = collections.defaultdict(collections.Counter)
+    for clip in bandai_dataset.clips:
+        by_style[clip.style][clip.split] += 1
+    for style, count in by_style.items():
+        assert count["validation"] == count["test"] >= 1, style
+        assert abs(count["test"] - count.total() / 10) <= 0.5, style
+    motion = bandai_dataset.clips[0].load()
+    assert motion.skeleton.num_joints == 21 and motion.skeleton.names[0] == "Hips"
+
+
+def test_real_bandai_archive_truncated(bandai_archive, tmp_path):
+    zips = [bandai_archive] if bandai_archive.is_file() else sorted(bandai_archive.glob("*.zip"))
+    if not zips:
+        pytest.skip("the Bandai data is an unpacked folder here")
+    short = tmp_path / "bandai_namco.zip"
+    with zips[0].open("rb") as whole:
+        short.write_bytes(whole.read(5_000_000))
+    with pytest.raises(ValueError, match=r"bandai_namco\.zip: broken or truncated"):
+        open_dataset("bandai", path=short)

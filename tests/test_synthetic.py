@@ -1,0 +1,383 @@
+"""The synthetic walker: its skeleton, its styles, and whether a person could move like that."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
+from f3amd_lib.motion.skeleton import mirror
+from f3amd_lib.motion.synthetic import (
+    STYLES,
+    SYNTHETIC_SKELETON,
+    StyleParameters,
+    style_parameters,
+    synthesize,
+    synthesize_with_contacts,
+)
+
+SAMPLE = (
+    "Neutral",
+    "Shuffling",
+    "Runner",
+    "HighKnees",
+    "TwoFootJump",
+    "Crab",
+    "LimpLeft",
+    "Drunk",
+    "Tightrope",
+    "DeepKnees",
+)
+
+
+@pytest.fixture(scope="module")
+def all_styles():
+    """Twenty seconds of every style: {name: (motion, contacts)}."""
+    return {style: synthesize_with_contacts(style, 20.0, seed=1) for style in STYLES}
+
+
+def toe_steps(motion) -> np.ndarray:
+    """How far each toe moves from a frame to the next, [T - 1, 2], metres."""
+    toes = motion.positions[:, list(motion.skeleton.toes)]
+    return np.linalg.norm(np.diff(toes, axis=0), axis=-1)
+
+
+def ground_speed(motion) -> np.ndarray:
+    """Speed of the root over the ground, [T - 1], m/s."""
+    step = np.diff(motion.root_position[:, [0, 2]], axis=0)
+    return np.linalg.norm(step, axis=-1) * motion.fps
+
+
+# --------------------------------------------------------------------------------- skeleton
+
+
+def test_rest_pose_is_a_t_pose_facing_z():
+    rig = SYNTHETIC_SKELETON
+    assert rig.num_joints == 23
+    eye = np.broadcast_to(np.eye(3), (1, 23, 3, 3))
+    rest = synthetic.Motion(rig, np.zeros((1, 3)), eye).positions[0]
+    at = {name: rest[joint] for joint, name in enumerate(rig.names)}
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        shoulder, elbow, wrist = (at[f"{side}{part}"] for part in ("Shoulder", "Elbow", "Wrist"))
+        assert 0 < sign * shoulder[0] < sign * elbow[0] < sign * wrist[0]
+        np.testing.assert_allclose([elbow[1:], wrist[1:]], [shoulder[1:]] * 2, atol=1e-12)
+        hip, knee, ankle, toe = (at[f"{side}{part}"] for part in ("Hip", "Knee", "Ankle", "Toe"))
+        assert hip[1] > knee[1] > ankle[1] > toe[1]
+        assert toe[2] > ankle[2] + 0.1
+        np.testing.assert_allclose(knee[[0, 2]], hip[[0, 2]], atol=1e-12)
+    assert at["Head"][1] > at["Neck"][1] > at["Chest4"][1] > at["Hips"][1]
+    assert len(rig.end_sites) == 5
+
+
+# ----------------------------------------------------------------------------------- styles
+
+
+def test_there_are_a_hundred_styles_with_parameters_of_their_own():
+    assert len(STYLES) == len(set(STYLES)) == 100
+    assert list(STYLES) == sorted(STYLES)
+    assert all(name.isidentifier() and name[0].isupper() for name in STYLES)
+    assert len({style_parameters(name) for name in STYLES}) == 100
+    assert style_parameters("Neutral") == StyleParameters()
+
+
+def test_unknown_style_names_the_nearest():
+    with pytest.raises(ValueError, match=r"unknown synthetic style 'Zombi'; nearest: Zombie"):
+        style_parameters("Zombi")
+    with pytest.raises(ValueError, match="unknown synthetic style"):
+        synthesize("qqq", 1.0)
+
+
+def test_every_parameter_is_documented():
+    for record in (StyleParameters, synthetic.ArmPose):
+        for item in dataclasses.fields(record):
+            assert item.name in record.__doc__, item.name
+
+
+def test_symmetric_styles_are_those_without_a_side():
+    assert style_parameters("Neutral").symmetric
+    assert style_parameters("FlappingWings").symmetric
+    for name in ("LimpLeft", "PhoneRight", "LeaningLeft", "LookingRight", "Gallop", "Crab"):
+        assert not style_parameters(name).symmetric, name
+
+
+def test_speeds_are_those_of_people():
+    speeds = np.array([style_parameters(name).speed for name in STYLES])
+    assert np.mean((speeds >= 0.6) & (speeds <= 1.6)) > 0.9
+    assert 2.0 < speeds.max() < 3.5
+
+
+def features(motion, window: int = 150) -> np.ndarray:
+    """Mean and spread of the pose in windows of five seconds, [K, F]."""
+    steady = matrix_from_yaw(-motion.yaw)
+    relative = motion.positions - motion.positions[:, :1] * [1.0, 0.0, 1.0]
+    relative = np.einsum("tab,tjb->tja", steady, relative).reshape(motion.num_frames, -1)
+    local = 0.4 * motion.rotations[:, 1:, :, :2].reshape(motion.num_frames, -1)
+    poses = np.concatenate([relative, local], axis=-1)
+    poses = poses[: len(poses) // window * window].reshape(-1, window, poses.shape[-1])
+    return np.concatenate([poses.mean(1), poses.std(1)], axis=-1)
+
+
+def test_styles_can_be_told_apart(all_styles):
+    # The nearest of a hundred class means, from clips of another seed; chance is 1 %.
+    known = np.stack([features(motion) for motion, _ in all_styles.values()])
+    scale = known.reshape(-1, known.shape[-1]).std(0) + 1e-3
+    centres = known.mean(1) / scale
+    right = []
+    for index, style in enumerate(STYLES):
+        for vector in features(synthesize(style, 10.0, seed=2)) / scale:
+            right.append(np.linalg.norm(centres - vector, axis=-1).argmin() == index)
+    assert np.mean(right) > 0.8
+
+
+# -------------------------------------------------------------------------------- promises
+
+
+def test_equal_arguments_give_equal_clips_and_others_do_not():
+    first, again = synthesize("Happy", 5.0, seed=3), synthesize("Happy", 5.0, seed=3)
+    np.testing.assert_array_equal(first.rotations, again.rotations)
+    np.testing.assert_array_equal(first.root_position, again.root_position)
+    other = synthesize("Happy", 5.0, seed=4)
+    assert np.abs(first.root_position - other.root_position).max() > 0.05
+
+
+def test_random_numbers_are_pinned_for_all_machines():
+    draws = synthetic._generator("Neutral", 0).integers(0, 1000, 6)
+    assert draws.tolist() == [549, 15, 65, 709, 262, 609]
+
+
+@pytest.mark.parametrize(("seconds", "fps", "frames"), [(2.0, 30.0, 60), (1.51, 60.0, 91)])
+def test_length_and_rate(seconds, fps, frames):
+    motion, contacts = synthesize_with_contacts("March", seconds, fps=fps)
+    assert (motion.num_frames, motion.fps) == (frames, fps)
+    assert contacts.shape == (frames, 2)
+    assert contacts.dtype == bool
+    assert motion.skeleton is SYNTHETIC_SKELETON
+
+
+def test_a_single_frame_is_a_clip():
+    assert synthesize("Neutral", 1 / 30).num_frames == 1
+
+
+def test_the_frame_rate_does_not_change_the_motion():
+    slow, fast = synthesize("Neutral", 10.0, seed=4), synthesize("Neutral", 10.0, seed=4, fps=60.0)
+    gap = np.linalg.norm(slow.positions - fast.positions[::2], axis=-1)
+    assert gap.mean() < 1e-3
+    assert gap.max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seconds": 0.0}, "at least one frame"),
+        ({"seconds": -3.0}, "at least one frame"),
+        ({"seconds": np.nan}, "at least one frame"),
+        ({"fps": 0.0}, "fps must be positive"),
+        ({"fps": np.inf}, "fps must be positive"),
+    ],
+)
+def test_impossible_lengths_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        synthesize("Neutral", **arguments)
+
+
+def test_rotations_are_rotations(all_styles):
+    for motion, _ in all_styles.values():
+        product = np.swapaxes(motion.rotations, -1, -2) @ motion.rotations
+        assert np.abs(product - np.eye(3)).max() < 1e-9
+        assert np.linalg.det(motion.rotations).min() > 0.999
+
+
+def test_clips_start_at_the_origin_in_any_direction():
+    starts = [synthesize("Neutral", 1.0, seed=seed) for seed in range(12)]
+    places = np.array([motion.root_position[0, [0, 2]] for motion in starts])
+    assert np.linalg.norm(places, axis=-1).max() < 0.10
+    assert np.ptp([motion.yaw[0] for motion in starts]) > 2.0
+
+
+# ------------------------------------------------------------------------------------- feet
+
+
+@pytest.mark.parametrize("style", SAMPLE)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_planted_toes_do_not_slide(style, seed):
+    motion, contacts = synthesize_with_contacts(style, 30.0, seed=seed)
+    steps = toe_steps(motion)
+    planned = contacts[:-1]
+    assert 0.15 < planned.mean() < 0.9
+    # By plan a planted toe does not move at all: what is left is rounding.
+    assert steps[planned].max() < 1e-6
+    # By speed (under 1 cm a frame) the first and last moments of a swing count as contact too.
+    assert steps[motion.contacts[:-1]].mean() < 1e-3
+    # The plan misses no contact, and speed finds few that are not planned.
+    assert np.all(motion.contacts[:-1][planned])
+    assert np.mean(motion.contacts[:-1] & ~planned) < 0.22
+
+
+def test_planted_toes_touch_the_floor_and_nothing_is_below_it(all_styles):
+    for style, (motion, contacts) in all_styles.items():
+        toes = motion.positions[:, list(motion.skeleton.toes), 1]
+        assert 0.0 <= toes[contacts].min() and toes[contacts].max() < 0.02, style
+        assert motion.positions[..., 1].min() > 0.0, style
+
+
+def test_heels_rise_while_the_toe_stays(all_styles):
+    motion, contacts = all_styles["Neutral"]
+    ankles = motion.positions[:, [SYNTHETIC_SKELETON.index(f"{s}Ankle") for s in ("Left", "Right")]]
+    heights = ankles[..., 1][contacts]
+    flat = np.median(heights)
+    assert abs(flat - 0.087) < 0.005
+    assert heights.max() > flat + 0.03
+
+
+def test_walks_always_have_a_foot_on_the_ground_and_runs_do_not(all_styles):
+    in_the_air = {style: np.mean(~c.any(axis=1)) for style, (_, c) in all_styles.items()}
+    assert in_the_air["Neutral"] < 0.03
+    assert in_the_air["Runner"] > 0.15
+
+
+def test_feet_take_turns(all_styles):
+    motion, contacts = all_styles["Neutral"]
+    landings = [(f, s) for s in (0, 1) for f in np.flatnonzero(np.diff(contacts[:, s] * 1) == 1)]
+    sides = [side for _, side in sorted(landings)]
+    assert len(sides) > 20
+    assert np.mean(np.diff(sides) != 0) > 0.9
+
+
+# ------------------------------------------------------------------------------------- body
+
+
+def test_knees_bend_forwards_only(all_styles):
+    for style, (motion, _) in all_styles.items():
+        for side in ("Left", "Right"):
+            knee = motion.rotations[:, SYNTHETIC_SKELETON.index(f"{side}Knee")]
+            # A hinge about the thigh's own X axis.
+            np.testing.assert_allclose(knee[:, 0, 0], 1.0, atol=1e-9)
+            bend = np.degrees(np.arctan2(knee[:, 2, 1], knee[:, 1, 1]))
+            assert bend.min() > 5.0, style
+            assert bend.max() < 150.0, style
+
+
+def test_legs_reach_the_feet_without_stretching(all_styles):
+    knee, ankle = (SYNTHETIC_SKELETON.index(f"Left{part}") for part in ("Knee", "Ankle"))
+    length = -SYNTHETIC_SKELETON.offsets[[knee, ankle], 1].sum()
+    for style, (motion, _) in all_styles.items():
+        for side in ("Left", "Right"):
+            ends = [SYNTHETIC_SKELETON.index(f"{side}{part}") for part in ("Hip", "Ankle")]
+            hip, ankle = (motion.positions[:, joint] for joint in ends)
+            assert np.linalg.norm(hip - ankle, axis=-1).max() < 0.995 * length, style
+
+
+def test_pelvis_height_is_that_of_a_walking_person(all_styles):
+    for style, (motion, _) in all_styles.items():
+        assert 0.6 < motion.root_position[:, 1].min(), style
+        assert motion.root_position[:, 1].max() < 1.05, style
+    assert abs(np.median(all_styles["Neutral"][0].root_position[:, 1]) - 0.92) < 0.03
+
+
+def test_arms_stay_out_of_the_trunk(all_styles):
+    low, high = SYNTHETIC_SKELETON.index("Hips"), SYNTHETIC_SKELETON.index("Chest4")
+    for style, (motion, _) in all_styles.items():
+        start, along = motion.positions[:, low], motion.positions[:, high]
+        along = along - start
+        for name in ("LeftElbow", "LeftWrist", "RightElbow", "RightWrist"):
+            point = motion.positions[:, SYNTHETIC_SKELETON.index(name)] - start
+            share = np.sum(point * along, -1) / np.sum(along * along, -1)
+            gap = np.linalg.norm(point - np.clip(share, 0, 1)[:, None] * along, axis=-1)
+            assert np.quantile(gap, 0.02) > 0.07, (style, name)
+
+
+def test_accelerations_are_human(all_styles):
+    medians = []
+    for style, (motion, _) in all_styles.items():
+        change = 100.0 * np.linalg.norm(np.diff(motion.positions, 2, axis=0), axis=-1)
+        medians.append(np.median(change))
+        assert 0.03 < medians[-1] < 1.5, style
+        # Real runs peak at about 12 cm per frame squared, at the knees and feet.
+        assert change.max() < 16.0, style
+        head = change[:, SYNTHETIC_SKELETON.index("Head")]
+        assert head.max() < 4.0, style
+    # Of real clips elderly walks have 0.2, ordinary ones 0.4, runs 1.8.
+    assert 0.15 < np.median(medians) < 0.6
+
+
+def test_joints_do_not_pop(all_styles):
+    for style, (motion, _) in all_styles.items():
+        turn = np.swapaxes(motion.rotations[:-1], -1, -2) @ motion.rotations[1:]
+        cosine = 0.5 * (np.trace(turn, axis1=-2, axis2=-1) - 1.0)
+        degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        # The largest step between two frames of real locomotion is 60 degrees, at the toes.
+        assert degrees.max() < 60.0, (style, degrees.max())
+
+
+# ------------------------------------------------------------------------------------ paths
+
+
+def test_paths_turn_stop_and_change_speed():
+    motion, contacts = synthesize_with_contacts("Neutral", 120.0, seed=0)
+    speed = ground_speed(motion)
+    assert np.quantile(speed, 0.02) < 0.1
+    assert np.quantile(speed, 0.95) > 1.2
+    turned = np.cumsum(wrap_angle(np.diff(motion.yaw)))
+    assert np.ptp(turned) > np.pi / 2
+    still = contacts[:-1].all(axis=1) & (speed < 0.1)
+    assert still.sum() > 30
+
+
+def test_some_stretches_go_sideways_and_backwards():
+    bearings = []
+    for seed in range(4):
+        motion = synthesize("Neutral", 60.0, seed=seed)
+        step = np.diff(motion.root_position[:, [0, 2]], axis=0)
+        moving = ground_speed(motion) > 0.3
+        course = np.arctan2(step[:, 0], step[:, 1])
+        bearings.append(np.degrees(np.abs(wrap_angle(course - motion.yaw[:-1])))[moving])
+    bearings = np.concatenate(bearings)
+    assert np.mean(bearings < 45) > 0.6
+    assert np.mean((bearings > 60) & (bearings < 120)) > 0.01
+    assert np.mean(bearings > 150) > 0.01
+
+
+def test_a_crab_walks_sideways():
+    motion = synthesize("Crab", 30.0, seed=0)
+    step = np.diff(motion.root_position[:, [0, 2]], axis=0)
+    bearing = wrap_angle(np.arctan2(step[:, 0], step[:, 1]) - motion.yaw[:-1])
+    bearing = np.degrees(bearing[ground_speed(motion) > 0.3])
+    # Its left is in front: moving left is a bearing of +90 degrees.
+    assert abs(np.median(bearing) - 88.0) < 15.0
+
+
+def test_postures_look_like_their_names(all_styles):
+    def height(style, joint):
+        motion = all_styles[style][0]
+        return np.median(motion.positions[:, SYNTHETIC_SKELETON.index(joint), 1])
+
+    assert height("HandsUp", "LeftWrist") > height("HandsUp", "Head")
+    assert height("RightArmUp", "RightWrist") > height("RightArmUp", "Head")
+    assert height("RightArmUp", "LeftWrist") < height("RightArmUp", "Hips") + 0.1
+    assert height("DeepKnees", "Hips") < height("Neutral", "Hips") - 0.12
+    assert height("BentForward", "Head") < height("Neutral", "Head") - 0.12
+    assert height("Tiptoe", "LeftAnkle") > height("Neutral", "LeftAnkle") + 0.04
+    assert height("ArmsWide", "LeftWrist") > height("Neutral", "LeftWrist") + 0.4
+
+
+def test_sided_styles_are_mirror_images():
+    # LimpLeft mirrored limps on the right: its right foot stands for less time than its left.
+    left = synthesize_with_contacts("LimpLeft", 60.0, seed=0)[1].mean(axis=0)
+    right = synthesize_with_contacts("LimpRight", 60.0, seed=0)[1].mean(axis=0)
+    assert left[0] < left[1] and right[1] < right[0]
+    motion = synthesize("WaveLeft", 5.0)
+    flipped = mirror(motion)
+    hand, other = (SYNTHETIC_SKELETON.index(f"{side}Wrist") for side in ("Left", "Right"))
+    np.testing.assert_allclose(
+        flipped.positions[:, other, 1], motion.positions[:, hand, 1], atol=1e-9
+    )
+
+
+def test_a_free_arm_hangs_down_under_a_sideways_lean(all_styles):
+    motion = all_styles["LeaningLeft"][0]
+    shoulder, elbow = (SYNTHETIC_SKELETON.index(f"Left{part}") for part in ("Shoulder", "Elbow"))
+    arm = motion.positions[:, elbow] - motion.positions[:, shoulder]
+    left = np.stack([np.cos(motion.yaw), -np.sin(motion.yaw)], axis=-1)
+    outwards = np.degrees(np.arctan2(np.sum(arm[:, [0, 2]] * left, axis=-1), -arm[:, 1]))
+    assert -5.0 < np.median(outwards) < 15.0
