@@ -38,6 +38,7 @@ __all__ = [
     "gather_windows",
     "draw_windows",
     "sample_windows",
+    "spread_windows",
     "restart_from",
     "mean_poses",
     "fit_normaliser",
@@ -276,6 +277,28 @@ def sample_windows(
     """
     index, yaw, smoothing = draw_windows(windows, key, batch_size)
     return gather_windows(windows, index, yaw, smoothing, window=window, num_history=num_history)
+
+
+def spread_windows(windows: WindowSet, num_samples: int) -> Batch:
+    """Return windows spread evenly over a set, unturned, with the path as captured.
+
+    Args:
+      windows: from `build_windows`.
+      num_samples: how many, at most as many as there are.
+
+    Returns:
+      The batch; the same every time, so that measurements compare.
+    """
+    count = min(num_samples, windows.num_windows)
+    index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
+    return gather_windows(
+        windows,
+        index,
+        jnp.zeros(count),
+        jnp.zeros(count, jnp.int32),
+        window=windows.window,
+        num_history=windows.num_history,
+    )
 
 
 def restart_from(batch: Batch, history) -> Batch:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.data.windows import Batch, WindowSet, gather_windows
+from f3amd_lib.data.windows import Batch, WindowSet, spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.evaluation.metrics import joint_acceleration
 from f3amd_lib.evaluation.rollout import MotionGenerator
@@ -27,16 +27,13 @@ CM = 100.0
 
 def held_out_batch(windows: WindowSet, trained: TrainedModel, num_samples: int = 512) -> Batch:
     """Return windows spread evenly over a held-out set, unturned, with the path as captured."""
-    count = min(num_samples, windows.num_windows)
-    index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
-    return gather_windows(
-        windows,
-        index,
-        jnp.zeros(count),
-        jnp.zeros(count, jnp.int32),
-        window=trained.config.window,
-        num_history=trained.config.num_history,
-    )
+    config = trained.config
+    if (windows.window, windows.num_history) != (config.window, config.num_history):
+        raise ValueError(
+            f"{trained.name} takes {config.num_history} + {config.window} frames, but the windows "
+            f"were built for {windows.num_history} + {windows.window}"
+        )
+    return spread_windows(windows, num_samples)
 
 
 def _joint_error(trained: TrainedModel, x0_hat, batch: Batch):

@@ -29,6 +29,7 @@ from f3amd_lib.data.windows import (
     gather_windows,
     mean_poses,
     restart_from,
+    spread_windows,
 )
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import VarianceExploding
@@ -390,16 +391,8 @@ class Trainer:
 
         return jax.lax.scan(one_step, state, None, length=length)
 
-    def _held_out_terms(self, params, windows: WindowSet, index, key):
-        size = index.shape[0]
-        batch = gather_windows(
-            windows,
-            index,
-            jnp.zeros(size),
-            jnp.zeros(size, jnp.int32),
-            window=self.model_config.window,
-            num_history=self.model_config.num_history,
-        )
+    def _held_out_terms(self, params, batch: Batch, key):
+        size = batch.future.shape[0]
         key_sigma, key_loss = jax.random.split(key)
         sigma = self.config.noise_schedule().sigma(jax.random.uniform(key_sigma, (size,)))
         return self._loss(params, batch, sigma, key_loss)[1]
@@ -412,9 +405,8 @@ class Trainer:
           windows: of another split than the one trained on.
           num_samples: windows to take, spread evenly.
         """
-        count = min(num_samples, windows.num_windows)
-        index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
-        terms = self._evaluate(params, windows, index, jax.random.key(7))
+        batch = spread_windows(windows, num_samples)
+        terms = self._evaluate(params, batch, jax.random.key(7))
         return {name: float(value) for name, value in terms.items()}
 
     def save(self, path: Path, state: TrainingState) -> None:
