@@ -754,6 +754,18 @@ def kept_modes(signal, cut: Mapping[int, np.ndarray], label: str):
     return figure
 
 
+def _map_row(maps: Mapping[str, np.ndarray], height: float, label: str, **image_options):
+    """Draw maps side by side under one colour scale from 0; return the figure and its axes."""
+    figure, axes = new_figure(8.8, height, 1, len(maps), sharey=True, squeeze=False)
+    highest = max(values.max() for values in maps.values())
+    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
+        image = axis.imshow(values, cmap="viridis", vmin=0.0, vmax=highest, **image_options)
+        axis.set_title(title)
+        axis.grid(visible=False)
+    figure.colorbar(image, ax=list(axes[0]), label=label, shrink=0.85)
+    return figure, list(axes[0])
+
+
 @_styled
 def influence_maps(maps: Mapping[str, np.ndarray]):
     """Draw how strongly each input frame reaches each output frame, a panel for each branch.
@@ -761,15 +773,10 @@ def influence_maps(maps: Mapping[str, np.ndarray]):
     Args:
       maps: title -> [T out, T in], not negative.
     """
-    figure, axes = new_figure(8.8, 3.2, 1, len(maps), sharey=True, squeeze=False)
-    highest = max(values.max() for values in maps.values())
-    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
-        image = axis.imshow(values, cmap="viridis", vmin=0.0, vmax=highest)
-        axis.set_title(title)
+    figure, axes = _map_row(maps, 3.2, "size of the derivative")
+    for axis in axes:
         axis.set_xlabel("input frame")
-        axis.grid(visible=False)
-    axes[0, 0].set_ylabel("output frame")
-    figure.colorbar(image, ax=list(axes[0]), label="size of the derivative", shrink=0.85)
+    axes[0].set_ylabel("output frame")
     return figure
 
 
@@ -799,21 +806,16 @@ def film_gate(gamma, gate, z_base, z_tilde, gammas: Sequence[float]):
 @_styled
 def attention_maps(maps: Mapping[str, np.ndarray], num_history: int, window: int):
     """Draw attention of each future frame (row) to the context tokens, [T, H + T + 1] each."""
-    figure, axes = new_figure(8.8, 3.5, 1, len(maps), sharey=True, squeeze=False)
-    top = max(values.max() for values in maps.values())
-    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
-        image = axis.imshow(values, cmap="viridis", vmin=0.0, vmax=top, aspect="auto")
+    figure, axes = _map_row(maps, 3.5, "attention weight", aspect="auto")
+    for axis in axes:
         for edge in (num_history - 0.5, num_history + window - 0.5):
             axis.axvline(edge, color="white", linewidth=1.5)
         axis.set_xticks(
             [(num_history - 1) / 2, num_history + (window - 1) / 2, num_history + window],
             ["history", "path", "style"],
         )
-        axis.set_title(title)
         axis.set_xlabel("context token")
-        axis.grid(visible=False)
-    axes[0, 0].set_ylabel("future frame that asks")
-    figure.colorbar(image, ax=list(axes[0]), label="attention weight", shrink=0.85)
+    axes[0].set_ylabel("future frame that asks")
     return figure
 
 

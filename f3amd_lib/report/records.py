@@ -21,6 +21,8 @@ from pathlib import Path, PurePath
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.files import whole_file
+
 __all__ = ["run_record", "record_hash", "write_table", "read_table"]
 
 _LIBRARY = Path(__file__).resolve().parents[1]
@@ -212,15 +214,8 @@ def _refuse_foreign(path: Path, record_path: Path, record: dict) -> None:
 
 def _replace(path: Path, text: str) -> None:
     """Write a whole file or none."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)  # mkstemp makes it private
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with whole_file(path, overwrite=True) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _text_hash(text: str) -> str:

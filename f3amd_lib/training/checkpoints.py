@@ -87,11 +87,12 @@ def describe(path: Path) -> dict:
 
 
 def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
-    """Read a tree written by `save_tree`.
+    """Read a tree written by `save_tree`; the file is read and its checksum taken once.
 
     Args:
       path: the file.
-      template: tree of arrays or shapes that says what must be there.
+      template: tree of arrays or shapes that says what must be there, or a function that makes one
+        from the file's description, which it may refuse with a ValueError.
 
     Returns:
       (tree, metadata).
@@ -100,6 +101,8 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
       ValueError: naming the file and what is missing, misshapen or too much.
     """
     arrays, metadata = _read(path)
+    if callable(template):
+        template = template(metadata)
     wanted = _named_leaves(template)
     if wanted.keys() != arrays.keys():
         odd = sorted(wanted.keys() ^ arrays.keys())
@@ -179,11 +182,24 @@ def load_model(path: Path) -> TrainedModel:
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    _, metadata = _read(path)
-    if metadata.get("kind") != "trained model":
-        raise ValueError(f"{path}: holds a {metadata.get('kind')}, not a trained model")
     try:
-        return _assemble(path, metadata)
+        tree, metadata = load_tree(path, _model_template)
+        skeleton = Skeleton(
+            tuple(metadata["joints"]),
+            tuple(metadata["parents"]),
+            np.asarray(tree["offsets"], np.float64),
+            tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
+        )
+        return TrainedModel(
+            name=metadata["name"],
+            config=F3AMDConfig.from_dict(metadata["model"]),
+            params=tree["params"],
+            normaliser=Normaliser(**tree["normaliser"]),
+            skeleton=skeleton,
+            styles=tuple(metadata["styles"]),
+            seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
+            record=metadata["record"],
+        )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: description lacks or garbles {error}") from None
     except ValueError as error:
@@ -191,39 +207,23 @@ def load_model(path: Path) -> TrainedModel:
         raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
-def _assemble(path: Path, metadata: dict) -> TrainedModel:
-    """Read the arrays that a trained model's description speaks of."""
+def _model_template(metadata: dict) -> dict:
+    """Return the shapes that a trained model's description speaks of."""
+    if metadata.get("kind") != "trained model":
+        raise ValueError(f"holds a {metadata.get('kind')}, not a trained model")
     config = F3AMDConfig.from_dict(metadata["model"])
     params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
-    channels, joints = config.channels, len(metadata["joints"])
     single = jax.ShapeDtypeStruct
-    template = {
+    return {
         "params": params,
         "normaliser": {
-            "mean": single((channels,), jnp.float32),
-            "deviation": single((channels,), jnp.float32),
+            "mean": single((config.channels,), jnp.float32),
+            "deviation": single((config.channels,), jnp.float32),
             "path_scale": single((), jnp.float32),
         },
         "seeds": {
             name: single(tuple(shape), jnp.float32)
             for name, shape in metadata["seed_shapes"].items()
         },
-        "offsets": single((joints, 3), jnp.float32),
+        "offsets": single((len(metadata["joints"]), 3), jnp.float32),
     }
-    tree, _ = load_tree(path, template)
-    skeleton = Skeleton(
-        tuple(metadata["joints"]),
-        tuple(metadata["parents"]),
-        np.asarray(tree["offsets"], np.float64),
-        tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
-    )
-    return TrainedModel(
-        name=metadata["name"],
-        config=config,
-        params=tree["params"],
-        normaliser=Normaliser(**tree["normaliser"]),
-        skeleton=skeleton,
-        styles=tuple(metadata["styles"]),
-        seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
-        record=metadata["record"],
-    )

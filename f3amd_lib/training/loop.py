@@ -37,7 +37,7 @@ from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.f3amd import F3AMDConfig, refuse_unknown
 from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.training.checkpoints import describe, load_tree, save_tree
+from f3amd_lib.training.checkpoints import load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
 
 __all__ = [
@@ -281,7 +281,7 @@ class Trainer:
             steps.insert(0, optax.clip_by_global_norm(config.gradient_clip))
         self.optimiser = optax.chain(*steps)
         self._chunk = jax.jit(self._run_chunk, static_argnames="length", donate_argnums=0)
-        self._evaluate = jax.jit(self._held_out_terms)
+        self._evaluate = jax.jit(self._held_out_terms, static_argnames="num_samples")
 
     def initial_state(self) -> TrainingState:
         """Return the state before the first step."""
@@ -391,7 +391,8 @@ class Trainer:
 
         return jax.lax.scan(one_step, state, None, length=length)
 
-    def _held_out_terms(self, params, batch: Batch, key):
+    def _held_out_terms(self, params, windows: WindowSet, key, num_samples: int):
+        batch = spread_windows(windows, num_samples)
         size = batch.future.shape[0]
         key_sigma, key_loss = jax.random.split(key)
         sigma = self.config.noise_schedule().sigma(jax.random.uniform(key_sigma, (size,)))
@@ -405,8 +406,7 @@ class Trainer:
           windows: of another split than the one trained on.
           num_samples: windows to take, spread evenly.
         """
-        batch = spread_windows(windows, num_samples)
-        terms = self._evaluate(params, batch, jax.random.key(7))
+        terms = self._evaluate(params, windows, jax.random.key(7), num_samples=num_samples)
         return {name: float(value) for name, value in terms.items()}
 
     def save(self, path: Path, state: TrainingState) -> None:
@@ -427,20 +427,24 @@ class Trainer:
         Raises:
           ValueError: if the file is broken, or was made with other settings.
         """
-        metadata, mine = describe(path), self._identity()
-        for part in ("model", "training"):
-            theirs = metadata.get(part, {})
-            changed = sorted(
-                name for name, value in mine[part].items() if value != theirs.get(name)
-            )
-            if changed:
-                raise ValueError(
-                    f"{path}: checkpoint was made with other {part} settings "
-                    f"({', '.join(changed)}); choose another file or the old settings"
+
+        def template(metadata: dict):
+            mine = self._identity()
+            for part in ("model", "training"):
+                theirs = metadata.get(part, {})
+                changed = sorted(
+                    name for name, value in mine[part].items() if value != theirs.get(name)
                 )
-        if metadata.get("dataset_fingerprint") != self.dataset_fingerprint:
-            raise ValueError(f"{path}: checkpoint was made on other data; choose another file")
-        return load_tree(path, jax.eval_shape(self.initial_state))[0]
+                if changed:
+                    raise ValueError(
+                        f"{path}: checkpoint was made with other {part} settings "
+                        f"({', '.join(changed)}); choose another file or the old settings"
+                    )
+            if metadata.get("dataset_fingerprint") != self.dataset_fingerprint:
+                raise ValueError(f"{path}: checkpoint was made on other data; choose another file")
+            return jax.eval_shape(self.initial_state)
+
+        return load_tree(path, template)[0]
 
     def run(
         self,

@@ -208,16 +208,16 @@ def train(
         held_out_split=prepared.held_out_split,
         num_train_windows=int(prepared.windows("train").num_windows),
     )
-    rows = []
+    state, rows = None, []
     if files.state.exists():
         if not files.history.exists():
             raise ValueError(
                 f"{files.state}: its loss history {files.history.name} is missing; put it back "
                 "beside it, or move the state away to start anew"
             )
-        step = int(trainer.restore(files.state).step)
+        state = trainer.restore(files.state)
         earlier, _ = read_table(files.history)
-        rows = earlier[earlier["step"] <= step].to_dict("records")
+        rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
 
     def keep(row: dict) -> None:
         rows.append(row)
@@ -225,6 +225,7 @@ def train(
             write_table(files.history, pd.DataFrame(rows), record)
 
     state, _ = trainer.run(
+        state,
         checkpoint=files.state,
         checkpoint_every=max(1, config.num_steps // 20),
         held_out=held_out,
