@@ -8,12 +8,12 @@ unknown names and wrong types are refused here.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import numbers
 import os
-from collections.abc import Iterable
 from pathlib import Path
+
+from f3amd_lib.names import nearest_hint
 
 __all__ = [
     "PROFILES",
@@ -22,7 +22,6 @@ __all__ = [
     "RESULTS_DIR_VARIABLE",
     "Profile",
     "load_profile",
-    "nearest_hint",
     "repository_root",
     "results_dir",
     "runs_dir",
@@ -222,25 +221,6 @@ def _checked(key: str, value, annotation: str):
     if key in _NOT_NEGATIVE and value < 0:
         raise ValueError(f"{key} must be 0 or more, got {value!r}")
     return value
-
-
-def nearest_hint(name, known: Iterable[str]) -> str:
-    """Return the end of an error message about an unknown name: the nearest one, and all of them.
-
-    Args:
-      name: what was given, of any type.
-      known: the names that exist.
-
-    Returns:
-      "; did you mean 'laptop'? (one of smoke, laptop, gpu)", without the question where nothing is
-      near.
-    """
-    known = list(known)
-    if not known:
-        return "; there is none to choose from"
-    near = difflib.get_close_matches(str(name).lower(), known, n=1)
-    question = f"; did you mean {near[0]!r}?" if near else ""
-    return f"{question} (one of {', '.join(known)})"
 
 
 def repository_root() -> Path:

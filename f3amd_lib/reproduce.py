@@ -30,7 +30,8 @@ from tqdm import tqdm
 from f3amd_lib import profiles
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE
-from f3amd_lib.profiles import load_profile, nearest_hint, results_dir, runs_dir
+from f3amd_lib.names import nearest_hint
+from f3amd_lib.profiles import load_profile, results_dir, runs_dir
 from f3amd_lib.report.records import run_record, write_table
 
 __all__ = [

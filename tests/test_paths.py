@@ -127,9 +127,9 @@ def test_ramp_starts_from_rest():
 
 
 def test_unknown_name_names_the_nearest():
-    with pytest.raises(ValueError, match="did you mean spiral"):
+    with pytest.raises(ValueError, match="did you mean 'spiral'"):
         named_path("spirale", 10)
-    with pytest.raises(ValueError, match="known paths are straight, circle"):
+    with pytest.raises(ValueError, match="one of straight, circle"):
         named_path("zzz", 10)
 
 

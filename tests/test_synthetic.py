@@ -82,7 +82,7 @@ def test_there_are_a_hundred_styles_with_parameters_of_their_own():
 
 
 def test_unknown_style_names_the_nearest():
-    with pytest.raises(ValueError, match=r"unknown synthetic style 'Zombi'; nearest: Zombie"):
+    with pytest.raises(ValueError, match=r"unknown synthetic style 'Zombi'; did you mean 'Zombie'"):
         style_parameters("Zombi")
     with pytest.raises(ValueError, match="unknown synthetic style"):
         synthesize("qqq", 1.0)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
 
 from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.names import nearest_hint
 
 __all__ = [
     "RootPath",
@@ -149,9 +149,7 @@ def named_path(
     Source: ours; the paper does not give its test trajectory.
     """
     if name not in NAMES:
-        near = difflib.get_close_matches(str(name).lower(), NAMES, n=2, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise ValueError(f"unknown path {name!r}: {hint}known paths are {', '.join(NAMES)}")
+        raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
     if int(num_frames) != num_frames or num_frames < 2:
         raise ValueError(f"a path needs at least 2 whole frames, got num_frames={num_frames}")
     if not (np.isfinite(fps) and fps > 0):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,9 @@ from flax import nnx
 
 from f3amd_lib.models.conditioning import Condition, ConditionEncoder, Context, FiLM
 from f3amd_lib.models.spectral import FNOBlock
+from f3amd_lib.names import refuse_unknown
 
-__all__ = ["F3AMDConfig", "F3AMD", "refuse_unknown"]
+__all__ = ["F3AMDConfig", "F3AMD"]
 
 
 @dataclass(frozen=True)
@@ -96,16 +96,6 @@ class F3AMDConfig:
         if missing:
             raise ValueError(f"model settings lack {', '.join(sorted(missing))}")
         return cls(**values)
-
-
-def refuse_unknown(values: dict, config_class: type, what: str) -> None:
-    """Raise ValueError, with the nearest name, for a key that is no field of a config class."""
-    known = [field.name for field in dataclasses.fields(config_class)]
-    for key in values:
-        if key not in known:
-            near = get_close_matches(key, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"unknown {what} {key!r}{hint}")
 
 
 def cosine_basis(num_frames: int) -> np.ndarray:

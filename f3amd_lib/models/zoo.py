@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
-
 import jax
 import pandas as pd
 from flax import nnx
 
 from f3amd_lib.models.f3amd import F3AMD, F3AMDConfig
+from f3amd_lib.names import nearest_hint
 
 __all__ = ["PRESETS", "build_config", "build", "build_from_config", "count_parameters", "table"]
 
@@ -56,10 +55,7 @@ def build_config(name: str, *, channels: int, num_styles: int, window: int = 32,
       ValueError: for an unknown name (with the nearest ones) or field.
     """
     if name not in PRESETS:
-        near = get_close_matches(name, PRESETS, n=3, cutoff=0.3)
-        raise ValueError(
-            f"unknown model {name!r}; nearest: {', '.join(near) or ', '.join(PRESETS)}"
-        )
+        raise ValueError(f"unknown model {name!r}{nearest_hint(name, PRESETS)}")
     values = {
         "channels": channels,
         "num_styles": num_styles,

@@ -17,7 +17,6 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 from dataclasses import dataclass, field
 
@@ -28,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.names import nearest_hint
 
 __all__ = [
     "ArmPose",
@@ -1041,10 +1041,9 @@ def style_parameters(name: str) -> StyleParameters:
     try:
         return _STYLE_TABLE[name]
     except KeyError:
-        near = difflib.get_close_matches(str(name), STYLES, n=5, cutoff=0.4) or STYLES[:5]
         raise ValueError(
-            f"unknown synthetic style {name!r}; nearest: {', '.join(near)} "
-            f"(f3amd_lib.motion.synthetic.STYLES lists all {len(STYLES)})"
+            f"unknown synthetic style {name!r}{nearest_hint(name, STYLES)}; "
+            "f3amd_lib.motion.synthetic.STYLES lists them"
         ) from None
 
 

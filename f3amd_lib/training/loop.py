@@ -34,9 +34,10 @@ from f3amd_lib.data.windows import (
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.f3amd import F3AMDConfig, refuse_unknown
+from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.names import refuse_unknown
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
 

@@ -1,0 +1,43 @@
+"""Messages about names that nobody knows."""
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from f3amd_lib.names import nearest_hint, nearest_names, refuse_unknown
+
+
+@dataclass(frozen=True)
+class Settings:
+    width: int = 1
+    depth: int = 2
+    kind: str = field(default="fixed", init=False)
+
+
+def test_the_nearest_name_comes_first_and_case_is_ignored():
+    assert nearest_names("f3amd-fno-69", ["CAMDM", "F3AMD-FNO-96", "F3AMD-FNO-32"])[0] == (
+        "F3AMD-FNO-96"
+    )
+    assert nearest_names("zzz", ["CAMDM"]) == []
+
+
+def test_the_hint_asks_and_lists():
+    hint = nearest_hint("labtop", ["smoke", "laptop"])
+    assert hint == "; did you mean 'laptop'? (one of smoke, laptop)"
+    assert nearest_hint("zzz", ["smoke", "laptop"]) == " (one of smoke, laptop)"
+    assert nearest_hint("zzz", []) == "; there is none to choose from"
+
+
+def test_a_long_list_is_cut_to_the_nearest():
+    names = [f"style {number}" for number in range(40)]
+    hint = nearest_hint("stile 7", names)
+    assert hint.startswith("; did you mean 'style 7'? (40 are known, nearest style 7, ")
+    assert nearest_hint("zzz", names) == " (40 are known, such as style 0, style 1, style 2)"
+
+
+def test_unknown_settings_are_refused_and_fixed_fields_are_no_settings():
+    refuse_unknown({"width": 3}, Settings, "setting")
+    with pytest.raises(ValueError, match="unknown setting 'widht'; did you mean 'width'"):
+        refuse_unknown({"widht": 3}, Settings, "setting")
+    with pytest.raises(ValueError, match="unknown setting 'kind'"):
+        refuse_unknown({"kind": "other"}, Settings, "setting")
