@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import build_windows, fit_normaliser, seed_histories
-from f3amd_lib.models.f3amd import F3AMD, F3AMDConfig
+from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.models.config import NetworkConfig
+from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -120,11 +122,11 @@ def tiny_config(**changes) -> F3AMDConfig:
 
 
 @functools.cache
-def _built(config: F3AMDConfig):
+def _built(config: NetworkConfig):
     return nnx.split(build_from_config(config, jax.random.key(0)))
 
 
-def network_of(config: F3AMDConfig) -> F3AMD:
+def network_of(config: NetworkConfig) -> nnx.Module:
     """A network of its own, always with the same initial weights; built once per config."""
     graph, state = _built(config)
     return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, state))
@@ -136,7 +138,7 @@ def _evaluate(graph, state, x_noisy, sigma, condition):
     return network(x_noisy, sigma, network.encode(condition))
 
 
-def evaluate(network: F3AMD, x_noisy, sigma, condition):
+def evaluate(network, x_noisy, sigma, condition):
     """Encode and denoise under jit, which is compiled once per config and shape."""
     graph, state = nnx.split(network)
     return _evaluate(graph, state, x_noisy, sigma, condition)
@@ -159,7 +161,7 @@ def tiny_trainer(model=None, *, windows=None, **settings) -> Trainer:
     """A trainer of the tiny network on the tiny data set."""
     windows = tiny_windows() if windows is None else windows
     normaliser = tiny_normaliser()
-    config = TrainingConfig(**{"num_steps": 12, "batch_size": 8, **settings})
+    config = TrainingConfig.from_dict({"num_steps": 12, "batch_size": 8, **settings})
     return Trainer(model or tiny_config(), config, SKELETON, normaliser, windows)
 
 
@@ -180,9 +182,9 @@ def same_tree(first, second) -> bool:
     )
 
 
-def tiny_trained(record=None, **changes) -> TrainedModel:
+def tiny_trained(record=None, config=None, diffusion=None, **changes) -> TrainedModel:
     """A trained model in form only: initial weights, real normaliser, real seed histories."""
-    config = tiny_config(**changes)
+    config = config or tiny_config(**changes)
     packed = tiny_packed()
     return TrainedModel(
         name="F3AMD-FNO-8",
@@ -191,6 +193,7 @@ def tiny_trained(record=None, **changes) -> TrainedModel:
         normaliser=tiny_normaliser(),
         skeleton=SKELETON,
         styles=packed.styles,
+        diffusion=diffusion or VarianceExploding(),
         seeds=seed_histories(packed, num_history=HISTORY),
         record={"note": "made by hand"} if record is None else record,
     )

@@ -1,4 +1,4 @@
-"""Condition tokens, cross-attention and FiLM against plain numpy (sections 3.3, 3.4.3)."""
+"""Condition tokens, and the ways of c into a block, against plain numpy (3.3, 3.4.3, Table 11)."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,19 @@ import pytest
 from flax import nnx
 
 from f3amd_lib.models import conditioning
+from f3amd_lib.models.attention import TransformerBlock, position_code
 from f3amd_lib.models.conditioning import (
+    CONDITIONINGS,
+    AdaLNZero,
+    Concatenation,
     Condition,
     ConditionEncoder,
+    CrossAttention,
     FiLM,
+    conditioning_layer,
     noise_features,
-    position_code,
 )
+from f3amd_lib.models.spectral import FNOBlock
 
 CHANNELS, STYLES, WIDTH, WINDOW, HISTORY = 9, 3, 8, 6, 4
 
@@ -24,6 +30,21 @@ def draw(*shape, seed=0):
 
 def silu(x):
     return x / (1.0 + np.exp(-x))
+
+
+def linear(layer, x):
+    return x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+
+
+def randomise(module, seed=0):
+    """Replace every weight of a module, zero ones too, by a random number; return the module."""
+    rng = np.random.default_rng(seed)
+    state = jax.tree.map(
+        lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype),
+        nnx.state(module),
+    )
+    nnx.update(module, state)
+    return module
 
 
 def make_condition(batch=2, seed=0):
@@ -60,19 +81,6 @@ def test_eq01_noise_features_tell_levels_apart_and_never_change():
     assert float(distance[~np.eye(5, dtype=bool)].min()) > 0.5
 
 
-def test_position_code_by_hand():
-    code = position_code(-2, 3, 4)
-    assert code.shape == (5, 4)
-    np.testing.assert_allclose(code[2], [0.0, 1.0, 0.0, 1.0], atol=1e-15)  # frame 0
-    rate = 1000.0 ** (-2 / 4)
-    np.testing.assert_allclose(
-        code[3], [np.sin(1), np.cos(1), np.sin(rate), np.cos(rate)], atol=1e-15
-    )
-    # History frames are the negatives of future ones: sine odd, cosine even.
-    np.testing.assert_allclose(code[1], code[3] * [-1, 1, -1, 1], atol=1e-15)
-    assert position_code(0, 3, 5).shape == (3, 5)
-
-
 def test_section_3_3_tokens_are_history_path_and_style():
     encoder = make_encoder()
     condition = make_condition()
@@ -91,7 +99,6 @@ def test_section_3_3_tokens_are_history_path_and_style():
 def test_section_3_3_cross_attention_equals_a_plain_loop(num_heads):
     encoder = make_encoder(num_heads)
     condition, sigma = make_condition(), np.float32([0.5, 30.0])
-    linear = lambda layer, x: x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
     expected = np.zeros((2, WINDOW, WIDTH))
     each = WIDTH // num_heads
     for b in range(2):
@@ -172,7 +179,13 @@ def film_with(gamma, beta):
 
 def test_eq05_to_eq07_zero_condition_weights_leave_scale_one():
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
-    np.testing.assert_allclose(film_with(0.0, 0.0)(z, c), silu(z), atol=1e-6)
+    np.testing.assert_allclose(film_with(0.0, 0.0).modulate(z, c), silu(z), atol=1e-6)
+
+
+def test_eq05_to_eq07_zero_condition_leaves_the_output_layer():
+    film, z = FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)), draw(2, WINDOW, WIDTH)
+    expected = silu(linear(film.output, z))
+    np.testing.assert_allclose(film.modulate(z, jnp.zeros((2, WINDOW, 5))), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("gamma", [-1e4, -1.0, 0.3, 1e4])
@@ -180,42 +193,156 @@ def test_eq06_gate_stays_within_zero_and_two(gamma):
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
     gate = 1.0 + np.tanh(gamma)
     assert 0.0 <= gate <= 2.0
-    np.testing.assert_allclose(film_with(gamma, 0.7)(z, c), silu(gate * z + 0.7), atol=1e-5)
+    np.testing.assert_allclose(
+        film_with(gamma, 0.7).modulate(z, c), silu(gate * z + 0.7), atol=1e-5
+    )
 
 
 def test_eq05_to_eq07_equal_plain_numpy():
-    film = FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0))
-    film.modulation.bias[...] = jnp.asarray(draw(2 * WIDTH, seed=4))
-    film.output.bias[...] = jnp.asarray(draw(WIDTH, seed=5))
+    film = randomise(FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
-    mixed = c @ np.asarray(film.modulation.kernel[...]) + np.asarray(film.modulation.bias[...])
+    mixed = linear(film.modulation, c)
     gamma, beta = mixed[..., :WIDTH], mixed[..., WIDTH:]
-    z_tilde = z * (1.0 + np.tanh(gamma)) + beta
-    expected = silu(
-        z_tilde @ np.asarray(film.output.kernel[...]) + np.asarray(film.output.bias[...])
-    )
-    np.testing.assert_allclose(film(z, c), expected, atol=1e-5)
+    expected = silu(linear(film.output, z * (1.0 + np.tanh(gamma)) + beta))
+    np.testing.assert_allclose(film.modulate(z, c), expected, atol=1e-5)
+    # As a layer of a block it modulates what the base block returns.
+    np.testing.assert_array_equal(film(lambda z: 2.0 * z, z / 2.0, c), film.modulate(z, c))
 
 
 def test_eq05_modulation_is_a_frames_own():
     film, z = FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)), draw(1, WINDOW, WIDTH)
     c = draw(1, WINDOW, 5, seed=1)
-    moved = film(z, jnp.asarray(c).at[0, 2].add(1.0)) - film(z, c)
+    moved = film.modulate(z, jnp.asarray(c).at[0, 2].add(1.0)) - film.modulate(z, c)
     changed = np.abs(moved).max(axis=(0, 2)) > 1e-5
     np.testing.assert_array_equal(changed, np.arange(WINDOW) == 2)
 
 
-def test_film_with_zero_output_starts_at_zero_but_learns():
-    film = FiLM(WIDTH, 5, zero_output=True, rngs=nnx.Rngs(params=0))
+def test_table_11_concatenation_is_the_base_block_and_the_output_layer():
+    layer = randomise(Concatenation(WIDTH, rngs=nnx.Rngs(params=0)))
+    z, c = draw(2, 2 * WINDOW, WIDTH), draw(2, WINDOW, WIDTH, seed=1)
+    expected = silu(linear(layer.output, np.sin(z)))
+    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
+    np.testing.assert_array_equal(layer(jnp.sin, z, c + 1.0), layer(jnp.sin, z, c))
+
+
+@pytest.mark.parametrize("kind", ["fno", "transformer"])
+def test_table_11_concatenated_condition_reaches_the_features(kind):
+    base = make_base(kind, 2 * WINDOW)
+    layer = Concatenation(WIDTH, rngs=nnx.Rngs(params=0))
+    z, c = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
+    features = lambda c: layer(base, jnp.concatenate([c, z], axis=1), None)[:, WINDOW:]
+    moved = jnp.abs(features(c) - features(jnp.asarray(c).at[0, 0].add(1.0)))
+    assert float(moved.max(axis=(0, 2)).min()) > 1e-4
+
+
+def make_base(kind, num_frames=WINDOW):
+    if kind == "transformer":
+        return TransformerBlock(WIDTH, 2, 4 * WIDTH, rngs=nnx.Rngs(params=1))
+    return FNOBlock(WIDTH, WIDTH, num_frames // 2 + 1, rngs=nnx.Rngs(params=1))
+
+
+@pytest.mark.parametrize("kind", ["fno", "transformer"])
+def test_table_11_adaln_zero_starts_as_the_identity(kind):
+    base, layer = make_base(kind), AdaLNZero(WIDTH, 5, rngs=nnx.Rngs(params=0))
+    z, c = draw(2, WINDOW, WIDTH), 100.0 * draw(2, WINDOW, 5, seed=1)
+    np.testing.assert_array_equal(layer(base, z, c), z)
+    gradient = nnx.jit(nnx.grad(lambda layer: jnp.sum(layer(base, z, c) ** 2)))(layer)
+    # Only the gate can move at first, and it does.
+    parts = np.split(np.asarray(gradient["modulation"]["kernel"][...]), 3, axis=-1)
+    reached = [bool(np.abs(part).max() > 0.1) for part in parts]
+    assert reached == [False, False, True]
+
+
+def test_table_11_adaln_zero_equals_plain_numpy():
+    layer = randomise(AdaLNZero(WIDTH, 5, rngs=nnx.Rngs(params=0)))
+    z, c = 3.0 * draw(2, WINDOW, WIDTH) + 1.0, draw(2, WINDOW, 5, seed=1)
+    shift, scale, gate = np.split(linear(layer.modulation, c), 3, axis=-1)
+    centred = z - z.mean(axis=-1, keepdims=True)
+    normalised = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True))
+    expected = z + gate * np.sin(normalised * (1.0 + scale) + shift)
+    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("num_heads", [1, 2])
+def test_table_11_cross_attention_equals_a_plain_loop(num_heads):
+    layer = randomise(CrossAttention(WIDTH, 5, num_heads, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
-    np.testing.assert_array_equal(film(z, c), np.zeros_like(z))
-    gradient = nnx.grad(lambda m: jnp.sum(m(z, c)))(film)
+    z_base, each = np.sin(z), WIDTH // num_heads
+    expected = np.zeros_like(z)
+    for b in range(2):
+        keys, values = linear(layer.attention.key, c[b]), linear(layer.attention.value, c[b])
+        for t in range(WINDOW):
+            query = linear(layer.attention.query, z_base[b, t] + position_code(0, WINDOW, WIDTH)[t])
+            answer = np.zeros(WIDTH)
+            for head in range(num_heads):
+                part = slice(head * each, (head + 1) * each)
+                weight = np.exp(keys[:, part] @ query[part] / np.sqrt(each))
+                answer[part] = weight @ values[:, part] / weight.sum()
+            z_tilde = z_base[b, t] + linear(layer.attention.output, answer)
+            expected[b, t] = silu(linear(layer.output, z_tilde))
+    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
+
+
+def test_table_11_cross_attention_frames_ask_different_questions():
+    layer = randomise(CrossAttention(WIDTH, 5, rngs=nnx.Rngs(params=0)))
+    # All frames of the features alike: only the position code tells them apart.
+    answers = layer(lambda z: z, jnp.ones((1, WINDOW, WIDTH)), draw(1, WINDOW, 5, seed=1))
+    assert float(answers.std(axis=1).max()) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["film", "concatenation", "cross_attention"])
+def test_table_11_zero_output_starts_at_zero_but_learns(name):
+    layer = conditioning_layer(name, WIDTH, WIDTH, zero_output=True, rngs=nnx.Rngs(params=0))
+    z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, WIDTH, seed=1)
+    np.testing.assert_array_equal(layer(jnp.sin, z, c), np.zeros_like(z))
+    gradient = nnx.jit(nnx.grad(lambda layer: jnp.sum(layer(jnp.sin, z, c))))(layer)
     assert float(jnp.abs(gradient["output"]["kernel"][...]).max()) > 0.1
 
 
-def test_cached_codes_cannot_be_spoilt_by_a_caller():
-    with pytest.raises(ValueError, match="read-only"):
-        position_code(0, 3, 4)[0] = 7.0
+@pytest.mark.parametrize("name", CONDITIONINGS)
+def test_table_11_gradients_are_finite_and_reach_every_weight(name):
+    class Block(nnx.Module):
+        def __init__(self):
+            self.base = FNOBlock(WIDTH, WIDTH, 4, rngs=nnx.Rngs(params=0))
+            self.layer = conditioning_layer(
+                name, WIDTH, WIDTH, num_heads=2, rngs=nnx.Rngs(params=1)
+            )
+
+    block = randomise(Block())
+    z, c, wanted = (draw(3, WINDOW, WIDTH, seed=seed) for seed in range(3))
+    loss = lambda block: jnp.mean((block.layer(block.base, z, c) - wanted) ** 2)
+    for path, part in nnx.to_flat_state(nnx.jit(nnx.grad(loss))(block)):
+        part = np.asarray(part[...])
+        assert np.all(np.isfinite(part)), path
+        if path[-2:] == ("key", "bias"):
+            # Softmax does not see what all keys have in common.
+            assert np.abs(part).max() < 1e-6
+        else:
+            assert np.abs(part).max() > 1e-5, path
+
+
+def test_table_11_names_make_their_layers():
+    made = [
+        type(conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(params=0)))
+        for name in CONDITIONINGS
+    ]
+    assert made == [FiLM, Concatenation, AdaLNZero, CrossAttention]
+    layer = conditioning_layer("cross_attention", WIDTH, 5, num_heads=4, rngs=nnx.Rngs(params=0))
+    assert layer.attention.num_heads == 4 and layer.attention.key.kernel[...].shape == (5, WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("name", "condition_width", "options", "message"),
+    [
+        ("films", WIDTH, {}, "unknown conditioning 'films'; did you mean 'film'"),
+        ("concatenation", 5, {}, f"as wide as the features, {WIDTH}, got 5"),
+        ("adaln_zero", WIDTH, {"zero_output": True}, "adds its input itself"),
+        ("cross_attention", WIDTH, {"num_heads": 3}, f"divide the width {WIDTH}, got 3"),
+    ],
+)
+def test_table_11_what_cannot_be_made_is_refused(name, condition_width, options, message):
+    with pytest.raises(ValueError, match=message):
+        conditioning_layer(name, WIDTH, condition_width, **options, rngs=nnx.Rngs(params=0))
 
 
 def test_encoder_runs_under_jit_like_outside():

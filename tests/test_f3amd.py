@@ -1,4 +1,4 @@
-"""The network as a whole, its config and the paper's names (sections 3.4 and 4.5)."""
+"""The F3AMD network as a whole, its variants and its config (section 3.4, Tables 8 to 11)."""
 
 import json
 
@@ -9,9 +9,9 @@ import pytest
 from builders import CHANNELS, HISTORY, WINDOW, evaluate, network_of, tiny_config
 from flax import nnx
 
-from f3amd_lib.models import zoo
+from f3amd_lib.models.attention import position_code
 from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.f3amd import F3AMDConfig, cosine_basis
+from f3amd_lib.models.f3amd import F3AMDConfig
 
 SIGMA = jnp.array([0.3, 20.0])
 
@@ -39,58 +39,8 @@ def run(network, x_noisy, sigma=SIGMA, condition=None):
 
 
 @pytest.mark.parametrize(
-    ("width", "parameters"),
-    [(32, 745505), (48, 1361889), (64, 1806113), (96, 3501921), (128, 4334241)],
+    "changes", [{}, {"history_anchor": True, "sigma_data": 0.5, "conditioning": "adaln_zero"}]
 )
-def test_section_4_5_parameter_counts(width, parameters):
-    config = zoo.build_config(f"F3AMD-FNO-{width}", channels=135, num_styles=100)
-    assert zoo.count_parameters(config) == parameters
-
-
-@pytest.mark.parametrize(("width", "depth"), [(32, 8), (48, 8), (64, 6), (96, 6), (128, 4)])
-def test_section_4_5_depths_and_modes(width, depth):
-    for window, modes in ((32, 17), (64, 33)):
-        config = zoo.build_config(f"F3AMD-FNO-{width}", channels=129, num_styles=22, window=window)
-        assert (config.latent_width, config.depth, config.num_kept_modes) == (width, depth, modes)
-        assert (config.num_history, config.window, config.kernel_size) == (10, window, 3)
-        # Nothing of ours in a row of the paper.
-        assert not (config.block_residual or config.history_anchor or config.residual_prior)
-
-
-def test_counted_parameters_are_those_of_the_built_network():
-    config = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
-    network = network_of(config)
-    built = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network)))
-    assert zoo.count_parameters(config) == built
-    # The anchor and the prior each add one number per frame and channel.
-    assert built - zoo.count_parameters(tiny_config(block_residual=True)) == 2 * WINDOW * CHANNELS
-
-
-def test_zoo_table_has_a_row_per_preset():
-    table = zoo.table(channels=135, num_styles=100)
-    assert list(table["model"]) == list(zoo.PRESETS)
-    row = table.set_index("model").loc["F3AMD-FNO-96"]
-    assert list(row) == [96, 6, 17, 3501921]
-
-
-def test_zoo_builds_the_same_network_from_the_same_key():
-    settings = tiny_config().to_dict()
-    first, again, other = (
-        nnx.state(zoo.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2)
-    )
-    same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), first, again)
-    assert all(jax.tree.leaves(same))
-    assert not all(jax.tree.leaves(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), first, other)))
-
-
-def test_unknown_names_are_refused_with_the_nearest():
-    with pytest.raises(ValueError, match="'F3AMD-FNO-69'.*F3AMD-FNO-96"):
-        zoo.build_config("F3AMD-FNO-69", channels=9, num_styles=2)
-    with pytest.raises(ValueError, match="'latent_with'; did you mean 'latent_width'"):
-        zoo.build_config("F3AMD-FNO-96", channels=9, num_styles=2, latent_with=8)
-
-
-@pytest.mark.parametrize("changes", [{}, {"history_anchor": True, "sigma_data": 0.5}])
 def test_config_survives_json(changes):
     config = tiny_config(**changes)
     again = F3AMDConfig.from_dict(json.loads(json.dumps(config.to_dict())))
@@ -112,8 +62,18 @@ def test_config_names_unknown_keys():
         ({"normalise": 1}, "normalise must be of type bool"),
         ({"sigma_data": "1"}, "sigma_data must be of type float"),
         ({"sigma_data": 0}, "sigma_data must be positive"),
-        ({"num_kept_modes": 6}, "at most 5 for a window of 8"),
+        ({"num_kept_modes": 6}, "at most 5 for blocks of 8 frames"),
+        ({"num_kept_modes": 9, "spectral_variant": "cosine"}, "at most 8 for blocks of 8"),
+        ({"num_kept_modes": 10, "conditioning": "concatenation"}, "at most 9 for blocks of 16"),
         ({"num_condition_heads": 3}, "num_(condition_)?heads"),
+        ({"num_heads": 3}, "num_heads must divide the latent width 8"),
+        ({"base_block": "transfomer"}, "'transfomer'; did you mean 'transformer'"),
+        ({"conditioning": "adaln-zero"}, "'adaln-zero'; did you mean 'adaln_zero'"),
+        ({"encoder_decoder": "cnn"}, "unknown encoder_decoder 'cnn'"),
+        ({"spectral_variant": "dct"}, "unknown spectral_variant 'dct'"),
+        ({"dropout": 1.0}, "dropout must be below 1"),
+        ({"dropout": -0.1}, "dropout must be positive"),
+        ({"block_residual": True, "conditioning": "adaln_zero"}, "residual already"),
     ],
 )
 def test_impossible_configs_are_refused(changes, message):
@@ -176,15 +136,6 @@ def test_input_scaling_is_c_in():
         assert float(jnp.abs(run(scaled, x_noisy) - run(raw, x_noisy)).max()) > 1e-2
 
 
-def test_raw_presets_have_neither_scaling_nor_normalisation():
-    size = {"channels": CHANNELS, "num_styles": 2}
-    for name in ("F3AMD-FNO-32", "F3AMD-FNO-96"):
-        sane = zoo.build_config(name, **size).to_dict()
-        raw = zoo.build_config(f"{name}-raw", **size).to_dict()
-        assert {key for key in sane if sane[key] != raw[key]} == {"input_scaling", "normalise"}
-        assert not raw["input_scaling"] and not raw["normalise"]
-
-
 def test_block_residual_starts_as_decoder_of_encoder():
     network, x_noisy = make_network(block_residual=True, depth=3), draw(2, WINDOW, CHANNELS)
     scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
@@ -232,13 +183,6 @@ def test_residual_prior_weighs_each_cosine_mode_apart():
     np.testing.assert_allclose(run(network, x_noisy, sigma), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("num_frames", [1, 8, 9, 32])
-def test_cosine_basis_is_orthonormal(num_frames):
-    basis = cosine_basis(num_frames)
-    np.testing.assert_allclose(basis @ basis.T, np.eye(num_frames), atol=1e-12)
-    np.testing.assert_allclose(basis[0], np.full(num_frames, num_frames**-0.5), atol=1e-12)
-
-
 def test_every_parameter_learns():
     network = make_network(history_anchor=True, residual_prior=True)
     x_noisy, wanted = draw(2, WINDOW, CHANNELS), draw(2, WINDOW, CHANNELS, seed=9)
@@ -251,3 +195,103 @@ def test_every_parameter_learns():
         # A key's bias shifts all scores of a query alike, which softmax does not see.
         if not ("'key'" in name and "'bias'" in name):
             assert float(jnp.abs(leaf).max()) > 1e-9, name
+
+
+VARIANTS = {
+    "transformer": {"base_block": "transformer", "num_heads": 2},
+    "linear coders": {"encoder_decoder": "linear"},
+    "cosine": {"spectral_variant": "cosine", "num_kept_modes": WINDOW},
+    "reduced rank": {"spectral_variant": "reduced_rank", "spectral_rank": 3},
+    "weighted": {"spectral_variant": "weighted"},
+    "concatenation": {"conditioning": "concatenation", "num_kept_modes": WINDOW + 1},
+    "adaln_zero": {"conditioning": "adaln_zero"},
+    "cross_attention": {"conditioning": "cross_attention"},
+    "one mode": {"num_kept_modes": 1},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_tables_8_to_11_every_variant_is_its_own_function(variant):
+    network, x_noisy = make_network(**VARIANTS[variant]), draw(2, WINDOW, CHANNELS)
+    x0_hat = run(network, x_noisy)
+    assert x0_hat.shape == x_noisy.shape and bool(jnp.all(jnp.isfinite(x0_hat)))
+    assert float(jnp.abs(x0_hat - run(make_network(), x_noisy)).max()) > 1e-3
+    for name in Condition._fields:
+        changed = make_condition()
+        changed = changed._replace(**{name: getattr(changed, name) + 1.0})
+        moved = float(jnp.abs(run(network, x_noisy, condition=changed) - x0_hat).max())
+        # AdaLN-zero starts as the identity: before training no condition comes through.
+        assert moved == 0.0 if variant == "adaln_zero" else moved > 1e-5, name
+
+
+def test_table_9_linear_coders_are_one_matrix_a_frame():
+    network = make_network(encoder_decoder="linear")
+    assert isinstance(network.encoder, nnx.Linear) and isinstance(network.decoder, nnx.Linear)
+    assert network.encoder.kernel.shape == (CHANNELS, 8)
+    assert network.decoder.kernel.shape == (8, CHANNELS)
+
+
+def test_table_8_variants_leave_encoder_and_decoder_alone():
+    for name in ("cosine", "reduced rank", "weighted"):
+        network = make_network(**VARIANTS[name])
+        standard = make_network()
+        for part in ("encoder", "decoder"):
+            shapes = [
+                jax.tree.map(jnp.shape, nnx.state(getattr(n, part))) for n in (network, standard)
+            ]
+            assert shapes[0] == shapes[1], (name, part)
+
+
+def test_table_10_fewer_modes_reach_encoder_blocks_and_decoder():
+    network = make_network(num_kept_modes=2)
+    for block in (network.encoder, network.blocks[0], network.decoder):
+        assert block.spectral.weight_real.shape[0] == 2
+
+
+def test_table_11_concatenation_runs_its_blocks_on_twice_the_frames():
+    network, condition = make_network(**VARIANTS["concatenation"]), make_condition()
+    x_noisy = draw(2, WINDOW, CHANNELS)
+    stages = dict(network.stages(x_noisy, SIGMA, network.encode(condition)))
+    assert stages["c"].shape == stages["encoder"].shape == (2, WINDOW, 8)
+    assert stages["block 1"].shape == (2, 2 * WINDOW, 8)
+    sequence = jnp.concatenate([stages["c"], stages["encoder"]], axis=1)
+    block = network.conditionings[0](network.blocks[0], sequence, None)
+    np.testing.assert_allclose(stages["block 1"], block, atol=1e-5)
+    np.testing.assert_allclose(stages["x0_hat"], network.decoder(block[:, -WINDOW:]), atol=1e-5)
+
+
+def test_table_11_adaln_zero_starts_as_decoder_of_encoder():
+    network, x_noisy = make_network(conditioning="adaln_zero", depth=3), draw(2, WINDOW, CHANNELS)
+    scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
+    np.testing.assert_allclose(
+        run(network, x_noisy), network.decoder(network.encoder(scaled)), atol=1e-5
+    )
+
+
+def test_section_3_4_1_transformer_blocks_see_the_order_of_frames():
+    network, condition = make_network(**VARIANTS["transformer"]), make_condition()
+    stages = dict(network.stages(draw(2, WINDOW, CHANNELS), SIGMA, network.encode(condition)))
+    placed = stages["encoder"] + position_code(0, WINDOW, 8)
+    block = network.conditionings[0](network.blocks[0], placed, stages["c"])
+    np.testing.assert_allclose(stages["block 1"], block, atol=1e-5)
+
+
+def test_stages_end_with_what_the_call_returns():
+    network, condition = make_network(depth=2, history_anchor=True), make_condition()
+    x_noisy = draw(2, WINDOW, CHANNELS)
+    stages = list(network.stages(x_noisy, SIGMA, network.encode(condition)))
+    names = [name for name, _ in stages]
+    assert names == ["c", "encoder", "block 1", "block 2", "decoder", "x0_hat"]
+    np.testing.assert_allclose(stages[-1][1], run(network, x_noisy), atol=1e-5)
+
+
+def test_dropout_acts_only_with_a_key():
+    network = make_network(base_block="transformer", dropout=0.5, depth=2)
+    x_noisy, context = draw(2, WINDOW, CHANNELS), network.encode(make_condition())
+    call = jax.jit(lambda key: network(x_noisy, SIGMA, context, key=key))
+    quiet = network(x_noisy, SIGMA, context)
+    np.testing.assert_array_equal(quiet, network(x_noisy, SIGMA, context))
+    first, again, other = (call(jax.random.key(k)) for k in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert float(jnp.abs(first - other).max()) > 1e-3
+    assert float(jnp.abs(first - quiet).max()) > 1e-3

@@ -240,6 +240,131 @@ def test_planted_foot_does_not_slide():
     assert value == 0.0 and share == pytest.approx(0.5)
 
 
+# ------------------------------------------------------------------------------------- CAMDM
+
+
+def zigzag(degrees, num_frames=4 * WINDOW + 1, step=0.04, towards=0.0):
+    """Steps of 4 cm, by turns so many degrees to the left and to the right of a direction."""
+    angle = towards + np.deg2rad(degrees) * (-1.0) ** np.arange(num_frames - 1)
+    steps = step * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    ground = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return POSE + ground[:, None, :]
+
+
+def test_camdm_path_walked_ten_degrees_off():
+    path = named_path("straight", 4 * WINDOW, speed=1.2)
+    for off in (10.0, -10.0):
+        positions = glide(step=0.04, direction=np.deg2rad(off))
+        assert metrics.camdm_trajectory_error(positions, path) == pytest.approx(10.0)
+        # A direction has no speed: half as fast is no better and no worse.
+        slow = glide(step=0.02, direction=np.deg2rad(off))
+        assert metrics.camdm_trajectory_error(slow, path) == pytest.approx(10.0)
+
+
+def test_camdm_errors_to_both_sides_cancel():
+    path = named_path("straight", 4 * WINDOW + 1, speed=1.2)
+    assert metrics.camdm_trajectory_error(zigzag(40.0), path) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.trajectory_error(zigzag(40.0), path, WINDOW) > 0.1
+    yaw = np.deg2rad(25.0) * (-1.0) ** np.arange(4 * WINDOW)
+    assert metrics.camdm_orientation_error(yaw, np.zeros(4 * WINDOW)) == pytest.approx(0.0)
+    assert metrics.direction_error(yaw, np.zeros(4 * WINDOW), WINDOW) == pytest.approx(25.0)
+
+
+def test_camdm_does_not_wrap_steps_across_the_cut():
+    """Towards +X the angle is 180 degrees: a step to the left of it reads 175, to the right -175.
+
+    Half of the steps are 5 degrees off and half, by the unwrapped difference, 355.
+    """
+    towards_x = np.pi / 2
+    target = np.zeros((4 * WINDOW + 1, 2))
+    target[:, 0] = 0.04 * np.arange(len(target))
+    found = metrics.camdm_trajectory_error(zigzag(5.0, towards=towards_x), target)
+    assert found == pytest.approx(180.0)
+    # The same walk towards +Z reads 0: the figure depends on where the world's axes lie.
+    ahead = metrics.camdm_trajectory_error(zigzag(5.0), target[:, ::-1])
+    assert ahead == pytest.approx(0.0, abs=1e-9)
+    # Facing has its cut at -X.
+    yaw = -np.pi / 2 + np.deg2rad(5.0) * (-1.0) ** np.arange(10)
+    found = metrics.camdm_orientation_error(yaw, np.full(10, -np.pi / 2 + 1e-9))
+    assert found == pytest.approx(180.0)
+
+
+def test_camdm_constant_wrong_facing_is_an_orientation_error():
+    yaw = np.full(4 * WINDOW, np.deg2rad(10.0))
+    assert metrics.camdm_orientation_error(yaw, np.zeros(4 * WINDOW)) == pytest.approx(10.0)
+    assert metrics.camdm_orientation_error(yaw + 6 * np.pi, np.zeros(4 * WINDOW)) == pytest.approx(
+        10.0
+    )
+
+
+def test_camdm_direction_of_what_stands_is_undefined():
+    path = named_path("straight", 4 * WINDOW, speed=1.2)
+    still = np.tile(POSE, (4 * WINDOW, 1, 1))
+    assert np.isnan(metrics.camdm_trajectory_error(still, path))
+    assert np.isnan(metrics.camdm_trajectory_error(glide(), np.zeros((4 * WINDOW, 2))))
+    # A rest half-way takes nothing from the steps before and after it.
+    positions = glide(step=0.04, direction=np.deg2rad(10.0))
+    positions[50:80] = positions[50]
+    positions[80:] -= positions[80] - positions[79] - (positions[1] - positions[0])
+    assert metrics.camdm_trajectory_error(positions, path) == pytest.approx(10.0)
+
+
+def test_camdm_foot_sliding_counts_a_last_frame_that_cannot_slide():
+    """90 frames in contact, 89 of which step 2 cm where the root steps 1 / 30 m."""
+    assert metrics.camdm_foot_sliding(slider(), SKELETON) == pytest.approx(0.6 * 89 / 90)
+    assert metrics.camdm_foot_sliding(slider(rest=0.0425), (3, 4)) == pytest.approx(0.6 * 89 / 90)
+    lifted = slider()
+    lifted[-1, 3, 1] = 0.02  # no contact in the last frame: the two definitions agree
+    assert metrics.camdm_foot_sliding(lifted, (3, 4)) == pytest.approx(0.6)
+    assert metrics.foot_sliding(lifted, (3, 4))[0] == pytest.approx(0.6)
+    assert np.isnan(metrics.camdm_foot_sliding(np.tile(POSE, (9, 1, 1)), (3, 4)))
+
+
+def test_camdm_metrics_of_a_batch_one_by_one_in_any_order_and_after_a_history():
+    batch = np.stack([wobble(seed=seed) for seed in range(3)])
+    paths = [named_path("slalom", batch.shape[1], seed=seed) for seed in range(3)]
+    together = metrics.camdm_metrics(batch, None, paths, SKELETON)
+    backwards = metrics.camdm_metrics(batch[::-1], None, paths[::-1], SKELETON)
+    assert set(together) == set(metrics.CAMDM_METRICS)
+    for index in range(3):
+        alone = metrics.camdm_metrics(batch[index], None, paths[index], SKELETON)
+        started = np.concatenate([batch[2 - index, :10], batch[index]])
+        after = metrics.camdm_metrics(started, None, paths[index], SKELETON, history=10)
+        assert after == pytest.approx(alone)
+        for key, value in alone.items():
+            assert isinstance(value, float)
+            assert together[key][index] == pytest.approx(value), key
+            assert backwards[key][2 - index] == pytest.approx(value), key
+
+
+def test_camdm_metrics_and_the_place_and_turn_of_the_world():
+    """All may be moved; turned, only those without angles, as the text of the angles says."""
+    positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
+    path = named_path("slalom", len(positions))
+    before = metrics.camdm_metrics(positions, None, path, SKELETON)
+    moved = metrics.camdm_metrics(
+        positions + shift, None, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON
+    )
+    assert moved == pytest.approx(before)
+    turned = positions @ matrix_from_yaw(np.float64(angle)).T
+    after = metrics.camdm_metrics(turned, None, path.placed((0, 0), angle), SKELETON)
+    for key in ("camdm_foot_sliding", "coherence"):
+        assert after[key] == pytest.approx(before[key])
+
+
+def test_camdm_metrics_cannot_be_taken_for_those_of_the_text():
+    for key, (name, _, _) in metrics.CAMDM_METRICS.items():
+        if key != "coherence":  # the text has nothing of that name
+            assert key.startswith("camdm_") and name.startswith("CAMDM_")
+            assert key not in metrics.METRICS
+    both = metrics.METRICS | metrics.CAMDM_METRICS
+    assert len({name for name, _, _ in both.values()}) == len(both)
+    values = metrics.camdm_metrics(glide(), None, None, SKELETON)
+    assert set(values) == {"camdm_foot_sliding", "coherence"}
+    rows = metrics.tidy_metrics(values, model="CAMDM")
+    assert [row["metric"] for row in rows] == ["CAMDM_foot_sliding", "coherence"]
+
+
 # ------------------------------------------------------------------------------------- all together
 
 
@@ -321,7 +446,7 @@ def test_tidy_rows_average_and_count():
             "characters": 2,
         }
     ]
-    with pytest.raises(ValueError, match="unknown metric 'ird'"):
+    with pytest.raises(ValueError, match="unknown metric 'ird'; did you mean 'ird_cm'"):
         metrics.tidy_metrics({"ird": 1.0})
 
 
@@ -337,6 +462,8 @@ POSITION_METRICS = [
     metrics.inter_frame_step,
     metrics.joint_acceleration,
     lambda positions: metrics.path_drift(positions, np.zeros((128, 2))),
+    lambda positions: metrics.camdm_trajectory_error(positions, np.zeros((128, 2))),
+    lambda positions: metrics.camdm_foot_sliding(positions, (3, 4)),
 ]
 
 
@@ -370,7 +497,14 @@ def test_paths_that_do_not_fit_are_refused():
         metrics.trajectory_error(glide()[None].repeat(3, 0), np.zeros((2, 128, 2)), WINDOW)
     with pytest.raises(ValueError, match="window must be"):
         metrics.ird_excess(glide(), 1)
-    with pytest.raises(ValueError, match="toes must be"):
-        metrics.foot_sliding(glide(), (3, 9))
+    for toes in ((3, 9), (-1, 3), ()):
+        with pytest.raises(ValueError, match="toes must be"):
+            metrics.foot_sliding(glide(), toes)
     with pytest.raises(ValueError, match="for this skeleton"):
         metrics.first_metrics(glide()[:, :4], None, None, WINDOW, SKELETON)
+    with pytest.raises(ValueError, match="for this skeleton"):
+        metrics.camdm_metrics(glide()[:, :4], None, None, SKELETON)
+    with pytest.raises(ValueError, match="path yaw has 100 frames; it needs 128"):
+        metrics.camdm_orientation_error(np.zeros(128), np.zeros(100))
+    with pytest.raises(ValueError, match="yaw must be .* for these positions"):
+        metrics.camdm_metrics(glide(), np.zeros(5), named_path("straight", 128), SKELETON)

@@ -183,10 +183,9 @@ def test_frames_are_true_rotations_and_make_a_motion(network_generator):
 
 
 def test_noise_levels_are_those_of_training_unless_told(trained):
-    levels = {"sigma_max": 80.0, "sigma_min": 0.1, "rho": 7.0}
-    record = {"training": {**levels, "seed": 0}}
-    generator = MotionGenerator(tiny_trained(record=record), num_steps=3)
-    np.testing.assert_array_equal(generator.sigmas, VarianceExploding(**levels).grid(3))
+    levels = VarianceExploding(80.0, 0.1, 7.0)
+    generator = MotionGenerator(tiny_trained(diffusion=levels), num_steps=3)
+    np.testing.assert_array_equal(generator.sigmas, levels.grid(3))
     np.testing.assert_array_equal(MotionGenerator(trained, 4).sigmas, VarianceExploding().grid(4))
     chosen = MotionGenerator(trained, 4, schedule=VarianceExploding(8.0, 1.0), spacing="uniform")
     np.testing.assert_array_equal(chosen.sigmas, VarianceExploding(8.0, 1.0).grid(4, "uniform"))

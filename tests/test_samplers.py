@@ -5,16 +5,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import (
+    SAMPLERS,
     add_noise,
     ddim_step,
     ddim_step_vp,
+    ddpm_posterior,
+    ddpm_step,
+    num_evaluations,
+    probability_flow_slope,
+    sample,
     sample_ddim,
     sample_ddim_vp,
+    sample_ddpm,
+    sample_euler,
+    sample_heun,
 )
-from f3amd_lib.diffusion.schedules import VarianceExploding, alpha_bar_from_sigma
+from f3amd_lib.diffusion.schedules import (
+    SCHEDULES,
+    VarianceExploding,
+    VariancePreservingCosine,
+    VariancePreservingLinear,
+    alpha_bar_from_sigma,
+)
 
 SCHEDULE = VarianceExploding()
+DETERMINISTIC = [sample_ddim, sample_ddim_vp, sample_euler, sample_heun]
 
 
 def two_modes(width=0.1):
@@ -90,6 +107,14 @@ def test_appendix_f_vp_equals_ve_in_float64(num_steps):
     np.testing.assert_allclose(vp, ve, atol=1e-12)
 
 
+def test_appendix_f_vp_equals_ve_on_variance_preserving_levels():
+    sigmas, x_init = VariancePreservingCosine().grid(4), jnp.asarray(start(), jnp.float32)
+    ve = sample_ddim(two_modes(), x_init, sigmas, unroll=True)
+    vp = sample_ddim_vp(two_modes(), x_init, sigmas, unroll=True)
+    np.testing.assert_allclose(vp, ve, atol=2e-4)
+    assert float(jnp.std(ve)) > 0.1
+
+
 @pytest.mark.parametrize("unroll", [False, True])
 def test_scan_equals_a_python_loop(unroll):
     sigmas, x = SCHEDULE.grid(8), start(64)
@@ -101,18 +126,20 @@ def test_scan_equals_a_python_loop(unroll):
     np.testing.assert_allclose(sampled, x, atol=1e-6)
 
 
-def test_unrolled_program_has_no_loop():
-    sigmas, x_init = SCHEDULE.grid(4), jnp.zeros((1, 2, 3))
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_unrolled_program_has_no_loop(name):
+    key = jax.random.key(0, impl="unsafe_rbg")  # the default random numbers loop by themselves
 
-    def lowered(unroll):
-        sample = lambda x: sample_ddim(two_modes(), x, sigmas, unroll=unroll)
-        return jax.jit(sample).lower(x_init).as_text()
+    def lowered(num_steps, unroll):
+        sigmas = SCHEDULE.grid(num_steps)
+        walk = lambda x, key: sample(name, two_modes(), x, sigmas, key=key, unroll=unroll)
+        return jax.jit(walk).lower(jnp.zeros((1, 2, 3)), key).as_text()
 
-    assert "while" in lowered(False)
-    assert "while" not in lowered(True)
+    assert "while" in lowered(4, False)
+    assert all("while" not in lowered(num_steps, True) for num_steps in (1, 2, 4))
 
 
-@pytest.mark.parametrize("sample", [sample_ddim, sample_ddim_vp])
+@pytest.mark.parametrize("sample", DETERMINISTIC)
 def test_one_step_returns_the_denoiser_at_sigma_max(sample):
     x_init = jnp.asarray(start(16), jnp.float32)
     seen = two_modes(width=100.0)(x_init, 128.0)
@@ -121,7 +148,7 @@ def test_one_step_returns_the_denoiser_at_sigma_max(sample):
     )
 
 
-@pytest.mark.parametrize("sample", [sample_ddim, sample_ddim_vp])
+@pytest.mark.parametrize("sample", DETERMINISTIC)
 def test_the_denoiser_always_sees_the_variance_exploding_state(sample):
     # A denoiser that knows x0 keeps the state on the line x0 + sigma * noise, which it can check.
     rng = np.random.default_rng(0)
@@ -191,8 +218,258 @@ def test_gaussian_oracle_reaches_known_mean_and_deviation():
     assert x.std() == pytest.approx(0.3, rel=0.05)
 
 
-@pytest.mark.parametrize("sample", [sample_ddim, sample_ddim_vp])
+@pytest.mark.parametrize("sample", DETERMINISTIC)
 @pytest.mark.parametrize("sigmas", [[1.0], [], [[1.0, 0.0]]])
 def test_grids_without_a_step_are_refused(sample, sigmas):
     with pytest.raises(ValueError, match="sigmas"):
         sample(two_modes(), jnp.zeros((1, 1, 1)), sigmas)
+
+
+def test_ddpm_posterior_is_camdms():
+    # K = 4 levels, least noisy first; the last step of a sampler goes to a clean signal.
+    alpha_bars = VariancePreservingCosine(4).alpha_bars
+    on_x0, on_z, variance = ddpm_posterior(alpha_bars, np.append(1.0, alpha_bars[:-1]))
+    np.testing.assert_allclose(on_x0, [1.0, 0.758145, 0.581307, 0.379507], atol=1e-6)
+    np.testing.assert_allclose(on_z, [0.0, 0.230793, 0.319702, 0.027064], atol=1e-6)
+    # The released configuration repeats the second entry in place of log 0.
+    assert variance[0] == 0.0
+    np.testing.assert_allclose(np.log(variance[1:]), [-2.071257, -0.870617, -0.156659], atol=1e-6)
+
+
+@pytest.mark.parametrize(("alpha_bar", "alpha_bar_next"), [(0.1, 0.7), (0.6, 0.65), (0.01, 0.99)])
+def test_ddpm_posterior_is_bayes_rule(alpha_bar, alpha_bar_next):
+    # p(z_next | z, x0) is p(z | z_next) p(z_next | x0): both are Gaussians of the forward process.
+    x0, z = 0.8, -0.3
+    z_next = np.linspace(-8.0, 8.0, 40_001)
+    alpha = alpha_bar / alpha_bar_next
+    prior = np.exp(-0.5 * (z_next - np.sqrt(alpha_bar_next) * x0) ** 2 / (1.0 - alpha_bar_next))
+    likelihood = np.exp(-0.5 * (z - np.sqrt(alpha) * z_next) ** 2 / (1.0 - alpha))
+    density = prior * likelihood / np.sum(prior * likelihood)
+    mean = np.sum(z_next * density)
+    on_x0, on_z, variance = ddpm_posterior(alpha_bar, alpha_bar_next)
+    assert on_x0 * x0 + on_z * z == pytest.approx(mean, abs=1e-9)
+    assert variance == pytest.approx(np.sum((z_next - mean) ** 2 * density), rel=1e-9)
+
+
+def test_ddpm_step_by_hand():
+    # From sigma 2 to 1 a quarter of the seen noise stays: 1 + (5 - 1) / 4. Fresh: sqrt(1 - 1/4).
+    assert ddpm_step(5.0, 1.0, 2.0, 1.0, 0.0) == pytest.approx(2.0)
+    assert ddpm_step(5.0, 1.0, 2.0, 1.0, 2.0) == pytest.approx(2.0 + np.sqrt(3.0))
+
+
+def test_ddpm_step_in_the_exploding_state_is_the_posterior():
+    rng = np.random.default_rng(5)
+    x_noisy, x0_hat, noise = rng.standard_normal((3, 6, 4))
+    for sigma, sigma_next in ((83.0, 2.4), (2.4, 1.0), (1.0, 0.99), (0.4, 0.0)):
+        alpha_bar, alpha_bar_next = alpha_bar_from_sigma(sigma), alpha_bar_from_sigma(sigma_next)
+        on_x0, on_z, variance = ddpm_posterior(alpha_bar, alpha_bar_next)
+        z_next = on_x0 * x0_hat + on_z * np.sqrt(alpha_bar) * x_noisy + np.sqrt(variance) * noise
+        x_next = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, noise)
+        np.testing.assert_allclose(np.sqrt(alpha_bar_next) * x_next, z_next, rtol=0, atol=1e-13)
+
+
+def test_ddpm_adds_no_noise_at_the_end():
+    x_noisy, x0_hat, noise = np.float32([[3e3, -4e3], [0.1, -0.7], [5.0, -6.0]])
+    np.testing.assert_array_equal(ddpm_step(x_noisy, x0_hat, 9.0, 0.0, noise), x0_hat)
+
+
+def test_ddpm_equals_camdms_loop_over_its_own_levels():
+    # The released code walks the VP state with a table of coefficients, from z ~ N(0, 1).
+    schedule, key = VariancePreservingCosine(4), jax.random.key(2)
+    alpha_bars = schedule.alpha_bars
+    before = np.append(1.0, alpha_bars[:-1])
+    betas = 1.0 - alpha_bars / before
+    with jax.enable_x64(True):
+        z = start(32) / 128.0
+        x_init = jnp.asarray(z / np.sqrt(alpha_bars[-1]))
+        found = np.asarray(sample_ddpm(two_modes(), x_init, schedule.grid(4), key))
+        for level, key_step in zip((3, 2, 1, 0), jax.random.split(key, 4), strict=True):
+            noise = np.asarray(jax.random.normal(key_step, z.shape, z.dtype))
+            x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.sigmas[level]))
+            left = 1.0 - alpha_bars[level]
+            mean = betas[level] * np.sqrt(before[level]) / left * x0_hat
+            mean += np.sqrt(1.0 - betas[level]) * (1.0 - before[level]) / left * z
+            z = mean + np.sqrt(betas[level] * (1.0 - before[level]) / left) * noise
+    np.testing.assert_allclose(found, z, atol=1e-11)
+    assert np.std(z) > 0.1
+
+
+def ddpm_variance(width, sigmas, variance):
+    """Variance that ancestral sampling ends with, under the exact denoiser of one Gaussian.
+
+    That denoiser is linear, so that a Gaussian state stays one, with this recursion.
+    """
+    for sigma, sigma_next in zip(sigmas[:-1], sigmas[1:], strict=True):
+        towards, share = width**2 / (width**2 + sigma**2), (sigma_next / sigma) ** 2
+        kept = towards + share * (1.0 - towards)
+        variance = kept**2 * variance + sigma_next**2 * (1.0 - share)
+    return variance
+
+
+DDPM_GRIDS = {
+    "linear 1000": VariancePreservingLinear(1000).grid(1000),
+    "cosine 8": VariancePreservingCosine(8).grid(8),
+    "cosine 8 in 4": VariancePreservingCosine(8).grid(4),
+    "exploding 8": VarianceExploding().grid(8),
+}
+
+
+@pytest.mark.parametrize("name", DDPM_GRIDS)
+def test_ddpm_on_the_gaussian_oracle_has_the_variance_worked_out(name):
+    mean, width, sigmas = 0.7, 0.3, DDPM_GRIDS[name]
+    one = GaussianMixture([mean], width)
+    key_init, key = jax.random.split(jax.random.key(11))
+    x_init = np.float32(sigmas[0]) * jax.random.normal(key_init, (4000, 1))
+    x = np.asarray(sample_ddpm(one.denoise, x_init, sigmas, key))
+    assert x.mean() == pytest.approx(mean, abs=0.015)
+    assert x.var() == pytest.approx(ddpm_variance(width, sigmas, sigmas[0] ** 2), rel=0.06)
+    if len(sigmas) > 1000:  # then it is nearly that of the data, too
+        assert x.var() == pytest.approx(width**2, rel=0.06)
+
+
+def test_ddpm_needs_many_levels_for_the_whole_variance():
+    # The estimate of x0 is a mean, which varies less than the data do: a step that takes it for
+    # the truth loses some variance, and a long one more.
+    def share(sigmas):
+        return ddpm_variance(0.3, sigmas, sigmas[0] ** 2) / 0.3**2
+
+    few = [share(VariancePreservingCosine(8).grid(num_steps)) for num_steps in (1, 2, 4, 8)]
+    assert np.all(np.diff(few) > 0.05) and few[-1] < 0.5
+    counts = [500, 1000, 2000, 4000]
+    missing = [1.0 - share(VariancePreservingLinear(count).grid(count)) for count in counts]
+    assert missing[-1] < 0.01
+    assert -np.polyfit(np.log(counts), np.log(missing), 1)[0] == pytest.approx(1.0, abs=0.1)
+    # One step from sigma = 1 with unit width, by hand: x0_hat is half of what is seen.
+    assert ddpm_variance(1.0, [1.0, 0.0], 1.0) == pytest.approx(0.25)
+
+
+def test_ddpm_keeps_the_noise_level_when_the_clean_signal_is_known():
+    # Then every state is x0 + sigma * noise, fresh and old noise together, whatever the steps.
+    key_init, key = jax.random.split(jax.random.key(8))
+    x_init = 0.5 + 8.0 * jax.random.normal(key_init, (20_000, 1))
+    x = np.asarray(sample_ddpm(lambda x, sigma: 0.0 * x + 0.5, x_init, [8.0, 6.0, 4.0, 3.0], key))
+    assert x.mean() == pytest.approx(0.5, abs=0.07)
+    assert x.std() == pytest.approx(3.0, rel=0.02)
+
+
+def test_ddpm_is_decided_by_its_key():
+    sigmas, x_init = SCHEDULE.grid(4), jnp.asarray(start(64), jnp.float32)
+    walk = jax.jit(lambda key: sample("ddpm", two_modes(), x_init, sigmas, key=key))
+    first, again, other = (walk(jax.random.key(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert float(jnp.abs(first - other).mean()) > 0.05
+
+
+def test_probability_flow_follows_the_score():
+    # dx/dsigma = -sigma * grad log p(x; sigma) (Karras et al. 2022, Eq. 3 with sigma(t) = t).
+    mixture = GaussianMixture([-1.0, 1.0], 0.3)
+    x, sigma = np.linspace(-4.0, 4.0, 17)[:, None], 0.6
+    slope = probability_flow_slope(x, mixture.denoise(x, sigma), sigma)
+    np.testing.assert_allclose(slope, -sigma * mixture.score(x, sigma), atol=1e-13)
+    # And it is the slope of the path itself.
+    step = 1e-4
+    path = mixture.flow(x, sigma, sigma + step) - mixture.flow(x, sigma, sigma - step)
+    np.testing.assert_allclose(slope, path / (2 * step), atol=1e-6)
+
+
+@pytest.mark.parametrize("num_steps", [1, 16])
+def test_euler_is_ddim(num_steps):
+    sigmas = SCHEDULE.grid(num_steps)
+    with jax.enable_x64(True):
+        x_init = jnp.asarray(start())
+        euler = np.asarray(sample_euler(two_modes(), x_init, sigmas))
+        ddim = np.asarray(sample_ddim(two_modes(), x_init, sigmas))
+    np.testing.assert_allclose(euler, ddim, atol=1e-11)
+
+
+def test_heun_step_by_hand():
+    # x0_hat = x / 2, so the slope is x / (2 sigma): 1 at (8, 4), 1.5 at the guess (6, 2).
+    half = lambda x, sigma: 0.5 * x
+    x = sample_heun(half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 0.0])
+    # 8 - 2 * 1.25 = 5.5, of which the Euler step to 0 keeps the estimate.
+    assert float(x[0, 0, 0]) == pytest.approx(2.75, rel=1e-6)
+    # The Euler step, from where the same grid is cut: 8 - 2 * 1.25 = 5.5, then 5.5 - 1 * 1.375.
+    x = sample_heun(half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 1.0])
+    assert float(x[0, 0, 0]) == pytest.approx(4.125, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "order", "to_zero"),
+    [
+        ("ddim", 1.0, True),
+        ("ddim_vp", 1.0, True),
+        ("euler", 1.0, True),
+        ("heun", 2.0, True),
+        ("heun", 2.0, False),
+    ],
+)
+def test_order_of_convergence_on_the_mixture_oracle(sampler, order, to_zero):
+    # The grid t = linspace(0, 1, N) of Eq. 9. Its step from sigma_min to 0 answers with the
+    # denoiser at sigma_min, in every sampler, so that the exact path is finished in this way too.
+    # Without that step the grid ends at sigma_min, and Heun's last step is one of Euler's.
+    mixture, x_init = GaussianMixture([-1.0, 1.0], 0.3), start(128)[:, 0]
+    exact = mixture.flow(x_init, SCHEDULE.sigma_max, SCHEDULE.sigma_min)
+    exact = mixture.denoise(exact, SCHEDULE.sigma_min) if to_zero else exact
+    counts, errors = [64, 128, 256], []
+    with jax.enable_x64(True):
+        for num_steps in counts:
+            sigmas = SCHEDULE.grid(num_steps)
+            sigmas = sigmas if to_zero else sigmas[:-1]
+            x = sample(sampler, two_modes(0.3), jnp.asarray(x_init), sigmas)
+            errors.append(np.abs(np.asarray(x) - exact).mean())
+    found = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert found == pytest.approx(order, abs=0.1)
+
+
+@pytest.mark.parametrize(("num_steps", "unroll"), [(1, False), (3, True), (5, False)])
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_evaluations_are_as_many_as_promised(name, num_steps, unroll):
+    levels = []
+
+    def denoise(x_noisy, sigma):
+        jax.debug.callback(lambda level: levels.append(float(level)), sigma)
+        return 0.5 * x_noisy
+
+    grid = SCHEDULE.grid(num_steps)
+    walk = jax.jit(lambda x: sample(name, denoise, x, grid, key=jax.random.key(0), unroll=unroll))
+    walk(jnp.ones((1, 2, 1))).block_until_ready()
+    jax.effects_barrier()
+    assert len(levels) == num_evaluations(name, num_steps)
+    assert len(levels) == (2 * num_steps - 1 if name == "heun" else num_steps)
+    np.testing.assert_allclose(sorted(set(levels)), grid[-2::-1], rtol=1e-6)  # and never at 0
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_samplers_go_by_name_and_take_traced_levels(name):
+    # One compiled program then serves every list of as many levels.
+    grid, x_init, key = SCHEDULE.grid(4), jnp.asarray(start(16), jnp.float32), jax.random.key(1)
+    arguments = (key,) if name == "ddpm" else ()
+    direct = SAMPLERS[name](two_modes(), x_init, grid, *arguments)
+    walk = jax.jit(lambda x, sigmas: sample(name, two_modes(), x, sigmas, key=key))
+    np.testing.assert_allclose(walk(x_init, jnp.asarray(grid)), direct, atol=1e-4)
+    assert float(jnp.abs(walk(x_init, 0.5 * grid) - direct).max()) > 0.01
+
+
+def test_every_schedule_asks_for_a_sampler_that_is_there():
+    # The paper pairs VE with DDIM, and VP with DDPM for the baseline.
+    wanted = {kind: schedule.sampler for kind, schedule in SCHEDULES.items()}
+    assert wanted == {
+        "variance_exploding": "ddim",
+        "variance_preserving_cosine": "ddpm",
+        "variance_preserving_linear": "ddpm",
+    }
+    assert set(wanted.values()) <= set(SAMPLERS)
+
+
+def test_unknown_samplers_and_missing_keys_are_refused():
+    x_init, sigmas = jnp.zeros((1, 1, 1)), [1.0, 0.0]
+    with pytest.raises(ValueError, match="'hein'.*did you mean 'heun'"):
+        sample("hein", two_modes(), x_init, sigmas)
+    with pytest.raises(ValueError, match="did you mean 'ddim'"):
+        num_evaluations("dim", 4)
+    with pytest.raises(ValueError, match="'ddpm'.*give it a key"):
+        sample("ddpm", two_modes(), x_init, sigmas)
+    with pytest.raises(ValueError, match="sigmas"):
+        sample("ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
+    with pytest.raises(ValueError, match="num_steps=0"):
+        num_evaluations("ddim", 0)

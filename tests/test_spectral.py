@@ -1,15 +1,20 @@
-"""The FNO block against numpy's FFT and flax's convolution (Eqs 2-4)."""
+"""The FNO block against numpy's FFT, scipy's DCT and flax's convolution (Eqs 2-4, Table 8)."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.fft
 from flax import nnx
 
 from f3amd_lib.models.spectral import (
+    SPECTRAL_VARIANTS,
     FNOBlock,
     SpectralConvolution,
     TemporalConvolution,
+    cosine_basis,
+    cosine_convolution,
+    count_modes,
     fourier_matrices,
     spectral_convolution,
 )
@@ -104,21 +109,181 @@ def test_eq02_modes_out_of_range_are_refused(num_frames, modes):
         fourier_matrices(num_frames, modes)
 
 
-def test_eq02_initial_weights_keep_the_variance():
-    layer = SpectralConvolution(64, 64, 17, rngs=nnx.Rngs(params=0))
-    assert layer(draw(256, 32, 64)).var() == pytest.approx(1.0, abs=0.08)
+@pytest.mark.parametrize("num_frames", [31, 32])
+@pytest.mark.parametrize("variant", SPECTRAL_VARIANTS)
+def test_eq02_initial_weights_keep_the_variance(variant, num_frames):
+    modes = count_modes(variant, num_frames)
+    layer = SpectralConvolution(
+        64, 64, modes, variant, rank=32, initial_gain=1.0, rngs=nnx.Rngs(params=0)
+    )
+    # Of a complex weight, the real part alone acts on bins 0 and T / 2: half of their variance.
+    halved = {"cosine": 0.0}.get(variant, (2 - num_frames % 2) / num_frames / 2)
+    variance = layer(draw(256, num_frames, 64)).var()
+    assert variance == pytest.approx(1.0 - halved, abs=0.03)
 
 
 def test_eq02_gradients_are_finite_and_reach_every_weight():
     layer = SpectralConvolution(3, 4, 5, rngs=nnx.Rngs(params=0))
     z, wanted = draw(6, 8, 3), draw(6, 8, 4, seed=1)
-    gradient = nnx.grad(lambda m: jnp.mean((m(z) - wanted) ** 2))(layer)
+    gradient = nnx.jit(nnx.grad(lambda layer: jnp.mean((layer(z) - wanted) ** 2)))(layer)
     real, imag = np.asarray(gradient["weight_real"][...]), np.asarray(gradient["weight_imag"][...])
     assert np.all(np.isfinite(real)) and np.all(np.isfinite(imag))
     assert np.all(np.abs(real).max(axis=(1, 2)) > 1e-4)
     assert np.all(np.abs(imag[1:-1]).max(axis=(1, 2)) > 1e-4)
     # Bins 0 and T / 2 of a real signal have no imaginary part to learn.
     assert np.abs(imag[[0, -1]]).max() < 1e-6
+
+
+@pytest.mark.parametrize("variant", ["cosine", "reduced_rank", "weighted"])
+def test_table_8_gradients_are_finite_and_reach_every_mode(variant):
+    modes = count_modes(variant, 9)
+    layer = SpectralConvolution(3, 4, modes, variant, rank=2, rngs=nnx.Rngs(params=0))
+    z, wanted = draw(6, 9, 3), draw(6, 9, 4, seed=1)
+    gradient = nnx.jit(nnx.grad(lambda layer: jnp.mean((layer(z) - wanted) ** 2)))(layer)
+    for (name,), part in nnx.to_flat_state(gradient):
+        part = np.abs(np.asarray(part[...]).reshape(modes, -1)).max(axis=1)
+        assert np.all(np.isfinite(part)), name
+        real_only = name == "weight_imag"  # bin 0 of a real signal
+        assert np.all(part[int(real_only) :] > 1e-4), name
+
+
+def test_default_layer_has_the_weights_that_files_hold():
+    block = FNOBlock(3, 4, 5, rngs=nnx.Rngs(params=0))
+    shapes = {".".join(path): leaf[...].shape for path, leaf in nnx.to_flat_state(nnx.state(block))}
+    assert shapes == {
+        "spectral.weight_real": (5, 3, 4),
+        "spectral.weight_imag": (5, 3, 4),
+        "local_first.kernel": (3, 3, 3),
+        "local_first.bias": (3,),
+        "local_second.kernel": (3, 3, 4),
+        "local_second.bias": (4,),
+    }
+
+
+@pytest.mark.parametrize(("num_frames", "fourier", "cosine"), [(32, 17, 32), (31, 16, 31)])
+def test_table_8_modes_there_are(num_frames, fourier, cosine):
+    counted = {variant: count_modes(variant, num_frames) for variant in SPECTRAL_VARIANTS}
+    assert counted == {
+        "fourier": fourier,
+        "cosine": cosine,
+        "reduced_rank": fourier,
+        "weighted": fourier,
+    }
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 7, 8, 32])
+def test_table_8_cosine_basis_is_orthonormal(num_frames):
+    basis = cosine_basis(num_frames)
+    np.testing.assert_allclose(basis @ basis.T, np.eye(num_frames), atol=1e-12)
+    np.testing.assert_array_equal(cosine_basis(num_frames, 1), basis[:1])
+    with pytest.raises(ValueError, match="read-only"):
+        basis[0] = 7.0
+
+
+@pytest.mark.parametrize("modes", [0, 9])
+def test_table_8_cosine_modes_out_of_range_are_refused(modes):
+    layer = SpectralConvolution(3, 4, modes, "cosine", rngs=nnx.Rngs(params=0))
+    with pytest.raises(ValueError, match=f"between 1 and 8 for 8 frames, got {modes}"):
+        layer(draw(2, 8, 3))
+
+
+@pytest.mark.parametrize(("num_frames", "modes"), [(8, 8), (8, 3), (9, 9), (9, 4), (1, 1)])
+def test_table_8_cosine_layer_equals_scipys_transform(num_frames, modes):
+    layer = SpectralConvolution(3, 4, modes, "cosine", rngs=nnx.Rngs(params=0))
+    z, weight = draw(2, num_frames, 3), np.asarray(layer.weight[...])
+    mixed = np.zeros((2, num_frames, 4))
+    spectrum = scipy.fft.dct(z.astype(np.float64), norm="ortho", axis=1)
+    mixed[:, :modes] = np.einsum("bkc,kcd->bkd", spectrum[:, :modes], weight)
+    expected = scipy.fft.idct(mixed, norm="ortho", axis=1)
+    np.testing.assert_allclose(layer(z), expected, atol=1e-5)
+
+
+def test_table_8_cosine_layer_equals_its_dense_matrix():
+    z, weight = draw(2, 7, 3), draw(4, 3, 5, seed=1)
+    # One matrix from all frames and channels to all frames and channels.
+    dense = np.zeros((7, 5, 7, 3))
+    for k in range(4):
+        size = np.sqrt((1.0 if k == 0 else 2.0) / 7)
+        wave = size * np.cos(np.pi * k * (2 * np.arange(7) + 1) / 14)
+        dense += np.einsum("t,s,cd->tdsc", wave, wave, weight[k])
+    expected = np.einsum("tdsc,bsc->btd", dense, z)
+    np.testing.assert_allclose(cosine_convolution(jnp.asarray(z), weight), expected, atol=1e-5)
+
+
+def test_table_8_one_cosine_mode_is_the_time_mean():
+    z, weight = draw(2, 9, 3), draw(1, 3, 4, seed=1)
+    expected = np.repeat(z.mean(axis=1, keepdims=True) @ weight[0], 9, axis=1)
+    np.testing.assert_allclose(cosine_convolution(jnp.asarray(z), weight), expected, atol=1e-5)
+
+
+def test_table_8_cosine_ends_do_not_meet():
+    # A weight that spreads over neighbours: a low-pass in either transform.
+    z = np.eye(32, dtype=np.float32)[:1, :, None]
+    falling = lambda modes: np.exp(-0.5 * np.linspace(0.0, 4.0, modes) ** 2)[:, None, None]
+    mirrored = np.asarray(cosine_convolution(jnp.asarray(z), falling(32)))[0, :, 0]
+    joined = np.asarray(spectral_convolution(jnp.asarray(z), falling(17), 0 * falling(17)))[0, :, 0]
+    assert joined[-1] == pytest.approx(joined[1], rel=1e-4)
+    assert joined[-1] > 0.1 and abs(mirrored[-1]) < 1e-3
+
+
+@pytest.mark.parametrize(("num_frames", "modes"), [(8, 5), (9, 5), (9, 2)])
+def test_eq02_unit_gains_equal_the_dense_layer(num_frames, modes):
+    dense = SpectralConvolution(3, 4, modes, rngs=nnx.Rngs(params=0))
+    weighted = SpectralConvolution(
+        3, 4, modes, "weighted", initial_gain=1.0, rngs=nnx.Rngs(params=0)
+    )
+    z = draw(2, num_frames, 3)
+    np.testing.assert_allclose(weighted(z), dense(z), atol=1e-6)
+
+
+def test_eq02_gains_start_at_seven_tenths_and_scale_one_mode_each():
+    layer = SpectralConvolution(3, 4, 5, "weighted", rngs=nnx.Rngs(params=0))
+    np.testing.assert_array_equal(layer.gain[...], np.full(5, 0.7, np.float32))
+    z, gain = draw(2, 8, 3), np.array([1.0, 0.0, -2.0, 0.5, 3.0], np.float32)
+    layer.gain[...] = jnp.asarray(gain)
+    weights = np.asarray(layer.weight_real[...]), np.asarray(layer.weight_imag[...])
+    expected = fft_convolution(z, *(w * gain[:, None, None] for w in weights))
+    np.testing.assert_allclose(layer(z), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("num_frames", "modes"), [(8, 5), (9, 5), (9, 2)])
+def test_eq02_factors_of_a_kernel_of_rank_eight_equal_the_dense_layer(num_frames, modes):
+    rng = np.random.default_rng(0)
+    complex_normal = lambda *shape: rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    dense = complex_normal(modes, 12, 8) @ complex_normal(modes, 8, 10)
+    left, singular, right = np.linalg.svd(dense, full_matrices=False)
+    assert singular[:, 8:].max() < 1e-12 < singular[:, 7].min()
+    first, second = left[..., :8] * singular[:, None, :8], right[:, :8]
+    layer = SpectralConvolution(12, 10, modes, "reduced_rank", rngs=nnx.Rngs(params=0))
+    layer.first_real[...], layer.first_imag[...] = jnp.asarray(first.real), jnp.asarray(first.imag)
+    layer.second_real[...] = jnp.asarray(second.real)
+    layer.second_imag[...] = jnp.asarray(second.imag)
+    z = draw(2, num_frames, 12)
+    got, expected = layer(z), fft_convolution(z, dense.real, dense.imag)
+    tolerance = 1e-5 * np.abs(expected).max()
+    np.testing.assert_allclose(got, expected, atol=tolerance)
+    dense_layer = spectral_convolution(jnp.asarray(z), dense.real, dense.imag)
+    np.testing.assert_allclose(got, dense_layer, atol=tolerance)
+
+
+def test_eq02_factors_are_fewer_numbers():
+    count = lambda layer: sum(leaf.size for leaf in jax.tree.leaves(nnx.state(layer)))
+    dense = SpectralConvolution(96, 96, 17, rngs=nnx.Rngs(params=0))
+    factors = SpectralConvolution(96, 96, 17, "reduced_rank", rngs=nnx.Rngs(params=0))
+    assert count(dense) == 17 * 2 * 96 * 96 and count(factors) == 17 * 2 * 8 * (96 + 96)
+
+
+@pytest.mark.parametrize("rank", [0, 4])
+def test_eq02_rank_out_of_range_is_refused(rank):
+    with pytest.raises(ValueError, match=f"between 1 and 3 for widths 3 and 4, got {rank}"):
+        SpectralConvolution(3, 4, 5, "reduced_rank", rank, rngs=nnx.Rngs(params=0))
+
+
+def test_unknown_variant_names_the_nearest():
+    with pytest.raises(ValueError, match="'cosines'; did you mean 'cosine'"):
+        FNOBlock(3, 4, 5, variant="cosines", rngs=nnx.Rngs(params=0))
+    with pytest.raises(ValueError, match="did you mean 'reduced_rank'"):
+        count_modes("reduced-rank", 32)
 
 
 def flax_convolution(layer):
@@ -174,6 +339,16 @@ def test_eq04_block_is_the_sum_of_both_branches(width_in, width_out):
     got = block(z)
     assert got.shape == (2, 8, width_out)
     np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", SPECTRAL_VARIANTS)
+def test_eq04_block_passes_its_variant_on(variant):
+    block = FNOBlock(3, 4, 5, variant=variant, rank=2, initial_gain=0.5, rngs=nnx.Rngs(params=0))
+    alone = SpectralConvolution(3, 4, 5, variant, 2, 0.5, rngs=nnx.Rngs(params=0))
+    z = draw(2, 8, 3)
+    np.testing.assert_allclose(block(z), alone(z) + block.local(z), atol=1e-6)
+    # A base block takes a dropout key, and this one drops nothing.
+    np.testing.assert_array_equal(block(z, key=jax.random.key(0)), block(z))
 
 
 def test_characters_do_not_mix():

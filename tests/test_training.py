@@ -11,13 +11,15 @@ import pytest
 from builders import CHANNELS, HISTORY, WINDOW, same_tree, tiny_config, tiny_trainer, tiny_windows
 
 from f3amd_lib.data.windows import gather_windows
+from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.training import loop
 from f3amd_lib.training.loop import (
     TrainingConfig,
     TrainingDiverged,
     learning_rate_schedule,
     network_inputs,
-    training_recipe,
+    paper_recipe,
+    short_recipe,
 )
 from f3amd_lib.training.losses import LOSS_TERMS, LossWeights
 
@@ -69,22 +71,23 @@ def test_other_schedules_by_hand():
 def test_section_4_5_defaults_are_the_papers():
     config = TrainingConfig(10)
     assert (config.batch_size, config.learning_rate, config.ema_decay) == (512, 5e-4, 0.993)
-    assert (config.sigma_max, config.sigma_min, config.rho) == (128.0, 0.01, 3.0)
+    assert config.diffusion == VarianceExploding(sigma_max=128.0, sigma_min=0.01, rho=3.0)
     assert config.history_noise == config.own_history_share == config.gradient_clip == 0.0
+    assert paper_recipe("F3AMD-FNO-96", 10) == config
     assert config.loss == LossWeights()
 
 
 def test_recipes_keep_the_papers_loss_except_for_plus():
-    paper, plus = (training_recipe(f"F3AMD-FNO-96{end}", 1000) for end in ("", "-plus"))
+    paper, plus = (short_recipe(f"F3AMD-FNO-96{end}", 1000) for end in ("", "-plus"))
     assert paper.loss == LossWeights() and paper.noise == "schedule"
     assert paper.history_noise == paper.own_history_share == 0.0
     assert plus.loss.ird_form == "excess" and plus.own_history_share > 0
-    assert training_recipe("F3AMD-FNO-96", 1000, batch_size=7).batch_size == 7
+    assert short_recipe("F3AMD-FNO-96", 1000, batch_size=7).batch_size == 7
 
 
-@pytest.mark.parametrize("preset", ["F3AMD-FNO-96", "F3AMD-FNO-96-plus"])
+@pytest.mark.parametrize("preset", ["F3AMD-FNO-96", "F3AMD-FNO-96-plus", "CAMDM-code"])
 def test_config_survives_json(preset):
-    config = training_recipe(preset, 1000, seed=3)
+    config = short_recipe(preset, 1000, seed=3)
     assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
@@ -99,7 +102,8 @@ def test_config_survives_json(preset):
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"own_history_share": 1.5}, "own_history_share"),
         ({"captured_path_share": -0.1}, "captured_path_share"),
-        ({"sigma_min": 200.0}, "sigma_min < sigma_max"),
+        ({"history_dropout": 2.0}, "history_dropout"),
+        ({"noise": "mixed", "diffusion": VariancePreservingCosine(8)}, "mixed noise needs"),
     ],
 )
 def test_impossible_configs_are_refused(settings, message):
@@ -130,7 +134,7 @@ def test_network_inputs_by_hand(trainer):
 def test_eq09_training_noise_is_uniform_in_schedule_time():
     config = TrainingConfig(10)
     sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, config))
-    time = config.noise_schedule().time(sigma)
+    time = config.diffusion.time(sigma)
     counts = np.histogram(time, bins=8, range=(0, 1))[0]
     assert counts.sum() == 4000 and np.all(np.abs(counts - 500) < 100)
 
@@ -138,7 +142,7 @@ def test_eq09_training_noise_is_uniform_in_schedule_time():
 def test_mixed_noise_draws_half_of_the_levels_below_one():
     sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, TrainingConfig(10, noise="mixed")))
     # Half log-uniform on [0.01, 1], and of Eq. 9's half those with t > 0.837.
-    expected = 0.5 + 0.5 * (1.0 - TrainingConfig(10).noise_schedule().time(1.0))
+    expected = 0.5 + 0.5 * (1.0 - TrainingConfig(10).diffusion.time(1.0))
     assert np.mean(sigma <= 1.0) == pytest.approx(expected, abs=0.03)
     assert 0.0099 < sigma.min() < 0.011 and 100.0 < sigma.max() <= 128.01
     assert np.median(sigma[sigma < 1.0]) == pytest.approx(0.1, rel=0.35)
@@ -320,8 +324,7 @@ def test_raw_networks_are_trained_without_normalisation():
 
 
 def test_our_recipe_trains_and_resumes_exactly(tmp_path):
-    recipe = training_recipe("F3AMD-FNO-32-plus", 8, batch_size=8).to_dict()
-    recipe["loss"] = LossWeights(**recipe["loss"])
+    recipe = short_recipe("F3AMD-FNO-32-plus", 8, batch_size=8).to_dict()
     model = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
     trainer = tiny_trainer(model, **recipe)
     whole, _ = trainer.run(**QUIET)

@@ -15,6 +15,7 @@ import pandas as pd
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import Batch, WindowSet, spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
+from f3amd_lib.evaluation.distributions import diversity
 from f3amd_lib.evaluation.metrics import joint_acceleration
 from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -121,27 +122,21 @@ def seed_spread(
     num_seeds: int = 10,
     seed: int = 0,
 ) -> float:
-    """Return how far samples of one condition differ, in cm, after the Diversity of Appendix C.
+    """Return how far samples of one condition differ, in cm: `diversity` of one round.
 
-    Square root of the variance, over noise seeds, of joint positions relative to the root, averaged
-    over conditions, frames and joints before the root is taken. Our readings: the root of the
-    variance, since the paper prints cm; positions from which the root's place is subtracted but not
-    its facing, which the path fixes; and a mean over several conditions, for a steadier figure.
+    Averaged over several held-out conditions, for a steadier figure.
     """
     trained = generator.trained
     batch = held_out_batch(windows, trained, num_conditions)
     _, condition = network_inputs(batch, trained.normaliser)
 
     @jax.jit
-    def relative_positions(key):
+    def sample_positions(key):
         x0_hat = generator.sample_window(key, condition)
-        positions = frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
-        return positions - positions[:, :, :1]
+        return frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
 
     keys = jax.random.split(jax.random.key(seed), num_seeds)
-    samples = jnp.stack([relative_positions(key) for key in keys])
-    variance = jnp.sum(jnp.var(samples, axis=0, ddof=1), axis=-1)
-    return float(CM * jnp.sqrt(jnp.mean(variance)))
+    return diversity(np.stack([np.asarray(sample_positions(key)) for key in keys], axis=1))
 
 
 def noise_use(

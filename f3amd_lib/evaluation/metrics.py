@@ -22,9 +22,11 @@ import numpy as np
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
+from f3amd_lib.names import nearest_hint
 
 __all__ = [
     "METRICS",
+    "CAMDM_METRICS",
     "CONTACT_HEIGHT",
     "seam_frames",
     "trajectory_error",
@@ -37,7 +39,11 @@ __all__ = [
     "inter_frame_step",
     "joint_acceleration",
     "path_drift",
+    "camdm_trajectory_error",
+    "camdm_orientation_error",
+    "camdm_foot_sliding",
     "first_metrics",
+    "camdm_metrics",
     "tidy_metrics",
 ]
 
@@ -60,6 +66,18 @@ METRICS = {
 """For each key of `first_metrics`: name in the paper's tables (or ours), unit, which way is better.
 
 The paper marks IRD "down". We say "near real": real motion itself takes a step at every seam.
+"""
+
+CAMDM_METRICS = {
+    "camdm_trajectory_error_deg": ("CAMDM_trajectory_error", "deg", "down"),
+    "camdm_orientation_error_deg": ("CAMDM_orientation_error", "deg", "down"),
+    "camdm_foot_sliding": ("CAMDM_foot_sliding", "", "down"),
+    "coherence": METRICS["coherence"],
+}
+"""The same for each key of `camdm_metrics`: definitions of the released CAMDM code.
+
+They are not those of the F3AMD text, though some bear the same names there. Never set a figure of
+one column beside a figure of the other. Its FID is `distributions.camdm_frechet_distance`.
 """
 
 _STILL = 1e-6  # metres; a mean root step or acceleration under a micrometre is none
@@ -127,6 +145,37 @@ def _path_positions(path) -> np.ndarray:
     if position.ndim < 2 or position.shape[-1] != 2:
         raise ValueError(f"path must be a RootPath or [..., T, 2] (x, z), got {position.shape}")
     return position
+
+
+def _checked_toes(toes, num_joints: int) -> np.ndarray:
+    """Return the toes' joint indices, of a skeleton or as given."""
+    indices = np.array(toes.toes if isinstance(toes, Skeleton) else toes, dtype=int)
+    if (
+        indices.ndim != 1
+        or not indices.size
+        or not 0 <= indices.min() <= indices.max() < num_joints
+    ):
+        raise ValueError(
+            f"toes must be joint indices from 0 to {num_joints - 1}, got {indices.tolist()}"
+        )
+    return indices
+
+
+def _checked_yaws(yaw, path, history: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the generated part of the facing and the wanted facing, [..., T] each."""
+    yaw = np.asarray(yaw, dtype=np.float64)
+    if yaw.ndim < 1 or yaw.shape[-1] <= history:
+        raise ValueError(f"yaw must be [..., T] with more than {history} frames, got {yaw.shape}")
+    if not np.all(np.isfinite(yaw)):
+        raise ValueError(f"yaw is not finite at frame {np.argwhere(~np.isfinite(yaw))[0][-1]}")
+    generated = yaw[..., history:]
+    wanted = path.yaw if isinstance(path, RootPath) else np.asarray(path, dtype=np.float64)
+    if wanted.ndim < 1:
+        raise ValueError("path must be a RootPath or the wanted yaw [..., T]")
+    target = _reference(
+        wanted[..., None], generated.shape[-1], history, generated.shape[:-1], "path yaw"
+    )
+    return generated, target[..., 0]
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray):
@@ -208,20 +257,9 @@ def direction_error(yaw, path, window: int, history: int = 0):
     Source: paper section 4.4 (Dir.). Our reading: differences are wrapped to half a turn, and the
     first frame, 0 by construction, is one of those averaged.
     """
-    yaw = np.asarray(yaw, dtype=np.float64)
-    if yaw.ndim < 1 or yaw.shape[-1] <= history:
-        raise ValueError(f"yaw must be [..., T] with more than {history} frames, got {yaw.shape}")
-    if not np.all(np.isfinite(yaw)):
-        raise ValueError(f"yaw is not finite at frame {np.argwhere(~np.isfinite(yaw))[0][-1]}")
+    shown, wanted = _checked_yaws(yaw, path, history)
     window = _checked_window(window)
-    generated = yaw[..., history:, None]
-    wanted = path.yaw if isinstance(path, RootPath) else np.asarray(path, dtype=np.float64)
-    if wanted.ndim < 1:
-        raise ValueError("path must be a RootPath or the wanted yaw [..., T]")
-    target = _reference(
-        wanted[..., None], generated.shape[-2], history, generated.shape[:-2], "path yaw"
-    )
-    turned, asked = _by_window(generated, window), _by_window(target, window)
+    turned, asked = _by_window(shown[..., None], window), _by_window(wanted[..., None], window)
     gap = wrap_angle((turned - turned[..., :1, :]) - (asked - asked[..., :1, :]))
     return np.rad2deg(np.abs(gap)).mean(axis=(-3, -2, -1))
 
@@ -272,7 +310,8 @@ def coherence(positions, history: int = 0):
       ValueError: for NaN, a wrong shape, or fewer than 2 frames.
 
     Source: the released CAMDM code, which names it "coherence" (first, not second, differences).
-    Not comparable with `smoothness`, the F3AMD text's definition.
+    Not comparable with `smoothness`, the F3AMD text's definition. Where the root stands still the
+    code divides by 1 in its own unit, so that its figure depends on the unit: here that is NaN.
     """
     generated = _checked_positions(positions, history, least=2)
     first = np.diff(generated, axis=-3)
@@ -312,12 +351,7 @@ def foot_sliding(
     clip; CAMDM's code does it, and without it a toe joint that rests at 4 cm would never touch.
     """
     generated = _checked_positions(positions, history, least=2)
-    indices = np.array(toes.toes if isinstance(toes, Skeleton) else toes, dtype=int)
-    if indices.ndim != 1 or indices.size == 0 or indices.max() >= generated.shape[-2]:
-        raise ValueError(
-            f"toes must be joint indices below {generated.shape[-2]}, got {indices.tolist()}"
-        )
-    foot = generated[..., indices, :]
+    foot = generated[..., _checked_toes(toes, generated.shape[-2]), :]
     if floor_shift is None:
         floor = foot[..., 1].min(axis=(-2, -1))
     else:
@@ -454,6 +488,111 @@ def path_drift(positions, path, history: int = 0):
     return _ratio(np.linalg.norm(gap, axis=-1), length)
 
 
+def _angle_error(angle: np.ndarray, wanted: np.ndarray, counts: np.ndarray):
+    """Return | mean of wanted - angle |, degrees, over the frames that count; NaN for none."""
+    number = counts.sum(axis=-1)
+    total = np.sum(np.where(counts, wanted - angle, 0.0), axis=-1)
+    return np.where(number > 0, np.rad2deg(np.abs(total)) / np.maximum(number, 1), np.nan)[()]
+
+
+def camdm_trajectory_error(positions, path, history: int = 0):
+    """CAMDM's trajectory error: mean angle between wanted and walked steps, over the whole rollout.
+
+        | mean_t(a*_t - a_t) |,  a_t = angle of the root's step on the ground from t to t + 1.
+
+    The absolute value is taken after the mean. Errors to the left and to the right cancel, so that
+    a zigzag about the path reads 0, as does a root at any distance beside it. The differences are
+    not wrapped: a step that lies across the cut at +-180 degrees from its target counts as nearly
+    360 degrees off. The cut lies at steps along +X, so that the figure is not the same for the
+    same motion turned about +Y.
+
+    Args:
+      positions: [..., T, J, 3], metres, T >= 2 after the history.
+      path: the target, a `RootPath` or [..., T, 2] (x, z); T or T - history frames.
+      history: given frames to leave out.
+
+    Returns:
+      Degrees, one a character.
+
+    Raises:
+      ValueError: for NaN, shapes that do not fit, or fewer than 2 frames.
+
+    Source: the released CAMDM code ("traj_error"), angles and cut as there. Our reading: the wanted
+    direction is that of the path's own step (the code's comes from a list of commands), and frames
+    in which path or root stand still have no direction and are left out; NaN if all are. (Section
+    4.4 of the F3AMD text describes it with vectors from the first frame to the current one.)
+    """
+    generated = _checked_positions(positions, history, least=2)
+    root = generated[..., 0, [0, 2]]
+    target = _reference(_path_positions(path), root.shape[-2], history, root.shape[:-2], "path")
+    steps = [np.diff(line, axis=-2) for line in (root, target)]
+    angle, wanted = (np.arctan2(step[..., 1], -step[..., 0]) for step in steps)
+    lengths = [np.linalg.norm(step, axis=-1) for step in steps]
+    return _angle_error(angle, wanted, np.minimum(*lengths) > _STILL)
+
+
+def camdm_orientation_error(yaw, path, history: int = 0):
+    """CAMDM's orientation error: mean angle between wanted and shown facing, whole rollout.
+
+        | mean_t(f*_t - f_t) |,  f_t = angle of the facing on the ground.
+
+    As in `camdm_trajectory_error` signed errors cancel before the absolute value, and differences
+    are not wrapped; here the cut lies at facing -X.
+
+    Args:
+      yaw: facing of the character, [..., T], radians.
+      path: a `RootPath`, or the wanted facing [..., T], radians; T or T - history frames.
+      history: given frames to leave out.
+
+    Returns:
+      Degrees, one a character.
+
+    Raises:
+      ValueError: for NaN or shapes that do not fit.
+
+    Source: the released CAMDM code ("orien_error"), angles and cut as there. It takes the facing
+    from shoulders and hips together; use the `yaw` you mean (`facing_yaw` takes the hips).
+    """
+    shown, wanted = _checked_yaws(yaw, path, history)
+    angle, target = (np.arctan2(np.cos(each), np.sin(each)) for each in (shown, wanted))
+    return _angle_error(angle, target, np.ones(angle.shape, dtype=bool))
+
+
+def camdm_foot_sliding(positions, toes, history: int = 0):
+    """CAMDM's foot sliding: as `foot_sliding` with the clip lowered, but for its last frame.
+
+        mean over toe-frames in contact of s_t  /  mean_t || root_{t+1} - root_t ||_xz,
+        s_t = || toe_{t+1} - toe_t ||_xz,  and 0 for the last frame.
+
+    Contact is a toe under 1 cm above the clip's lowest toe. A toe that touches in the last frame
+    adds a step of 0, which lowers the figure by about 1 / T.
+
+    Args:
+      positions: [..., T, J, 3], metres, T >= 2 after the history.
+      toes: joint indices of the two toes (`skeleton.toes`), or a `Skeleton`.
+      history: given frames to leave out.
+
+    Returns:
+      One ratio a character; 0 without any contact. NaN where the root stands still, where the code
+      divides by 1 in its own unit.
+
+    Raises:
+      ValueError: for NaN, a wrong shape, toe indices out of range, or fewer than 2 frames.
+
+    Source: the released CAMDM code.
+    """
+    generated = _checked_positions(positions, history, least=2)
+    foot = generated[..., _checked_toes(toes, generated.shape[-2]), :]
+    height = foot[..., 1] - foot[..., 1].min(axis=(-2, -1), keepdims=True)
+    contact = height < CONTACT_HEIGHT
+    step = np.linalg.norm(np.diff(foot, axis=-3)[..., [0, 2]], axis=-1)
+    slide = (step * contact[..., :-1, :]).sum(axis=(-2, -1)) / np.maximum(
+        contact.sum(axis=(-2, -1)), 1
+    )
+    root = np.linalg.norm(np.diff(generated[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
+    return _ratio(slide, root)
+
+
 def _position_and_yaw(path) -> tuple[np.ndarray, np.ndarray]:
     """Unpack one RootPath, or stack several, into [..., T, 2] and [..., T]."""
     if isinstance(path, RootPath):
@@ -464,6 +603,29 @@ def _position_and_yaw(path) -> tuple[np.ndarray, np.ndarray]:
     if len({item.num_frames for item in paths}) > 1:
         raise ValueError("all paths of a batch must have the same number of frames")
     return np.stack([item.position for item in paths]), np.stack([item.yaw for item in paths])
+
+
+def _checked_measurands(positions, yaw, path, skeleton: Skeleton):
+    """Return the facing and (wanted positions, wanted yaws), or None and None without a path."""
+    shape = np.shape(positions)
+    if len(shape) < 3 or shape[-2] != skeleton.num_joints:
+        raise ValueError(
+            f"positions must be [..., T, {skeleton.num_joints}, 3] for this skeleton, got {shape}"
+        )
+    if path is None:
+        return None, None
+    if yaw is None:
+        yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
+    if np.shape(yaw) != shape[:-2]:
+        raise ValueError(f"yaw must be {shape[:-2]} for these positions, got {np.shape(yaw)}")
+    return yaw, _position_and_yaw(path)
+
+
+def _plain(values: dict) -> dict:
+    return {
+        key: float(value) if np.ndim(value) == 0 else np.asarray(value)
+        for key, value in values.items()
+    }
 
 
 def first_metrics(
@@ -499,18 +661,10 @@ def first_metrics(
 
     Source: paper section 4.4 and Appendix C, and the additions marked "ours" above.
     """
-    shape = np.shape(positions)
-    if len(shape) < 3 or shape[-2] != skeleton.num_joints:
-        raise ValueError(
-            f"positions must be [..., T, {skeleton.num_joints}, 3] for this skeleton, got {shape}"
-        )
+    yaw, wanted = _checked_measurands(positions, yaw, path, skeleton)
     values = {}
-    if path is not None:
-        if yaw is None:
-            yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
-        if np.shape(yaw) != shape[:-2]:
-            raise ValueError(f"yaw must be {shape[:-2]} for these positions, got {np.shape(yaw)}")
-        wanted_position, wanted_yaw = _position_and_yaw(path)
+    if wanted is not None:
+        wanted_position, wanted_yaw = wanted
         values["trajectory_error_m"] = trajectory_error(positions, wanted_position, window, history)
         values["direction_error_deg"] = direction_error(yaw, wanted_yaw, window, history)
     values["smoothness"] = smoothness(positions, history)
@@ -522,19 +676,44 @@ def first_metrics(
     values["ird_excess_cm"] = ird_excess(positions, window, history)
     values["inter_frame_step_cm"] = inter_frame_step(positions, 1, history)
     values["joint_acceleration_cm"] = joint_acceleration(positions, history, fps)
-    if path is not None:
+    if wanted is not None:
         values["path_drift"] = path_drift(positions, wanted_position, history)
-    return {
-        key: float(value) if np.ndim(value) == 0 else np.asarray(value)
-        for key, value in values.items()
-    }
+    return _plain(values)
+
+
+def camdm_metrics(positions, yaw, path, skeleton: Skeleton, *, history: int = 0) -> dict:
+    """Measure a rollout, or real motion, as the released CAMDM code does.
+
+    Args:
+      positions, yaw, path, skeleton, history: as for `first_metrics`.
+
+    Returns:
+      Key -> number (float for one character, [B] for many); keys, names and units are in
+      `CAMDM_METRICS`. Without a path the two angles are left out.
+
+    Raises:
+      ValueError: for NaN or shapes that do not fit.
+
+    Source: the released CAMDM code.
+    """
+    yaw, wanted = _checked_measurands(positions, yaw, path, skeleton)
+    values = {}
+    if wanted is not None:
+        wanted_position, wanted_yaw = wanted
+        values["camdm_trajectory_error_deg"] = camdm_trajectory_error(
+            positions, wanted_position, history
+        )
+        values["camdm_orientation_error_deg"] = camdm_orientation_error(yaw, wanted_yaw, history)
+    values["camdm_foot_sliding"] = camdm_foot_sliding(positions, skeleton, history)
+    values["coherence"] = coherence(positions, history)
+    return _plain(values)
 
 
 def tidy_metrics(values: dict, **columns) -> list[dict]:
-    """Turn a dict of `first_metrics` into the rows of a tidy table, averaged over characters.
+    """Turn a dict of metrics into the rows of a tidy table, averaged over characters.
 
     Args:
-      values: what `first_metrics` returned.
+      values: what `first_metrics` or `camdm_metrics` returned, or both together.
       columns: what the rows are about, such as model="F3AMD-FNO-96", steps=8.
 
     Returns:
@@ -542,13 +721,14 @@ def tidy_metrics(values: dict, **columns) -> list[dict]:
       spread (standard deviation over characters, NaN for one), characters (those with a number).
 
     Raises:
-      ValueError: for a key that is not in `METRICS`.
+      ValueError: for a key that is neither in `METRICS` nor in `CAMDM_METRICS`.
     """
+    known = METRICS | CAMDM_METRICS
     rows = []
     for key, value in values.items():
-        if key not in METRICS:
-            raise ValueError(f"unknown metric {key!r}; known are {', '.join(METRICS)}")
-        name, unit, better = METRICS[key]
+        if key not in known:
+            raise ValueError(f"unknown metric {key!r}{nearest_hint(key, known)}")
+        name, unit, better = known[key]
         numbers = np.ravel(value)
         numbers = numbers[np.isfinite(numbers)]
         count = len(numbers)

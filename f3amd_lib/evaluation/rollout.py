@@ -22,8 +22,8 @@ from f3amd_lib.data.features import (
     path_condition,
     turn_frames,
 )
-from f3amd_lib.diffusion.samplers import sample_ddim
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.samplers import sample
+from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -65,9 +65,11 @@ class MotionGenerator:
 
     Args:
       trained: a trained model.
-      num_steps: network evaluations a round (the paper: 8, 4, 2 or 1).
+      num_steps: steps a round (the paper: 8, 4, 2 or 1); an evaluation each, but for "heun".
       schedule: noise levels; by default those the model was trained with.
-      spacing: where the steps lie, see `VarianceExploding.grid`.
+      spacing: where the steps lie, see the schedule's `grid`.
+      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule (F3AMD
+        DDIM, CAMDM ancestral DDPM).
     """
 
     def __init__(
@@ -75,16 +77,14 @@ class MotionGenerator:
         trained: TrainedModel,
         num_steps: int = 8,
         *,
-        schedule: VarianceExploding | None = None,
+        schedule: NoiseSchedule | None = None,
         spacing: str = "endpoints",
+        sampler: str | None = None,
     ):
         self.trained = trained
         self.num_steps = num_steps
-        if schedule is None:
-            training = trained.record.get("training", {})
-            schedule = VarianceExploding(
-                **{k: training[k] for k in ("sigma_max", "sigma_min", "rho") if k in training}
-            )
+        schedule = schedule or trained.diffusion
+        self.sampler = sampler or schedule.sampler
         self.sigmas = schedule.grid(num_steps, spacing)
         self._network = trained.network()
         self._run = jax.jit(self._rounds)
@@ -94,9 +94,14 @@ class MotionGenerator:
         config = self.trained.config
         context = self._network.encode(condition)
         shape = (condition.history.shape[0], config.window, config.channels)
-        x_init = self.sigmas[0].astype(np.float32) * jax.random.normal(key, shape)
-        return sample_ddim(
-            lambda x_noisy, sigma: self._network(x_noisy, sigma, context), x_init, self.sigmas
+        key_init, key_steps = jax.random.split(key)
+        x_init = self.sigmas[0].astype(np.float32) * jax.random.normal(key_init, shape)
+        return sample(
+            self.sampler,
+            lambda x_noisy, sigma: self._network(x_noisy, sigma, context),
+            x_init,
+            self.sigmas,
+            key=key_steps,
         )
 
     def _rounds(self, history, positions, yaws, before, style, key):

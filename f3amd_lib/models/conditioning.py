@@ -1,4 +1,8 @@
-"""Conditions: context tokens, noise embedding, cross-attention to c, FiLM (sections 3.3, 3.4.3)."""
+"""Conditions (sections 3.3, 3.4.3, Table 11).
+
+Context tokens and noise embedding become the conditioning signal c by cross-attention; then c
+enters every backbone block, by FiLM or by one of the three ways that the paper compares with it.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,30 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from f3amd_lib.models.attention import (
+    MultiHeadAttention,
+    attention,
+    check_num_heads,
+    position_code,
+    split_heads,
+)
+from f3amd_lib.names import nearest_hint
+
 __all__ = [
+    "CONDITIONINGS",
     "Condition",
     "Context",
     "noise_features",
-    "position_code",
     "ConditionEncoder",
     "FiLM",
+    "Concatenation",
+    "AdaLNZero",
+    "CrossAttention",
+    "conditioning_layer",
 ]
+
+CONDITIONINGS = ("film", "concatenation", "adaln_zero", "cross_attention")
+"""The ways of Table 11 for c to enter a backbone block."""
 
 PATH_CHANNELS = 8
 """2D displacement (x, z) and yaw in 6D, per future frame (section 3.3)."""
@@ -72,23 +92,6 @@ def noise_features(sigma, width: int):
     return (jnp.sqrt(2.0) * jnp.cos(angle)).astype(position.dtype)
 
 
-@functools.lru_cache(maxsize=64)
-def position_code(first: int, last: int, width: int) -> np.ndarray:
-    """Return sinusoidal codes of frames first .. last - 1, [last - first, width].
-
-    After Vaswani et al. 2017, with a base of 1,000 for their 10,000: windows are short.
-    Future frames count from 0, history frames are negative, so that a query of frame t and the path
-    token of frame t carry the same code.
-    """
-    frame = np.arange(first, last)[:, None]
-    rate = np.exp(-np.log(1000.0) * np.arange(0, width, 2) / width)[None, :]
-    code = np.zeros((last - first, width))
-    code[:, 0::2] = np.sin(frame * rate)
-    code[:, 1::2] = np.cos(frame * rate)[:, : width // 2]
-    code.setflags(write=False)  # cached, and so shared by all callers
-    return code
-
-
 class ConditionEncoder(nnx.Module):
     """Condition -> context tokens -> cross-attention -> c (section 3.3).
 
@@ -109,8 +112,7 @@ class ConditionEncoder(nnx.Module):
         *,
         rngs: nnx.Rngs,
     ):
-        if num_heads < 1 or width % num_heads:
-            raise ValueError(f"num_heads must divide the width {width}, got {num_heads}")
+        check_num_heads(width, num_heads)
         self.width, self.window, self.num_history = width, window, num_history
         self.num_heads = num_heads
         self.history = nnx.Linear(channels, width, rngs=rngs)
@@ -151,14 +153,19 @@ class ConditionEncoder(nnx.Module):
         code = jnp.asarray(position_code(0, self.window, self.width), dtype)
         asked = noise[..., None, :] + code
         asked = jnp.broadcast_to(asked, (context.keys.shape[0], self.window, self.width))
-
-        def heads(array):
-            return array.reshape(*array.shape[:2], self.num_heads, self.width // self.num_heads)
-
-        answer = jax.nn.dot_product_attention(
-            heads(self.query(asked)), heads(context.keys), heads(context.values)
+        answer = attention(
+            split_heads(self.query(asked), self.num_heads),
+            split_heads(context.keys, self.num_heads),
+            split_heads(context.values, self.num_heads),
         )
         return asked + self.output(answer.reshape(asked.shape))
+
+
+def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
+    """Return the linear layer of Eq. 7 (a convolution of kernel 1 is a linear layer per frame)."""
+    # Zero at the start makes a residual block the identity, so that depth costs nothing.
+    initial = {"kernel_init": nnx.initializers.zeros_init()} if zero_output else {}
+    return nnx.Linear(width, width, rngs=rngs, **initial)
 
 
 class FiLM(nnx.Module):
@@ -167,14 +174,118 @@ class FiLM(nnx.Module):
     def __init__(
         self, width: int, condition_width: int, *, zero_output: bool = False, rngs: nnx.Rngs
     ):
-        # A convolution of kernel 1 is a linear layer per frame.
         self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs)
-        # Zero at the start makes a residual block the identity, so that depth costs nothing.
-        initial = {"kernel_init": nnx.initializers.zeros_init()} if zero_output else {}
-        self.output = nnx.Linear(width, width, rngs=rngs, **initial)
+        self.output = _output_layer(width, zero_output, rngs)
 
-    def __call__(self, z_base, c):
-        """Modulate [B, T, D] by c [B, T, C_cond]."""
+    def modulate(self, z_base, c):
+        """Modulate [B, T, D] by c [B, T, C_cond] (Eqs 5-7)."""
         gamma, beta = jnp.split(self.modulation(c), 2, axis=-1)  # Eq. 5
         z_tilde = z_base * (1.0 + jnp.tanh(gamma)) + beta  # Eq. 6
         return nnx.silu(self.output(z_tilde))  # Eq. 7
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, T, D] and modulate the result by c [B, T, C_cond]."""
+        return self.modulate(base(z), c)
+
+
+class Concatenation(nnx.Module):
+    """Condition and features in one sequence, as CAMDM concatenates its conditions in time.
+
+    The network lays c before the features once, ahead of the first block, and drops its frames
+    after the last: blocks run on 2 T frames, which agrees with the 2.05 times as long of Table 11.
+    The base block brings both together, so that only the output layer of Eq. 7 is left here.
+    """
+
+    def __init__(self, width: int, *, zero_output: bool = False, rngs: nnx.Rngs):
+        self.output = _output_layer(width, zero_output, rngs)
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, 2 T, D], whose first T frames came from c; c is not read."""
+        return nnx.silu(self.output(base(z)))
+
+
+class AdaLNZero(nnx.Module):
+    """Adaptive layer normalisation, which starts as the identity (Peebles and Xie 2023, DiT).
+
+    The condition scales and shifts what the base block reads, and gates what it adds to its input.
+    """
+
+    def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):
+        zeros = nnx.initializers.zeros_init()
+        self.modulation = nnx.Linear(condition_width, 3 * width, kernel_init=zeros, rngs=rngs)
+
+    def __call__(self, base, z, c):
+        """Add to z [B, T, D] what the base block makes of it under c [B, T, C_cond]."""
+        shift, scale, gate = jnp.split(self.modulation(c), 3, axis=-1)
+        normalised = jax.nn.standardize(z, axis=-1, epsilon=1e-6)
+        return z + gate * base(normalised * (1.0 + scale) + shift)
+
+
+class CrossAttention(nnx.Module):
+    """Every frame asks the frames of c; the answer is added, and the output layer of Eq. 7 follows.
+
+    Questions carry a position code, as those of `ConditionEncoder` do: without one, a frame could
+    not prefer its own part of c.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        condition_width: int,
+        num_heads: int = 1,
+        *,
+        zero_output: bool = False,
+        rngs: nnx.Rngs,
+    ):
+        self.attention = MultiHeadAttention(width, num_heads, condition_width, rngs=rngs)
+        self.output = _output_layer(width, zero_output, rngs)
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, T, D], and let the result ask c [B, T, C_cond]."""
+        z_base = base(z)
+        code = jnp.asarray(position_code(0, *z_base.shape[1:]), z_base.dtype)
+        z_tilde = z_base + self.attention(z_base + code, c)
+        return nnx.silu(self.output(z_tilde))
+
+
+def conditioning_layer(
+    name: str,
+    width: int,
+    condition_width: int,
+    *,
+    num_heads: int = 1,
+    zero_output: bool = False,
+    rngs: nnx.Rngs,
+):
+    """Return a layer that brings c into a backbone block, called as layer(base, z, c).
+
+    There `base` is the base block (a callable z -> z_base), z is [B, T, D] and c [B, T, C_cond].
+    Except for AdaLN-zero all end with the output layer of Eq. 7, so that only the way in differs.
+
+    Args:
+      name: one of `CONDITIONINGS`.
+      width: D.
+      condition_width: C_cond.
+      num_heads: of "cross_attention".
+      zero_output: start as zero, for a block whose input is added to its output.
+
+    Raises:
+      ValueError: for an unknown name (with the nearest); for "concatenation" of features and a
+        condition of other width; for "adaln_zero" with `zero_output`, as it adds its input itself.
+    """
+    if name not in CONDITIONINGS:
+        raise ValueError(f"unknown conditioning {name!r}{nearest_hint(name, CONDITIONINGS)}")
+    if name == "concatenation":
+        if condition_width != width:
+            raise ValueError(
+                f"concatenation needs a condition as wide as the features, {width}, "
+                f"got {condition_width}"
+            )
+        return Concatenation(width, zero_output=zero_output, rngs=rngs)
+    if name == "adaln_zero":
+        if zero_output:
+            raise ValueError("adaln_zero adds its input itself and has no output layer to zero")
+        return AdaLNZero(width, condition_width, rngs=rngs)
+    if name == "cross_attention":
+        return CrossAttention(width, condition_width, num_heads, zero_output=zero_output, rngs=rngs)
+    return FiLM(width, condition_width, zero_output=zero_output, rngs=rngs)

@@ -1,45 +1,55 @@
-"""The F3AMD network (paper section 3.4, Figure 2).
+"""The F3AMD network (paper section 3.4, Figure 2) and all variants of it that the paper ablates.
 
-    x_noisy -> FNO encoder -> N x (FNO block -> FiLM) -> FNO decoder -> x0_hat
+    x_noisy -> encoder -> N x (base block under the condition) -> decoder -> x0_hat
 
-Where the paper is silent the filling is a field of `F3AMDConfig`: each reading is one value.
+Every variant is a value of `F3AMDConfig`, and so is every filling where the paper is silent.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.models.conditioning import Condition, ConditionEncoder, Context, FiLM
-from f3amd_lib.models.spectral import FNOBlock
-from f3amd_lib.names import refuse_unknown
+from f3amd_lib.models.attention import TransformerBlock, position_code
+from f3amd_lib.models.conditioning import (
+    CONDITIONINGS,
+    Condition,
+    ConditionEncoder,
+    Context,
+    conditioning_layer,
+)
+from f3amd_lib.models.config import NetworkConfig, last_stage, scaled_input
+from f3amd_lib.models.spectral import SPECTRAL_VARIANTS, FNOBlock, cosine_basis, count_modes
 
 __all__ = ["F3AMDConfig", "F3AMD"]
 
 
 @dataclass(frozen=True)
-class F3AMDConfig:
+class F3AMDConfig(NetworkConfig):
     """Everything that decides an F3AMD network's shape and formulas.
 
     Attributes:
-      channels: C, features a frame (6 J + 3).
-      num_styles: S, width of the one-hot style.
-      window: T, future frames a round makes (32 or 64).
-      num_history: H, past frames seen (section 4.5: 10).
-      latent_width: D (section 4.2).
-      depth: N, backbone blocks (section 4.5).
-      num_kept_modes: m, RFFT bins kept (section 4.5: 17 of 17, or 33 of 33 with 64 frames).
+      base_block: "fno" or "transformer" (section 3.4.1).
+      num_kept_modes: m, modes kept by the FNO blocks (section 4.5: 17 of 17 RFFT bins, or 33 of 33
+        with 64 frames). Encoder and decoder keep as many of theirs, if they have so many.
+      spectral_variant: transform and weights of the base blocks (Table 8); encoder and decoder stay
+        Fourier, since the table speaks of the backbone.
+      spectral_rank: rank of "reduced_rank" (Appendix E: 8).
+      initial_mode_gain: where the gains of "weighted" start (Appendix E: 0.7).
+      encoder_decoder: "fno" or "linear" (Table 9).
+      conditioning: how c enters a block (Table 11).
       kernel_size: k of Eq. 3; not in the paper, 3 here.
       num_condition_heads: heads of the cross-attention to c; not in the paper, 1 here.
-      input_scaling: multiply the noisy input by c_in = 1 / sqrt(sigma^2 + sigma_data^2); the paper
-        does not say. Without it the first layer meets numbers up to sigma_max = 128.
-      normalise: features have mean 0 and deviation 1 per channel; the paper does not say.
-      sigma_data: deviation of the clean features in network units.
+      num_heads: attention heads of a Transformer base block (Appendix A).
+      feed_forward_factor: its hidden width over D; not in the paper, 4 as in Vaswani et al. 2017.
+      dropout: of Transformer blocks in training; not in the paper, 0 here.
       block_residual: add each block's input to its output (ours; the paper's Figure 2 has none).
       history_anchor: add the last history frame, with a learned weight that starts as a decay over
         the window, so that the network predicts a change (ours).
@@ -47,64 +57,60 @@ class F3AMDConfig:
         Gaussian residual whose variance per channel and cosine mode is learned (ours).
 
     Raises:
-      ValueError: for sizes that are not positive or modes out of range.
+      ValueError: for sizes that are not positive, unknown variants, modes out of range, or heads
+        that do not divide the width.
     """
 
-    channels: int
-    num_styles: int
-    window: int = 32
-    num_history: int = 10
-    latent_width: int = 96
-    depth: int = 6
+    family: ClassVar[str] = "F3AMD"
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {
+        "base_block": ("fno", "transformer"),
+        "spectral_variant": SPECTRAL_VARIANTS,
+        "encoder_decoder": ("fno", "linear"),
+        "conditioning": CONDITIONINGS,
+    }
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+
+    base_block: str = "fno"
     num_kept_modes: int = 17
+    spectral_variant: str = "fourier"
+    spectral_rank: int = 8
+    initial_mode_gain: float = 0.7
+    encoder_decoder: str = "fno"
+    conditioning: str = "film"
     kernel_size: int = 3
     num_condition_heads: int = 1
-    input_scaling: bool = True
-    normalise: bool = True
-    sigma_data: float = 1.0
+    num_heads: int = 1
+    feed_forward_factor: int = 4
+    dropout: float = 0.0
     block_residual: bool = False
     history_anchor: bool = False
     residual_prior: bool = False
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            wanted = {"int": int, "float": float, "bool": bool}[str(field.type)]
-            if wanted is float and type(value) is int:
-                object.__setattr__(self, field.name, float(value))
-            elif type(value) is not wanted:
-                raise ValueError(f"{field.name} must be of type {field.type}, got {value!r}")
-            if wanted is not bool and not 0 < value < float("inf"):
-                raise ValueError(f"{field.name} must be positive and finite, got {value!r}")
-        if self.window < 2:
-            raise ValueError(f"window must be at least 2 frames, got {self.window}")
-        if self.num_kept_modes > self.window // 2 + 1:
+        super().__post_init__()
+        modes = self.count_block_modes()
+        if self.num_kept_modes > modes:
             raise ValueError(
-                f"num_kept_modes must be at most {self.window // 2 + 1} for a window of "
-                f"{self.window} frames, got {self.num_kept_modes}"
+                f"num_kept_modes must be at most {modes} for blocks of {self.block_frames} "
+                f"frames and spectral_variant {self.spectral_variant!r}, got {self.num_kept_modes}"
             )
+        if self.latent_width % self.num_heads:
+            raise ValueError(
+                f"num_heads must divide the latent width {self.latent_width}, got {self.num_heads}"
+            )
+        if self.dropout >= 1.0:
+            raise ValueError(f"dropout must be below 1, got {self.dropout}")
+        if self.block_residual and self.conditioning == "adaln_zero":
+            raise ValueError("adaln_zero is residual already: leave block_residual off")
 
-    def to_dict(self) -> dict:
-        """Return the fields as JSON-ready values."""
-        return dataclasses.asdict(self)
+    @property
+    def block_frames(self) -> int:
+        """Frames that a backbone block sees: concatenation lays c before the features."""
+        return 2 * self.window if self.conditioning == "concatenation" else self.window
 
-    @classmethod
-    def from_dict(cls, values: dict) -> F3AMDConfig:
-        """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
-        refuse_unknown(values, cls, "model setting")
-        missing = {"channels", "num_styles"} - values.keys()
-        if missing:
-            raise ValueError(f"model settings lack {', '.join(sorted(missing))}")
-        return cls(**values)
-
-
-def cosine_basis(num_frames: int) -> np.ndarray:
-    """Return the orthonormal DCT-II matrix, [mode, frame]."""
-    frame = (np.arange(num_frames) + 0.5) / num_frames
-    basis = np.cos(np.pi * np.arange(num_frames)[:, None] * frame[None, :])
-    basis *= np.sqrt(2.0 / num_frames)
-    basis[0] /= np.sqrt(2.0)
-    return basis
+    def count_block_modes(self) -> int:
+        """Return how many modes the backbone's transform has; as many can be kept."""
+        return count_modes(self.spectral_variant, self.block_frames)
 
 
 class F3AMD(nnx.Module):
@@ -112,7 +118,7 @@ class F3AMD(nnx.Module):
 
     def __init__(self, config: F3AMDConfig, *, rngs: nnx.Rngs):
         self.config = config
-        width, modes = config.latent_width, config.num_kept_modes
+        width = config.latent_width
         self.condition = ConditionEncoder(
             config.channels,
             config.num_styles,
@@ -122,18 +128,11 @@ class F3AMD(nnx.Module):
             config.num_condition_heads,
             rngs=rngs,
         )
-        kernel = config.kernel_size
-        self.encoder = FNOBlock(config.channels, width, modes, kernel, rngs=rngs)
-        self.blocks = nnx.List(
-            [FNOBlock(width, width, modes, kernel, rngs=rngs) for _ in range(config.depth)]
-        )
-        self.films = nnx.List(
-            [
-                FiLM(width, width, zero_output=config.block_residual, rngs=rngs)
-                for _ in range(config.depth)
-            ]
-        )
-        self.decoder = FNOBlock(width, config.channels, modes, kernel, rngs=rngs)
+        depth = range(config.depth)
+        self.encoder = self._coder(config.channels, width, rngs)
+        self.blocks = nnx.List([self._base_block(rngs) for _ in depth])
+        self.conditionings = nnx.List([self._conditioning_layer(rngs) for _ in depth])
+        self.decoder = self._coder(width, config.channels, rngs)
         if config.history_anchor:
             decay = np.exp(-np.arange(1, config.window + 1) / 10.0)
             anchor = np.repeat(decay[:, None], config.channels, axis=1)
@@ -145,7 +144,41 @@ class F3AMD(nnx.Module):
             start = np.repeat(0.1 * 2.0 * log_deviation[:, None], config.channels, axis=1)
             self.residual_variance = nnx.Param(jnp.asarray(start, jnp.float32))
 
-    def encode(self, condition: Condition) -> Context | tuple:
+    def _coder(self, width_in: int, width_out: int, rngs: nnx.Rngs):
+        config = self.config
+        if config.encoder_decoder == "linear":
+            return nnx.Linear(width_in, width_out, rngs=rngs)
+        modes = min(config.num_kept_modes, count_modes("fourier", config.window))
+        return FNOBlock(width_in, width_out, modes, config.kernel_size, rngs=rngs)
+
+    def _base_block(self, rngs: nnx.Rngs):
+        config, width = self.config, self.config.latent_width
+        if config.base_block == "transformer":
+            hidden = config.feed_forward_factor * width
+            return TransformerBlock(width, config.num_heads, hidden, config.dropout, rngs=rngs)
+        return FNOBlock(
+            width,
+            width,
+            config.num_kept_modes,
+            config.kernel_size,
+            config.spectral_variant,
+            config.spectral_rank,
+            config.initial_mode_gain,
+            rngs=rngs,
+        )
+
+    def _conditioning_layer(self, rngs: nnx.Rngs):
+        config = self.config
+        return conditioning_layer(
+            config.conditioning,
+            config.latent_width,
+            config.latent_width,
+            num_heads=config.num_condition_heads,
+            zero_output=config.block_residual,
+            rngs=rngs,
+        )
+
+    def encode(self, condition: Condition) -> tuple[Context, jax.Array]:
         """Encode a condition once a round.
 
         Args:
@@ -157,51 +190,64 @@ class F3AMD(nnx.Module):
         Raises:
           ValueError: if a shape does not fit the config.
         """
-        config, batch = self.config, condition.history.shape[0]
-        expected = Condition(
-            (batch, config.num_history, config.channels),
-            (batch, config.window, 8),
-            (batch, config.num_styles),
-        )
-        for name, array, shape in zip(Condition._fields, condition, expected, strict=True):
-            if array.shape != shape:
-                raise ValueError(f"condition {name} must have shape {shape}, got {array.shape}")
+        self.config.check_condition(condition)
         return self.condition.encode(condition), condition.history[:, -1]
 
-    def __call__(self, x_noisy, sigma, context):
-        """Estimate the clean features.
+    def stages(self, x_noisy, sigma, context, key=None) -> Iterator[tuple[str, jax.Array]]:
+        """Yield the name and value of every station from x_noisy to x0_hat (Figure 2).
 
         Args:
-          x_noisy: variance-exploding state, [B, T, C].
-          sigma: noise level, [B] or scalar, > 0.
-          context: from `encode`.
+          x_noisy, sigma, context, key: as in `__call__`.
 
-        Returns:
-          x0_hat, [B, T, C].
+        Yields:
+          "c" [B, T, D], "encoder" [B, T, D], "block 1" ... (2 T frames under concatenation),
+          "decoder", and last "x0_hat" [B, T, C].
         """
         config = self.config
-        if x_noisy.shape[1:] != (config.window, config.channels):
-            raise ValueError(
-                f"x_noisy must be [B, {config.window}, {config.channels}], got {x_noisy.shape}"
-            )
+        config.check_state(x_noisy)
         tokens, last_frame = context
         sigma = jnp.broadcast_to(jnp.asarray(sigma, x_noisy.dtype), x_noisy.shape[:1])
         c = self.condition(tokens, sigma)
-        level = sigma[:, None, None]
-        scaled = x_noisy
-        if config.input_scaling:
-            scaled = x_noisy * jax.lax.rsqrt(level**2 + config.sigma_data**2)
-        z = self.encoder(scaled)
-        for block, film in zip(self.blocks, self.films, strict=True):
-            update = film(block(z), c)
+        yield "c", c
+        z = self.encoder(scaled_input(config, x_noisy, sigma))
+        yield "encoder", z
+        if config.conditioning == "concatenation":
+            z = jnp.concatenate([c, z], axis=1)
+        if config.base_block == "transformer":
+            # Attention has no sense of order of its own (section 3.4.1).
+            z = z + jnp.asarray(position_code(0, config.block_frames, z.shape[-1]), z.dtype)
+        layers = zip(self.blocks, self.conditionings, strict=True)
+        for number, (block, conditioning) in enumerate(layers):
+            if key is not None:
+                block = partial(block, key=jax.random.fold_in(key, number))
+            update = conditioning(block, z, c)
             z = z + update if config.block_residual else update
-        x0_hat = self.decoder(z)
+            yield f"block {number + 1}", z
+        x0_hat = self.decoder(z[:, -config.window :])
+        yield "decoder", x0_hat
         if config.history_anchor:
             x0_hat = x0_hat + self.anchor[...] * last_frame[:, None, :]
         if config.residual_prior:
             basis = jnp.asarray(cosine_basis(config.window), x_noisy.dtype)
             variance = jnp.exp(10.0 * self.residual_variance[...])
-            gain = variance / (variance + level**2)
+            gain = variance / (variance + sigma[:, None, None] ** 2)
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)
-        return x0_hat
+        yield "x0_hat", x0_hat
+
+    def __call__(self, x_noisy, sigma, context, key=None):
+        """Estimate the clean features (Eq. 1).
+
+        Args:
+          x_noisy: variance-exploding state, [B, T, C].
+          sigma: noise level, [B] or scalar, > 0.
+          context: from `encode`.
+          key: random key for dropout, in training; without one nothing is dropped.
+
+        Returns:
+          x0_hat, [B, T, C].
+
+        Raises:
+          ValueError: if x_noisy does not fit the config.
+        """
+        return last_stage(self.stages(x_noisy, sigma, context, key))

@@ -1,8 +1,9 @@
-"""The Fourier Neural Operator block (paper section 3.4.2, Eqs 2-4).
+"""The Fourier Neural Operator block (paper section 3.4.2, Eqs 2-4) and its variants (Table 8).
 
 The paper writes channels first, z in R^{D x t}; arrays here are [batch, frames, channels].
 Windows are short (32 or 64 frames), so the real Fourier transform is a product with a small cosine
-and sine matrix: the same numbers as an FFT, and faster on the hardware this was measured on.
+and sine matrix: the same numbers as an FFT, and faster on the hardware this was measured on. So is
+the cosine transform.
 """
 
 from __future__ import annotations
@@ -14,13 +15,55 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from f3amd_lib.names import nearest_hint
+
 __all__ = [
+    "SPECTRAL_VARIANTS",
+    "count_modes",
     "fourier_matrices",
+    "cosine_basis",
     "spectral_convolution",
+    "cosine_convolution",
     "SpectralConvolution",
     "TemporalConvolution",
     "FNOBlock",
 ]
+
+SPECTRAL_VARIANTS = ("fourier", "cosine", "reduced_rank", "weighted")
+"""Spectral layers of Table 8: Eq. 2; the discrete cosine transform; factorised weights; gains."""
+
+
+def count_modes(variant: str, num_frames: int) -> int:
+    """Return how many modes a variant's transform of `num_frames` frames has.
+
+    Args:
+      variant: one of `SPECTRAL_VARIANTS`.
+      num_frames: window length T, odd or even.
+
+    Returns:
+      T cosine modes, or T // 2 + 1 Fourier modes for every other variant.
+
+    Raises:
+      ValueError: for an unknown variant.
+    """
+    _check_variant(variant)
+    return num_frames if variant == "cosine" else num_frames // 2 + 1
+
+
+def _check_variant(variant: str) -> None:
+    if variant not in SPECTRAL_VARIANTS:
+        raise ValueError(
+            f"unknown spectral variant {variant!r}{nearest_hint(variant, SPECTRAL_VARIANTS)}"
+        )
+
+
+def _check_num_kept_modes(variant: str, num_frames: int, num_kept_modes: int) -> None:
+    modes = count_modes(variant, num_frames)
+    if not 1 <= num_kept_modes <= modes:
+        raise ValueError(
+            f"num_kept_modes must be between 1 and {modes} for {num_frames} frames, "
+            f"got {num_kept_modes}"
+        )
 
 
 @functools.lru_cache(maxsize=32)
@@ -39,12 +82,7 @@ def fourier_matrices(num_frames: int, num_kept_modes: int) -> tuple[np.ndarray, 
     Raises:
       ValueError: if m is out of range.
     """
-    bins = num_frames // 2 + 1
-    if not 1 <= num_kept_modes <= bins:
-        raise ValueError(
-            f"num_kept_modes must be between 1 and {bins} for {num_frames} frames, "
-            f"got {num_kept_modes}"
-        )
+    _check_num_kept_modes("fourier", num_frames, num_kept_modes)
     mode = np.arange(num_kept_modes)[:, None]
     angle = 2.0 * np.pi * mode * np.arange(num_frames)[None, :] / num_frames
     analysis = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
@@ -57,44 +95,162 @@ def fourier_matrices(num_frames: int, num_kept_modes: int) -> tuple[np.ndarray, 
     return analysis, synthesis
 
 
-def spectral_convolution(z, weight_real, weight_imag):
+@functools.lru_cache(maxsize=32)
+def cosine_basis(num_frames: int, num_kept_modes: int | None = None) -> np.ndarray:
+    """Return the first rows of the orthonormal cosine transform (DCT-II).
+
+    Args:
+      num_frames: window length T.
+      num_kept_modes: m, the number of rows kept, 1 <= m <= T; all T by default.
+
+    Returns:
+      [m, T], float64, read-only (it is cached). Its transpose maps back.
+
+    Raises:
+      ValueError: if m is out of range.
+    """
+    modes = num_frames if num_kept_modes is None else num_kept_modes
+    _check_num_kept_modes("cosine", num_frames, modes)
+    frame = (np.arange(num_frames) + 0.5) / num_frames
+    basis = np.cos(np.pi * np.arange(modes)[:, None] * frame[None, :])
+    basis *= np.sqrt(2.0 / num_frames)
+    basis[0] /= np.sqrt(2.0)
+    basis.setflags(write=False)
+    return basis
+
+
+def _spectrum(z, modes: int):
+    """Map [B, T, D] to its first Fourier modes, [m, 2, B, D]: real part, then imaginary part."""
+    batch, num_frames, width = z.shape
+    analysis, _ = fourier_matrices(num_frames, modes)
+    analysis = jnp.asarray(analysis.reshape(2 * modes, num_frames), z.dtype)
+    return jnp.einsum("ft,btc->fbc", analysis, z).reshape(modes, 2, batch, width)
+
+
+def _signal(spectrum, num_frames: int):
+    """Map Fourier modes [m, 2, B, D] back to [B, T, D]."""
+    modes, _, batch, width = spectrum.shape
+    _, synthesis = fourier_matrices(num_frames, modes)
+    synthesis = jnp.asarray(synthesis.reshape(num_frames, 2 * modes), spectrum.dtype)
+    return jnp.einsum("tf,fbd->btd", synthesis, spectrum.reshape(2 * modes, batch, width))
+
+
+def _complex_product(spectrum, weight_real, weight_imag):
+    """Multiply [m, 2, B, D0] by complex weights [m, D0, D1], mode by mode: [m, 2, B, D1]."""
+    modes, _, batch, width_in = spectrum.shape
+    # One batched product gives all four real products of the complex one.
+    products = spectrum.reshape(modes, 2 * batch, width_in) @ jnp.concatenate(
+        [weight_real, weight_imag], axis=-1
+    )
+    products = products.reshape(modes, 2, batch, 2, weight_real.shape[-1])
+    real = products[:, 0, :, 0] - products[:, 1, :, 1]
+    imag = products[:, 0, :, 1] + products[:, 1, :, 0]
+    return jnp.stack([real, imag], axis=1)
+
+
+def spectral_convolution(z, weight_real, weight_imag, *factors, gain=None):
     """Return IRFFT(W . RFFT(z)[:m]) over the frame axis (Eq. 2).
 
     Args:
       z: [B, T, D0].
       weight_real, weight_imag: the complex weights W as two real arrays, [m, D0, D1].
+      *factors: further complex weights, again two real arrays each, that are applied after the
+        first ones: W = U V as U [m, D0, r], then V [m, r, D1].
+      gain: [m], one factor per mode on the spectrum of z; none by default.
 
     Returns:
       [B, T, D1].
     """
-    batch, num_frames, width_in = z.shape
-    modes, _, width_out = weight_real.shape
-    analysis, synthesis = fourier_matrices(num_frames, modes)
-    analysis = jnp.asarray(analysis.reshape(2 * modes, num_frames), z.dtype)
-    synthesis = jnp.asarray(synthesis.reshape(num_frames, 2 * modes), z.dtype)
-    spectrum = jnp.einsum("ft,btc->fbc", analysis, z).reshape(modes, 2 * batch, width_in)
-    # One batched product gives all four real products of the complex one.
-    products = spectrum @ jnp.concatenate([weight_real, weight_imag], axis=-1)
-    products = products.reshape(modes, 2, batch, 2, width_out)
-    real = products[:, 0, :, 0] - products[:, 1, :, 1]
-    imag = products[:, 0, :, 1] + products[:, 1, :, 0]
-    mixed = jnp.stack([real, imag], axis=1).reshape(2 * modes, batch, width_out)
-    return jnp.einsum("tf,fbd->btd", synthesis, mixed)
+    spectrum = _spectrum(z, len(weight_real))
+    if gain is not None:
+        spectrum = spectrum * gain[:, None, None, None]
+    spectrum = _complex_product(spectrum, weight_real, weight_imag)
+    for real, imag in zip(factors[::2], factors[1::2], strict=True):
+        spectrum = _complex_product(spectrum, real, imag)
+    return _signal(spectrum, z.shape[1])
+
+
+def cosine_convolution(z, weight):
+    """Return the inverse cosine transform of weights times the first modes of z (Table 8, DCT).
+
+    Unlike a Fourier layer it mirrors the window at its ends instead of joining them.
+
+    Args:
+      z: [B, T, D0].
+      weight: real, [m, D0, D1].
+
+    Returns:
+      [B, T, D1].
+    """
+    basis = jnp.asarray(cosine_basis(z.shape[1], len(weight)), z.dtype)
+    mixed = jnp.einsum("kt,btc->kbc", basis, z) @ weight
+    return jnp.einsum("kt,kbd->btd", basis, mixed)
 
 
 class SpectralConvolution(nnx.Module):
-    """Learned complex weights on the first m Fourier modes (Eq. 2)."""
+    """Learned weights on the first m modes (Eq. 2), in the variants of Table 8.
 
-    def __init__(self, width_in: int, width_out: int, num_kept_modes: int, *, rngs: nnx.Rngs):
-        # Unit gain: white input of variance 1 leaves with variance about 1 when no bin is cut.
-        scale = 1.0 / np.sqrt(2.0 * width_in)
-        shape = (num_kept_modes, width_in, width_out)
-        self.weight_real = nnx.Param(scale * jax.random.normal(rngs.params(), shape))
-        self.weight_imag = nnx.Param(scale * jax.random.normal(rngs.params(), shape))
+    Args:
+      width_in, width_out: D0 and D1.
+      num_kept_modes: m, at most `count_modes(variant, T)`.
+      variant: "fourier", complex weights [m, D0, D1]; "cosine", real ones on the cosine transform;
+        "reduced_rank", complex factors [m, D0, r] and [m, r, D1] (Chou and Chen 2025); "weighted",
+        complex weights and one learned gain per mode (Liu and Tang 2025).
+      rank: r of "reduced_rank" (Appendix E: 8).
+      initial_gain: where the gains of "weighted" start (Appendix E: 0.7).
+
+    Raises:
+      ValueError: for an unknown variant, or a rank above min(D0, D1), which would save nothing.
+    """
+
+    def __init__(
+        self,
+        width_in: int,
+        width_out: int,
+        num_kept_modes: int,
+        variant: str = "fourier",
+        rank: int = 8,
+        initial_gain: float = 0.7,
+        *,
+        rngs: nnx.Rngs,
+    ):
+        _check_variant(variant)
+        self.variant = variant
+
+        def draw(rows: int, columns: int, parts: int = 2):
+            # Unit gain: white input of variance 1 leaves with variance about 1 when no mode is cut.
+            scale = 1.0 / np.sqrt(parts * rows)
+            shape = (num_kept_modes, rows, columns)
+            return nnx.Param(scale * jax.random.normal(rngs.params(), shape))
+
+        if variant == "cosine":
+            self.weight = draw(width_in, width_out, parts=1)
+        elif variant == "reduced_rank":
+            if not 1 <= rank <= min(width_in, width_out):
+                raise ValueError(
+                    f"rank must be between 1 and {min(width_in, width_out)} for widths "
+                    f"{width_in} and {width_out}, got {rank}"
+                )
+            self.first_real = draw(width_in, rank)
+            self.first_imag = draw(width_in, rank)
+            self.second_real = draw(rank, width_out)
+            self.second_imag = draw(rank, width_out)
+        else:
+            self.weight_real = draw(width_in, width_out)
+            self.weight_imag = draw(width_in, width_out)
+        if variant == "weighted":
+            self.gain = nnx.Param(jnp.full(num_kept_modes, initial_gain, jnp.float32))
 
     def __call__(self, z):
         """Map [B, T, D0] to [B, T, D1]."""
-        return spectral_convolution(z, self.weight_real[...], self.weight_imag[...])
+        if self.variant == "cosine":
+            return cosine_convolution(z, self.weight[...])
+        if self.variant == "reduced_rank":
+            first = self.first_real[...], self.first_imag[...]
+            second = self.second_real[...], self.second_imag[...]
+            return spectral_convolution(z, *first, *second)
+        gain = self.gain[...] if self.variant == "weighted" else None
+        return spectral_convolution(z, self.weight_real[...], self.weight_imag[...], gain=gain)
 
 
 class TemporalConvolution(nnx.Module):
@@ -121,7 +277,13 @@ class TemporalConvolution(nnx.Module):
 
 
 class FNOBlock(nnx.Module):
-    """Spectral branch plus local branch (Eqs 2-4); encoder or decoder if the widths differ."""
+    """Spectral branch plus local branch (Eqs 2-4); encoder or decoder if the widths differ.
+
+    Args:
+      width_in, width_out: D0 and D1.
+      num_kept_modes, variant, rank, initial_gain: of `SpectralConvolution`.
+      kernel_size: k of Eq. 3.
+    """
 
     def __init__(
         self,
@@ -129,10 +291,15 @@ class FNOBlock(nnx.Module):
         width_out: int,
         num_kept_modes: int,
         kernel_size: int = 3,
+        variant: str = "fourier",
+        rank: int = 8,
+        initial_gain: float = 0.7,
         *,
         rngs: nnx.Rngs,
     ):
-        self.spectral = SpectralConvolution(width_in, width_out, num_kept_modes, rngs=rngs)
+        self.spectral = SpectralConvolution(
+            width_in, width_out, num_kept_modes, variant, rank, initial_gain, rngs=rngs
+        )
         self.local_first = TemporalConvolution(width_in, width_in, kernel_size, rngs=rngs)
         self.local_second = TemporalConvolution(width_in, width_out, kernel_size, rngs=rngs)
 
@@ -140,6 +307,11 @@ class FNOBlock(nnx.Module):
         """Return the local branch, SiLU(Conv(SiLU(Conv(SiLU(z))))) (Eq. 3)."""
         return nnx.silu(self.local_second(nnx.silu(self.local_first(nnx.silu(z)))))
 
-    def __call__(self, z):
-        """Map [B, T, D0] to [B, T, D1] (Eq. 4)."""
+    def __call__(self, z, key=None):
+        """Map [B, T, D0] to [B, T, D1] (Eq. 4).
+
+        Args:
+          z: [B, T, D0].
+          key: not used; every base block takes one, and only Transformers drop anything.
+        """
         return self.spectral(z) + self.local(z)

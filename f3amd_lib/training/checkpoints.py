@@ -6,6 +6,7 @@ the name, so that a crash leaves the old file whole. Reading checks names, shape
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
@@ -20,9 +21,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.flax import save_file
 
 from f3amd_lib.data.features import Normaliser
+from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.files import whole_file
-from f3amd_lib.models.f3amd import F3AMDConfig
-from f3amd_lib.models.zoo import build_from_config
+from f3amd_lib.models.config import NetworkConfig
+from f3amd_lib.models.zoo import build_from_config, config_from_dict
 from f3amd_lib.motion.skeleton import Skeleton
 
 __all__ = ["save_tree", "describe", "load_tree", "TrainedModel", "save_model", "load_model"]
@@ -127,16 +129,18 @@ class TrainedModel:
       normaliser: of its features.
       skeleton: of the data it was trained on.
       styles: names, in the order of the one-hot vector.
+      diffusion: the noise schedule it was trained with.
       seeds: per style name, seed histories as world frames, [K, H, C], metres and 6D; K may differ.
       record: how it was trained, on what, under what terms.
     """
 
     name: str
-    config: F3AMDConfig
+    config: NetworkConfig
     params: Any
     normaliser: Normaliser
     skeleton: Skeleton
     styles: tuple[str, ...]
+    diffusion: NoiseSchedule
     seeds: dict
     record: dict
 
@@ -167,6 +171,7 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "name": trained.name,
         "model": trained.config.to_dict(),
         "styles": list(trained.styles),
+        "diffusion": dataclasses.asdict(trained.diffusion),
         "joints": list(trained.skeleton.names),
         "parents": list(trained.skeleton.parents),
         "end_sites": [[joint, list(offset)] for joint, offset in trained.skeleton.end_sites],
@@ -192,11 +197,12 @@ def load_model(path: Path) -> TrainedModel:
         )
         return TrainedModel(
             name=metadata["name"],
-            config=F3AMDConfig.from_dict(metadata["model"]),
+            config=config_from_dict(metadata["model"]),
             params=tree["params"],
             normaliser=Normaliser(**tree["normaliser"]),
             skeleton=skeleton,
             styles=tuple(metadata["styles"]),
+            diffusion=schedule_from_dict(metadata["diffusion"]),
             seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
             record=metadata["record"],
         )
@@ -211,7 +217,7 @@ def _model_template(metadata: dict) -> dict:
     """Return the shapes that a trained model's description speaks of."""
     if metadata.get("kind") != "trained model":
         raise ValueError(f"holds a {metadata.get('kind')}, not a trained model")
-    config = F3AMDConfig.from_dict(metadata["model"])
+    config = config_from_dict(metadata["model"])
     params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
     single = jax.ShapeDtypeStruct
     return {

@@ -32,10 +32,10 @@ from f3amd_lib.data.windows import (
     spread_windows,
 )
 from f3amd_lib.diffusion.samplers import add_noise
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import NoiseSchedule, VarianceExploding, schedule_from_dict
 from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.f3amd import F3AMDConfig
-from f3amd_lib.models.zoo import build_from_config
+from f3amd_lib.models.config import NetworkConfig
+from f3amd_lib.models.zoo import build_from_config, find_preset
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.names import refuse_unknown
 from f3amd_lib.training.checkpoints import load_tree, save_tree
@@ -49,7 +49,8 @@ __all__ = [
     "draw_sigma",
     "learning_rate_schedule",
     "network_inputs",
-    "training_recipe",
+    "paper_recipe",
+    "short_recipe",
 ]
 
 
@@ -71,11 +72,13 @@ class TrainingConfig:
       warmup_steps: of "warmup_cosine".
       ema_decay: moving average of the weights (paper: 0.993); what is evaluated and shipped.
       gradient_clip: largest global gradient norm; 0 clips nothing (the paper names none).
-      noise: "schedule" draws t uniform in Eq. 9; "mixed" (ours) draws every second sigma
-        log-uniform between sigma_min and 1, where the noisy input says something that the
-        condition does not.
+      noise: "schedule" draws levels as the schedule says (Eq. 9: t uniform); "mixed" (ours) draws
+        every second sigma log-uniform between sigma_min and 1, where the noisy input says something
+        that the condition does not.
       history_noise: deviation, in network units, of noise added to the history in training (ours;
         0 in paper presets): rounds are started from generated frames, which are never quite real.
+      history_dropout: share of samples whose history is set to 0 (CAMDM's code: 0.15; F3AMD
+        mentions none).
       captured_path_share: share of samples whose path condition is the captured root, sway and all;
         the rest see a smoothed one, as users draw them (CAMDM: 0.5).
       own_history_share: share of samples that start from the network's own last frames of the
@@ -86,7 +89,7 @@ class TrainingConfig:
         by a random amount, while the target soon returns to what was captured (ours; 0 in paper
         presets): the same remedy, for histories that have lost the swing of more than one round.
       loss: weights of the loss terms.
-      sigma_max, sigma_min, rho: the noise schedule (section 4.5).
+      diffusion: the noise schedule (section 4.5).
       seed: of initial weights and batches.
 
     Raises:
@@ -103,13 +106,12 @@ class TrainingConfig:
     gradient_clip: float = 0.0
     noise: str = "schedule"
     history_noise: float = 0.0
+    history_dropout: float = 0.0
     captured_path_share: float = 0.5
     own_history_share: float = 0.0
     history_damping: float = 0.0
     loss: LossWeights = field(default_factory=LossWeights)
-    sigma_max: float = 128.0
-    sigma_min: float = 0.01
-    rho: float = 3.0
+    diffusion: NoiseSchedule = field(default_factory=VarianceExploding)
     seed: int = 0
 
     def __post_init__(self):
@@ -129,18 +131,19 @@ class TrainingConfig:
         for name in ("gradient_clip", "history_noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more, got {getattr(self, name)!r}")
-        if self.noise == "mixed" and self.sigma_min >= 1.0:
-            raise ValueError(f"mixed noise needs sigma_min below 1, got {self.sigma_min!r}")
-        for name in ("captured_path_share", "own_history_share", "history_damping"):
+        if self.noise == "mixed" and not (
+            isinstance(self.diffusion, VarianceExploding) and self.diffusion.sigma_min < 1.0
+        ):
+            raise ValueError(
+                "mixed noise needs a variance-exploding schedule with sigma_min below 1, "
+                f"got {self.diffusion!r}"
+            )
+        shares = ("history_dropout", "captured_path_share", "own_history_share", "history_damping")
+        for name in shares:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
         if not 0.0 <= self.ema_decay < 1.0:
             raise ValueError(f"ema_decay must be in [0, 1), got {self.ema_decay!r}")
-        self.noise_schedule()
-
-    def noise_schedule(self) -> VarianceExploding:
-        """Return the noise schedule of Eq. 9."""
-        return VarianceExploding(self.sigma_max, self.sigma_min, self.rho)
 
     def to_dict(self) -> dict:
         """Return the fields as JSON-ready values."""
@@ -154,44 +157,42 @@ class TrainingConfig:
         if isinstance(values.get("loss"), dict):
             refuse_unknown(values["loss"], LossWeights, "loss setting")
             values["loss"] = LossWeights(**values["loss"])
+        if isinstance(values.get("diffusion"), dict):
+            values["diffusion"] = schedule_from_dict(values["diffusion"])
         return cls(**values)
 
 
-def training_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
-    """Return how a preset is trained in a run far shorter than the paper's 100 epochs.
-
-    The paper's names get the paper's losses; "-plus" gets ours. Both get a warm-up and a cosine
-    from a higher rate, which short runs need (the paper's schedule is `TrainingConfig`'s default).
+def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
+    """Return how the paper trains a preset (section 4.5), but for the number of steps.
 
     Args:
-      preset: a name of `zoo.PRESETS`.
+      preset: see `zoo.find_preset`; its own noise, losses and remedies are in it.
       num_steps: optimiser steps.
       **settings: fields of `TrainingConfig` to change.
     """
-    values = {
-        "num_steps": num_steps,
+    found = find_preset(preset)
+    return TrainingConfig.from_dict(
+        {"num_steps": num_steps, "diffusion": found.diffusion, **found.training, **settings}
+    )
+
+
+def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
+    """Return how a preset is trained in a run far shorter than the paper's 100 epochs.
+
+    As `paper_recipe`, with a warm-up and a cosine from a higher rate, which short runs need (the
+    paper's schedule is `TrainingConfig`'s default).
+
+    Args:
+      preset, num_steps, **settings: as for `paper_recipe`.
+    """
+    short = {
         "batch_size": 128,
         "learning_rate": 2e-3,
         "schedule": "warmup_cosine",
         "warmup_steps": max(1, min(200, num_steps // 10)),
         "gradient_clip": 1.0,
     }
-    if preset.endswith("-plus"):
-        values["noise"] = "mixed"
-        values["history_noise"] = 0.02
-        values["captured_path_share"] = 0.25
-        values["own_history_share"] = 0.75
-        values["history_damping"] = 0.5
-        values["loss"] = LossWeights(
-            sample=1.0,
-            position=20.0,
-            feature_velocity=5.0,
-            joint_velocity=300.0,
-            foot=300.0,
-            ird=1.0,
-            ird_form="excess",
-        )
-    return TrainingConfig(**{**values, **settings})
+    return paper_recipe(preset, num_steps, **{**short, **settings})
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
@@ -237,10 +238,10 @@ def network_inputs(batch: Batch, normaliser: Normaliser) -> tuple[jax.Array, Con
 def draw_sigma(key, batch_size: int, config: TrainingConfig):
     """Draw the noise level of each sample, [B], as `config.noise` says (Eqs 8 and 9)."""
     key_time, key_low, key_choice = jax.random.split(key, 3)
-    sigma = config.noise_schedule().sigma(jax.random.uniform(key_time, (batch_size,)))
+    sigma = config.diffusion.draw(key_time, (batch_size,))
     if config.noise == "mixed":
         log_low = jax.random.uniform(
-            key_low, (batch_size,), minval=np.log(config.sigma_min), maxval=0.0
+            key_low, (batch_size,), minval=np.log(config.diffusion.sigma_min), maxval=0.0
         )
         low = jax.random.bernoulli(key_choice, 0.5, (batch_size,))
         sigma = jnp.where(low, jnp.exp(log_low), sigma)
@@ -261,7 +262,7 @@ class Trainer:
 
     def __init__(
         self,
-        model_config: F3AMDConfig,
+        model_config: NetworkConfig,
         config: TrainingConfig,
         skeleton: Skeleton,
         normaliser: Normaliser,
@@ -302,17 +303,16 @@ class Trainer:
         # A fresh tree, so that editing the network leaves the given weights alone.
         return nnx.merge(self.graph, jax.tree.map(lambda leaf: leaf, params))
 
-    def _loss(self, params, batch: Batch, sigma, key, history_noise: float = 0.0):
-        key_noise, key_history = jax.random.split(key)
+    def _loss(self, params, batch: Batch, sigma, key, training: bool = False):
+        key_noise, key_history, key_dropout = jax.random.split(key, 3)
         x0, condition = network_inputs(batch, self.normaliser)
-        if history_noise > 0:
-            noise = jax.random.normal(key_history, condition.history.shape)
-            history = condition.history + history_noise * noise
-            condition = condition._replace(history=history)
+        if training:
+            condition = self._disturbed(condition, key_history)
         noise = jax.random.normal(key_noise, x0.shape)
         model = self.model(params)
         x_noisy = add_noise(x0, sigma[:, None, None], noise)
-        x0_hat = model(x_noisy, sigma, model.encode(condition))
+        drops = training and self.model_config.dropout > 0
+        x0_hat = model(x_noisy, sigma, model.encode(condition), key=key_dropout if drops else None)
         terms = loss_terms(
             self.skeleton,
             x0_hat,
@@ -324,6 +324,18 @@ class Trainer:
         )
         loss = total_loss(terms, self.config.loss)
         return loss, {"loss": loss, **terms}
+
+    def _disturbed(self, condition: Condition, key) -> Condition:
+        """Add noise to the history, or take it away, as the config says."""
+        config, history = self.config, condition.history
+        key_noise, key_dropout = jax.random.split(key)
+        if config.history_noise > 0:
+            history = history + config.history_noise * jax.random.normal(key_noise, history.shape)
+        if config.history_dropout > 0:
+            size = (history.shape[0], 1, 1)
+            kept = jax.random.bernoulli(key_dropout, 1.0 - config.history_dropout, size)
+            history = jnp.where(kept, history, 0.0)
+        return condition._replace(history=history)
 
     def _training_batch(self, windows: WindowSet, state: TrainingState, key) -> Batch:
         """Draw a batch; where the recipe asks, start it from histories as a rollout meets them."""
@@ -350,8 +362,9 @@ class Trainer:
         key_noise, key_choice = jax.random.split(key)
         x0, condition = network_inputs(before, self.normaliser)
         model = self.model(state.params)
-        x_noisy = config.sigma_max * jax.random.normal(key_noise, x0.shape)
-        x0_hat = jax.lax.stop_gradient(model(x_noisy, config.sigma_max, model.encode(condition)))
+        sigma = config.diffusion.sigma_max
+        x_noisy = sigma * jax.random.normal(key_noise, x0.shape)
+        x0_hat = jax.lax.stop_gradient(model(x_noisy, sigma, model.encode(condition)))
         made = orthonormalise(self.normaliser.denormalise(x0_hat))
         # Short windows leave some captured frames at the front, as they would in a rollout.
         made = jnp.concatenate([before.history, made], axis=1)[:, -batch.history.shape[1] :]
@@ -383,7 +396,7 @@ class Trainer:
             batch = self._training_batch(windows, state, key_batch)
             sigma = draw_sigma(key_sigma, config.batch_size, config)
             gradient, terms = jax.grad(self._loss, has_aux=True)(
-                state.params, batch, sigma, key_loss, config.history_noise
+                state.params, batch, sigma, key_loss, training=True
             )
             updates, optimiser = self.optimiser.update(gradient, state.optimiser, state.params)
             params = optax.apply_updates(state.params, updates)
@@ -396,7 +409,7 @@ class Trainer:
         batch = spread_windows(windows, num_samples)
         size = batch.future.shape[0]
         key_sigma, key_loss = jax.random.split(key)
-        sigma = self.config.noise_schedule().sigma(jax.random.uniform(key_sigma, (size,)))
+        sigma = self.config.diffusion.draw(key_sigma, (size,))
         return self._loss(params, batch, sigma, key_loss)[1]
 
     def held_out_terms(self, params, windows: WindowSet, *, num_samples: int = 512) -> dict:

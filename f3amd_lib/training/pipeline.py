@@ -23,11 +23,11 @@ from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
 from f3amd_lib.models import zoo
-from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.report.records import read_table, run_record, write_table
 from f3amd_lib.training.checkpoints import TrainedModel, describe, load_model, save_model
-from f3amd_lib.training.loop import Trainer, TrainingConfig, training_recipe
+from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
 
 __all__ = [
     "PreparedData",
@@ -150,11 +150,14 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
     """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
     preset = preset or profile.preset
-    settings = {"batch_size": profile.batch_size, "seed": profile.seed}
-    if profile.name == "gpu" and not preset.endswith("-plus"):
-        return TrainingConfig(profile.train_steps, learning_rate=profile.learning_rate, **settings)
-    return training_recipe(
-        preset, profile.train_steps, learning_rate=profile.learning_rate, **settings
+    ours = preset.endswith("-plus")
+    recipe = paper_recipe if profile.name == "gpu" and not ours else short_recipe
+    return recipe(
+        preset,
+        profile.train_steps,
+        learning_rate=profile.learning_rate,
+        batch_size=profile.batch_size,
+        seed=profile.seed,
     )
 
 
@@ -241,6 +244,7 @@ def train(
         normaliser=trainer.normaliser,
         skeleton=packed.skeleton,
         styles=packed.styles,
+        diffusion=config.diffusion,
         seeds=seed_histories(packed, num_history=prepared.num_history),
         record=record,
     )
@@ -304,7 +308,7 @@ def obtain_model(
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
-def _identity(prepared: PreparedData, model: F3AMDConfig, config: TrainingConfig) -> dict:
+def _identity(prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> dict:
     """Return all that decides a model's weights, as a state or record tells it."""
     return {
         "model": model.to_dict(),

@@ -1,0 +1,289 @@
+"""Attention and the Transformer block against plain numpy loops (section 3.4.1, Appendix A)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy.special import erf
+
+from f3amd_lib.models import attention as attention_module
+from f3amd_lib.models import conditioning
+from f3amd_lib.models.attention import (
+    MultiHeadAttention,
+    TransformerBlock,
+    attention,
+    attention_weights,
+    dropout,
+    position_code,
+    split_heads,
+)
+
+WIDTH, HEADS, HIDDEN = 8, 2, 12
+
+
+def draw(*shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+
+
+def linear(layer, x):
+    return x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+
+
+def plain_attention(query, key, value):
+    """Attention on [B, T, heads, width per head], number by number."""
+    batch, frames, heads, each = query.shape
+    result = np.zeros((batch, frames, heads, each))
+    for b in range(batch):
+        for h in range(heads):
+            for t in range(frames):
+                scores = [float(query[b, t, h] @ key[b, s, h]) for s in range(key.shape[1])]
+                shares = np.exp(np.array(scores) / np.sqrt(each))
+                for s, share in enumerate(shares / shares.sum()):
+                    result[b, t, h] += share * value[b, s, h]
+    return result
+
+
+def plain_multi_head(layer, asking, answering):
+    heads = lambda x: x.reshape(*x.shape[:2], layer.num_heads, -1)
+    query, key, value = (
+        heads(linear(part, x))
+        for part, x in (
+            (layer.query, asking),
+            (layer.key, answering),
+            (layer.value, answering),
+        )
+    )
+    return linear(layer.output, plain_attention(query, key, value).reshape(asking.shape))
+
+
+def plain_norm(layer, x):
+    x = x - x.mean(axis=-1, keepdims=True)
+    x = x / np.sqrt((x**2).mean(axis=-1, keepdims=True) + 1e-5)
+    return x * np.asarray(layer.scale[...]) + np.asarray(layer.bias[...])
+
+
+def make_block(dropout=0.0, activation="gelu"):
+    """A block whose every weight is random, biases and norms too."""
+    block = TransformerBlock(WIDTH, HEADS, HIDDEN, dropout, activation, rngs=nnx.Rngs(params=0))
+    rng = np.random.default_rng(1)
+    nnx.update(
+        block,
+        jax.tree.map(
+            lambda leaf: jnp.asarray(0.4 * rng.standard_normal(leaf.shape), leaf.dtype),
+            nnx.state(block),
+        ),
+    )
+    return block
+
+
+def test_position_code_by_hand():
+    code = position_code(-2, 3, 4)
+    assert code.shape == (5, 4)
+    np.testing.assert_allclose(code[2], [0.0, 1.0, 0.0, 1.0], atol=1e-15)  # frame 0
+    rate = 1000.0 ** (-2 / 4)
+    np.testing.assert_allclose(
+        code[3], [np.sin(1), np.cos(1), np.sin(rate), np.cos(rate)], atol=1e-15
+    )
+    # History frames are the negatives of future ones: sine odd, cosine even.
+    np.testing.assert_allclose(code[1], code[3] * [-1, 1, -1, 1], atol=1e-15)
+    assert position_code(0, 3, 5).shape == (3, 5)
+    assert conditioning.position_code is position_code
+
+
+def test_position_code_with_the_base_of_vaswani_et_al():
+    code = position_code(0, 76, 256, base=10_000.0)
+    for frame, pair in ((0, 0), (7, 3), (75, 127)):
+        angle = frame / 10_000.0 ** (2 * pair / 256)
+        np.testing.assert_allclose(
+            code[frame, 2 * pair : 2 * pair + 2], [np.sin(angle), np.cos(angle)], atol=1e-13
+        )
+
+
+def test_cached_codes_cannot_be_spoilt_by_a_caller():
+    with pytest.raises(ValueError, match="read-only"):
+        position_code(0, 3, 4)[0] = 7.0
+
+
+@pytest.mark.parametrize("rate", [0.2, 0.5])
+def test_dropout_keeps_the_mean(rate):
+    x = 1.0 + np.abs(draw(400, 500))
+    dropped = np.asarray(dropout(jnp.asarray(x), rate, jax.random.key(0)))
+    kept = dropped != 0.0
+    assert kept.mean() == pytest.approx(1.0 - rate, abs=0.005)
+    np.testing.assert_allclose(dropped[kept], x[kept] / (1.0 - rate), rtol=1e-6)
+    assert dropped.mean() == pytest.approx(x.mean(), rel=0.01)
+    other = dropout(jnp.asarray(x), rate, jax.random.key(1))
+    assert (np.asarray(other != 0.0) != kept).mean() == pytest.approx(
+        2.0 * rate * (1.0 - rate), abs=0.005
+    )
+
+
+def test_dropout_of_nothing_changes_nothing_and_of_all_is_refused():
+    x = draw(3, 4)
+    np.testing.assert_array_equal(dropout(x, 0.0, jax.random.key(0)), x)
+    for rate in (1.0, -0.1):
+        with pytest.raises(ValueError, match=f"below 1, got {rate}"):
+            dropout(x, rate, jax.random.key(0))
+
+
+@pytest.mark.parametrize("heads", [1, 3])
+def test_attention_equals_a_plain_loop(heads):
+    query, key, value = (
+        2.0 * draw(2, frames, heads, 4, seed=seed) for seed, frames in enumerate((5, 7, 7))
+    )
+    expected = plain_attention(query, key, value)
+    np.testing.assert_allclose(attention(query, key, value), expected, atol=1e-5)
+    # The form that can drop weights, when it drops none.
+    got = attention(query, key, value, dropout_rate=0.0, dropout_key=jax.random.key(0))
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+    np.testing.assert_allclose(attention_weights(query, key).sum(axis=-1), 1.0, atol=1e-6)
+
+
+def test_attention_by_hand():
+    query = jnp.array([[[[2.0, 0.0, 0.0, 0.0]]]])
+    key = jnp.zeros((1, 2, 1, 4)).at[0, 1, 0, 0].set(np.log(3.0))
+    value = jnp.array([[[[4.0, 0.0, 0.0, 1.0]], [[8.0, 0.0, 0.0, 1.0]]]])
+    # Scores 0 and 2 log(3) / sqrt(4): shares 1/4 and 3/4.
+    np.testing.assert_allclose(attention_weights(query, key)[0, 0, 0], [0.25, 0.75], atol=1e-6)
+    np.testing.assert_allclose(attention(query, key, value)[0, 0, 0], [7, 0, 0, 1], atol=1e-5)
+
+
+def test_attention_drops_weights_and_keeps_their_mean():
+    query, key = draw(1, 3, 2, 4), draw(1, 4, 2, 4, seed=1)
+    # With the unit matrix for values, the result is the weights themselves.
+    value = jnp.broadcast_to(jnp.eye(4)[None, :, None, :], (1, 4, 2, 4))
+    weights = jnp.swapaxes(attention_weights(query, key), 1, 2)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    dropped = jax.vmap(lambda k: attention(query, key, value, dropout_rate=0.25, dropout_key=k))(
+        keys
+    )
+    there = np.asarray(dropped) != 0.0
+    assert there.mean() == pytest.approx(0.75, abs=0.01)
+    full = np.broadcast_to(weights / 0.75, there.shape)
+    np.testing.assert_allclose(np.asarray(dropped)[there], full[there], atol=1e-5)
+    np.testing.assert_allclose(dropped.mean(axis=0), weights, atol=0.03)
+
+
+def test_attention_has_finite_gradients_at_large_scores():
+    query, key, value = (100.0 * draw(1, 3, 1, 4, seed=seed) for seed in range(3))
+    for options in ({}, {"dropout_rate": 0.5, "dropout_key": jax.random.key(0)}):
+        total = lambda *arrays, options=options: jnp.sum(attention(*arrays, **options) ** 2)
+        for part in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(query, key, value):
+            assert np.all(np.isfinite(part))
+
+
+def test_heads_are_neighbouring_channels():
+    z = draw(2, 3, 8)
+    heads = split_heads(z, 2)
+    np.testing.assert_array_equal(heads[:, :, 1], z[:, :, 4:])
+
+
+@pytest.mark.parametrize("num_heads", [1, 2, 4])
+def test_multi_head_attention_equals_a_plain_loop(num_heads):
+    layer = MultiHeadAttention(WIDTH, num_heads, rngs=nnx.Rngs(params=0))
+    for seed, part in enumerate((layer.query, layer.key, layer.value, layer.output)):
+        part.bias[...] = jnp.asarray(draw(WIDTH, seed=seed))
+    z, other = draw(2, 5, WIDTH), draw(2, 3, WIDTH, seed=1)
+    np.testing.assert_allclose(layer(z), plain_multi_head(layer, z, z), atol=1e-5)
+    np.testing.assert_allclose(layer(z, other), plain_multi_head(layer, z, other), atol=1e-5)
+
+
+def test_multi_head_attention_to_a_sequence_of_other_width():
+    layer = MultiHeadAttention(WIDTH, HEADS, 5, rngs=nnx.Rngs(params=0))
+    z, other = draw(2, 4, WIDTH), draw(2, 3, 5, seed=1)
+    np.testing.assert_allclose(layer(z, other), plain_multi_head(layer, z, other), atol=1e-5)
+
+
+@pytest.mark.parametrize("num_heads", [0, 3])
+def test_heads_must_divide_the_width(num_heads):
+    with pytest.raises(ValueError, match=f"divide the width {WIDTH}, got {num_heads}"):
+        TransformerBlock(WIDTH, num_heads, HIDDEN, rngs=nnx.Rngs(params=0))
+
+
+def test_section_3_4_1_block_has_the_weights_of_an_encoder_layer():
+    block = nnx.eval_shape(lambda: TransformerBlock(256, 4, 1024, rngs=nnx.Rngs(params=0)))
+    assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(block))) == 789_760
+
+
+@pytest.mark.parametrize("activation", ["gelu", "relu"])
+def test_section_3_4_1_block_equals_a_plain_loop(activation):
+    block, z = make_block(activation=activation), draw(2, 5, WIDTH)
+    kinds = {
+        "gelu": lambda x: 0.5 * x * (1.0 + erf(x / np.sqrt(2.0))),
+        "relu": lambda x: np.maximum(x, 0.0),
+    }
+    middle = plain_norm(block.attention_norm, z + plain_multi_head(block.attention, z, z))
+    hidden = kinds[activation](linear(block.hidden, middle))
+    expected = plain_norm(block.output_norm, middle + linear(block.output, hidden))
+    np.testing.assert_allclose(block(z), expected, atol=1e-5)
+
+
+def test_section_3_4_1_norm_has_pytorchs_epsilon():
+    block = make_block()
+    # An input so small that epsilon decides.
+    x = 3e-3 * draw(2, WIDTH)
+    for norm in (block.attention_norm, block.output_norm):
+        np.testing.assert_allclose(norm(x), plain_norm(norm, x), rtol=1e-4, atol=1e-6)
+
+
+def test_section_3_4_1_without_a_position_code_order_does_not_matter():
+    block, z = make_block(), draw(2, 6, WIDTH)
+    order = np.array([3, 0, 5, 1, 4, 2])
+    np.testing.assert_allclose(block(z[:, order]), block(z)[:, order], atol=1e-5)
+    coded = lambda z: block(z + position_code(0, 6, WIDTH).astype(np.float32))
+    assert float(jnp.abs(coded(z[:, order]) - coded(z)[:, order]).max()) > 0.01
+
+
+def test_characters_do_not_mix():
+    block, z = make_block(), draw(2, 5, WIDTH)
+    other = z.copy()
+    other[1] += 1.0
+    np.testing.assert_allclose(block(z)[0], block(other)[0], atol=1e-6)
+
+
+def test_dropout_needs_a_key_and_is_a_function_of_it():
+    block, z, key = make_block(dropout=0.3), draw(2, 5, WIDTH), jax.random.key(3)
+    np.testing.assert_array_equal(block(z), make_block()(z))
+    np.testing.assert_array_equal(block(z, key=key), block(z, key=key))
+    assert float(jnp.abs(block(z, key=key) - block(z)).max()) > 0.01
+    assert float(jnp.abs(block(z, key=key) - block(z, key=jax.random.key(4))).max()) > 0.01
+    np.testing.assert_allclose(make_block()(z, key=key), make_block()(z), atol=1e-5)
+
+
+def test_dropout_has_four_places_in_a_block(monkeypatch):
+    places = []
+
+    def record(x, rate, key):
+        places.append((x.shape, rate, tuple(np.asarray(jax.random.key_data(key)))))
+        return x
+
+    monkeypatch.setattr(attention_module, "dropout", record)
+    block, z = make_block(dropout=0.3), draw(2, 5, WIDTH)
+    np.testing.assert_allclose(block(z, key=jax.random.key(0)), block(z), atol=1e-5)
+    weights, frames, hidden = (2, HEADS, 5, 5), (2, 5, WIDTH), (2, 5, HIDDEN)
+    assert [shape for shape, _, _ in places] == [weights, frames, hidden, frames]
+    assert {rate for _, rate, _ in places} == {0.3}
+    assert len({key for _, _, key in places}) == 4
+
+
+@pytest.mark.parametrize("key", [None, 0])
+def test_gradients_are_finite_and_reach_every_weight(key):
+    block, z, wanted = make_block(dropout=0.1), draw(3, 6, WIDTH), draw(3, 6, WIDTH, seed=1)
+    key = None if key is None else jax.random.key(key)
+    loss = lambda block: jnp.mean((block(z, key=key) - wanted) ** 2)
+    gradient = nnx.jit(nnx.grad(loss))(block)
+    found = {".".join(path): np.asarray(part[...]) for path, part in nnx.to_flat_state(gradient)}
+    assert len(found) == 16
+    for name, part in found.items():
+        assert np.all(np.isfinite(part)), name
+        if name == "attention.key.bias":
+            # Softmax does not see what all keys have in common.
+            assert np.abs(part).max() < 1e-6
+        else:
+            assert np.abs(part).max() > 1e-5, name
+
+
+def test_unknown_activation_names_the_nearest():
+    with pytest.raises(ValueError, match="unknown activation 'gelu2'; did you mean 'gelu'"):
+        make_block(activation="gelu2")

@@ -1,0 +1,204 @@
+"""The CAMDM baseline: tokens, step numbers and sizes (sections 4.5 and 6; CAMDM's code)."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import CHANNELS, HISTORY, WINDOW, evaluate, network_of
+from flax import nnx
+
+from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.models import zoo
+from f3amd_lib.models.attention import position_code
+from f3amd_lib.models.camdm import CAMDMConfig, step_features
+from f3amd_lib.models.conditioning import Condition
+
+LEVELS = tuple(VariancePreservingCosine(4).sigmas.tolist())
+
+
+def tiny_camdm(**changes) -> CAMDMConfig:
+    values = {
+        "channels": CHANNELS,
+        "num_styles": 2,
+        "window": WINDOW,
+        "num_history": HISTORY,
+        "latent_width": 8,
+        "depth": 2,
+        "num_heads": 2,
+        "noise_levels": LEVELS,
+    }
+    return CAMDMConfig(**{**values, **changes})
+
+
+def draw(*shape, seed=0):
+    values = np.random.default_rng(seed).standard_normal(shape)
+    return jnp.asarray(values, jnp.float32)
+
+
+def make_condition(batch=2):
+    return Condition(
+        history=draw(batch, HISTORY, CHANNELS, seed=1),
+        path=draw(batch, WINDOW, 8, seed=2),
+        style=jnp.eye(2)[jnp.arange(batch) % 2],
+    )
+
+
+def run(network, x_noisy, sigma, condition=None):
+    return evaluate(network, x_noisy, sigma, condition or make_condition(x_noisy.shape[0]))
+
+
+def test_released_code_has_this_many_parameters():
+    config = zoo.build_config("CAMDM-code", channels=156, num_styles=100)
+    assert zoo.count_parameters(config) == 3_439_260
+    assert config.num_tokens == 108
+
+
+def test_section_6_the_papers_baseline_reads_76_tokens():
+    config = zoo.build_config("CAMDM", channels=129, num_styles=22)
+    # T' = 2 T + T_hist + T_style, and a token for the noise level.
+    assert config.num_tokens == 2 * 32 + 10 + 1 + 1 == 76
+    assert (config.latent_width, config.depth) == (256, 4)
+    assert len(config.noise_levels) == 8
+
+
+def test_sequence_is_as_long_as_the_config_says():
+    for split_path in (False, True):
+        network = network_of(tiny_camdm(split_path=split_path))
+        context = network.encode(make_condition())
+        tokens = dict(network.stages(draw(2, WINDOW, CHANNELS), 1.0, context))["tokens"]
+        expected = 2 + (2 if split_path else 1) * WINDOW + HISTORY + WINDOW
+        assert tokens.shape == (2, expected, 8)
+        assert network.config.num_tokens == expected
+
+
+def test_tokens_by_hand():
+    network = network_of(tiny_camdm(split_path=True))
+    condition, x_noisy, sigma = make_condition(), draw(2, WINDOW, CHANNELS), LEVELS[2]
+    context = network.encode(condition)
+    tokens = dict(network.stages(x_noisy, sigma, context))["tokens"]
+    code = position_code(0, network.config.num_tokens, 8, base=10_000.0)
+    bare = np.asarray(tokens) - code
+    weights = lambda layer: (np.asarray(layer.kernel[...]), np.asarray(layer.bias[...]))
+    affine = lambda layer, x: np.asarray(x) @ weights(layer)[0] + weights(layer)[1]
+    step = position_code(2, 3, 8, base=10_000.0)
+    hidden = affine(network.noise_first, step)
+    noise = affine(network.noise_second, hidden / (1.0 + np.exp(-hidden)))
+    np.testing.assert_allclose(bare[:, 0], np.repeat(noise, 2, axis=0), atol=1e-5)
+    np.testing.assert_allclose(bare[:, 1], network.style.kernel[...][:2], atol=1e-5)
+    start = 2
+    pieces = [
+        affine(network.path[0], condition.path[..., :2]),
+        affine(network.path[1], condition.path[..., 2:]),
+        affine(network.history, condition.history),
+        affine(network.future, x_noisy / np.sqrt(1.0 + sigma**2)),
+    ]
+    for piece in pieces:
+        np.testing.assert_allclose(bare[:, start : start + piece.shape[1]], piece, atol=1e-5)
+        start += piece.shape[1]
+    assert start == tokens.shape[1]
+
+
+def test_answer_is_a_linear_layer_on_the_last_tokens():
+    network = network_of(tiny_camdm())
+    stages = dict(network.stages(draw(2, WINDOW, CHANNELS), 1.0, network.encode(make_condition())))
+    expected = network.output(stages["block 2"][:, -WINDOW:])
+    np.testing.assert_allclose(stages["x0_hat"], expected, atol=1e-6)
+    assert expected.shape == (2, WINDOW, CHANNELS)
+
+
+def test_input_is_the_variance_preserving_state():
+    network, x_noisy = network_of(tiny_camdm()), draw(2, WINDOW, CHANNELS)
+    raw = network_of(tiny_camdm(input_scaling=False))
+    sigma = jnp.array([LEVELS[0], LEVELS[3]])
+    alpha_bar = 1.0 / (1.0 + sigma**2)
+    z = jnp.sqrt(alpha_bar)[:, None, None] * x_noisy
+    np.testing.assert_allclose(run(network, x_noisy, sigma), run(raw, z, sigma), atol=1e-5)
+
+
+def test_steps_are_told_by_their_number():
+    rows = step_features(jnp.arange(5.0), 8)
+    np.testing.assert_allclose(rows, position_code(0, 5, 8, base=10_000.0), atol=1e-6)
+    between = step_features(jnp.array(1.5), 8)
+    np.testing.assert_allclose(between[0], np.sin(1.5), atol=1e-6)
+    assert step_features(jnp.zeros(3), 7).shape == (3, 7)
+
+
+def test_without_levels_any_noise_level_is_told():
+    network, x_noisy = network_of(tiny_camdm(noise_levels=())), draw(2, WINDOW, CHANNELS)
+    known = network_of(tiny_camdm())
+    raw = {"input_scaling": False}
+    far, farther = 2.0 * LEVELS[-1], 4.0 * LEVELS[-1]
+    # Beyond the last step there is no other number to tell.
+    told = network_of(tiny_camdm(**raw))
+    np.testing.assert_allclose(run(told, x_noisy, far), run(told, x_noisy, farther), atol=1e-6)
+    free = network_of(tiny_camdm(noise_levels=(), **raw))
+    moved = jnp.abs(run(free, x_noisy, far) - run(free, x_noisy, farther))
+    assert float(moved.max()) > 1e-3
+    assert float(jnp.abs(run(network, x_noisy, 1.0) - run(known, x_noisy, 1.0)).max()) > 1e-3
+
+
+def test_every_condition_and_every_character_counts():
+    network, x_noisy = network_of(tiny_camdm()), draw(2, WINDOW, CHANNELS)
+    condition = make_condition()
+    base = run(network, x_noisy, 1.0, condition)
+    for name in Condition._fields:
+        other = condition._replace(**{name: getattr(condition, name) + 1.0})
+        assert float(jnp.abs(run(network, x_noisy, 1.0, other) - base).max()) > 1e-4, name
+    alone = run(network, x_noisy[:1], 1.0, Condition(*(part[:1] for part in condition)))
+    np.testing.assert_allclose(base[:1], alone, atol=2e-5)
+
+
+def test_dropout_acts_only_with_a_key():
+    network = network_of(tiny_camdm(dropout=0.5))
+    x_noisy, context = draw(2, WINDOW, CHANNELS), network.encode(make_condition())
+    call = jax.jit(lambda key: network(x_noisy, 1.0, context, key=key))
+    quiet = network(x_noisy, 1.0, context)
+    first, again, other = (call(jax.random.key(k)) for k in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert float(jnp.abs(first - other).max()) > 1e-3
+    assert float(jnp.abs(first - quiet).max()) > 1e-3
+
+
+def test_every_parameter_learns():
+    network = network_of(tiny_camdm(split_path=True))
+    x_noisy, wanted = draw(2, WINDOW, CHANNELS), draw(2, WINDOW, CHANNELS, seed=9)
+    graph, state = nnx.split(network)
+    loss = lambda state: jnp.mean((run(nnx.merge(graph, state), x_noisy, 1.0) - wanted) ** 2)
+    gradient = jax.jit(jax.grad(loss))(state)
+    for path, leaf in jax.tree_util.tree_flatten_with_path(gradient)[0]:
+        name = jax.tree_util.keystr(path)
+        assert bool(jnp.all(jnp.isfinite(leaf))), name
+        # A key's bias shifts all scores of a query alike, which softmax does not see.
+        if not ("'key'" in name and "'bias'" in name):
+            assert float(jnp.abs(leaf).max()) > 1e-9, name
+
+
+def test_config_survives_json():
+    config = tiny_camdm(split_path=True, dropout=0.2)
+    assert CAMDMConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_heads": 3}, "num_heads must divide the latent width 8"),
+        ({"dropout": 1.0}, "dropout must be below 1"),
+        ({"noise_levels": (1.0, 0.5)}, "noise_levels must rise"),
+        ({"noise_levels": (0.0, 0.5)}, "noise_levels must be positive"),
+        ({"noise_levels": 3.0}, "noise_levels must be positive"),
+        ({"split_path": 1}, "split_path must be of type bool"),
+    ],
+)
+def test_impossible_configs_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        tiny_camdm(**changes)
+
+
+def test_wrong_shapes_are_refused_by_name():
+    network, condition = network_of(tiny_camdm()), make_condition()
+    with pytest.raises(ValueError, match="condition path must have shape"):
+        network.encode(condition._replace(path=draw(2, WINDOW, 7)))
+    with pytest.raises(ValueError, match=rf"\[B, {WINDOW}, {CHANNELS}\]"):
+        network(draw(2, WINDOW + 1, CHANNELS), 1.0, network.encode(condition))
