@@ -28,6 +28,9 @@ from f3amd_lib.report.figures import (
 from f3amd_lib.report.pictures import LIMB_COLORS, limb_side
 
 __all__ = [
+    "ORDER",
+    "styled",
+    "shades",
     "keep_figure",
     "paper_tradeoff",
     "road_map",
@@ -40,30 +43,12 @@ __all__ = [
     "turned_windows",
     "clip_statistics_figure",
     "channel_statistics",
-    "densities",
-    "denoiser_curves",
-    "schedule_figure",
-    "step_positions",
-    "sample_paths",
-    "flow_and_steps",
-    "vector_fields",
-    "collapse_figure",
-    "convergence_figure",
-    "sample_histograms",
-    "input_scaling_figure",
-    "spectral_kernel",
-    "kept_modes",
-    "influence_maps",
-    "film_gate",
-    "attention_maps",
-    "parameter_bars",
-    "prediction_error",
 ]
 
-_ORDER = ("purple", "orange", "green", "vermilion", "blue", "sky")
+ORDER = ("purple", "orange", "green", "vermilion", "blue", "sky")
 
 
-def _styled(draw):
+def styled(draw):
     """Draw in the project's style, whatever style the caller uses."""
 
     @functools.wraps(draw)
@@ -96,15 +81,15 @@ def keep_figure(figure, results, name: str):
     return shown
 
 
-def _shades(count: int) -> list[tuple]:
+def shades(count: int) -> list[tuple]:
     """Return dark to light shades of one colour, for curves in an order."""
     return [matplotlib.colormaps["viridis"](value) for value in np.linspace(0.05, 0.85, count)]
 
 
-# ------------------------------------------------------------------------------ reading guide
+# ----------------------------------------------------------------------------------- reading guide
 
 
-@_styled
+@styled
 def paper_tradeoff(times: pd.DataFrame, quality: pd.DataFrame):
     """Draw the paper's Tables 4 and 5 as one picture: time a round against FID.
 
@@ -136,7 +121,7 @@ def paper_tradeoff(times: pd.DataFrame, quality: pd.DataFrame):
     return figure
 
 
-@_styled
+@styled
 def road_map():
     """Draw the road from BVH text to a walking character, with the notebooks along it."""
     stations = (
@@ -167,7 +152,7 @@ def road_map():
     return figure
 
 
-# ---------------------------------------------------------------------------- data preparation
+# -------------------------------------------------------------------------------- data preparation
 
 
 def _stick_figure(axis, positions, skeleton, across: int, sign: float = 1.0, **line) -> None:
@@ -180,7 +165,7 @@ def _stick_figure(axis, positions, skeleton, across: int, sign: float = 1.0, **l
             axis.plot(sign * ends[:, across], ends[:, 1], **style)
 
 
-@_styled
+@styled
 def skeleton_views(motion: Motion, frame: int = 0):
     """Draw a pose from the front and from its left, joints numbered, with their names beside.
 
@@ -218,7 +203,7 @@ def skeleton_views(motion: Motion, frame: int = 0):
     return figure
 
 
-@_styled
+@styled
 def contact_timeline(motion: Motion, threshold: float):
     """Draw height and speed of both toes against time, frames in contact shaded below.
 
@@ -257,7 +242,7 @@ def _plan(axis, margin: float = 0.15) -> None:
     axis.set_ylabel("z (m)")
 
 
-@_styled
+@styled
 def facing_plan(motion: Motion):
     """Draw a clip's root path from above with its facing, and the yaw against time."""
     figure, (plan, angle) = new_figure(8.2, 3.4, 1, 2)
@@ -285,7 +270,7 @@ def facing_plan(motion: Motion):
     return figure
 
 
-@_styled
+@styled
 def rotation_signals(turn_deg, euler_deg, rotation_6d):
     """Draw one steady turn as Euler angles and as 6D numbers.
 
@@ -295,14 +280,14 @@ def rotation_signals(turn_deg, euler_deg, rotation_6d):
       rotation_6d: the same in 6D, [T, 6].
     """
     figure, (left, right) = new_figure(8.2, 3.2, 1, 2)
-    for axis_name, angle, shade in zip("ZXY", euler_deg.T, _shades(3), strict=True):
+    for axis_name, angle, shade in zip("ZXY", euler_deg.T, shades(3), strict=True):
         left.plot(turn_deg, angle, color=shade, label=axis_name)
     left.set_title("Euler angles: torn")
     left.set_ylabel("angle (degrees)")
     left.legend(title="axis", ncols=3)
     left.set_ylim(-200, 290)
     names = ("R00", "R10", "R20", "R01", "R11", "R21")
-    for name, value, shade in zip(names, rotation_6d.T, _shades(6), strict=True):
+    for name, value, shade in zip(names, rotation_6d.T, shades(6), strict=True):
         right.plot(turn_deg, value, color=shade, label=name)
     right.set_title("6D: smooth")
     right.set_ylabel("matrix entry")
@@ -313,7 +298,7 @@ def rotation_signals(turn_deg, euler_deg, rotation_6d):
     return figure
 
 
-@_styled
+@styled
 def mirror_overlay(motion: Motion, mirrored: Motion, frames: Sequence[int]):
     """Draw poses seen from the left, above the same frames of the mirrored clip."""
     figure, axes = new_figure(8.2, 4.4, 2, 1, sharex=True)
@@ -336,7 +321,7 @@ def mirror_overlay(motion: Motion, mirrored: Motion, frames: Sequence[int]):
     return figure
 
 
-@_styled
+@styled
 def window_plan(history, future, paths: Mapping[str, np.ndarray], yaw):
     """Draw one window from above.
 
@@ -380,7 +365,7 @@ def _sideways(path, reference):
     return (path - path[0]) @ normal
 
 
-@_styled
+@styled
 def turned_windows(history, future):
     """Draw root paths of the same window under several random turns.
 
@@ -388,7 +373,7 @@ def turned_windows(history, future):
       history, future: root x, z, [B, H, 2] and [B, T, 2].
     """
     figure, axis = new_figure(4.6, 3.9)
-    for past, coming, shade in zip(history, future, _shades(len(history)), strict=True):
+    for past, coming, shade in zip(history, future, shades(len(history)), strict=True):
         axis.plot(*past.T, color=shade, linestyle=":")
         axis.plot(*coming.T, color=shade)
     axis.plot(0, 0, "o", color=PALETTE["black"])
@@ -400,7 +385,7 @@ def turned_windows(history, future):
     return figure
 
 
-@_styled
+@styled
 def clip_statistics_figure(clips: pd.DataFrame):
     """Draw speed, turning and contact share of a table of clips.
 
@@ -431,7 +416,7 @@ def clip_statistics_figure(clips: pd.DataFrame):
     return figure
 
 
-@_styled
+@styled
 def channel_statistics(before, after, names: Sequence[str]):
     """Draw mean and deviation of every feature channel before and after normalising.
 
@@ -459,401 +444,4 @@ def channel_statistics(before, after, names: Sequence[str]):
     axes[1].set_xlim(-1, 3 + 6 * len(names))
     axes[1].grid(axis="x", visible=False)
     axes[0].grid(axis="x", visible=False)
-    return figure
-
-
-# ------------------------------------------------------------------------------ sampler theory
-
-
-@_styled
-def densities(x, rows: Mapping[str, Mapping[float, np.ndarray]]):
-    """Draw densities of noisy data, a panel for each data set, a curve for each noise level.
-
-    Args:
-      x: points, [P].
-      rows: title -> {sigma: density [P]}.
-    """
-    figure, axes = new_figure(8.2, 3.1, 1, len(rows), sharex=True, squeeze=False)
-    for axis, (title, curves) in zip(axes[0], rows.items(), strict=True):
-        for (sigma, density), shade in zip(curves.items(), _shades(len(curves)), strict=True):
-            axis.plot(x, density, color=shade, label=f"σ = {sigma:g}")
-        axis.set_title(title)
-        axis.set_xlabel("x")
-    axes[0, 0].set_ylabel("density")
-    axes[0, -1].legend()
-    return figure
-
-
-@_styled
-def denoiser_curves(x, denoised: Mapping[float, np.ndarray], scores: Mapping[float, np.ndarray]):
-    """Draw denoiser and score against x, a curve for each noise level; values [P]."""
-    figure, (left, right) = new_figure(8.2, 3.3, 1, 2)
-    for axis, curves in ((left, denoised), (right, scores)):
-        for (sigma, values), shade in zip(curves.items(), _shades(len(curves)), strict=True):
-            axis.plot(x, values, color=shade, label=f"σ = {sigma:g}")
-        axis.set_xlabel("noisy x")
-    left.plot(x, x, color=PALETTE["grey"], linestyle=":", label="x itself")
-    left.set_ylim(-1.9, 1.9)
-    left.set_title("denoiser D(x, σ)")
-    left.set_ylabel("clean estimate")
-    left.legend(loc="lower right", fontsize=8)
-    right.set_title("σ² × score = D − x")
-    right.set_ylabel("push")
-    right.axhline(0, color=PALETTE["grey"], linewidth=0.8)
-    return figure
-
-
-@_styled
-def schedule_figure(t, sigma, alpha_bar, log_snr):
-    """Draw noise level, signal share and log signal-to-noise against schedule time, [P] each."""
-    figure, axes = new_figure(8.6, 2.9, 1, 3)
-    for axis, values, name, color in zip(
-        axes,
-        (sigma, alpha_bar, log_snr),
-        ("noise level σ", "signal share ᾱ = 1/(1+σ²)", "log SNR = −2 log σ"),
-        ("purple", "green", "orange"),
-        strict=True,
-    ):
-        axis.plot(t, values, color=PALETTE[color], linewidth=2.4)
-        axis.set_title(name)
-        axis.set_xlabel("schedule time t")
-    axes[0].set_yscale("log")
-    axes[1].set_yscale("log")
-    return figure
-
-
-@_styled
-def step_positions(grids: Mapping[str, Mapping[int, np.ndarray]]):
-    """Draw where N-step grids evaluate the network, a panel for each reading of Eq. 9.
-
-    Args:
-      grids: reading -> {N: noise levels [N], without the final 0}.
-    """
-    figure, axes = new_figure(8.6, 2.7, 1, len(grids), sharey=True, squeeze=False)
-    for axis, (title, by_steps) in zip(axes[0], grids.items(), strict=True):
-        for row, (_, sigmas) in enumerate(by_steps.items()):
-            axis.plot(sigmas, np.full(len(sigmas), row), "o-", color=PALETTE["purple"],
-                      linewidth=0.8)  # fmt: skip
-        axis.set_yticks(range(len(by_steps)), [f"N = {steps}" for steps in by_steps])
-        axis.set_xscale("log")
-        axis.set_xlim(300, 0.005)
-        axis.set_ylim(-0.6, len(by_steps) - 0.4)
-        axis.set_title(title)
-        axis.set_xlabel("noise level σ, sampling runs to the right")
-    return figure
-
-
-@_styled
-def sample_paths(sigmas, variance_exploding, variance_preserving):
-    """Draw sampling paths in both coordinates, and laid over each other after rescaling.
-
-    Args:
-      sigmas: noise levels, [N], the last above 0.
-      variance_exploding: states x, [N, P].
-      variance_preserving: states z, [N, P].
-    """
-    figure, axes = new_figure(9.0, 3.3, 1, 3)
-    level = np.asarray(sigmas)
-    scale = np.sqrt(1.0 + level**2)[:, None]
-    axes[0].plot(level, variance_exploding, color=PALETTE["purple"], linewidth=1.2)
-    axes[0].set_yscale("symlog", linthresh=2)
-    axes[0].set_title("VE state x")
-    axes[1].plot(level, variance_preserving, color=PALETTE["orange"], linewidth=1.2)
-    axes[1].set_title("VP state z")
-    axes[2].plot(level, variance_exploding / scale, color=PALETTE["purple"], linewidth=3.4)
-    axes[2].plot(level, variance_preserving, color=PALETTE["orange"], linewidth=1.2,
-                 linestyle="--")  # fmt: skip
-    axes[2].plot([], [], color=PALETTE["purple"], linewidth=3.4, label="x / √(1+σ²)")
-    axes[2].plot([], [], "--", color=PALETTE["orange"], linewidth=1.2, label="z")
-    axes[2].set_ylim(top=axes[2].get_ylim()[1] + 1.2)
-    axes[2].legend(loc="upper right")
-    axes[2].set_title("laid over each other")
-    for axis in axes:
-        axis.set_xscale("log")
-        axis.set_xlim(level[0], level[-1])
-        axis.set_xlabel("σ, sampling runs to the right")
-    return figure
-
-
-@_styled
-def flow_and_steps(sigmas, exact, grid, steps, title: str):
-    """Draw exact flow lines and the chords of a coarse sampler, as x / sqrt(1 + sigma^2).
-
-    Args:
-      sigmas: fine noise levels, [F]; exact: states on them, [F, P].
-      grid: coarse noise levels, [N]; steps: states on them, [N, P].
-      title: of the panel.
-    """
-    figure, axis = new_figure(7.0, 3.5)
-    axis.plot(sigmas, exact / np.sqrt(1 + sigmas**2)[:, None], color="#BDBDBD", linewidth=1.2)
-    axis.plot(grid, steps / np.sqrt(1 + grid**2)[:, None], "o-", color=PALETTE["purple"],
-              linewidth=1.3, markersize=4)  # fmt: skip
-    axis.plot([], [], color="#BDBDBD", label="exact flow")
-    axis.plot([], [], "o-", color=PALETTE["purple"], label=f"{len(grid)} points, DDIM")
-    axis.set_xscale("log")
-    axis.set_xlim(sigmas[0] * 1.15, sigmas[-1] / 1.15)
-    axis.set_xlabel("σ, sampling runs to the right")
-    axis.set_ylabel("x / √(1+σ²)")
-    axis.set_title(title)
-    axis.set_ylim(top=axis.get_ylim()[1] + 0.6)
-    axis.legend(loc="upper left", ncols=2)
-    return figure
-
-
-@_styled
-def vector_fields(points, fields: Mapping[float, np.ndarray], modes, samples):
-    """Draw where a denoiser pulls points of the plane, a panel for each noise level.
-
-    Args:
-      points: [P, 2]; fields: {sigma: D(x, sigma) - x, [P, 2]}; modes: [K, 2].
-      samples: data points to show behind, [S, 2].
-    """
-    figure, axes = new_figure(8.8, 3.2, 1, len(fields), sharey=True, squeeze=False)
-    for axis, (sigma, field) in zip(axes[0], fields.items(), strict=True):
-        axis.plot(*samples.T, ".", color=PALETTE["sky"], markersize=2.0)
-        axis.quiver(
-            *points.T, *field.T, color=PALETTE["purple"], angles="xy", scale_units="xy",
-            scale=3.5, width=0.006,
-        )  # fmt: skip
-        axis.plot(*modes.T, "*", color=PALETTE["vermilion"], markersize=14, zorder=5,
-                  markeredgecolor="white")  # fmt: skip
-        axis.set_title(f"σ = {sigma:g}")
-        axis.set_aspect("equal")
-        axis.grid(visible=False)
-        axis.set_xlabel("x₁")
-    axes[0, 0].set_ylabel("x₂")
-    return figure
-
-
-@_styled
-def collapse_figure(table: pd.DataFrame, truth: float):
-    """Draw the mean size of samples against the number of steps for each form of the update.
-
-    Args:
-      table: columns form, steps, mean_abs.
-      truth: mean |x| of the data.
-    """
-    figure, axis = new_figure(6.4, 3.4)
-    looks = zip(table.groupby("form", sort=False), ("purple", "vermilion"), "os", strict=True)
-    for (form, rows), color, marker in looks:
-        axis.plot(rows["steps"], rows["mean_abs"], marker=marker, color=PALETTE[color], label=form)
-    axis.axhline(truth, color=PALETTE["black"], linestyle="--", linewidth=1.2, label="data")
-    axis.set_xscale("log", base=2)
-    axis.set_xticks(sorted(table["steps"].unique()), sorted(table["steps"].unique()))
-    axis.set_xlabel("steps N")
-    axis.set_ylabel("mean |x| of the samples")
-    axis.legend()
-    return figure
-
-
-@_styled
-def convergence_figure(table: pd.DataFrame, orders: Mapping[str, float]):
-    """Draw the error against the number of steps on log-log axes with the fitted slope.
-
-    Args:
-      table: columns data, steps, error.
-      orders: data -> fitted order.
-    """
-    figure, axis = new_figure(6.4, 3.6)
-    looks = zip(table.groupby("data", sort=False), ("purple", "orange"), "os", strict=False)
-    for (name, rows), color, marker in looks:
-        axis.plot(rows["steps"], rows["error"], marker=marker, color=PALETTE[color],
-                  label=f"{name}: order {orders[name]:.2f}")  # fmt: skip
-    steps = np.array([rows["steps"].min(), rows["steps"].max()])
-    axis.plot(steps, 0.4 * rows["error"].iloc[0] * steps[0] / steps, color=PALETTE["grey"],
-              linestyle=":", label="slope −1")  # fmt: skip
-    axis.set_xscale("log", base=2)
-    axis.set_yscale("log")
-    axis.set_xlabel("steps N")
-    axis.set_ylabel("mean distance from the exact flow")
-    axis.legend()
-    return figure
-
-
-@_styled
-def sample_histograms(data, samples: Mapping[str, np.ndarray]):
-    """Draw histograms of samples over that of the data, a panel each; arrays [P]."""
-    figure, axes = new_figure(8.8, 2.6, 1, len(samples), sharex=True, squeeze=False)
-    bins = np.linspace(-1.6, 1.6, 65)
-    for axis, (title, values) in zip(axes[0], samples.items(), strict=True):
-        weights = np.full(len(values), 1 / len(values))
-        axis.hist(data, bins, weights=np.full(len(data), 1 / len(data)), color="#CFCFCF",
-                  label="data")  # fmt: skip
-        axis.hist(np.clip(values, -1.6, 1.6), bins, weights=weights, histtype="step",
-                  color=PALETTE["purple"], linewidth=1.6, label="samples")  # fmt: skip
-        axis.set_title(title)
-        axis.set_xlabel("x")
-    axes[0, 0].set_ylabel("share per bin")
-    axes[0, -1].legend()
-    return figure
-
-
-@_styled
-def input_scaling_figure(sigmas, deviations: Mapping[str, np.ndarray], inputs):
-    """Draw the spread of a network's input against the noise level, and its histogram at the top.
-
-    Args:
-      sigmas: [S]; deviations: label -> deviation of the input, [S].
-      inputs: label -> values of the input at the highest noise level, [P].
-    """
-    figure, axes = new_figure(8.8, 3.0, 1, 3, width_ratios=[1.4, 1.0, 1.0])
-    for (label, values), color in zip(deviations.items(), ("vermilion", "purple"), strict=True):
-        axes[0].plot(sigmas, values, color=PALETTE[color], label=label)
-    axes[0].set_xscale("log")
-    axes[0].set_yscale("log")
-    axes[0].set_xlabel("noise level σ")
-    axes[0].set_title("deviation of the input")
-    axes[0].legend()
-    for axis, (label, values), color in zip(
-        axes[1:], inputs.items(), ("vermilion", "purple"), strict=True
-    ):
-        axis.hist(values, bins=60, density=True, color=PALETTE[color])
-        axis.set_title(f"{label}, σ = {sigmas[-1]:g}", fontsize=10)
-        axis.set_xlabel("input value")
-    return figure
-
-
-# -------------------------------------------------------------------------------- architecture
-
-
-@_styled
-def spectral_kernel(weights, kernel, signal, response):
-    """Draw a spectral layer of one channel: weights on modes, kernel in time, what it does.
-
-    Args:
-      weights: complex, [m]; kernel: the same in time, [T]; signal, response: [T].
-    """
-    figure, axes = new_figure(8.8, 2.9, 1, 3)
-    mode = np.arange(len(weights))
-    axes[0].bar(mode, np.abs(weights), color=PALETTE["purple"])
-    axes[0].set_title("weights |W| on modes")
-    axes[0].set_xlabel("mode (turns a window)")
-    frame = np.arange(len(kernel))
-    axes[1].plot(frame, kernel, ".-", color=PALETTE["green"])
-    axes[1].set_title("the same as a kernel")
-    axes[1].set_xlabel("lag (frames, circular)")
-    axes[2].plot(frame, signal, color=PALETTE["grey"], label="in")
-    axes[2].plot(frame, response, color=PALETTE["purple"], label="out")
-    axes[2].set_title("what it does to a signal")
-    axes[2].set_xlabel("frame")
-    axes[2].legend()
-    return figure
-
-
-@_styled
-def kept_modes(signal, cut: Mapping[int, np.ndarray], label: str):
-    """Draw a signal [T] and what is left of it when only the first m modes are kept."""
-    figure, axes = new_figure(8.8, 2.6, 1, len(cut), sharey=True, squeeze=False)
-    for axis, (modes, values) in zip(axes[0], cut.items(), strict=True):
-        axis.plot(signal, color=PALETTE["grey"], linewidth=3.0, label="in")
-        axis.plot(values, color=PALETTE["purple"], linewidth=1.6, label="kept")
-        axis.set_title(f"m = {modes}")
-        axis.set_xlabel("frame")
-    axes[0, 0].set_ylabel(label)
-    axes[0, 0].legend(fontsize=8)
-    return figure
-
-
-def _map_row(maps: Mapping[str, np.ndarray], height: float, label: str, **image_options):
-    """Draw maps side by side under one colour scale from 0; return the figure and its axes."""
-    figure, axes = new_figure(8.8, height, 1, len(maps), sharey=True, squeeze=False)
-    highest = max(values.max() for values in maps.values())
-    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
-        image = axis.imshow(values, cmap="viridis", vmin=0.0, vmax=highest, **image_options)
-        axis.set_title(title)
-        axis.grid(visible=False)
-    figure.colorbar(image, ax=list(axes[0]), label=label, shrink=0.85)
-    return figure, list(axes[0])
-
-
-@_styled
-def influence_maps(maps: Mapping[str, np.ndarray]):
-    """Draw how strongly each input frame reaches each output frame, a panel for each branch.
-
-    Args:
-      maps: title -> [T out, T in], not negative.
-    """
-    figure, axes = _map_row(maps, 3.2, "size of the derivative")
-    for axis in axes:
-        axis.set_xlabel("input frame")
-    axes[0].set_ylabel("output frame")
-    return figure
-
-
-@_styled
-def film_gate(gamma, gate, z_base, z_tilde, gammas: Sequence[float]):
-    """Draw the gate of Eq. 6 against gamma, and a signal under a few settings of it.
-
-    Args:
-      gamma, gate: [P]; z_base: [T]; z_tilde: one signal [T] for each of `gammas`.
-    """
-    figure, (left, right) = new_figure(8.2, 3.0, 1, 2)
-    left.plot(gamma, gate, color=PALETTE["purple"], linewidth=2.4)
-    left.axhline(1, color=PALETTE["grey"], linewidth=0.8)
-    left.set_xlabel("γ")
-    left.set_title("gate 1 + tanh γ")
-    left.set_ylim(-0.1, 2.1)
-    right.plot(z_base, color=PALETTE["black"], linewidth=3, alpha=0.35, label="z base")
-    for value, signal, shade in zip(gammas, z_tilde, _shades(len(gammas)), strict=True):
-        right.plot(signal, color=shade, label=f"γ = {value:g}")
-    right.set_title("a channel behind the gate (β = 0)")
-    right.set_xlabel("frame")
-    right.legend(fontsize=8, loc="upper right", ncols=2)
-    right.set_ylim(top=1.75 * right.get_ylim()[1])
-    return figure
-
-
-@_styled
-def attention_maps(maps: Mapping[str, np.ndarray], num_history: int, window: int):
-    """Draw attention of each future frame (row) to the context tokens, [T, H + T + 1] each."""
-    figure, axes = _map_row(maps, 3.5, "attention weight", aspect="auto")
-    for axis in axes:
-        for edge in (num_history - 0.5, num_history + window - 0.5):
-            axis.axvline(edge, color="white", linewidth=1.5)
-        axis.set_xticks(
-            [(num_history - 1) / 2, num_history + (window - 1) / 2, num_history + window],
-            ["history", "path", "style"],
-        )
-        axis.set_xlabel("context token")
-    axes[0].set_ylabel("future frame that asks")
-    return figure
-
-
-@_styled
-def parameter_bars(table: pd.DataFrame):
-    """Draw learned numbers by part of the network, a bar for each model.
-
-    Args:
-      table: columns model, part, parameters.
-    """
-    figure, axis = new_figure(8.2, 3.2)
-    wide = table.pivot(index="model", columns="part", values="parameters")
-    wide = wide.loc[table["model"].unique()[::-1], table["part"].unique()] / 1e6
-    left = np.zeros(len(wide))
-    colors = ("purple", "sky", "green", "orange", "vermilion")
-    for part, color in zip(wide.columns, colors, strict=False):
-        axis.barh(wide.index, wide[part], left=left, color=PALETTE[color], label=part)
-        left += wide[part].to_numpy()
-    for row, total in enumerate(left):
-        axis.text(total + 0.05, row, f"{total:.2f} M", va="center", fontsize=9)
-    axis.set_xlabel("learned numbers (millions)")
-    axis.set_xlim(0, 1.15 * left.max())
-    axis.grid(axis="y", visible=False)
-    axis.legend(loc="upper right")
-    return figure
-
-
-@_styled
-def prediction_error(sigmas, errors: Mapping[str, np.ndarray]):
-    """Draw the error of the clean estimate against the noise level for kinds of prediction, [S]."""
-    figure, axis = new_figure(6.6, 3.3)
-    for (label, values), color, line in zip(
-        errors.items(), ("purple", "vermilion", "orange"), ("-", "--", "-."), strict=False
-    ):
-        axis.plot(sigmas, values, color=PALETTE[color], linestyle=line, label=label)
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.set_xlabel("noise level σ")
-    axis.set_ylabel("error of the clean estimate")
-    axis.legend()
     return figure
