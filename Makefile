@@ -5,6 +5,7 @@
 DATA ?= synthetic
 PROFILE ?= laptop
 LAB_OPTIONS ?=
+MEASURE ?=
 PYTEST_OPTIONS ?=
 
 SHELL := /bin/bash
@@ -16,12 +17,12 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke test lint lab clean
+.PHONY: help install figures smoke measure test lint lab clean
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
 	@awk -F ': .*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
-	@echo "Settings: DATA=synthetic|bandai|100style|folder  PROFILE=smoke|laptop|gpu"
+	@echo "Settings: MEASURE=name of one measurement; DATA=synthetic|bandai|100style|folder  PROFILE=smoke|laptop|gpu"
 	@echo "          F3AMD_PYTHON=python3.12   F3AMD_DATA_DIR=folder or zip with the motion data"
 
 $(INSTALLED): requirements.lock pyproject.toml scripts/bootstrap.sh
@@ -38,6 +39,10 @@ smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under r
 # Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
 PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durations=5
+
+measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
+	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
+	  $(PYTHON) -m f3amd_lib.measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
 
 test: lint ## Lint, run the tests and check the notebooks' committed outputs
 	$(PYTEST) tests $(PYTEST_OPTIONS)

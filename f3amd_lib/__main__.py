@@ -98,7 +98,7 @@ def _rollout(arguments) -> None:
     taken = [str(target) for target in targets if target.exists()]
     if taken and not arguments.overwrite:
         raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
-    generator = MotionGenerator(trained, arguments.steps)
+    generator = MotionGenerator(trained, arguments.steps, sampler=arguments.sampler)
     motion = generator.rollout(path, arguments.style, seed=arguments.seed).motion()
     out.mkdir(parents=True, exist_ok=True)
     write_bvh(targets[0], motion, overwrite=arguments.overwrite)
@@ -153,6 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         "--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own"
     )
     rollout.add_argument("--steps", type=int, default=8, help="denoising steps a round")
+    rollout.add_argument("--sampler", help="ddim, ddpm, euler, heun; by default the model's own")
     rollout.add_argument("--data", default="synthetic", help="use the model of this data set")
     rollout.add_argument("--weights", help="a weights file, instead of the data set's own")
     rollout.add_argument("--out", default="out", help="folder to write to")

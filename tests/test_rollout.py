@@ -6,9 +6,10 @@ import pytest
 from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_trained
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.evaluation.paths import RootPath, named_path
 from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.models.camdm import CAMDMConfig
 from f3amd_lib.motion.rotations import wrap_angle
 
 POSE = np.tile(np.float32([1, 0, 0, 0, 1, 0]), SKELETON.num_joints)
@@ -191,6 +192,43 @@ def test_noise_levels_are_those_of_training_unless_told(trained):
     np.testing.assert_array_equal(chosen.sigmas, VarianceExploding(8.0, 1.0).grid(4, "uniform"))
     with pytest.raises(ValueError, match="num_steps=0"):
         MotionGenerator(trained, 0)
+
+
+def test_the_sampler_belongs_to_the_noise_that_the_model_was_trained_with():
+    levels = VariancePreservingCosine(4)
+    config = CAMDMConfig(
+        channels=CHANNELS,
+        num_styles=2,
+        window=WINDOW,
+        num_history=HISTORY,
+        latent_width=8,
+        depth=1,
+        num_heads=2,
+        noise_levels=tuple(levels.sigmas.tolist()),
+    )
+    camdm = tiny_trained(config=config, diffusion=levels)
+    assert MotionGenerator(camdm, 2).sampler == "ddpm"
+    assert MotionGenerator(tiny_trained(), 2).sampler == "ddim"
+    np.testing.assert_array_equal(MotionGenerator(camdm, 4).sigmas[:-1], levels.sigmas[::-1])
+    path = named_path("straight", 2 * WINDOW)
+    made = {
+        name: MotionGenerator(camdm, 4, sampler=name).rollout(path, "calm", seed=1).frames
+        for name in ("ddpm", "ddim", "euler", "heun")
+    }
+    again = MotionGenerator(camdm, 4).rollout(path, "calm", seed=1).frames
+    np.testing.assert_array_equal(made["ddpm"], again)
+    np.testing.assert_allclose(made["ddim"], made["euler"], atol=1e-4)
+    for name in ("ddpm", "heun"):
+        assert np.isfinite(made[name]).all()
+        assert np.abs(made[name] - made["ddim"]).max() > 1e-3, name
+    # With one step nothing is drawn anew, and all samplers answer alike.
+    one = [MotionGenerator(camdm, 1, sampler=name) for name in ("ddpm", "heun")]
+    first, second = (generator.rollout(path, "calm", seed=1).frames for generator in one)
+    np.testing.assert_allclose(first, second, atol=1e-4)
+    with pytest.raises(ValueError, match="unknown sampler 'ddmp'; did you mean 'dd"):
+        MotionGenerator(camdm, 4, sampler="ddmp")
+    with pytest.raises(ValueError, match="4"):
+        MotionGenerator(camdm, 5)
 
 
 def test_unknown_styles_are_refused_with_the_known(network_generator):

@@ -12,6 +12,7 @@ from builders import CHANNELS, HISTORY, WINDOW, same_tree, tiny_config, tiny_tra
 
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.training import loop
 from f3amd_lib.training.loop import (
     TrainingConfig,
@@ -321,6 +322,40 @@ def test_raw_networks_are_trained_without_normalisation():
     np.testing.assert_array_equal(raw.mean, np.zeros(CHANNELS))
     np.testing.assert_array_equal(raw.deviation, np.ones(CHANNELS))
     assert float(raw.path_scale) == 1.0
+
+
+def test_section_6_camdm_trains_on_the_levels_of_its_schedule():
+    levels = VariancePreservingCosine(4)
+    config = TrainingConfig(10, diffusion=levels)
+    sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, config))
+    found, counts = np.unique(sigma, return_counts=True)
+    np.testing.assert_allclose(found, levels.sigmas, rtol=1e-6)
+    assert np.all(np.abs(counts - 1000) < 120)
+
+
+def test_history_dropout_takes_whole_histories_away(trainer):
+    dropping = tiny_trainer(history_dropout=0.25)
+    history = 1.0 + jnp.zeros((400, HISTORY, CHANNELS))
+    condition = Condition(history, jnp.zeros((400, WINDOW, 8)), jnp.zeros((400, 2)))
+    disturbed = np.asarray(dropping._disturbed(condition, jax.random.key(1)).history)
+    gone = (disturbed == 0.0).all(axis=(1, 2))
+    assert 60 < gone.sum() < 140
+    assert (disturbed[~gone] == 1.0).all()
+    assert trainer._disturbed(condition, jax.random.key(1)).history is history
+
+
+def test_dropout_is_drawn_in_training_alone():
+    model = tiny_config(base_block="transformer", num_heads=2, dropout=0.5)
+    trainer = tiny_trainer(model)
+    params = trainer.initial_state().params
+    held_out = [trainer.held_out_terms(params, tiny_windows()) for _ in range(2)]
+    assert held_out[0] == held_out[1]
+    quiet = tiny_trainer(dataclasses.replace(model, dropout=0.0))
+    assert quiet.held_out_terms(params, tiny_windows()) == held_out[0]
+    # Same weights, batch and noise: only dropout makes a training step differ.
+    with_dropout, _ = trainer.run(stop_after=3, **QUIET)
+    without, _ = quiet.run(stop_after=3, **QUIET)
+    assert largest_change(with_dropout.params, without.params) > 1e-6
 
 
 def test_our_recipe_trains_and_resumes_exactly(tmp_path):

@@ -22,11 +22,12 @@ from f3amd_lib.data.features import (
     path_condition,
     turn_frames,
 )
-from f3amd_lib.diffusion.samplers import sample
+from f3amd_lib.diffusion.samplers import SAMPLERS, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.names import nearest_hint
 from f3amd_lib.training.checkpoints import TrainedModel
 
 __all__ = ["MotionGenerator", "Rollout"]
@@ -85,6 +86,10 @@ class MotionGenerator:
         self.num_steps = num_steps
         schedule = schedule or trained.diffusion
         self.sampler = sampler or schedule.sampler
+        if self.sampler not in SAMPLERS:
+            raise ValueError(
+                f"unknown sampler {self.sampler!r}{nearest_hint(self.sampler, SAMPLERS)}"
+            )
         self.sigmas = schedule.grid(num_steps, spacing)
         self._network = trained.network()
         self._run = jax.jit(self._rounds)

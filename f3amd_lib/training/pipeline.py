@@ -127,6 +127,11 @@ class ModelFiles:
     history: Path
 
 
+def _preset_name(profile: Profile, preset: str | None) -> str:
+    """Return our name, fit for files, of a preset that may be called by the paper's."""
+    return zoo.find_preset(preset or profile.preset).name
+
+
 def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> ModelFiles:
     """Return where a run on this profile keeps a preset's files.
 
@@ -135,7 +140,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
       preset: by default the profile's own.
       folder: instead of `runs/<data set>/<profile>/models`.
     """
-    preset = preset or profile.preset
+    preset = _preset_name(profile, preset)
     name = preset if profile.window == 32 else f"{preset}-{profile.window}frames"
     if folder is None:
         folder = runs_dir(profile.dataset, profile.name) / "models"
@@ -149,7 +154,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
     """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
-    preset = preset or profile.preset
+    preset = _preset_name(profile, preset)
     ours = preset.endswith("-plus")
     recipe = paper_recipe if profile.name == "gpu" and not ours else short_recipe
     return recipe(
@@ -188,7 +193,7 @@ def train(
       ValueError: if a training state lies there that was made with other settings.
       TrainingDiverged: if the loss stops being a number.
     """
-    preset = preset or profile.preset
+    preset = _preset_name(profile, preset)
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
     packed = prepared.packed
@@ -276,7 +281,7 @@ def obtain_model(
     Returns:
       (model, history, origin), origin being "shipped", "earlier run" or "trained now".
     """
-    preset = preset or profile.preset
+    preset = _preset_name(profile, preset)
     wanted = prepared.model_config(preset)
     if allow_shipped and profile.name == "laptop":
         shipped = model_files(profile, preset, folder=WEIGHTS_DIR / profile.dataset)

@@ -1,0 +1,107 @@
+"""Short runs of the family, and the measurement that keeps them."""
+
+import math
+
+import pandas as pd
+import pytest
+from builders import HISTORY, WINDOW, packed_from, wandering_motion
+
+from f3amd_lib import measure
+from f3amd_lib.models import zoo
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.records import read_table
+from f3amd_lib.training import family
+from f3amd_lib.training.pipeline import PreparedData
+
+SHORT = {"num_steps": 4, "batch_size": 2, "learning_rate": 1e-3}
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    clips = [(wandering_motion(60, seed), seed % 2, split) for seed, split in ((0, 0), (1, 1))]
+    return PreparedData(packed_from(clips), WINDOW, HISTORY)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The measurement on networks of one narrow block."""
+    build = zoo.build_config
+    monkeypatch.setattr(zoo, "build_config", lambda *a, **k: build(*a, **k, **{"depth": 1}))
+    monkeypatch.setattr(family, "SHORT_RUN", SHORT)
+    monkeypatch.setattr(measure, "SHORT_RUN", SHORT)
+
+
+def test_a_learning_curve_starts_before_the_first_step(prepared):
+    curve = family.learning_curve(prepared, "F3AMD-FNO-32", **SHORT)
+    assert list(curve["step"]) == [0, 1, 2, 3, 4]
+    assert math.isnan(curve["loss"][0]) and curve["loss"][1:].notna().all()
+    assert curve["held_out_loss"].notna().all()
+    assert curve["held_out_loss"][4] != curve["held_out_loss"][0]
+    assert set(curve["model"]) == {"F3AMD-FNO-32"}
+
+
+def test_the_table_says_what_fell():
+    def curve(model, losses, held_out):
+        return pd.DataFrame(
+            {"model": model, "step": [0, 1, 2], "loss": losses, "held_out_loss": held_out}
+        )
+
+    nan = float("nan")
+    table = family.learning_table(
+        pd.concat(
+            [
+                curve("learns", [nan, 2.0, 1.0], [3.0, 2.0, 1.0]),
+                curve("memorises", [nan, 2.0, 1.0], [3.0, 2.0, 4.0]),
+                curve("grows", [nan, 1.0, 2.0], [3.0, 2.0, 1.0]),
+            ]
+        )
+    ).set_index("model")
+    assert table["falls"].to_dict() == {"learns": True, "memorises": False, "grows": False}
+    row = table.loc["learns"]
+    assert (row["steps"], row["first_loss"], row["last_loss"]) == (2, 2.0, 1.0)
+    assert (row["held_out_before"], row["held_out_after"]) == (3.0, 1.0)
+
+
+def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeypatch):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    profile = load_profile("smoke", "synthetic")
+    first, second = "F3AMD-FNO-32", "F3AMD-FNO-32-raw"
+    path = measure.measure_learning(prepared, profile, [first])
+    assert path == tmp_path / "synthetic" / "smoke" / "records" / "learning.csv"
+    kept, record = read_table(path)
+    assert record["measurement"] == "learning" and record["num_steps"] == 4
+    two = {name: zoo.find_preset(name) for name in (first, second)}
+    monkeypatch.setattr(zoo, "PRESETS", two)
+    asked = []
+    curves = family.learning_curve
+
+    def spy(data, preset, **settings):
+        asked.append(preset)
+        return curves(data, preset, **settings)
+
+    monkeypatch.setattr(family, "learning_curve", spy)
+    measure.measure_learning(prepared, profile)
+    assert asked == [second]
+    both, _ = read_table(path)
+    assert list(dict.fromkeys(both["model"])) == [first, second]
+    pd.testing.assert_frame_equal(both[both["model"] == first].reset_index(drop=True), kept)
+    # Named, a model is measured again; and other settings keep nothing.
+    measure.measure_learning(prepared, profile, [first])
+    assert asked == [second, first] and len(read_table(path)[0]) == len(both)
+
+
+def test_other_settings_keep_no_rows(prepared, small, tmp_path, monkeypatch):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    profile = load_profile("smoke", "synthetic")
+    path = measure.measure_learning(prepared, profile, ["F3AMD-FNO-32"])
+    monkeypatch.setattr(measure, "SHORT_RUN", {**SHORT, "num_steps": 5})
+    measure.measure_learning(prepared, profile, ["F3AMD-FNO-32-raw"])
+    assert set(read_table(path)[0]["model"]) == {"F3AMD-FNO-32-raw"}
+
+
+def test_unknown_names_end_with_status_2(caplog):
+    assert measure.main(["lerning"]) == 2
+    assert "unknown measurement 'lerning'; did you mean 'learning'" in caplog.text
+    assert measure.main(["learning", "--model", "F3AMD-FNO-69"]) == 2
+    assert "did you mean 'F3AMD-FNO-96'" in caplog.text
+    assert measure.main(["--profile", "labtop"]) == 2
