@@ -9,21 +9,38 @@ the ignored `runs/` unless `F3AMD_RESULTS_DIR` says otherwise (`make measure` se
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import logging
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pandas as pd
+from tqdm import tqdm
 
+from f3amd_lib.evaluation.classifier import obtain_classifier
+from f3amd_lib.evaluation.protocol import (
+    REFERENCE_MODELS,
+    Protocol,
+    measure_model,
+    measure_real,
+    summarise,
+)
+from f3amd_lib.evaluation.quality import row_label
+from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.models import zoo
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir
 from f3amd_lib.report.records import read_table, record_hash, run_record, write_table
 from f3amd_lib.training.family import SHORT_RUN, learning_curves
-from f3amd_lib.training.pipeline import PreparedData, prepare
+from f3amd_lib.training.pipeline import (
+    PreparedData,
+    available_models,
+    obtain_model,
+    prepare,
+)
 
-__all__ = ["MEASUREMENTS", "measure_learning", "main"]
+__all__ = ["MEASUREMENTS", "STEPS", "measure_learning", "measure_quality", "main"]
 
 log = logging.getLogger("f3amd")
 
@@ -65,7 +82,85 @@ def measure_learning(
     return path
 
 
-MEASUREMENTS: dict[str, Callable] = {"learning": measure_learning}
+def measure_quality(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Run the evaluation protocol for every trained model, at 8, 4, 2 and 1 steps, and for real
+    and deliberately broken motion (see `evaluation.protocol`).
+
+    Args:
+      prepared: the data.
+      profile: says how long rollouts are, and where models and results lie.
+      models: presets; by default all that have weights for this data set and window, shipped or in
+        `runs/`. One that is asked for by name is measured again, and trained if it has none.
+
+    Returns:
+      The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
+      `quality_by_round.csv`.
+    """
+    folder = results_dir(profile.dataset, profile.name) / "records"
+    packed = prepared.packed
+    classifier, _ = obtain_classifier(packed, profile)
+    protocol = Protocol(
+        tuple(profile.evaluation_styles or packed.primary_styles[: profile.num_characters]),
+        num_frames=profile.rollout_rounds * profile.window,
+        **_PROTOCOL.get(profile.name, {}),
+    )
+    record = run_record(
+        profile=profile, dataset=packed, seed=protocol.path_seed, measurement="quality",
+        protocol=dataclasses.asdict(protocol), classifier=classifier.record["classifier_training"],
+        classifier_accuracy=classifier.accuracy,
+    )  # fmt: skip
+    paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
+    kept = {name: _kept_rows(path, record) for name, path in paths.items()}
+    held_out = prepared.windows(prepared.held_out_split)
+    chosen = list(models) if models else available_models(prepared, profile)
+
+    def keep(name: str, rows: pd.DataFrame) -> None:
+        """Put rows in place of those of the same model, window and steps, and write the table."""
+        earlier, keys = kept[name], ["model", "window_frames", "steps"]
+        if earlier is not None:
+            now = set(map(tuple, rows[keys].to_numpy().tolist()))
+            old = [tuple(row) not in now for row in earlier[keys].to_numpy().tolist()]
+            rows = pd.concat([earlier[old], rows])
+        kept[name] = rows
+        write_table(paths[name], rows, record)
+
+    def measured(model: str, steps: int) -> bool:
+        rows = kept["quality_by_seed"]
+        if rows is None or (models and model in chosen):
+            return False
+        mine = rows[(rows["model"] == model) & (rows["window_frames"] == profile.window)]
+        return steps in set(mine["steps"])
+
+    todo = [(model, 0) for model in REFERENCE_MODELS if not measured(model, 0)]
+    for model in chosen:
+        levels = len(getattr(prepared.model_config(model), "noise_levels", ())) or max(STEPS)
+        todo += [(model, n) for n in STEPS if n <= levels and not measured(model, n)]
+    with tqdm(todo, unit="row") as bar:
+        for model, steps in bar:
+            bar.set_postfix_str(row_label(model, steps) if steps else model)
+            if not steps:
+                keep(
+                    "quality_by_seed",
+                    measure_real(packed, classifier, protocol, window=profile.window, model=model),
+                )
+                continue
+            trained, _, _ = obtain_model(prepared, profile, preset=model)
+            generator = MotionGenerator(trained, steps)
+            rows, rounds = measure_model(generator, packed, classifier, protocol, held_out)
+            keep("quality_by_round", rounds)
+            keep("quality_by_seed", rows)
+    write_table(folder / "quality.csv", summarise(kept["quality_by_seed"]), record)
+    return folder / "quality.csv"
+
+
+STEPS = (8, 4, 2, 1)
+"""Numbers of denoising steps that the paper compares (Table 5)."""
+
+_PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2, "num_windows": 3}}
+
+MEASUREMENTS: dict[str, Callable] = {"learning": measure_learning, "quality": measure_quality}
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""
 
 

@@ -37,6 +37,7 @@ __all__ = [
     "profile_recipe",
     "train",
     "obtain_model",
+    "available_models",
     "find_model",
 ]
 
@@ -311,6 +312,25 @@ def obtain_model(
         for path in dataclasses.astuple(files):
             _set_aside(path)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
+
+
+def available_models(prepared: PreparedData, profile: Profile) -> list[str]:
+    """List the presets that `obtain_model` would return without training, in the zoo's order.
+
+    Args:
+      prepared: the data.
+      profile: as for `obtain_model`.
+    """
+    folders = [runs_dir(profile.dataset, profile.name) / "models"]
+    if profile.name == "laptop":
+        folders.append(WEIGHTS_DIR / profile.dataset)
+    suffix = "" if profile.window == 32 else f"-{profile.window}frames"
+    names = [*zoo.PRESETS, *(f"{name}-plus" for name in zoo.PRESETS)]
+    return [
+        name
+        for name in dict.fromkeys(names)
+        if any((folder / f"{name}{suffix}.safetensors").exists() for folder in folders)
+    ]
 
 
 def _identity(prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> dict:

@@ -1,0 +1,566 @@
+"""The style classifier: what it sees, its network against numpy, training, files, refusals."""
+
+import dataclasses
+import functools
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import SKELETON, packed_from, same_tree
+
+from f3amd_lib.evaluation import classifier as module
+from f3amd_lib.evaluation.classifier import (
+    ACCURACY_BAR,
+    CLASSIFIER_JOINTS,
+    NUM_CHANNELS,
+    ClassifierConfig,
+    StyleNetwork,
+    classifier_frames,
+    classifier_joints,
+    classifier_windows,
+    load_classifier,
+    obtain_classifier,
+    require_telling_styles,
+    save_classifier,
+    train_classifier,
+)
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.training.checkpoints import save_tree
+
+STYLES = ("ArmsOverhead", "Runner", "Zombie")
+WINDOW = 20
+SIZES = {"window": WINDOW, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
+CONFIG = ClassifierConfig(num_styles=3, **SIZES)
+TRAINING = {"num_steps": 80, "batch_size": 32, "progress": False, **SIZES}
+BRIEF = {**TRAINING, "num_steps": 3}
+
+BANDAI_NAMES = (
+    *("Hips", "Spine", "Chest", "Neck", "Head", "Shoulder_L", "UpperArm_L", "LowerArm_L"),
+    *("Hand_L", "Shoulder_R", "UpperArm_R", "LowerArm_R", "Hand_R", "UpperLeg_L", "LowerLeg_L"),
+    *("Foot_L", "Toes_L", "UpperLeg_R", "LowerLeg_R", "Foot_R", "Toes_R"),
+)
+MIXAMO_NAMES = (
+    *("Hips", "Neck", "Head", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand"),
+    *("RightShoulder", "RightArm", "RightForeArm", "LeftUpLeg", "LeftLeg", "LeftFoot"),
+    *("RightUpLeg", "RightLeg", "RightFoot"),
+)
+
+
+def named(names) -> Skeleton:
+    """A skeleton in name only."""
+    return Skeleton(names, (-1, *[0] * (len(names) - 1)), np.zeros((len(names), 3)))
+
+
+def three_styles(seconds=(4.0, 4.0, 3.0, 3.0), splits=(0, 0, 1, 2)):
+    """Four takes of each of three styles that nobody would mix up."""
+    return packed_from(
+        [
+            (synthesize(style, length, seed), number, split)
+            for number, style in enumerate(STYLES)
+            for seed, (length, split) in enumerate(zip(seconds, splits, strict=True))
+        ],
+        styles=STYLES,
+        mirror_styles=STYLES,
+    )
+
+
+@pytest.fixture(scope="module")
+def packed():
+    return three_styles()
+
+
+@pytest.fixture(scope="module")
+def trained(packed):
+    return train_classifier(packed, **TRAINING)
+
+
+@pytest.fixture(scope="module")
+def saved(trained, tmp_path_factory):
+    path = tmp_path_factory.mktemp("classifier") / "classifier.safetensors"
+    save_classifier(path, trained)
+    return path
+
+
+def walk(seed=7, style="Zombie", seconds=3.0) -> Motion:
+    return synthesize(style, seconds, seed)
+
+
+# ---------------------------------------------------------------------------- what it looks at
+
+
+def test_joints_are_found_under_the_names_of_three_conventions():
+    assert len(CLASSIFIER_JOINTS) == 15 and NUM_CHANNELS == 45
+    assert not [joint for joint in CLASSIFIER_JOINTS if "wrist" in joint or "toe" in joint]
+    found = {
+        joint: tuple(
+            skeleton.names[classifier_joints(skeleton)[index]]
+            for skeleton in (SYNTHETIC_SKELETON, named(BANDAI_NAMES), named(MIXAMO_NAMES))
+        )
+        for index, joint in enumerate(CLASSIFIER_JOINTS)
+    }
+    assert found["hips"] == ("Hips", "Hips", "Hips")
+    # "LeftShoulder" is the upper arm of one convention and the collar bone of another.
+    assert found["left clavicle"] == ("LeftCollar", "Shoulder_L", "LeftShoulder")
+    assert found["left shoulder"] == ("LeftShoulder", "UpperArm_L", "LeftArm")
+    assert found["right elbow"] == ("RightElbow", "LowerArm_R", "RightForeArm")
+    assert found["right hip"] == ("RightHip", "UpperLeg_R", "RightUpLeg")
+    assert found["left ankle"] == ("LeftAnkle", "Foot_L", "LeftFoot")
+
+
+def test_names_with_the_mixamo_prefix_are_the_same_joints():
+    prefixed = named(tuple(f"mixamorig:{name}" for name in MIXAMO_NAMES))
+    assert classifier_joints(prefixed) == classifier_joints(named(MIXAMO_NAMES))
+
+
+def test_skeleton_without_a_joint_is_refused_by_its_name():
+    without = named(tuple(name for name in BANDAI_NAMES if name != "LowerArm_R"))
+    with pytest.raises(ValueError, match=r"no 'LowerArm_R' \(right elbow\).*names of Bandai"):
+        classifier_joints(without)
+    with pytest.raises(ValueError, match="left clavicle"):
+        classifier_joints(SKELETON)
+
+
+def figure(hips_yaw=0.0, clavicle_yaw=0.0) -> np.ndarray:
+    """One frame of Bandai's joints: left side at +x, all else on the axis, [1, 21, 3]."""
+    frame = np.zeros((1, len(BANDAI_NAMES), 3))
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        hip, clavicle = np.array([0.1, 0, 0]) * sign, np.array([0.05, 0.4, 0]) * [sign, 1, 1]
+        frame[0, BANDAI_NAMES.index(f"UpperLeg_{side}")] = matrix_from_yaw(hips_yaw) @ hip
+        frame[0, BANDAI_NAMES.index(f"Shoulder_{side}")] = matrix_from_yaw(clavicle_yaw) @ clavicle
+    frame[0, BANDAI_NAMES.index("Head")] = [0.0, 0.6, 0.2]
+    return frame + [3.0, 0.9, -5.0]
+
+
+def seen(frame: np.ndarray) -> dict:
+    """What the classifier sees of one frame, [x, y, z] by joint."""
+    numbers = classifier_frames(frame, named(BANDAI_NAMES)).reshape(-1, 3)
+    return dict(zip(CLASSIFIER_JOINTS, numbers, strict=True))
+
+
+def test_a_frame_is_moved_to_its_hips_and_turned_to_face_z():
+    at = seen(figure())
+    np.testing.assert_allclose(at["hips"], [0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(at["head"], [0, 0.6, 0.2], atol=1e-12)
+    np.testing.assert_allclose(at["left hip"], [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(at["right clavicle"], [-0.05, 0.4, 0], atol=1e-12)
+
+
+def test_facing_lies_halfway_between_hips_and_shoulders():
+    """Unit vectors are added: that the hips are twice as broad gives them no more say."""
+    at = seen(figure(hips_yaw=0.0, clavicle_yaw=0.8))
+    turned = matrix_from_yaw(-0.4)
+    np.testing.assert_allclose(at["left hip"], turned @ [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(at["head"], turned @ [0, 0.6, 0.2], atol=1e-12)
+
+
+def test_place_and_direction_of_each_frame_are_not_seen():
+    motion = walk()
+    rng = np.random.default_rng(0)
+    turn = matrix_from_yaw(rng.uniform(-3, 3, motion.num_frames))
+    moved = motion.positions @ np.swapaxes(turn, -1, -2) + rng.normal(
+        size=(motion.num_frames, 1, 3)
+    )
+    expected = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
+    np.testing.assert_allclose(classifier_frames(moved, SYNTHETIC_SKELETON), expected, atol=1e-12)
+    assert expected.std(axis=0).max() > 0.02  # something is seen
+    np.testing.assert_array_equal(expected[:, :3], 0.0)
+
+
+def test_mirrored_channels_show_the_mirrored_motion():
+    motion = walk(style="LimpLeft")
+    channel, sign = module._mirror_channels()
+    shown = sign * classifier_frames(motion.positions, SYNTHETIC_SKELETON)[:, channel]
+    mirrored = classifier_frames(mirror(motion).positions, SYNTHETIC_SKELETON)
+    np.testing.assert_allclose(shown, mirrored, atol=1e-6)
+    assert np.abs(shown - classifier_frames(motion.positions, SYNTHETIC_SKELETON)).max() > 0.05
+
+
+def test_windows_lie_side_by_side_and_the_rest_is_left():
+    motion = walk(seconds=130 / 30)
+    frames = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
+    windows = classifier_windows(motion.positions, SYNTHETIC_SKELETON)
+    assert windows.shape == (2, 60, NUM_CHANNELS) and windows.dtype == np.float32
+    np.testing.assert_allclose(windows[1], frames[60:120], atol=1e-6)
+    many = np.stack([motion.positions, walk(8, seconds=130 / 30).positions])
+    both = classifier_windows(many, SYNTHETIC_SKELETON)
+    assert both.shape == (2, 2, 60, NUM_CHANNELS)
+    np.testing.assert_array_equal(both[0], windows)
+
+
+def test_motion_that_cannot_be_cut_is_refused():
+    positions = np.array(walk(seconds=59 / 30).positions)
+    with pytest.raises(ValueError, match="59 frames do not fill .* needs 60"):
+        classifier_windows(positions, SYNTHETIC_SKELETON)
+    with pytest.raises(ValueError, match=r"\[\.\.\., T, 23, 3\].*\(59, 22, 3\)"):
+        classifier_windows(positions[:, 1:], SYNTHETIC_SKELETON)
+    positions[40, 3, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite at frame 40, joint 'Chest3'$"):
+        classifier_windows(positions, SYNTHETIC_SKELETON)
+    with pytest.raises(ValueError, match=r"frame 40, joint 'Chest3' of motion \[1\]"):
+        classifier_windows(np.stack([np.zeros_like(positions), positions]), SYNTHETIC_SKELETON)
+
+
+# ------------------------------------------------------------------------------------- network
+
+
+def test_default_network_has_the_published_number_of_weights():
+    _, params, statistics = module._blank(ClassifierConfig(num_styles=100))
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 8_489_572
+    assert sum(leaf.size for leaf in jax.tree.leaves(statistics)) == 2 * (64 + 128 + 1024 + 512)
+
+
+def numpy_forward(network: StyleNetwork, windows: np.ndarray):
+    """The network written out in loops over frames, float64."""
+
+    def number(param):
+        return np.asarray(param[...], np.float64)
+
+    def leaky(z):
+        return np.where(z > 0, z, 0.01 * z)
+
+    def normalise(norm, z):
+        scale = number(norm.scale) / np.sqrt(number(norm.var) + 1e-5)
+        return scale * (z - number(norm.mean)) + number(norm.bias)
+
+    def linear(layer, z):
+        return z @ number(layer.kernel) + number(layer.bias)
+
+    z = windows.astype(np.float64)
+    for block in network.blocks:
+        kernel = number(block.convolution.kernel)
+        padded = np.pad(z, ((0, 0), (1, 1), (0, 0)))
+        convolved = np.stack(
+            [
+                sum(padded[:, frame + tap] @ kernel[tap] for tap in range(3))
+                for frame in range(z.shape[1])
+            ],
+            axis=1,
+        ) + number(block.convolution.bias)
+        z = leaky(normalise(block.norm, convolved)) + linear(block.shortcut, z)
+    z = leaky(normalise(network.hidden_norm, linear(network.hidden, z.reshape(len(z), -1))))
+    features = leaky(normalise(network.feature_norm, linear(network.feature, z)))
+    return features, linear(network.classes, features)
+
+
+def test_network_equals_its_layers_written_out(trained):
+    """With batch statistics far from what they are at first, and features of both signs."""
+    rng = np.random.default_rng(0)
+    statistics = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32),
+        trained.statistics,
+    )
+    windows = rng.normal(size=(4, WINDOW, NUM_CHANNELS)).astype(np.float32)
+    features, scores = module._answers(CONFIG, trained.params, statistics, windows)
+    network = module._network(CONFIG, trained.params, statistics)
+    expected_features, expected_scores = numpy_forward(network, windows)
+    assert features.shape == (4, 16) and scores.shape == (4, 3)
+    np.testing.assert_allclose(features, expected_features, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(scores, expected_scores, rtol=1e-4, atol=1e-4)
+    assert (expected_features < 0).any() and (expected_features > 0.1).any()
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def train_forward(config: ClassifierConfig, windows, key):
+    """Features, batch statistics after, and the first convolution, of one pass in training."""
+    params, statistics, _ = module._initial_state(jax.random.key(0), config, 80)
+    network = module._network(config, params, statistics)
+    features, _ = network(windows, key)
+    return features, network, network.blocks[0].convolution(windows)
+
+
+def test_in_training_the_batch_itself_is_the_norm_and_dropout_blanks():
+    windows = np.random.default_rng(1).normal(3.0, 2.0, (500, WINDOW, NUM_CHANNELS))
+    one, network, convolved = train_forward(CONFIG, windows, jax.random.key(0))
+    norm = network.blocks[0].norm
+    # A tenth of the way from the initial 0 and 1 to the batch.
+    mean, variance = np.mean(convolved, axis=(0, 1)), np.var(convolved, axis=(0, 1))
+    np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(norm.var[...], 0.9 + 0.1 * variance, rtol=1e-3)
+    other, _, _ = train_forward(CONFIG, windows, jax.random.key(1))
+    assert np.abs(np.asarray(one) - np.asarray(other)).max() > 0.1
+    network(windows[:2])
+    np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-3, atol=1e-4)
+
+
+def test_dropout_keeps_the_mean_of_what_it_passes_on():
+    window = np.random.default_rng(1).normal(size=(1, WINDOW, NUM_CHANNELS))
+    windows = np.repeat(window, 500, axis=0)
+    every = dataclasses.replace(CONFIG, dropout=0.0)
+    whole = train_forward(every, windows, jax.random.key(0))[1].hidden_norm
+    thinned = train_forward(CONFIG, windows, jax.random.key(0))[1].hidden_norm
+    spread = np.abs(whole.mean[...]).max()
+    np.testing.assert_allclose(thinned.mean[...], whole.mean[...], atol=0.1 * spread)
+    assert whole.var[...].max() < 0.901  # one window again and again
+    assert thinned.var[...].min() > 0.901
+
+
+def test_sizes_that_make_no_network_are_refused():
+    assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
+    with pytest.raises(ValueError, match="sizes must be 1 or more"):
+        ClassifierConfig(num_styles=3, hidden_width=0)
+    with pytest.raises(ValueError, match="dropout"):
+        ClassifierConfig(num_styles=3, dropout=1.0)
+    with pytest.raises(ValueError, match="'hiden_width'.*'hidden_width'"):
+        ClassifierConfig.from_dict({"num_styles": 3, "hiden_width": 5})
+
+
+# ------------------------------------------------------------------------------------ training
+
+
+def test_a_short_training_tells_three_styles_apart_on_unseen_clips(trained):
+    assert trained.styles == STYLES
+    assert trained.held_out_accuracy.keys() == set(STYLES)
+    assert trained.accuracy > 0.9
+    for number, style in enumerate(STYLES):
+        windows = trained.windows_of(walk(9, style, 10.0).positions, SYNTHETIC_SKELETON)
+        assert np.mean(trained.predict(windows) == number) > 0.8
+    require_telling_styles(trained)
+
+
+def test_a_mirrored_style_is_the_same_style(trained):
+    motion = mirror(walk(9, "Runner", 10.0))
+    predicted = trained.predict(trained.windows_of(motion.positions, SYNTHETIC_SKELETON))
+    assert np.mean(predicted == STYLES.index("Runner")) > 0.8
+
+
+def test_same_seed_same_classifier_and_another_seed_another(packed):
+    one, again, other = (train_classifier(packed, seed=seed, **BRIEF) for seed in (4, 4, 5))
+    assert same_tree((one.params, one.statistics), (again.params, again.statistics))
+    assert not same_tree(one.params, other.params)
+    assert one.record["classifier_training"]["seed"] == 4
+
+
+def test_held_out_accuracy_is_the_share_of_right_answers_on_held_out_clips(packed):
+    weak = train_classifier(packed, **BRIEF)
+    shares = {}
+    for number, style in enumerate(STYLES):
+        right = []
+        for clip in np.flatnonzero((packed.clip_style == number) & (packed.clip_split > 0)):
+            windows = weak.windows_of(packed.motion(int(clip)).positions, packed.skeleton)
+            right.extend(weak.predict(windows) == number)
+        shares[style] = np.mean(right)
+    assert weak.held_out_accuracy == pytest.approx(shares)
+    assert weak.accuracy == pytest.approx(np.mean(list(shares.values())))
+    assert weak.accuracy < 0.9  # or the test would say nothing
+
+
+def test_references_are_the_features_of_real_windows(packed, trained):
+    assert trained.references.keys() == {"train", "held_out"}
+    # 120 frames hold 6 windows of 20, 90 hold 4.
+    assert len(trained.reference("train")) == 3 * 2 * 6
+    assert len(trained.reference("held_out", "Zombie")) == 2 * 4
+    clip = int(np.flatnonzero((packed.clip_style == 1) & (packed.clip_split == 2))[0])
+    features = trained.features(trained.windows_of(packed.motion(clip).positions, packed.skeleton))
+    known = trained.references["held_out"]
+    np.testing.assert_allclose(known.features[known.clips == clip], features, rtol=1e-3, atol=1e-3)
+    assert set(known.styles[known.clips == clip]) == {1}
+    mean, covariance = trained.reference_moments("held_out", "Zombie")
+    mine = trained.reference("held_out", "Zombie").astype(np.float64)
+    np.testing.assert_allclose(mean, mine.sum(axis=0) / 8)
+    np.testing.assert_allclose(covariance, (mine - mean).T @ (mine - mean) / 7, atol=1e-12)
+
+
+def test_a_windows_features_depend_on_nothing_else(trained, monkeypatch):
+    windows = trained.windows_of(walk(9, seconds=130 / 30).positions, SYNTHETIC_SKELETON)
+    features = trained.features(windows)
+    assert features.shape == (6, 16)
+    np.testing.assert_array_equal(trained.features(windows[::-1])[::-1], features)
+    np.testing.assert_array_equal(trained.features(windows[3]), features[3])
+    nested = trained.features(windows.reshape(2, 3, WINDOW, NUM_CHANNELS))
+    np.testing.assert_array_equal(nested, features.reshape(2, 3, 16))
+    monkeypatch.setattr(module, "_BATCH", 2)
+    np.testing.assert_allclose(trained.features(windows), features, rtol=1e-5, atol=1e-5)
+
+
+def test_primary_styles_are_the_classes_unless_others_are_asked_for(packed):
+    fewer = dataclasses.replace(packed, primary_styles=("Runner", "Zombie"))
+    assert module._chosen_styles(fewer, None) == ("Runner", "Zombie")
+    asked = module._chosen_styles(fewer, ["Zombie", "ArmsOverhead"])
+    assert asked == ("Zombie", "ArmsOverhead")
+    takes = module._collect(fewer, asked, ("train",), WINDOW)
+    assert takes.styles.tolist() == [0, 0, 1, 1]
+    assert [STYLES[packed.clip_style[clip]] for clip in takes.clips] == [
+        *("Zombie", "Zombie", "ArmsOverhead", "ArmsOverhead")
+    ]
+
+
+def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
+    frames = np.zeros((40, NUM_CHANNELS), np.float32)
+    frames[:, 3] = 1.0  # x of the neck
+    frames[30:, 0] = 1.0  # tells the second style
+    data = module._TrainingData(
+        frames=jnp.asarray(frames),
+        starts=jnp.asarray([0, 5, 10, 15, 30]),
+        first=jnp.asarray([0, 4]),
+        count=jnp.asarray([4, 1]),
+        mirrored=jnp.asarray([True, False]),
+    )
+    windows, style = module._draw(data, jax.random.key(0), 2000, 10)
+    second = np.asarray(style) == 1
+    assert second.mean() == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_array_equal(np.asarray(windows[:, 0, 0]) == 1.0, second)
+    assert np.mean(np.asarray(windows)[~second, 0, 3]) == pytest.approx(0.0, abs=0.1)
+    np.testing.assert_array_equal(np.abs(windows[:, :, 3]), 1.0)
+    np.testing.assert_array_equal(np.asarray(windows)[second, :, 3], 1.0)
+
+
+def test_windows_start_every_stride_within_a_clip_and_short_clips_give_none():
+    uneven = three_styles(seconds=(1.0, 0.5, 1.4, 1.4))
+    takes = module._collect(uneven, STYLES, ("train",), WINDOW)
+    assert takes.length.tolist() == [30, 30, 30]  # the clips of 15 frames are left out
+    starts, take = takes.starts(10)
+    assert starts.tolist() == [0, 10, 30, 40, 60, 70]
+    assert takes.styles[take].tolist() == [0, 0, 1, 1, 2, 2]
+    held_out = module._collect(uneven, STYLES, ("validation", "test"), WINDOW)
+    assert held_out.length.tolist() == [42] * 6
+    windows, styles, clips = held_out.side_by_side()
+    assert windows.shape == (12, WINDOW, NUM_CHANNELS)
+    np.testing.assert_array_equal(windows[3], held_out.frames[62:82])
+    assert styles.tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
+    assert clips.tolist() == [2, 2, 3, 3, 6, 6, 7, 7, 10, 10, 11, 11]
+
+
+def test_a_style_without_clips_long_enough_is_named():
+    short = three_styles(seconds=(1.0, 1.0, 0.5, 0.5))
+    with pytest.raises(ValueError, match="'ArmsOverhead' has no validation or test clip .* 20"):
+        train_classifier(short, **TRAINING)
+
+
+def test_what_cannot_be_trained_is_refused(packed):
+    with pytest.raises(ValueError, match="no style 'Zomby'; did you mean 'Zombie'"):
+        train_classifier(packed, styles=("Runner", "Zomby"), **TRAINING)
+    with pytest.raises(ValueError, match="at least two styles"):
+        train_classifier(packed, styles=("Runner",), **TRAINING)
+    with pytest.raises(ValueError, match="each named once"):
+        train_classifier(packed, styles=("Runner", "Runner"), **TRAINING)
+    with pytest.raises(ValueError, match="at least 1 step and batches of 2"):
+        train_classifier(packed, **{**TRAINING, "batch_size": 1})
+    with pytest.raises(ValueError, match="unknown size of a style classifier 'widht'"):
+        train_classifier(packed, widht=3, **TRAINING)
+
+
+# ------------------------------------------------------------------------------------ refusals
+
+
+def test_a_classifier_that_guesses_is_refused_with_accuracy_and_bar(trained):
+    shares = dict(zip(STYLES, (0.5, 1.0, 0.7), strict=True))
+    weak = dataclasses.replace(trained, held_out_accuracy=shares)
+    with pytest.raises(ValueError, match=r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %"):
+        require_telling_styles(weak)
+    require_telling_styles(weak, bar=0.7)
+    at_the_bar = dataclasses.replace(trained, held_out_accuracy={"one": ACCURACY_BAR})
+    require_telling_styles(at_the_bar)
+    unknown = dataclasses.replace(trained, held_out_accuracy={"one": float("nan")})
+    with pytest.raises(ValueError, match="nan %"):
+        require_telling_styles(unknown)
+
+
+def test_motion_of_another_body_is_refused(trained):
+    longer = dataclasses.replace(SYNTHETIC_SKELETON, offsets=1.1 * SYNTHETIC_SKELETON.offsets)
+    with pytest.raises(ValueError, match="23 joints of 'tiny'.*bone lengths"):
+        trained.windows_of(walk().positions, longer)
+    with pytest.raises(ValueError, match="here 6 joints"):
+        trained.windows_of(np.zeros((60, 6, 3)), SKELETON)
+
+
+def test_windows_of_the_wrong_kind_are_refused(trained):
+    windows = np.zeros((3, WINDOW, NUM_CHANNELS))
+    for wrong in (windows[:, :-1], windows[..., :-1], windows[:0], np.zeros(3)):
+        with pytest.raises(ValueError, match=r"must be \[\.\.\., 20, 45\]"):
+            trained.features(wrong)
+    windows[2, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="window 2 is not finite"):
+        trained.predict(windows)
+
+
+def test_unknown_styles_and_references_are_refused(trained):
+    assert trained.style_index("Runner") == 1
+    with pytest.raises(ValueError, match="not trained on style 'runer'; did you mean 'Runner'"):
+        trained.style_index("runer")
+    with pytest.raises(ValueError, match="'runer'"):
+        trained.reference_moments("train", "runer")
+    with pytest.raises(ValueError, match="unknown reference 'test'"):
+        trained.reference("test")
+    one = {"train": module.ReferenceFeatures(np.zeros((1, 16)), np.zeros(1), np.zeros(1))}
+    alone = dataclasses.replace(trained, references=one)
+    with pytest.raises(ValueError, match="1 train window of style 'ArmsOverhead'.*at least two"):
+        alone.reference_moments("train", "ArmsOverhead")
+
+
+# --------------------------------------------------------------------------------------- files
+
+
+def test_classifier_comes_back_exactly(trained, saved):
+    loaded = load_classifier(saved)
+    windows = trained.windows_of(walk(seed=9).positions, SYNTHETIC_SKELETON)
+    np.testing.assert_array_equal(loaded.features(windows), trained.features(windows))
+    np.testing.assert_array_equal(loaded.predict(windows), trained.predict(windows))
+    for field in ("config", "styles", "held_out_accuracy", "record", "skeleton"):
+        assert getattr(loaded, field) == getattr(trained, field)
+    for split in ("train", "held_out"):
+        for field in ("features", "styles", "clips"):
+            np.testing.assert_array_equal(
+                getattr(loaded.references[split], field), getattr(trained.references[split], field)
+            )
+
+
+def test_broken_and_foreign_files_are_refused_by_name(saved, tmp_path):
+    cut = shutil.copy(saved, tmp_path / "cut.safetensors")
+    cut.write_bytes(cut.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"cut\.safetensors: .*cut short or damaged"):
+        load_classifier(cut)
+    save_tree(tmp_path / "model.safetensors", {"a": jnp.zeros(1)}, {"kind": "trained model"})
+    with pytest.raises(ValueError, match=r"model\.safetensors: holds a trained model, not a style"):
+        load_classifier(tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="no such weights file"):
+        load_classifier(tmp_path / "absent.safetensors")
+
+
+def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "runs_dir", lambda dataset, profile: tmp_path / dataset / profile)
+    profile = load_profile("smoke", "synthetic")
+    first, origin = obtain_classifier(packed, profile, **BRIEF)
+    assert origin == "trained now"
+    assert first.record["profile"] == "smoke"
+    assert first.record["dataset_fingerprint"] == packed.fingerprint
+    asked = []
+
+    def train_again(packed, **settings):
+        asked.append(settings)
+        return first
+
+    monkeypatch.setattr(module, "train_classifier", train_again)
+    again, origin = obtain_classifier(packed, profile, **BRIEF)
+    assert origin == "earlier run" and not asked
+    assert same_tree(again.params, first.params)
+    others = (
+        (dataclasses.replace(packed, fingerprint="1" * 64), BRIEF),
+        (packed, {**BRIEF, "num_steps": 4}),
+        (packed, {**BRIEF, "seed": 1}),
+        (packed, {**BRIEF, "styles": STYLES[:2]}),
+        (packed, {**BRIEF, "hidden_width": 25}),
+    )
+    for data, settings in others:
+        assert obtain_classifier(data, profile, **settings)[1] == "trained now"
+        assert settings.items() <= asked[-1].items()
+    assert len(list(tmp_path.rglob("synthetic/smoke/classifier/*.safetensors"))) == 6
+
+
+def test_profiles_train_for_different_lengths(packed, tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(module, "runs_dir", lambda dataset, profile: tmp_path / dataset / profile)
+    asked = {}
+    for name in ("smoke", "laptop", "gpu"):
+        monkeypatch.setattr(
+            module,
+            "train_classifier",
+            lambda packed, name=name, **settings: asked.update({name: settings}) or trained,
+        )
+        obtain_classifier(packed, load_profile(name, "synthetic"), progress=False)
+    samples = [asked[name]["num_steps"] * asked[name]["batch_size"] for name in asked]
+    assert list(asked) == ["smoke", "laptop", "gpu"] and samples == sorted(samples)
+    assert {settings["seed"] for settings in asked.values()} == {0}
