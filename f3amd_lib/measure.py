@@ -50,6 +50,8 @@ def _kept_rows(path: Path, record: dict) -> pd.DataFrame | None:
     if not path.exists():
         return None
     rows, earlier = read_table(path)
+    if "unit" in rows:
+        rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
     return rows if record_hash(earlier) == record_hash(record) else None
 
 

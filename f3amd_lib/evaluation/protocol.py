@@ -296,7 +296,7 @@ def measure_model(
         asked = np.repeat([classifier.style_index(style) for style in styles], windows.shape[1])
         windows = windows.reshape(-1, *windows.shape[2:])
         figures |= _distribution_figures(classifier, windows, asked, protocol.num_windows, seed)
-        rows += _rows(figures, seed=seed, **columns)
+        rows += _rows(figures, **columns, seed=seed)
     once = noise_use(generator, held_out)
     once = {
         "x0_error_ratio": once["x0_error_ratio"],
@@ -306,7 +306,7 @@ def measure_model(
     if seeds > 1:
         # [style, seed, frame, joint, 3]
         once["rollout_diversity"] = distributions.diversity(np.stack(positions, axis=1))
-    rows += _rows(once, seed=0, **columns)
+    rows += _rows(once, **columns, seed=0)
     return pd.DataFrame(rows), _rounds(rollout, columns)
 
 
@@ -395,7 +395,7 @@ def measure_real(
         means = _style_means([figures[place] for place in drawn], labels[drawn])
         windows, asked = np.concatenate(windows), np.array(asked)
         means |= _distribution_figures(classifier, windows, asked, protocol.num_windows, seed)
-        rows += _rows(means, seed=seed, **columns)
+        rows += _rows(means, **columns, seed=seed)
     return pd.DataFrame(rows)
 
 

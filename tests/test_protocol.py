@@ -1,0 +1,274 @@
+"""The protocol: what is measured on what, with intervals, in tidy rows."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from builders import packed_from
+
+from f3amd_lib import measure
+from f3amd_lib.data.features import num_channels
+from f3amd_lib.data.windows import seed_histories
+from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.evaluation import protocol as module
+from f3amd_lib.evaluation.classifier import train_classifier
+from f3amd_lib.evaluation.paths import RootPath, named_path
+from f3amd_lib.evaluation.protocol import (
+    PROTOCOL_METRICS,
+    REFERENCE_MODELS,
+    Protocol,
+    evaluation_paths,
+    measure_model,
+    measure_real,
+    path_statistics,
+    summarise,
+)
+from f3amd_lib.evaluation.quality import sideways_share
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.models import zoo
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.papers import load_paper_table
+from f3amd_lib.report.records import read_table
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.pipeline import PreparedData
+
+STYLES = ("ArmsOverhead", "Zombie")
+SIZES = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
+SMALL = Protocol(STYLES, num_frames=96, num_seeds=2, num_diversity_seeds=2, num_windows=6)
+
+
+@pytest.fixture(scope="module")
+def packed():
+    splits = (0, 0, 1, 2, 2)
+    return packed_from(
+        [
+            (synthesize(style, 4.0, seed), number, split)
+            for number, style in enumerate(STYLES)
+            for seed, split in enumerate(splits)
+        ],
+        styles=STYLES,
+    )
+
+
+@pytest.fixture(scope="module")
+def prepared(packed):
+    return PreparedData(packed, 32, 10)
+
+
+@pytest.fixture(scope="module")
+def classifier(packed):
+    return train_classifier(packed, num_steps=60, batch_size=32, progress=False, **SIZES)
+
+
+@pytest.fixture(scope="module")
+def generator(packed, prepared):
+    config = zoo.build_config(
+        "F3AMD-FNO-32",
+        channels=num_channels(packed.skeleton),
+        num_styles=2,
+        depth=1,
+        latent_width=8,
+    )
+    network = jax.jit(lambda key: module_state(config, key))(jax.random.key(0))
+    trained = TrainedModel(
+        "F3AMD-FNO-8",
+        config,
+        network,
+        prepared.normaliser,
+        packed.skeleton,
+        packed.styles,
+        VarianceExploding(),
+        seed_histories(packed, num_history=10),
+        {},
+    )
+    return MotionGenerator(trained, 1)
+
+
+def module_state(config, key):
+    from flax import nnx
+
+    return nnx.state(zoo.build_from_config(config, key))
+
+
+@pytest.fixture(scope="module")
+def measured(generator, packed, prepared, classifier):
+    return measure_model(generator, packed, classifier, SMALL, prepared.windows("validation"))
+
+
+def one(rows: pd.DataFrame, metric: str, seed: int = 0) -> float:
+    (value,) = rows[(rows["metric"] == metric) & (rows["seed"] == seed)]["value"]
+    return value
+
+
+def test_section_4_4_all_nine_metrics_are_measured_under_the_papers_names(measured):
+    rows, _ = measured
+    printed = load_paper_table(3)
+    for metric, unit, better in set(
+        zip(printed["metric"], printed["unit"], printed["better"], strict=True)
+    ):
+        assert metric in set(rows["metric"])
+        ours = PROTOCOL_METRICS[metric]
+        # Ours name two of them "near real": standing still at a seam is no virtue.
+        assert ours[0] == unit and ours[1] in (better, "near real")
+
+
+def test_a_models_rows_are_tidy(measured):
+    rows, rounds = measured
+    assert list(rows) == [
+        *("model", "window_frames", "steps", "seed", "metric", "unit", "better", "value")
+    ]
+    assert not rows.duplicated(["model", "steps", "seed", "metric"]).any()
+    assert set(rows["model"]) == {"F3AMD-FNO-8"} and set(rows["window_frames"]) == {32}
+    assert np.isfinite(rows["value"]).all()
+    per_seed = rows[~rows["metric"].isin(module._NOISE)]
+    assert set(per_seed["seed"]) == {0, 1}
+    assert len(per_seed) == 2 * per_seed["metric"].nunique()
+    # Seeds differ in noise and starting pose.
+    assert one(rows, "joint_acceleration", 0) != one(rows, "joint_acceleration", 1)
+    assert list(rounds) == ["model", "window_frames", "steps", "metric", "round", "value"]
+    assert set(rounds["round"]) == {1, 2, 3}
+
+
+def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, classifier):
+    rows, _ = measured
+    real = measure_real(packed, classifier, SMALL, window=32)
+    assert set(real["steps"]) == {0} and set(real["model"]) == {"real"}
+    for metric in ("FID", "EMD", "joint_acceleration", "trajectory_error", "IRD_excess"):
+        assert one(rows, metric) > 1.5 * one(real, metric), metric
+    assert one(real, "style_accuracy") == 100.0
+    assert not {"diversity", "x0_error_ratio"} & set(real["metric"])
+
+
+def test_bad_generators_are_told_apart(packed, classifier):
+    tables = {
+        model: measure_real(packed, classifier, SMALL, window=32, model=model)
+        for model in REFERENCE_MODELS
+    }
+    real = tables["real"]
+    assert one(tables["frozen pose"], "bone_swing") < 0.1 * one(real, "bone_swing")
+    assert one(tables["frozen pose"], "foot_alternation") == 0.0
+    for broken in ("shuffled frames", "noisy motion"):
+        assert one(tables[broken], "IRD") > 1.5 * one(real, "IRD")
+    for broken in REFERENCE_MODELS[1:]:
+        assert one(tables[broken], "FID") > one(real, "FID")
+    with pytest.raises(ValueError, match="unknown reference 'frozen'"):
+        measure_real(packed, classifier, SMALL, window=32, model="frozen")
+
+
+def test_real_rows_differ_from_seed_to_seed(packed, classifier):
+    rows = measure_real(packed, classifier, SMALL, window=32)
+    # Other clips in the bootstrap, other windows in FID; the same every time it is asked.
+    assert one(rows, "FID", 0) != one(rows, "FID", 1)
+    again = measure_real(packed, classifier, SMALL, window=32)
+    pd.testing.assert_frame_equal(rows, again)
+
+
+def test_the_same_paths_turn_alike_at_the_pace_of_each_style(packed):
+    paths = evaluation_paths(packed, STYLES, 300, seed=3)
+    assert [path.num_frames for path in paths] == [300, 300]
+    # The walker never steps sideways, so nobody is asked to.
+    assert max(sideways_share(path) for path in paths) == 0.0
+    assert paths[0].length != pytest.approx(paths[1].length, rel=0.01)
+    other = evaluation_paths(packed, STYLES, 300, seed=4)
+    assert np.abs(other[0].position - paths[0].position).max() > 0.1
+
+
+def test_path_statistics_of_a_line_and_of_a_circle():
+    line = path_statistics([named_path("straight", 300, speed=1.5, ramp_seconds=0.0)])
+    assert line["speed_m_s"] == pytest.approx(1.5, rel=1e-3)
+    assert line["turn_deg_s"] == pytest.approx(0.0, abs=1e-6)
+    assert line["standing_share"] == 0.0
+    angle = np.arange(600) / 30.0 * np.deg2rad(36.0)
+    circle = 2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    turning = path_statistics([RootPath(circle, np.zeros(600))])
+    assert turning["turn_deg_s"] == pytest.approx(36.0, rel=1e-3)
+    # It faces +Z all the way round: three quarters of the way go more than 45 degrees off.
+    assert turning["sideways_share"] == pytest.approx(0.75, abs=0.02)
+    still = RootPath(np.zeros((90, 2)), np.zeros(90))
+    assert path_statistics([still, RootPath(circle, angle)])["standing_share"] > 0.1
+
+
+def test_seeds_become_means_with_intervals():
+    rows = pd.DataFrame(
+        [
+            {"model": "A", "window_frames": 32, "steps": 8, "seed": seed, "metric": "FID",
+             "unit": "", "better": "down", "value": value}
+            for seed, value in enumerate((1.0, 2.0, 3.0))
+        ]
+    )  # fmt: skip
+    (row,) = summarise(rows).to_dict("records")
+    assert (row["value"], row["repeats"]) == (2.0, 3)
+    # Student's t with 2 degrees of freedom: 4.303 * 1 / sqrt(3).
+    assert row["high"] - row["value"] == pytest.approx(4.303 / np.sqrt(3), rel=1e-3)
+    assert row["low"] == pytest.approx(4.0 - row["high"])
+    single = summarise(rows[:1])
+    assert np.isnan(single["low"][0]) and single["value"][0] == 1.0
+
+
+def test_a_classifier_that_cannot_tell_styles_gives_no_fid(generator, packed, prepared, classifier):
+    blind = dataclasses.replace(classifier, held_out_accuracy={style: 0.5 for style in STYLES})
+    with pytest.raises(ValueError, match="bar"):
+        measure_model(generator, packed, blind, SMALL, prepared.windows("validation"))
+    with pytest.raises(ValueError, match="bar"):
+        measure_real(packed, blind, SMALL, window=32)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"styles": ()}, "at least one style"),
+        ({"num_frames": 40}, "num_frames must be at least 66"),
+        ({"num_seeds": 0}, "num_seeds must be at least 1"),
+        ({"num_windows": 1}, "num_windows must be at least 2"),
+    ],
+)
+def test_impossible_protocols_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(SMALL, **changes)
+
+
+def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
+    many = dataclasses.replace(SMALL, num_windows=1000)
+    with pytest.raises(ValueError, match="1000"):
+        measure_real(packed, classifier, many, window=32)
+    unknown = dataclasses.replace(SMALL, styles=("Zombi",))
+    with pytest.raises(ValueError, match="'?Zombi'?"):
+        measure_real(packed, classifier, unknown, window=32)
+
+
+def test_the_measurement_keeps_its_rows_and_goes_on(
+    prepared, classifier, generator, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    profile = load_profile("smoke", "synthetic", rollout_rounds=3)
+    name = "F3AMD-FNO-32"
+    monkeypatch.setattr(measure, "obtain_classifier", lambda *a, **k: (classifier, "earlier run"))
+    monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "earlier run"))
+    monkeypatch.setattr(measure, "available_models", lambda *a: [name])
+    monkeypatch.setattr(measure, "STEPS", (2, 1))
+    trained = dataclasses.replace(generator.trained, name=name)
+    path = measure.measure_quality(prepared, profile)
+    table, record = read_table(path)
+    rows = set(zip(table["model"], table["steps"], strict=True))
+    assert rows == {*((model, 0) for model in REFERENCE_MODELS), (name, 2), (name, 1)}
+    assert record["measurement"] == "quality" and record["protocol"]["num_seeds"] == 2
+    for other in ("quality_by_seed", "quality_by_round"):
+        kept, _ = read_table(path.with_name(f"{other}.csv"))
+        assert set(kept["model"]) <= {model for model, _ in rows}
+    calls = []
+    measure_again = measure.measure_model
+
+    def spy(generator, *arguments, **settings):
+        calls.append(generator.num_steps)
+        return measure_again(generator, *arguments, **settings)
+
+    monkeypatch.setattr(measure, "measure_model", spy)
+    measure.measure_quality(prepared, profile)
+    assert calls == []
+    pd.testing.assert_frame_equal(read_table(path)[0], table)
+    measure.measure_quality(prepared, profile, [name])
+    assert calls == [2, 1]
+    assert len(read_table(path)[0]) == len(table)
