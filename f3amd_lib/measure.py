@@ -116,7 +116,7 @@ def measure_quality(
     paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
     kept = {name: _kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
-    chosen = list(models) if models else available_models(prepared, profile)
+    chosen = list(models) if models else available_models(profile)
 
     def keep(name: str, rows: pd.DataFrame) -> None:
         """Put rows in place of those of the same model, window and steps, and write the table."""

@@ -71,6 +71,41 @@ def test_changed_settings_set_the_old_files_aside(trained_once, same_runs, monke
         path.with_name(path.name + ".old1").rename(path)
 
 
+def test_models_of_an_earlier_version_are_set_aside(trained_once, same_runs, monkeypatch):
+    _, prepared, profile, _ = trained_once
+    files = pipeline.model_files(profile)
+    kept = files.model.with_name(files.model.name + ".old1")
+
+    def outdated(path):
+        raise pipeline.OutdatedFile(f"{path}: written by version 0.1")
+
+    monkeypatch.setattr(pipeline, "load_model", outdated)
+    monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
+    *_, origin = pipeline.obtain_model(prepared, profile, progress=False)
+    assert origin == "trained now" and kept.exists() and not files.model.exists()
+    for path in dataclasses.astuple(files):
+        path.with_name(path.name + ".old1").rename(path)
+
+
+def test_presets_may_be_called_by_the_papers_names(trained_once):
+    profile = trained_once[2]
+    name = "F3AMD-FNO-96, m=14"
+    assert pipeline.model_files(profile, name).model.name == "F3AMD-FNO-96-m14.safetensors"
+    assert pipeline.profile_recipe(profile, name) == pipeline.profile_recipe(
+        profile, "F3AMD-FNO-96-m14"
+    )
+
+
+def test_models_that_lie_there_are_listed(trained_once, same_runs, monkeypatch, tmp_path):
+    profile = trained_once[2]
+    assert pipeline.available_models(profile) == [profile.preset]
+    laptop = dataclasses.replace(profile, name="laptop", dataset="bandai")
+    # Shipped ones count on a laptop, whatever lies in runs/.
+    assert {"F3AMD-FNO-96", "F3AMD-FNO-96-plus"} <= set(pipeline.available_models(laptop))
+    longer = dataclasses.replace(laptop, window=64)
+    assert pipeline.available_models(longer) == []
+
+
 def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs, monkeypatch):
     folder, prepared, profile, model = trained_once
     laptop = dataclasses.replace(profile, name="laptop")

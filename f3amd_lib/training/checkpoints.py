@@ -27,9 +27,21 @@ from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.models.zoo import build_from_config, config_from_dict
 from f3amd_lib.motion.skeleton import Skeleton
 
-__all__ = ["save_tree", "describe", "load_tree", "TrainedModel", "save_model", "load_model"]
+__all__ = [
+    "OutdatedFile",
+    "save_tree",
+    "describe",
+    "load_tree",
+    "TrainedModel",
+    "save_model",
+    "load_model",
+]
 
 FORMAT = "f3amd-1"
+
+
+class OutdatedFile(ValueError):
+    """A whole file of an earlier version of this project; the message names it and the fix."""
 
 
 def _named_leaves(tree) -> dict:
@@ -210,13 +222,19 @@ def load_model(path: Path) -> TrainedModel:
         raise ValueError(f"{path}: description lacks or garbles {error}") from None
     except ValueError as error:
         text = str(error)
-        raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        named = text if text.startswith(str(path)) else f"{path}: {text}"
+        raise (OutdatedFile if isinstance(error, OutdatedFile) else ValueError)(named) from None
 
 
 def _model_template(metadata: dict) -> dict:
     """Return the shapes that a trained model's description speaks of."""
     if metadata.get("kind") != "trained model":
         raise ValueError(f"holds a {metadata.get('kind')}, not a trained model")
+    if "family" not in metadata["model"] or "diffusion" not in metadata:
+        raise OutdatedFile(
+            "written by version 0.1 of this project, before models named their family and noise; "
+            "train it again (the file can stay under another name)"
+        )
     config = config_from_dict(metadata["model"])
     params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
     single = jax.ShapeDtypeStruct

@@ -9,6 +9,7 @@ project lies in `f3amd_lib/weights/<data set>/` in the same form.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from dataclasses import dataclass
@@ -26,7 +27,13 @@ from f3amd_lib.models import zoo
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.report.records import read_table, run_record, write_table
-from f3amd_lib.training.checkpoints import TrainedModel, describe, load_model, save_model
+from f3amd_lib.training.checkpoints import (
+    OutdatedFile,
+    TrainedModel,
+    describe,
+    load_model,
+    save_model,
+)
 from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
 
 __all__ = [
@@ -296,8 +303,11 @@ def obtain_model(
                 return trained, read_table(shipped.history)[0], "shipped"
     files = model_files(profile, preset)
     mine = _identity(prepared, wanted, profile_recipe(profile, preset))
+    trained = None
     if files.model.exists() and files.history.exists():
-        trained = load_model(files.model)
+        with contextlib.suppress(OutdatedFile):  # set aside below
+            trained = load_model(files.model)
+    if trained is not None:
         record = trained.record
         theirs = {"model": trained.config.to_dict()} | {
             "training": record.get("training"),
@@ -314,11 +324,10 @@ def obtain_model(
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
-def available_models(prepared: PreparedData, profile: Profile) -> list[str]:
-    """List the presets that `obtain_model` would return without training, in the zoo's order.
+def available_models(profile: Profile) -> list[str]:
+    """List the presets that have weights, of the user's or shipped ones, in the zoo's order.
 
     Args:
-      prepared: the data.
       profile: as for `obtain_model`.
     """
     folders = [runs_dir(profile.dataset, profile.name) / "models"]
