@@ -18,7 +18,7 @@ from f3amd_lib.profiles import Profile, load_profile, results_dir, runs_dir
 def test_every_pair_gives_a_profile_of_a_known_network(name, dataset):
     profile = load_profile(name, dataset)
     assert (profile.name, profile.dataset) == (name, dataset)
-    assert profile.preset in zoo.PRESETS
+    assert zoo.find_preset(profile.preset).name == profile.preset
     # Defaults must pass what overrides must pass.
     values = dataclasses.asdict(profile)
     del values["name"], values["dataset"]

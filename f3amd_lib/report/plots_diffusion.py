@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.report.figures import (
-    PALETTE,
-    new_figure,
-)
+from f3amd_lib.diffusion.schedules import sigma_from_alpha_bar, sigma_from_log_snr
+from f3amd_lib.report.figures import PALETTE, new_figure
 from f3amd_lib.report.plots import shades, styled
 
 __all__ = [
     "densities",
     "denoiser_curves",
-    "schedule_figure",
+    "schedule_lines",
     "step_positions",
     "sample_paths",
     "flow_and_steps",
     "vector_fields",
-    "collapse_figure",
     "convergence_figure",
+    "fresh_noise_walks",
+    "spread_left_figure",
+    "collapse_figure",
     "sample_histograms",
     "input_scaling_figure",
 ]
+
+_SAMPLER_LOOKS = {
+    "DDIM": (PALETTE["purple"], "o"),
+    "Euler": (PALETTE["purple"], "o"),
+    "Heun": (PALETTE["vermilion"], "s"),
+    "DDPM": (PALETTE["green"], "D"),
+}
+"""Colour and marker of each sampler; DDIM and Euler are one sampler."""
 
 
 @styled
@@ -67,42 +76,72 @@ def denoiser_curves(x, denoised: Mapping[float, np.ndarray], scores: Mapping[flo
 
 
 @styled
-def schedule_figure(t, sigma, alpha_bar, log_snr):
-    """Draw noise level, signal share and log signal-to-noise against schedule time, [P] each."""
-    figure, axes = new_figure(8.6, 2.9, 1, 3)
-    for axis, values, name, color in zip(
-        axes,
-        (sigma, alpha_bar, log_snr),
-        ("noise level σ", "signal share ᾱ = 1/(1+σ²)", "log SNR = −2 log σ"),
-        ("purple", "green", "orange"),
-        strict=True,
-    ):
-        axis.plot(t, values, color=PALETTE[color], linewidth=2.4)
-        axis.set_title(name)
-        axis.set_xlabel("schedule time t")
-    axes[0].set_yscale("log")
-    axes[1].set_yscale("log")
+def schedule_lines(schedules: Mapping[str, tuple[np.ndarray, np.ndarray]]):
+    """Draw noise level against schedule time, on one axis with three labels.
+
+    Args:
+      schedules: name -> (schedule time, sigma), [P] each. Few points are drawn as points, many as
+        a line.
+    """
+    figure, axis = new_figure(8.2, 3.9)
+    looks = itertools.cycle(zip(("purple", "green", "vermilion", "orange"), "osD^", strict=True))
+    for (name, (time, sigmas)), (color, marker) in zip(schedules.items(), looks, strict=False):
+        few = len(time) <= 32
+        axis.plot(
+            time, sigmas, color=PALETTE[color], label=name, linewidth=0.9 if few else 2.6,
+            marker=marker if few else "", linestyle=":" if few else "-", zorder=3 if few else 2,
+        )  # fmt: skip
+    axis.set_yscale("log")
+    axis.set_ylim(0.006, 400)
+    axis.set_xlim(-0.03, 1.02)
+    axis.set_xlabel("schedule time t, from noise alone (0) to clean (1)")
+    axis.set_ylabel("noise level σ")
+    axis.legend(loc="lower left")
+    axis.axhline(1.0, color=PALETTE["grey"], linewidth=0.9, linestyle="--", zorder=1)
+    axis.annotate("signal = noise", (0.01, 1.0), (0, -11), textcoords="offset points", fontsize=9)
+    shares = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.99, 0.9999])
+    ratios = np.array([-9, -6, -3, 0, 3, 6, 9])
+    other_names = (
+        ("signal share ᾱ", sigma_from_alpha_bar(shares), [f"{share:g}" for share in shares]),
+        ("log SNR", sigma_from_log_snr(ratios), [f"{ratio}".replace("-", "−") for ratio in ratios]),
+    )
+    for place, (title, sigmas, labels) in enumerate(other_names):
+        other = axis.twinx()
+        other.set_yscale("log")
+        other.set_ylim(axis.get_ylim())
+        other.set_yticks(sigmas, labels)
+        other.set_yticks([], minor=True)
+        other.grid(visible=False)
+        other.spines["right"].set_visible(True)
+        other.spines["right"].set_position(("outward", 66 * place))
+        other.set_ylabel(title)
     return figure
 
 
 @styled
-def step_positions(grids: Mapping[str, Mapping[int, np.ndarray]]):
-    """Draw where N-step grids evaluate the network, a panel for each reading of Eq. 9.
+def step_positions(
+    grids: Mapping[str, Mapping[int, np.ndarray]], levels: Mapping[str, np.ndarray] | None = None
+):
+    """Draw where N-step grids evaluate the network, a panel for each way to place them.
 
     Args:
-      grids: reading -> {N: noise levels [N], without the final 0}.
+      grids: title -> {N: noise levels [N], without the final 0}.
+      levels: title -> the only noise levels that there are, [K], where a schedule has but few.
     """
-    figure, axes = new_figure(8.6, 2.7, 1, len(grids), sharey=True, squeeze=False)
+    figure, axes = new_figure(9.0, 2.7, 1, len(grids), sharey=True, squeeze=False)
     for axis, (title, by_steps) in zip(axes[0], grids.items(), strict=True):
-        for row, (_, sigmas) in enumerate(by_steps.items()):
+        for row, sigmas in enumerate(by_steps.values()):
             axis.plot(sigmas, np.full(len(sigmas), row), "o-", color=PALETTE["purple"],
                       linewidth=0.8)  # fmt: skip
+        if levels and title in levels:
+            axis.vlines(levels[title], -0.6, len(by_steps) - 0.4, color=PALETTE["grey"],
+                        linewidth=0.8, linestyle=":", zorder=1)  # fmt: skip
         axis.set_yticks(range(len(by_steps)), [f"N = {steps}" for steps in by_steps])
         axis.set_xscale("log")
         axis.set_xlim(300, 0.005)
         axis.set_ylim(-0.6, len(by_steps) - 0.4)
-        axis.set_title(title)
-        axis.set_xlabel("noise level σ, sampling runs to the right")
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("noise level σ")
     return figure
 
 
@@ -176,7 +215,7 @@ def vector_fields(points, fields: Mapping[float, np.ndarray], modes, samples):
         axis.plot(*samples.T, ".", color=PALETTE["sky"], markersize=2.0)
         axis.quiver(
             *points.T, *field.T, color=PALETTE["purple"], angles="xy", scale_units="xy",
-            scale=3.5, width=0.006,
+            scale=4.5, width=0.006,
         )  # fmt: skip
         axis.plot(*modes.T, "*", color=PALETTE["vermilion"], markersize=14, zorder=5,
                   markeredgecolor="white")  # fmt: skip
@@ -184,6 +223,7 @@ def vector_fields(points, fields: Mapping[float, np.ndarray], modes, samples):
         axis.set_aspect("equal")
         axis.grid(visible=False)
         axis.set_xlabel("x₁")
+        axis.set_xticks([-2, 0, 2])
     axes[0, 0].set_ylabel("x₂")
     return figure
 
@@ -210,33 +250,101 @@ def collapse_figure(table: pd.DataFrame, truth: float):
 
 
 @styled
-def convergence_figure(table: pd.DataFrame, orders: Mapping[str, float]):
-    """Draw the error against the number of steps on log-log axes with the fitted slope.
+def convergence_figure(table: pd.DataFrame, orders: Mapping[tuple[str, str], float]):
+    """Draw the error against steps and against network evaluations, on log-log axes.
 
     Args:
-      table: columns data, steps, error.
-      orders: data -> fitted order.
+      table: columns sampler, data, steps, evaluations, error.
+      orders: (sampler, data) -> fitted order.
     """
-    figure, axis = new_figure(6.4, 3.6)
-    looks = zip(table.groupby("data", sort=False), ("purple", "orange"), "os", strict=False)
-    for (name, rows), color, marker in looks:
-        axis.plot(rows["steps"], rows["error"], marker=marker, color=PALETTE[color],
-                  label=f"{name}: order {orders[name]:.2f}")  # fmt: skip
-    steps = np.array([rows["steps"].min(), rows["steps"].max()])
-    axis.plot(steps, 0.4 * rows["error"].iloc[0] * steps[0] / steps, color=PALETTE["grey"],
-              linestyle=":", label="slope −1")  # fmt: skip
-    axis.set_xscale("log", base=2)
-    axis.set_yscale("log")
-    axis.set_xlabel("steps N")
-    axis.set_ylabel("mean distance from the exact flow")
-    axis.legend()
+    figure, axes = new_figure(8.8, 4.0, 1, 2, sharey=True)
+    first_data = table["data"].iloc[0]
+    for axis, column in zip(axes, ("steps", "evaluations"), strict=True):
+        for (sampler, data), rows in table.groupby(["sampler", "data"], sort=False):
+            color, marker = _SAMPLER_LOOKS[sampler]
+            axis.plot(
+                rows[column], rows["error"], marker=marker, color=color,
+                linestyle="-" if data == first_data else ":",
+                markerfacecolor=color if data == first_data else "white",
+                label=f"{sampler}, {data}: order {orders[sampler, data]:.2f}",
+            )  # fmt: skip
+        axis.set_xscale("log", base=2)
+        axis.set_yscale("log")
+        powers = np.log2([table[column].min(), table[column].max()]).round().astype(int)
+        ticks = 2 ** np.arange(powers[0], powers[1] + 1)
+        axis.set_xticks(ticks, ticks)
+        axis.axvline(8, color=PALETTE["black"], linewidth=0.9, linestyle="--", zorder=1)
+        axis.annotate("the paper's 8", (8, table["error"].min()), (5, 0), fontsize=9,
+                      textcoords="offset points")  # fmt: skip
+    axes[0].set_xlabel("steps N")
+    axes[1].set_xlabel("network evaluations (Heun: 2N − 1)")
+    axes[0].set_ylabel("mean distance from the exact answer")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    return figure
+
+
+@styled
+def fresh_noise_walks(sigmas, walks: Mapping[str, np.ndarray], modes, width: float):
+    """Draw walks that share their first state, a panel for each sampler, as x / sqrt(1 + sigma^2).
+
+    Args:
+      sigmas: noise levels, [N + 1], the last may be 0.
+      walks: title -> states x, [N + 1, W]; colours tell on which side of the modes' mean a walk
+        ends.
+      modes: centres of the data, [K].
+      width: deviation of each mode.
+    """
+    figure, axes = new_figure(8.8, 3.4, 1, len(walks), sharey=True, squeeze=False)
+    levels = np.asarray(sigmas)
+    place = np.arange(len(levels))
+    labels = [f"{level:.0f}" if level >= 10 else f"{level:.2g}" for level in levels]
+    for axis, (title, states) in zip(axes[0], walks.items(), strict=True):
+        for mode in modes:
+            axis.axhspan(mode - width, mode + width, color="#E6E6E6", linewidth=0, zorder=0)
+        scaled = states / np.sqrt(1.0 + levels**2)[:, None]
+        for walk in scaled.T:
+            color = PALETTE["purple" if walk[-1] > np.mean(modes) else "orange"]
+            axis.plot(place, walk, color=color, linewidth=1.2)
+            axis.plot(place[-1], walk[-1], "o", color=color, markersize=4)
+        axis.plot(place[0], scaled[0, 0], "o", color=PALETTE["black"], markersize=6, zorder=5)
+        axis.set_title(title)
+        axis.set_xticks(place, labels)
+        axis.set_xlabel("noise level σ")
+        axis.grid(axis="x", visible=False)
+    axes[0, 0].set_ylabel("x / √(1+σ²)")
+    return figure
+
+
+@styled
+def spread_left_figure(shares: Mapping[str, pd.DataFrame]):
+    """Draw how much of the data's variance the samples have, a panel for each choice of levels.
+
+    Args:
+      shares: title -> table with columns sampler, steps, exact (a line) and measured (marks).
+    """
+    figure, axes = new_figure(9.0, 3.3, 1, len(shares), sharey=True, squeeze=False)
+    for axis, (title, table) in zip(axes[0], shares.items(), strict=True):
+        for sampler, rows in table.groupby("sampler", sort=False):
+            color, marker = _SAMPLER_LOOKS[sampler]
+            axis.plot(rows["steps"], rows["exact"], color=color)
+            axis.plot(rows["steps"], rows["measured"], marker, color=color, markersize=6)
+            axis.plot([], [], color=color, marker=marker, markersize=6, label=sampler)
+        axis.axhline(1.0, color=PALETTE["black"], linestyle="--", linewidth=1.2)
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(sorted(table["steps"].unique()), sorted(table["steps"].unique()))
+        axis.set_ylim(-0.04, 1.1)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("steps N")
+    axes[0, 0].annotate("data", (1, 1.0), (0, 3), textcoords="offset points", fontsize=9)
+    axes[0, 0].set_ylabel("share of the data's variance")
+    axes[0, -1].legend(loc="lower right")
     return figure
 
 
 @styled
 def sample_histograms(data, samples: Mapping[str, np.ndarray]):
     """Draw histograms of samples over that of the data, a panel each; arrays [P]."""
-    figure, axes = new_figure(8.8, 2.6, 1, len(samples), sharex=True, squeeze=False)
+    figure, axes = new_figure(8.8, 2.8, 1, len(samples), sharex=True, squeeze=False)
     bins = np.linspace(-1.6, 1.6, 65)
     for axis, (title, values) in zip(axes[0], samples.items(), strict=True):
         weights = np.full(len(values), 1 / len(values))
@@ -247,7 +355,7 @@ def sample_histograms(data, samples: Mapping[str, np.ndarray]):
         axis.set_title(title)
         axis.set_xlabel("x")
     axes[0, 0].set_ylabel("share per bin")
-    axes[0, -1].legend()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
 
 
