@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import build_windows, fit_normaliser, seed_histories
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.models.camdm import CAMDMConfig
+from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.zoo import build_from_config
@@ -107,18 +110,25 @@ def tiny_packed(mirror_styles=("calm",)) -> PackedMotion:
     )
 
 
+_TINY = {
+    "channels": CHANNELS,
+    "num_styles": 2,
+    "window": WINDOW,
+    "num_history": HISTORY,
+    "latent_width": 8,
+    "depth": 1,
+}
+
+
 def tiny_config(**changes) -> F3AMDConfig:
     """The smallest network that still has every part."""
-    values = {
-        "channels": CHANNELS,
-        "num_styles": 2,
-        "window": WINDOW,
-        "num_history": HISTORY,
-        "latent_width": 8,
-        "depth": 1,
-        "num_kept_modes": WINDOW // 2 + 1,
-    }
-    return F3AMDConfig(**{**values, **changes})
+    return F3AMDConfig(**{**_TINY, "num_kept_modes": WINDOW // 2 + 1, **changes})
+
+
+def tiny_camdm(**changes) -> CAMDMConfig:
+    """The smallest CAMDM, told the four steps of its schedule."""
+    levels = tuple(VariancePreservingCosine(4).sigmas.tolist())
+    return CAMDMConfig(**{**_TINY, "num_heads": 2, "noise_levels": levels, **changes})
 
 
 @functools.cache
@@ -142,6 +152,20 @@ def evaluate(network, x_noisy, sigma, condition):
     """Encode and denoise under jit, which is compiled once per config and shape."""
     graph, state = nnx.split(network)
     return _evaluate(graph, state, x_noisy, sigma, condition)
+
+
+def draw(*shape, seed: int = 0):
+    """Normal numbers, float32."""
+    return jnp.asarray(np.random.default_rng(seed).standard_normal(shape), jnp.float32)
+
+
+def make_condition(batch: int = 2) -> Condition:
+    """A condition of random numbers for the tiny network."""
+    return Condition(
+        history=draw(batch, HISTORY, CHANNELS, seed=1),
+        path=draw(batch, WINDOW, 8, seed=2),
+        style=jnp.eye(2)[jnp.arange(batch) % 2],
+    )
 
 
 def tiny_windows(split: str = "train", packed: PackedMotion | None = None):

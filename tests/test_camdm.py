@@ -6,43 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, WINDOW, evaluate, network_of
+from builders import (
+    CHANNELS,
+    HISTORY,
+    WINDOW,
+    draw,
+    evaluate,
+    make_condition,
+    network_of,
+    tiny_camdm,
+)
 from flax import nnx
 
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.models import zoo
 from f3amd_lib.models.attention import position_code
 from f3amd_lib.models.camdm import CAMDMConfig, step_features
 from f3amd_lib.models.conditioning import Condition
 
-LEVELS = tuple(VariancePreservingCosine(4).sigmas.tolist())
-
-
-def tiny_camdm(**changes) -> CAMDMConfig:
-    values = {
-        "channels": CHANNELS,
-        "num_styles": 2,
-        "window": WINDOW,
-        "num_history": HISTORY,
-        "latent_width": 8,
-        "depth": 2,
-        "num_heads": 2,
-        "noise_levels": LEVELS,
-    }
-    return CAMDMConfig(**{**values, **changes})
-
-
-def draw(*shape, seed=0):
-    values = np.random.default_rng(seed).standard_normal(shape)
-    return jnp.asarray(values, jnp.float32)
-
-
-def make_condition(batch=2):
-    return Condition(
-        history=draw(batch, HISTORY, CHANNELS, seed=1),
-        path=draw(batch, WINDOW, 8, seed=2),
-        style=jnp.eye(2)[jnp.arange(batch) % 2],
-    )
+LEVELS = tiny_camdm().noise_levels
 
 
 def run(network, x_noisy, sigma, condition=None):
@@ -101,7 +82,7 @@ def test_tokens_by_hand():
 
 
 def test_answer_is_a_linear_layer_on_the_last_tokens():
-    network = network_of(tiny_camdm())
+    network = network_of(tiny_camdm(depth=2))
     stages = dict(network.stages(draw(2, WINDOW, CHANNELS), 1.0, network.encode(make_condition())))
     expected = network.output(stages["block 2"][:, -WINDOW:])
     np.testing.assert_allclose(stages["x0_hat"], expected, atol=1e-6)

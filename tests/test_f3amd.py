@@ -6,7 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, WINDOW, evaluate, network_of, tiny_config
+from builders import (
+    CHANNELS,
+    HISTORY,
+    WINDOW,
+    draw,
+    evaluate,
+    make_condition,
+    network_of,
+    tiny_config,
+)
 from flax import nnx
 
 from f3amd_lib.models.attention import position_code
@@ -14,19 +23,6 @@ from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.f3amd import F3AMDConfig
 
 SIGMA = jnp.array([0.3, 20.0])
-
-
-def draw(*shape, seed=0):
-    values = np.random.default_rng(seed).standard_normal(shape)
-    return jnp.asarray(values, jnp.float32)
-
-
-def make_condition(batch=2):
-    return Condition(
-        history=draw(batch, HISTORY, CHANNELS, seed=1),
-        path=draw(batch, WINDOW, 8, seed=2),
-        style=jnp.eye(2)[jnp.arange(batch) % 2],
-    )
 
 
 def make_network(**changes):

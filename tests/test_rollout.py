@@ -3,13 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_trained
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_camdm, tiny_trained
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.evaluation.paths import RootPath, named_path
 from f3amd_lib.evaluation.rollout import MotionGenerator
-from f3amd_lib.models.camdm import CAMDMConfig
 from f3amd_lib.motion.rotations import wrap_angle
 
 POSE = np.tile(np.float32([1, 0, 0, 0, 1, 0]), SKELETON.num_joints)
@@ -196,17 +195,7 @@ def test_noise_levels_are_those_of_training_unless_told(trained):
 
 def test_the_sampler_belongs_to_the_noise_that_the_model_was_trained_with():
     levels = VariancePreservingCosine(4)
-    config = CAMDMConfig(
-        channels=CHANNELS,
-        num_styles=2,
-        window=WINDOW,
-        num_history=HISTORY,
-        latent_width=8,
-        depth=1,
-        num_heads=2,
-        noise_levels=tuple(levels.sigmas.tolist()),
-    )
-    camdm = tiny_trained(config=config, diffusion=levels)
+    camdm = tiny_trained(config=tiny_camdm(), diffusion=levels)
     assert MotionGenerator(camdm, 2).sampler == "ddpm"
     assert MotionGenerator(tiny_trained(), 2).sampler == "ddim"
     np.testing.assert_array_equal(MotionGenerator(camdm, 4).sigmas[:-1], levels.sigmas[::-1])

@@ -20,7 +20,7 @@ from flax import nnx
 
 from f3amd_lib.models.attention import TransformerBlock, dropout, position_code
 from f3amd_lib.models.conditioning import Condition, noise_features
-from f3amd_lib.models.config import NetworkConfig, last_stage, scaled_input
+from f3amd_lib.models.config import Denoiser, NetworkConfig, scaled_input
 
 __all__ = ["CAMDMConfig", "CAMDM", "step_features"]
 
@@ -86,7 +86,7 @@ def step_features(step, width: int):
     return paired.reshape(*angle.shape[:-1], -1)[..., :width]
 
 
-class CAMDM(nnx.Module):
+class CAMDM(Denoiser):
     """Denoiser of Chen et al. 2024: conditions are tokens before the noisy frames."""
 
     def __init__(self, config: CAMDMConfig, *, rngs: nnx.Rngs):
@@ -178,20 +178,3 @@ class CAMDM(nnx.Module):
             z = block(z, key=None if key is None else jax.random.fold_in(key, number))
             yield f"block {number + 1}", z
         yield "x0_hat", self.output(z[:, -config.window :])
-
-    def __call__(self, x_noisy, sigma, context, key=None):
-        """Estimate the clean features (Eq. 1).
-
-        Args:
-          x_noisy: variance-exploding state, [B, T, C].
-          sigma: noise level, [B] or scalar, > 0.
-          context: from `encode`.
-          key: random key for dropout, in training; without one nothing is dropped.
-
-        Returns:
-          x0_hat, [B, T, C].
-
-        Raises:
-          ValueError: if x_noisy does not fit the config.
-        """
-        return last_stage(self.stages(x_noisy, sigma, context, key))

@@ -1,16 +1,17 @@
-"""What the configs of all networks have in common: checked fields that survive JSON."""
+"""What all networks have in common: checked configs that survive JSON, and one way to be called."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
+
+from flax import nnx
 
 from f3amd_lib.names import nearest_hint, refuse_unknown
 
-__all__ = ["NetworkConfig", "scaled_input", "last_stage"]
+__all__ = ["NetworkConfig", "Denoiser", "scaled_input"]
 
 _TYPES = {"int": int, "float": float, "bool": bool, "str": str}
 _TUPLE = "tuple[float, ...]"
@@ -133,7 +134,27 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
     return x_noisy * scale[:, None, None]
 
 
-def last_stage(stages: Iterable[tuple[str, Any]]):
-    """Return the value of the last of some named stages."""
-    *_, (_, value) = stages
-    return value
+class Denoiser(nnx.Module):
+    """What samplers, training and rollout ask of any network of the family.
+
+    A subclass has `config`, `encode(condition) -> context` (once a round) and `stages`, a generator
+    of (name, value) on the way from the noisy state to x0_hat, which comes last.
+    """
+
+    def __call__(self, x_noisy, sigma, context, key=None):
+        """Estimate the clean features (Eq. 1).
+
+        Args:
+          x_noisy: variance-exploding state, [B, T, C].
+          sigma: noise level, [B] or scalar, > 0.
+          context: from `encode`.
+          key: random key for dropout, in training; without one nothing is dropped.
+
+        Returns:
+          x0_hat, [B, T, C].
+
+        Raises:
+          ValueError: if x_noisy does not fit the config.
+        """
+        *_, (_, x0_hat) = self.stages(x_noisy, sigma, context, key)
+        return x0_hat

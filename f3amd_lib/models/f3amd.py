@@ -25,7 +25,7 @@ from f3amd_lib.models.conditioning import (
     Context,
     conditioning_layer,
 )
-from f3amd_lib.models.config import NetworkConfig, last_stage, scaled_input
+from f3amd_lib.models.config import Denoiser, NetworkConfig, scaled_input
 from f3amd_lib.models.spectral import SPECTRAL_VARIANTS, FNOBlock, cosine_basis, count_modes
 
 __all__ = ["F3AMDConfig", "F3AMD"]
@@ -113,7 +113,7 @@ class F3AMDConfig(NetworkConfig):
         return count_modes(self.spectral_variant, self.block_frames)
 
 
-class F3AMD(nnx.Module):
+class F3AMD(Denoiser):
     """Denoiser G of Eq. 1: noisy features, noise level and context in, clean features out."""
 
     def __init__(self, config: F3AMDConfig, *, rngs: nnx.Rngs):
@@ -234,20 +234,3 @@ class F3AMD(nnx.Module):
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)
         yield "x0_hat", x0_hat
-
-    def __call__(self, x_noisy, sigma, context, key=None):
-        """Estimate the clean features (Eq. 1).
-
-        Args:
-          x_noisy: variance-exploding state, [B, T, C].
-          sigma: noise level, [B] or scalar, > 0.
-          context: from `encode`.
-          key: random key for dropout, in training; without one nothing is dropped.
-
-        Returns:
-          x0_hat, [B, T, C].
-
-        Raises:
-          ValueError: if x_noisy does not fit the config.
-        """
-        return last_stage(self.stages(x_noisy, sigma, context, key))
