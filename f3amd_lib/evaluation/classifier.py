@@ -38,7 +38,13 @@ from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.names import nearest_hint, refuse_unknown
 from f3amd_lib.profiles import Profile, runs_dir
 from f3amd_lib.report.records import record_hash, run_record
-from f3amd_lib.training.checkpoints import load_tree, save_tree
+from f3amd_lib.training.checkpoints import (
+    describe_skeleton,
+    described_skeleton,
+    errors_name,
+    load_tree,
+    save_tree,
+)
 from f3amd_lib.training.loop import TrainingDiverged
 
 __all__ = [
@@ -898,9 +904,7 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "kind": "style classifier",
         "classifier": classifier.config.to_dict(),
         "styles": list(classifier.styles),
-        "joints": list(skeleton.names),
-        "parents": list(skeleton.parents),
-        "end_sites": [[joint, list(offset)] for joint, offset in skeleton.end_sites],
+        **describe_skeleton(skeleton),
         "held_out_accuracy": classifier.held_out_accuracy,
         "reference_windows": {
             split: len(reference.features) for split, reference in classifier.references.items()
@@ -916,19 +920,13 @@ def load_classifier(path: Path) -> StyleClassifier:
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    try:
+    with errors_name(path):
         tree, metadata = load_tree(path, _template)
-        skeleton = Skeleton(
-            tuple(metadata["joints"]),
-            tuple(metadata["parents"]),
-            np.asarray(tree["offsets"], np.float64),
-            tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
-        )
         return StyleClassifier(
             config=ClassifierConfig.from_dict(metadata["classifier"]),
             params=tree["params"],
             statistics=tree["statistics"],
-            skeleton=skeleton,
+            skeleton=described_skeleton(metadata, tree["offsets"]),
             styles=tuple(metadata["styles"]),
             held_out_accuracy=metadata["held_out_accuracy"],
             references={
@@ -937,11 +935,6 @@ def load_classifier(path: Path) -> StyleClassifier:
             },
             record=metadata["record"],
         )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: description lacks or garbles {error}") from None
-    except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
 def _template(metadata: dict) -> dict:

@@ -6,6 +6,7 @@ the name, so that a crash leaves the old file whole. Reading checks names, shape
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -32,6 +33,9 @@ __all__ = [
     "save_tree",
     "describe",
     "load_tree",
+    "errors_name",
+    "describe_skeleton",
+    "described_skeleton",
     "TrainedModel",
     "save_model",
     "load_model",
@@ -130,6 +134,38 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
 
 
+@contextlib.contextmanager
+def errors_name(path: Path):
+    """Let whatever goes wrong inside, reading a file's description, be an error that names it."""
+    try:
+        yield
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: description lacks or garbles {error}") from None
+    except ValueError as error:
+        text = str(error)
+        named = text if text.startswith(str(path)) else f"{path}: {text}"
+        raise (OutdatedFile if isinstance(error, OutdatedFile) else ValueError)(named) from None
+
+
+def describe_skeleton(skeleton: Skeleton) -> dict:
+    """Return a skeleton's names and tree as JSON-ready values; offsets go with the arrays."""
+    return {
+        "joints": list(skeleton.names),
+        "parents": list(skeleton.parents),
+        "end_sites": [[joint, list(offset)] for joint, offset in skeleton.end_sites],
+    }
+
+
+def described_skeleton(metadata: dict, offsets) -> Skeleton:
+    """Return the skeleton that `describe_skeleton` described, with its offsets [J, 3]."""
+    return Skeleton(
+        tuple(metadata["joints"]),
+        tuple(metadata["parents"]),
+        np.asarray(offsets, np.float64),
+        tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
+    )
+
+
 @dataclass(frozen=True)
 class TrainedModel:
     """A network ready to use: weights and all it needs to turn a path and a style into motion.
@@ -184,9 +220,7 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "model": trained.config.to_dict(),
         "styles": list(trained.styles),
         "diffusion": dataclasses.asdict(trained.diffusion),
-        "joints": list(trained.skeleton.names),
-        "parents": list(trained.skeleton.parents),
-        "end_sites": [[joint, list(offset)] for joint, offset in trained.skeleton.end_sites],
+        **describe_skeleton(trained.skeleton),
         "seed_shapes": {name: list(np.shape(seed)) for name, seed in trained.seeds.items()},
         "record": trained.record,
     }
@@ -199,31 +233,19 @@ def load_model(path: Path) -> TrainedModel:
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    try:
+    with errors_name(path):
         tree, metadata = load_tree(path, _model_template)
-        skeleton = Skeleton(
-            tuple(metadata["joints"]),
-            tuple(metadata["parents"]),
-            np.asarray(tree["offsets"], np.float64),
-            tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
-        )
         return TrainedModel(
             name=metadata["name"],
             config=config_from_dict(metadata["model"]),
             params=tree["params"],
             normaliser=Normaliser(**tree["normaliser"]),
-            skeleton=skeleton,
+            skeleton=described_skeleton(metadata, tree["offsets"]),
             styles=tuple(metadata["styles"]),
             diffusion=schedule_from_dict(metadata["diffusion"]),
             seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
             record=metadata["record"],
         )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: description lacks or garbles {error}") from None
-    except ValueError as error:
-        text = str(error)
-        named = text if text.startswith(str(path)) else f"{path}: {text}"
-        raise (OutdatedFile if isinstance(error, OutdatedFile) else ValueError)(named) from None
 
 
 def _model_template(metadata: dict) -> dict:
