@@ -1,0 +1,963 @@
+"""The claims ledger: every rule on made-up records, the paper's own tables, accepted verdicts."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from f3amd_lib.report import claims
+from f3amd_lib.report.ledger.evidence import (
+    NINE_METRICS,
+    Figure,
+    NotMeasured,
+    Setting,
+    difference,
+    mean_figure,
+    paper_evidence,
+    power_law,
+    ratio,
+    recorded_evidence,
+)
+from f3amd_lib.report.ledger.verdicts import (
+    CPU_COUNTS,
+    FAILS,
+    FEW,
+    HOLDS,
+    IN_PART,
+    LARGE_CROWD,
+    MANY,
+    OPEN,
+    REMARK,
+    SOME,
+    UNMEASURED,
+    VERDICTS,
+    combine,
+    every,
+    ordered,
+    within,
+)
+from f3amd_lib.report.records import write_table
+
+# --------------------------------------------------------------------------------- made-up records
+
+FNO, T64, CAMDM = "F3AMD-FNO-96", "F3AMD-Transformer-64", "CAMDM"
+GPU_FEW, GPU_MANY = (1, 2, 4, 8, 16), (32, 64, 128, 256, 512, 1024)
+
+
+def keep(root, tables, *, dataset="bandai", profile="laptop", **changes):
+    """Write tables (name -> rows) as records of a run."""
+    record = {
+        "dataset": dataset,
+        "profile": profile,
+        "seed": 0,
+        "device_platform": "gpu",
+        "device_kind": "Test GPU",
+        "cores": 2,
+    }
+    for name, rows in tables.items():
+        path = root / dataset / profile / "records" / f"{name}.csv"
+        write_table(path, pd.DataFrame(rows), {**record, **changes})
+    return root
+
+
+def judge(root, claim_id, datasets=("bandai", "synthetic"), profiles=("gpu", "laptop")):
+    evidences = {data: [recorded_evidence(root, data, p) for p in profiles] for data in datasets}
+    return claims.judge_claim(claims.find_claim(claim_id), evidences)
+
+
+def times(device, counts, *settings, spread=0.01):
+    """Rows of synthesis_time: each setting is (model, ms), or with steps, window, framework."""
+    rows = []
+    for model, value, *rest in settings:
+        steps, window, framework = (*rest, *(8, 32, "jax")[len(rest) :])
+        for count in counts:
+            ms = value(count) if callable(value) else value
+            rows.append(
+                {
+                    "model": model,
+                    "window_frames": window,
+                    "steps": steps,
+                    "framework": framework,
+                    "device": device,
+                    "characters": count,
+                    "unit": "ms",
+                    "value": ms,
+                    "low": ms * (1 - spread),
+                    "high": ms * (1 + spread),
+                }
+            )
+    return rows
+
+
+def synthesis(*parts):
+    return {"synthesis_time": [row for part in parts for row in part]}
+
+
+def training(*rows):
+    columns = ("model", "window_frames", "value", "peak_memory_mib")
+    fixed = {"device": "GPU", "batch_size": 512, "unit": "s"}
+    return [dict(zip(columns, row, strict=False)) | fixed for row in rows]
+
+
+BASE = {
+    "FID": 10.0,
+    "EMD": 16.0,
+    "style_coverage": 90.0,
+    "trajectory_error": 0.03,
+    "direction_error": 3.0,
+    "smoothness": 2.0,
+    "foot_sliding": 1.2,
+    "diversity": 20.0,
+    "IRD": 2.0,
+}
+
+
+def quality(model, *, steps=8, window=32, harm=1.0, half=0.01, **values):
+    """Rows of all nine metrics, `harm` times worse than usual, some replaced by `values`."""
+    rows = []
+    for metric, base in BASE.items():
+        unit, better = NINE_METRICS[metric]
+        value = values.get(metric, base / harm if better == "up" else base * harm)
+        rows.append(
+            {
+                "model": model,
+                "window_frames": window,
+                "steps": steps,
+                "metric": metric,
+                "unit": unit,
+                "value": value,
+                "low": value * (1 - half),
+                "high": value * (1 + half),
+                "repeats": 5,
+            }
+        )
+    return rows
+
+
+def qualities(*parts):
+    return {"quality": [row for part in parts for row in part]}
+
+
+def epochs(**reached):
+    """Curves over 100 epochs that come close to their best at a given epoch."""
+    models = {"fno": FNO, "camdm": CAMDM}
+    return {
+        "quality_by_epoch": [
+            {"model": models[key], "epoch": epoch, "metric": metric, "value": value}
+            for key, epoch_reached in reached.items()
+            for metric in ("held_out_loss", "style_coverage")
+            for epoch in range(1, 101)
+            for value in [
+                (1.0 if metric == "held_out_loss" else 90.0)
+                if epoch >= epoch_reached
+                else (2.0 if metric == "held_out_loss" else 40.0)
+            ]
+        ]
+    }
+
+
+def spectrum(fno, transformer):
+    """Power of toes over real; lower bands are those of real motion."""
+    return {
+        "foot_spectrum": [
+            {
+                "model": model,
+                "window_frames": 32,
+                "steps": 8,
+                "band": band,
+                "metric": metric,
+                "value": power,
+                "low": 0.95 * power,
+                "high": 1.05 * power,
+            }
+            for model, fine in ((FNO, fno), (T64, transformer))
+            for band, power in (("0.5-2 Hz", 1.0), ("2-5 Hz", 1.0), ("5-15 Hz", fine))
+            for metric in ("toe_power", "toe_power_over_real")
+        ]
+    }
+
+
+def rounds(growth):
+    wobble = np.random.default_rng(0).normal(1.0, 0.01, 80)
+    return {
+        "quality_by_round": [
+            {
+                "model": FNO,
+                "window_frames": 32,
+                "steps": 8,
+                "metric": metric,
+                "round": number + 1,
+                "value": wobble[number] * (1 + growth * number / 80),
+            }
+            for metric in ("gap_m", "FID", "worst_gap_m")
+            for number in range(80)
+        ]
+    }
+
+
+def graded(emd, fid):
+    return {
+        "corruptions": [
+            {"corruption": name, "strength": strength, "metric": metric, "value": value}
+            for name in ("noisy motion", "frozen pose")
+            for metric, values in (("EMD", emd), ("FID", fid))
+            for strength, value in zip((0.0, 0.5, 1.0), values, strict=True)
+        ]
+    }
+
+
+def x0_errors(fno, ve, vp):
+    levels = (0.01, 0.1, 1.0, 10.0, 128.0)
+    return {
+        "x0_by_sigma": [
+            {"model": model, "sigma": sigma, "x0_error": error}
+            for model, errors in ((FNO, fno), ("CAMDM-VE", ve), (CAMDM, vp))
+            for sigma, error in zip(levels, errors, strict=True)
+        ]
+    }
+
+
+def gradient(values):
+    return {
+        "gradient_norm": [
+            {"sigma": sigma, "value": value}
+            for sigma, value in zip((0.01, 0.1, 1.0, 10.0, 50.0, 128.0), values, strict=True)
+        ]
+    }
+
+
+def crowds(fno, t64):
+    return synthesis(
+        *(times(device, counts, (FNO, fno), (T64, t64)) for device, counts in LARGE_CROWD.items())
+    )
+
+
+def steps_times(gains):
+    """FNO-96 with 8 and 1 steps; gains by (device, characters)."""
+    return synthesis(
+        *(
+            times(device, (count,), (FNO, 100.0), (FNO, 100.0 / gain, 1))
+            for (device, count), gain in gains.items()
+        )
+    )
+
+
+def over_steps(exponents):
+    """FNO-96 at all steps, time = steps^p; p by (device, characters)."""
+    return synthesis(
+        *(
+            times(device, (count,), *((FNO, 10.0 * n**p, n) for n in (8, 4, 2, 1)), spread=0.001)
+            for (device, count), p in exponents.items()
+        )
+    )
+
+
+def modes(few, some, many):
+    """FNO-96 and m = 4, which saves so many percent."""
+    parts = ((FEW, few), (SOME, some), (MANY, many))
+    return synthesis(
+        *(
+            times("GPU", counts, (FNO, 100.0), (f"{FNO}-m4", 100.0 - saved), spread=0.001)
+            for counts, saved in parts
+        )
+    )
+
+
+def conditioning(concatenation, cross_attention, adaln):
+    others = {
+        "concatenation": concatenation,
+        "cross-attention": cross_attention,
+        "AdaLN-zero": adaln,
+    }
+    settings = [(f"{FNO}-{kind}", 100.0 * factor) for kind, factor in others.items()]
+    return synthesis(times("GPU", (1024,), (FNO, 100.0), *settings))
+
+
+def frameworks(gpu_few, gpu_many, cpu):
+    """CAMDM in both; figures are JAX over PyTorch."""
+    parts = (("GPU", GPU_FEW, gpu_few), ("GPU", GPU_MANY, gpu_many), ("CPU", CPU_COUNTS, cpu))
+    return synthesis(
+        *(
+            times(device, counts, (CAMDM, 100.0 * factor), (CAMDM, 100.0, 8, 32, "torch"))
+            for device, counts, factor in parts
+        )
+    )
+
+
+def headline(camdm, fno_8, fno_1):
+    return synthesis(
+        *(
+            times(device, (crowd,), (CAMDM, camdm), (FNO, fno_8), (FNO, fno_1, 1))
+            for device, crowd in (("GPU", 1024), ("CPU", 32))
+        )
+    )
+
+
+def widths(time, train, memory):
+    """FNO-128 over FNO-32."""
+    small, large = "F3AMD-FNO-32", "F3AMD-FNO-128"
+    pairs = ((small, 10.0), (large, 10.0 * time))
+    return {
+        **synthesis(times("GPU", (1024,), *pairs), times("CPU", (32,), *pairs)),
+        "training_time": training((small, 32, 1.0, 1000.0), (large, 32, train, 1000.0 * memory)),
+    }
+
+
+def small_against_many(fno_4_8, fno_16_32, transformer):
+    return synthesis(
+        times("CPU", CPU_COUNTS, (CAMDM, 100.0), (T64, 100.0 / transformer)),
+        times("CPU", (4, 8), (FNO, 100.0 / fno_4_8)),
+        times("CPU", (16, 32), (FNO, 100.0 / fno_16_32)),
+    )
+
+
+def variants(names, harm):
+    return qualities(quality(FNO), *(quality(name, harm=harm) for name in names))
+
+
+OTHER_FNO = ("F3AMD-DCT-96", "F3AMD-weighted-FNO-96", "F3AMD-reduced-rank-FNO-96")
+KINDS = [f"{FNO}-{kind}" for kind in ("concatenation", "AdaLN-zero", "cross-attention")]
+MODES = [f"{FNO}-m{m}" for m in (14, 12, 8, 4)]
+
+# Claim -> (tables for which it must hold, tables for which it must not).
+CASES = {
+    "E1": (
+        synthesis(
+            times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)),
+            times("GPU", (1024,), (CAMDM, 500.0), (FNO, 100.0)),
+        ),
+        synthesis(
+            times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)),
+            times("GPU", (1024,), (CAMDM, 150.0), (FNO, 100.0)),
+        ),
+    ),
+    "E2": (
+        synthesis(times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))),
+        synthesis(times("GPU", (1024,), (CAMDM, 200.0), (T64, 100.0))),
+    ),
+    "E3": (
+        synthesis(times("GPU", (1024,), (CAMDM, 500, 8, 64), (FNO, 125, 8, 64), (T64, 200, 8, 64))),
+        synthesis(times("GPU", (1024,), (CAMDM, 500, 8, 64), (FNO, 300, 8, 64), (T64, 400, 8, 64))),
+    ),
+    "E4": (small_against_many(6.0, 3.5, 2.5), small_against_many(3.0, 2.0, 1.5)),
+    "E5": (crowds(85.0, 100.0), crowds(100.0, 85.0)),
+    "E6": (
+        {
+            "training_time": training(
+                (CAMDM, 32, 2.5), (FNO, 32, 1.0), (CAMDM, 64, 3.4), (FNO, 64, 1)
+            )
+        },
+        {
+            "training_time": training(
+                (CAMDM, 32, 1.0), (FNO, 32, 1.0), (CAMDM, 64, 1.0), (FNO, 64, 1)
+            )
+        },
+    ),
+    "E7": (
+        steps_times({("CPU", 1): 6.4, ("CPU", 32): 3.4, ("GPU", 1): 2.9, ("GPU", 1024): 6.5}),
+        steps_times({("CPU", 1): 5.0, ("CPU", 32): 2.0, ("GPU", 1): 2.0, ("GPU", 1024): 5.0}),
+    ),
+    "E8": (
+        synthesis(
+            times("GPU", (16,), (CAMDM, 40.0), (FNO, 10.0, 1)),
+            times("GPU", (1024,), (CAMDM, 250.0), (FNO, 10.0, 1)),
+            times("CPU", CPU_COUNTS, (CAMDM, 150.0), (FNO, 10.0, 1)),
+        ),
+        synthesis(
+            times("GPU", (16,), (CAMDM, 30.0), (FNO, 10.0, 1)),
+            times("GPU", (1024,), (CAMDM, 150.0), (FNO, 10.0, 1)),
+            times("CPU", CPU_COUNTS, (CAMDM, 80.0), (FNO, 10.0, 1)),
+        ),
+    ),
+    "E9": (modes(3.5, 8.0, 15.5), modes(-5.0, 2.0, 5.0)),
+    "E10": (conditioning(2.0, 1.32, 1.09), conditioning(1.5, 1.0, 0.9)),
+    "E11": (frameworks(1.1, 0.9, 3.0), frameworks(0.5, 2.0, 0.5)),
+    "E12": (headline(88.0, 22.0, 4.3), headline(88.0, 50.0, 20.0)),
+    "E13": (epochs(fno=30, camdm=40), epochs(fno=40, camdm=30)),
+    "E14": (
+        synthesis(
+            times(
+                "GPU",
+                FEW,
+                *((f"F3AMD-{k}-{w}", 5) for k in ("FNO", "Transformer") for w in (64, 96)),
+            )
+        ),
+        synthesis(
+            times(
+                "GPU",
+                FEW,
+                *(
+                    (f"F3AMD-{k}-{w}", t)
+                    for k, t in (("FNO", 5), ("Transformer", 8))
+                    for w in (64, 96)
+                ),
+            )
+        ),
+    ),
+    "E15": (
+        over_steps({("GPU", 1): 0.5, ("GPU", 1024): 0.95, ("CPU", 1): 0.6, ("CPU", 32): 0.9}),
+        over_steps({("GPU", 1): 0.9, ("GPU", 1024): 0.5, ("CPU", 1): 0.9, ("CPU", 32): 0.6}),
+    ),
+    "E16": (widths(2.5, 2.5, 3.0), widths(1.2, 1.0, 0.9)),
+    "E17": (modes(1.0, 5.0, 12.0), modes(1.0, 2.0, 4.0)),
+    "Q1": (
+        qualities(quality(FNO, half=0.001), quality(T64, EMD=16.4), quality(CAMDM, EMD=16.2)),
+        qualities(quality(FNO, half=0.001), quality(T64, EMD=20.0), quality(CAMDM, EMD=16.2)),
+    ),
+    "Q2": (
+        qualities(quality(T64), quality("F3AMD-FNO-64", IRD=1.0, FID=15.0, style_coverage=80.0)),
+        qualities(quality(T64), quality("F3AMD-FNO-64", IRD=3.0, FID=5.0, style_coverage=95.0)),
+    ),
+    "Q3": (
+        qualities(quality(FNO), quality(T64), quality(CAMDM, FID=8.0, IRD=4.0)),
+        qualities(quality(FNO), quality(T64), quality(CAMDM, FID=12.0, IRD=1.0)),
+    ),
+    "Q4": (
+        qualities(
+            quality(FNO),
+            quality(FNO, window=64, harm=1.2),
+            quality(CAMDM),
+            quality(CAMDM, window=64, FID=40.0),
+        ),
+        qualities(
+            quality(FNO),
+            quality(FNO, window=64, harm=2.0),
+            quality(CAMDM),
+            quality(CAMDM, window=64),
+        ),
+    ),
+    "Q5": (
+        qualities(quality(FNO), *(quality(FNO, steps=n, harm=1.03) for n in (4, 2, 1))),
+        qualities(quality(FNO), *(quality(FNO, steps=n, harm=1.5) for n in (4, 2, 1))),
+    ),
+    "Q6": (
+        qualities(
+            *(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.1), (2, 1.6), (1, 3)))
+        ),
+        qualities(
+            *(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.6), (2, 1.0), (1, 1)))
+        ),
+    ),
+    "Q7": (
+        {
+            **qualities(quality(CAMDM), quality("CAMDM-VE", steps=1, harm=1.1)),
+            **synthesis(times("CPU", (32,), (CAMDM, 100.0), ("CAMDM-VE", 20.0, 1))),
+        },
+        {
+            **qualities(quality(CAMDM), quality("CAMDM-VE", steps=1, harm=2.0)),
+            **synthesis(times("CPU", (32,), (CAMDM, 100.0), ("CAMDM-VE", 60.0, 1))),
+        },
+    ),
+    "Q8": (
+        qualities(quality(FNO), quality(f"{FNO}-linear", style_coverage=80.0, diversity=10.0)),
+        qualities(quality(FNO), quality(f"{FNO}-linear", style_coverage=95.0, diversity=25.0)),
+    ),
+    "Q9": (
+        qualities(
+            quality(FNO), quality(f"{FNO}-m1", harm=2.0), *(quality(m, harm=1.1) for m in MODES)
+        ),
+        qualities(
+            quality(FNO), quality(f"{FNO}-m1", harm=0.5), *(quality(m, harm=2.0) for m in MODES)
+        ),
+    ),
+    "Q10": (variants(OTHER_FNO, 1.1), variants(OTHER_FNO, 2.0)),
+    "Q11": (variants(KINDS, 0.9), variants(KINDS, 0.5)),
+    "Q12": (
+        qualities(quality(FNO), quality("CAMDM-96", style_coverage=14.0, EMD=40.0)),
+        qualities(quality(FNO), quality("CAMDM-96", style_coverage=80.0, EMD=17.0)),
+    ),
+    "Q13": (
+        qualities(quality(FNO), quality(f"{FNO}-no-IRD", IRD=4.0)),
+        qualities(quality(FNO), quality(f"{FNO}-no-IRD", IRD=1.5)),
+    ),
+    "Q14": (
+        qualities(quality(FNO), quality(FNO, steps=1, diversity=15.0)),
+        qualities(quality(FNO), quality(FNO, steps=1, diversity=0.1)),
+    ),
+    "Q15": (spectrum(0.5, 0.9), spectrum(1.1, 0.9)),
+    "Q16": (rounds(0.8), rounds(-0.2)),
+    "Q17": (
+        qualities(
+            quality(CAMDM, smoothness=3.0),
+            quality("CAMDM published", trajectory_error=0.1, direction_error=9.0, IRD=4.0),
+        ),
+        qualities(
+            quality(CAMDM, smoothness=1.0),
+            quality("CAMDM published", trajectory_error=0.01, direction_error=1.0, IRD=1.0),
+        ),
+    ),
+    "Q18": (graded((1, 2, 3), (1, 3, 2)), graded((3, 1, 2), (1, 2, 3))),
+    "T4": (
+        x0_errors((1, 1, 1, 1.2, 1.5), (1, 1, 1, 1.2, 1.5), (0.1, 0.5, 1, 2, 3)),
+        x0_errors((0.1, 0.5, 1, 2, 3), (0.1, 0.5, 1, 2, 3), (1, 1, 1, 1.2, 1.5)),
+    ),
+    "T5": (gradient((1, 1, 1.5, 2, 3, 3)), gradient((3, 3, 2, 2, 1, 1))),
+}
+
+RECORDED = [claim.id for claim in claims.CLAIMS if not claim.computed]
+
+
+def test_every_recorded_claim_has_a_case():
+    assert set(CASES) == set(RECORDED)
+
+
+@pytest.mark.parametrize("claim_id", RECORDED)
+@pytest.mark.parametrize("wanted", [HOLDS, FAILS])
+def test_each_rule_holds_and_fails_on_made_up_records(tmp_path, claim_id, wanted):
+    tables = CASES[claim_id][wanted == FAILS]
+    judgement = judge(keep(tmp_path, tables), claim_id)
+    shown = [(s.says, s.verdict, s.figure) for s in judgement.ours]
+    assert judgement.verdict == wanted, shown
+    assert judgement.dataset == "bandai"
+    assert all(s.sources for s in judgement.ours if s.verdict not in (UNMEASURED, REMARK))
+
+
+@pytest.mark.parametrize("claim_id", RECORDED)
+def test_each_rule_says_why_nothing_was_measured(tmp_path, claim_id):
+    judgement = judge(tmp_path, claim_id)
+    assert judgement.verdict == UNMEASURED and judgement.dataset == ""
+    assert all(s.figure.endswith(".csv yet") for s in judgement.ours)
+
+
+RESTING_ON_FNO_96 = [
+    claim_id
+    for claim_id in RECORDED
+    if any(row.get("model") == FNO for rows in CASES[claim_id][0].values() for row in rows)
+]
+
+
+@pytest.mark.parametrize("claim_id", RESTING_ON_FNO_96)
+def test_models_of_ours_decide_nothing_of_the_papers(tmp_path, claim_id):
+    """With the -plus preset in place of the paper's, no claim holds any more."""
+    tables = {
+        name: [{**row, "model": f"{FNO}-plus"} if row["model"] == FNO else row for row in rows]
+        for name, rows in CASES[claim_id][0].items()
+    }
+    judgement = judge(keep(tmp_path, tables), claim_id)
+    assert judgement.verdict in (UNMEASURED, IN_PART)
+    assert any(s.verdict == UNMEASURED and FNO in s.figure for s in judgement.ours)
+
+
+# --------------------------------------------------------------------------- figures and verdicts
+
+
+def test_ratio_and_difference_recover_intervals():
+    """Of two normal means, the interval of the difference is known: squares add up."""
+    first, second = Figure.of(10.0, 7.0, 13.0), Figure.of(4.0, 0.0, 8.0)
+    assert difference(first, second) == Figure(6.0, 1.0, 11.0)
+    one = Figure.of(np.e**2, np.e ** (2 - 0.3), np.e ** (2 + 0.3))
+    other = Figure.of(np.e, np.e ** (1 - 0.4), np.e ** (1 + 0.4))
+    found = ratio(one, other)
+    assert np.allclose([found.value, found.low, found.high], np.exp([1.0, 0.5, 1.5]))
+
+
+def test_ratios_with_zero_are_told_apart():
+    nothing, some = Figure.of(0.0), Figure.of(2.0, 1.0, 4.0)
+    assert ratio(nothing, some) == Figure(0.0, 0.0, 0.0)
+    assert ratio(some, nothing).value == np.inf and ratio(nothing, nothing).value == 1.0
+    reaching = ratio(Figure.of(1.0, -0.5, 2.5), some)
+    assert reaching.low == 0.0 and reaching.value == 0.5
+    with pytest.raises(ValueError, match="means nothing"):
+        ratio(Figure.of(-1.0), some)
+
+
+def test_power_law_and_mean():
+    times_ = [Figure.of(3.0 * n**0.7) for n in (8, 4, 2, 1)]
+    assert power_law((8, 4, 2, 1), times_).value == pytest.approx(0.7)
+    wide = [Figure.of(f.value, 0.9 * f.value, 1.1 * f.value) for f in times_]
+    fitted = power_law((8, 4, 2, 1), wide)
+    assert fitted.low < 0.7 < fitted.high and fitted.high - fitted.low < 0.4
+    assert mean_figure([Figure.of(2.0), Figure.of(8.0)]).value == pytest.approx(4.0)
+
+
+def test_figures_refuse_what_is_no_interval():
+    assert Figure.of(2.0) == Figure(2.0, 2.0, 2.0)
+    for broken in ((float("nan"),), (1.0, 1.5, 2.0), (float("inf"),)):
+        with pytest.raises(ValueError, match="low <= value <= high"):
+            Figure.of(*broken)
+
+
+@pytest.mark.parametrize(
+    ("figure", "gain", "verdict"),
+    [
+        (Figure.of(3.5, 2.0, 5.0), False, HOLDS),  # the figure itself supports it
+        (Figure.of(2.0, 1.5, 2.5), False, FAILS),
+        (Figure.of(2.9, 2.5, 3.3), False, OPEN),
+        (Figure.of(6.0, 5.5, 6.5), False, FAILS),
+        (Figure.of(6.0, 5.5, 6.5), True, IN_PART),
+        (Figure.of(4.1, 3.9, 4.3), True, OPEN),
+    ],
+)
+def test_a_stated_range(figure, gain, verdict):
+    assert within(figure, (3.0, 4.0), gain=gain) == verdict
+
+
+def test_an_order_needs_an_interval_that_leaves_out_1():
+    assert ordered(Figure.of(1.2, 1.1, 1.3)) == HOLDS
+    assert ordered(Figure.of(0.8, 0.7, 0.9)) == FAILS
+    assert ordered(Figure.of(1.2, 0.9, 1.5)) == ordered(Figure.of(1.0)) == OPEN
+
+
+@pytest.mark.parametrize(
+    ("parts", "verdict"),
+    [
+        ([HOLDS, HOLDS, REMARK], HOLDS),
+        ([HOLDS, FAILS], IN_PART),
+        ([HOLDS, UNMEASURED], IN_PART),
+        ([HOLDS, OPEN], IN_PART),
+        ([IN_PART], IN_PART),
+        ([FAILS, OPEN, UNMEASURED], FAILS),
+        ([OPEN, UNMEASURED], OPEN),
+        ([UNMEASURED, REMARK], UNMEASURED),
+        ([], UNMEASURED),
+    ],
+)
+def test_a_claim_follows_from_its_statements(parts, verdict):
+    assert combine(parts) == verdict
+    assert every([HOLDS, IN_PART]) == IN_PART and every([HOLDS, OPEN, FAILS]) == FAILS
+
+
+@pytest.mark.parametrize("claim_id", ["Q3", "Q8", "Q13"])
+def test_a_difference_inside_its_interval_cannot_be_told_apart(tmp_path, claim_id):
+    rows = [
+        {**row, "low": 0.3 * row["value"], "high": 1.7 * row["value"]}
+        for row in CASES[claim_id][0]["quality"]
+    ]
+    assert judge(keep(tmp_path, {"quality": rows}), claim_id).verdict == OPEN
+
+
+def test_a_larger_gain_than_stated_holds_in_part(tmp_path):
+    judgement = judge(keep(tmp_path, conditioning(4.0, 1.32, 1.09)), "E10")
+    assert judgement.verdict == IN_PART
+    assert [s.verdict for s in judgement.ours] == [IN_PART, HOLDS, HOLDS]
+
+
+def test_a_run_that_still_gets_better_tells_nothing_of_convergence(tmp_path):
+    judgement = judge(keep(tmp_path, epochs(fno=30, camdm=99)), "E13")
+    assert judgement.verdict == UNMEASURED
+    assert "CAMDM was still getting better at the last epoch, 100" in judgement.ours[0].figure
+
+
+# ------------------------------------------------------------------------- whose records decide
+
+
+def test_gpu_claims_are_decided_by_gpu_rows(tmp_path):
+    root = keep(tmp_path, {"synthesis_time": times("CPU", (1024,), (CAMDM, 300.0), (T64, 100.0))})
+    judgement = judge(root, "E2")
+    assert judgement.verdict == UNMEASURED
+    assert judgement.ours[0].figure == "synthesis_time.csv has no rows of a GPU"
+
+
+def test_one_claim_may_rest_on_a_gpu_run_and_a_laptop_run(tmp_path):
+    rows = crowds(85.0, 100.0)["synthesis_time"]
+    for device, profile in (("GPU", "gpu"), ("CPU", "laptop")):
+        mine = [row for row in rows if row["device"] == device]
+        platform = {"device_platform": "cpu", "device_kind": "cpu"} if device == "CPU" else {}
+        keep(tmp_path, {"synthesis_time": mine}, profile=profile, **platform)
+    judgement = judge(tmp_path, "E5")
+    assert judgement.verdict == HOLDS
+    row = claims.ledger(judgements=[judgement]).iloc[0]
+    assert row["hardware"] == "Test GPU; CPU, 2 cores"
+    assert row["record"].startswith("bandai/gpu/records/synthesis_time.csv (")
+    assert "bandai/laptop/records/synthesis_time.csv (" in row["record"]
+
+
+def test_real_motion_decides_before_synthetic(tmp_path):
+    holds, fails = CASES["Q13"]
+    keep(tmp_path, holds, dataset="synthetic")
+    judgement = judge(tmp_path, "Q13")
+    assert judgement.verdict == HOLDS
+    labelled = claims.ledger(judgements=[judgement]).iloc[0]["dataset"]
+    assert labelled == "synthetic (procedural, no real motion)"
+    keep(tmp_path, fails, dataset="bandai")
+    assert judge(tmp_path, "Q13").verdict == FAILS
+    assert judge(tmp_path, "Q13", datasets=("synthetic",)).verdict == HOLDS
+
+
+def test_the_reason_is_the_row_that_is_missing(tmp_path):
+    keep(tmp_path, qualities(quality(FNO)), dataset="synthetic")
+    judgement = judge(tmp_path, "Q13")
+    wanted = "quality.csv has no F3AMD-FNO-96-no-IRD, 32 frames, 8 steps, IRD"
+    assert judgement.ours[0].figure == wanted
+    assert claims.ledger(judgements=[judgement]).iloc[0]["ours"] == wanted
+
+
+def test_undefined_figures_are_not_measured(tmp_path):
+    rows = CASES["Q13"][0]["quality"]
+    rows = [{**row, "value": float("nan")} if row["metric"] == "IRD" else row for row in rows]
+    assert judge(keep(tmp_path, {"quality": rows}), "Q13").verdict == UNMEASURED
+
+
+GOOD = CASES["Q13"][0]["quality"]
+ON_GPU = times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))
+
+
+@pytest.mark.parametrize(
+    ("claim_id", "tables", "changes", "message"),
+    [
+        ("Q13", {"quality": GOOD + GOOD[:1]}, {}, "two rows of"),
+        ("Q13", {"quality": [{**GOOD[0], "model": "FNO-96"}]}, {}, "unknown model 'FNO-96'"),
+        (
+            "Q13",
+            {"quality": [{**GOOD[3], "unit": "cm"}]},
+            {},
+            "trajectory_error is in cm, not in m",
+        ),
+        ("Q13", {"quality": [{"model": FNO, "value": 1.0}]}, {}, "needs a column 'window_frames'"),
+        ("E2", {"synthesis_time": ON_GPU}, {"device_platform": "cpu"}, "knows only a CPU"),
+        (
+            "E2",
+            {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]},
+            {},
+            "device must be CPU or GPU",
+        ),
+        ("Q13", {"quality": [{**GOOD[-1], "low": 9.0}]}, {}, "outside its interval"),
+    ],
+)
+def test_a_broken_table_is_an_error(tmp_path, claim_id, tables, changes, message):
+    keep(tmp_path, tables, **changes)
+    with pytest.raises(ValueError, match=message):
+        judge(tmp_path, claim_id)
+
+
+def test_a_foreign_or_lost_record_is_an_error(tmp_path):
+    keep(tmp_path, CASES["Q13"][0], dataset="synthetic")
+    (tmp_path / "synthetic").rename(tmp_path / "bandai")
+    with pytest.raises(ValueError, match="record of dataset 'synthetic', yet lies among"):
+        judge(tmp_path, "Q13")
+    record = tmp_path / "bandai" / "laptop" / "records" / "quality.json"
+    text = record.read_text()
+    record.unlink()
+    with pytest.raises(ValueError, match="has no run record"):
+        judge(tmp_path, "Q13")
+    record.write_text(text)
+    table = record.with_suffix(".csv")
+    table.write_text(table.read_text().replace("4.0", "0.4"))
+    with pytest.raises(ValueError, match="not the table that"):
+        judge(tmp_path, "Q13")
+
+
+def test_unknown_names_and_smoke_runs_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="unknown profile 'smoke'"):
+        claims.judge_claims(tmp_path, profile="smoke")
+    with pytest.raises(ValueError, match="unknown data set 'bandi'; did you mean 'bandai'"):
+        claims.judge_claims(tmp_path, dataset="bandi")
+    with pytest.raises(ValueError, match="unknown claim 'E18'"):
+        claims.find_claim("E18")
+
+
+# ----------------------------------------------------------------------- the paper's own tables
+
+
+def paper_figures(claim_id):
+    """Verdict and all figures of a claim, from the paper's tables."""
+    statements = [s for s in claims.find_claim(claim_id).rule(paper_evidence())]
+    judged = [s for s in statements if not (s.optional and s.verdict == UNMEASURED)]
+    return combine(s.verdict for s in judged), {s.says: s.figure for s in judged}
+
+
+# Claim -> verdict and figures that the paper's own tables give.
+PAPERS_OWN = {
+    "E1": (
+        HOLDS,
+        {
+            "GPU, 16 characters": "1.39 to 1.88x",
+            "GPU, FNO-96 with 8 steps": "above 4 at 128, 256, 1,024",
+        },
+    ),
+    "E4": (
+        IN_PART,
+        {
+            "CPU, FNO-96 at 4 to 8": "4.43 to 4.71x",
+            "CPU, FNO-96 at 16 to 32": "2.76 to 4.04x",
+            "CPU, 1 to 32 characters: Transformer 2 to 3 times": "1.71 to 6.57x, 10 of 30 in the "
+            "range",
+        },
+    ),
+    "E5": (
+        HOLDS,
+        {
+            "GPU, 128 to 1,024 characters: 10 to 22 % less time": "9.28 to 20.8 %",
+            "CPU, 16 to 32 characters: 10 to 22 % less time": "9.68 to 22.8 %",
+        },
+    ),
+    "E7": (IN_PART, {"CPU, 32 characters: about 3.4 times": "3.76x"}),
+    "E8": (HOLDS, {"CPU, 1 to 32 characters: 10 to 20 times": "9.77 to 21x"}),
+    "E11": (
+        IN_PART,
+        {
+            "CPU, 32 characters": "JAX / PyTorch 1.8",
+            "GPU, 1 to 16 characters: alike within a fifth": "JAX / PyTorch 0.346 to 0.717, 0 of "
+            "5 in the range",
+        },
+    ),
+    "E12": (
+        IN_PART,
+        {
+            "GPU, FNO-96 with 1 step": "above 20 at 256, 512, 1,024",
+            "CPU, FNO-96 with 1 step": "above 20 at 8",
+            "CPU, 32 characters: over 20 times": "10.4x",
+            "CPU, F3AMD-FNO-96 (1 step) against CAMDM in PyTorch": "3.63 to 5.77x",
+            "CPU, F3AMD-FNO-96 (8 steps) against CAMDM in PyTorch": "0.639 to 1.53x, slower at "
+            "1, 2, 4",
+        },
+    ),
+    "E15": (IN_PART, {"CPU, 8 -> 1 steps": "6.44x at 1 and 3.76x at 32"}),
+    "Q2": (
+        IN_PART,
+        {
+            "32 frames: FNO has the better IRD": "yes at D = 32, 48, 96, 128, no at D = 64",
+            "64 frames: FNO has the better IRD": "yes at D = 64, no at D = 96, 128",
+        },
+    ),
+    "Q4": (IN_PART, {"IRD is lower with 64 frames": "in 4 of 6 models"}),
+    "Q5": (
+        HOLDS,
+        {
+            "FNO-96 at 4, 2 and 1 steps: every metric within 10 % of 8 steps": "9 of 9 metrics; "
+            "largest change: IRD -3.68 % at 2 steps",
+            "largest change from one number of steps to the next": "8 to 4 0.056 %, 4 to 2 3.6 %, "
+            "2 to 1 0.058 %",
+        },
+    ),
+    "Q9": (
+        IN_PART,
+        {
+            "m = 1 is worse than m = 17, metric by metric": "worse in 6 of 9, better in EMD, "
+            "direction_error, smoothness",
+        },
+    ),
+    "Q11": (
+        IN_PART,
+        {"FiLM is last of the four in": "FID, EMD, style_coverage, trajectory_error"},
+    ),
+    "Q13": (UNMEASURED, {}),
+    "Q17": (HOLDS, {}),
+}
+
+
+@pytest.mark.parametrize("claim_id", PAPERS_OWN)
+def test_what_the_papers_own_tables_say(claim_id):
+    verdict, figures = PAPERS_OWN[claim_id]
+    found_verdict, found = paper_figures(claim_id)
+    assert found_verdict == verdict
+    assert {says: found[says] for says in figures} == figures
+
+
+@pytest.mark.parametrize(
+    ("claim_id", "parts"),
+    [
+        ("E5", ["9.28", "22.8 %"]),
+        ("Q4", ["trajectory_error 18x (F3AMD-FNO-64)", "FID +60.5 % (F3AMD-Transformer-64)"]),
+        ("Q9", ["trajectory_error 3.43x"]),
+        ("Q10", ["IRD 2.05x (F3AMD-DCT-96 over F3AMD-reduced-rank-FNO-96)"]),
+    ],
+)
+def test_outliers_in_the_papers_own_tables(claim_id, parts):
+    told = " ".join(paper_figures(claim_id)[1].values())
+    assert [part for part in parts if part not in told] == []
+
+
+def test_the_paper_is_read_like_our_records():
+    paper = paper_evidence()
+    assert paper.time(Setting(CAMDM), "GPU", 16).value == 8.95
+    assert paper.time(Setting("CAMDM-code"), "CPU", 1, "torch").value == 34.58
+    assert paper.time(Setting(f"{FNO}-concatenation"), "GPU", 1024).value == 183.39
+    assert paper.quality(Setting(f"{FNO}-m14"), "IRD").value == 3.131
+    assert paper.training(FNO, 512, 64).value == 6.48
+    with pytest.raises(NotMeasured, match="the paper prints no CAMDM, 64 frames, 8 steps, FID"):
+        paper.quality(Setting(CAMDM, window=64), "FID")
+
+
+# ------------------------------------------------------------------------------ computed claims
+
+
+def test_computed_claims_need_no_records(tmp_path):
+    """VE is VP; the update holds with rescaling only; convolutions are left out of the cost."""
+    t1, t2, t3 = (judge(tmp_path, name) for name in ("T1", "T2", "T3"))
+    assert t1.verdict == HOLDS and t2.verdict == t3.verdict == IN_PART
+    assert [s.verdict for s in t2.ours] == [HOLDS, HOLDS, FAILS]
+    assert "mean |x| 0.000" in t2.ours[2].figure
+    assert [s.verdict for s in t3.ours] == [HOLDS, HOLDS, FAILS]
+    assert t3.ours[0].figure == "24 T D² + 4 T² D operations"
+    assert "2.82 times the spectral product" in t3.ours[2].figure
+    assert claims.ledger(judgements=[t1]).iloc[0]["dataset"] == "computed"
+
+
+# ---------------------------------------------------------------------------- the ledger itself
+
+
+@pytest.fixture(scope="module")
+def committed():
+    """Judgements from the committed records."""
+    return claims.judge_claims()
+
+
+def test_the_verdicts_are_the_accepted_ones(committed):
+    changes = claims.changed_verdicts(
+        claims.ledger(judgements=committed), claims.accepted_verdicts()
+    )
+    assert not changes, (
+        "\n".join(changes) + "\nIf these are right, accept on purpose with "
+        "`python -m f3amd_lib.report.claims --accept`"
+    )
+
+
+def test_the_committed_page_is_up_to_date(committed):
+    page = claims.repository_root() / "paper_figures" / "claims.md"
+    assert page.read_text(encoding="utf-8") == claims.ledger_markdown(committed), (
+        "paper_figures/claims.md is stale: run `python -m f3amd_lib.report.claims`"
+    )
+
+
+def test_the_ledger_has_all_claims(committed):
+    frame = claims.ledger(judgements=committed)
+    ids = [f"E{i}" for i in range(1, 18)] + [f"Q{i}" for i in range(1, 19)]
+    assert frame["id"].tolist() == [*ids, *(f"T{i}" for i in range(1, 6))]
+    assert set(frame["verdict"]) | set(frame["paper_verdict"]) <= set(VERDICTS)
+    assert (frame[["claim", "where", "decided_by", "ours"]] != "").all(axis=None)
+    measured = frame[frame["verdict"] != UNMEASURED]
+    assert (measured[["dataset", "hardware"]] != "").all(axis=None)
+    assert (measured.loc[measured["dataset"] != "computed", "record"] != "").all()
+
+
+def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
+    holds, fails = ([judge(keep(tmp_path / str(i), CASES["Q13"][i]), "Q13")] for i in (0, 1))
+    path = tmp_path / "claims.md"
+    assert claims.write_ledger(path, holds) and not path.exists()
+    claims.write_ledger(path, holds, accept=True)
+    page, verdicts = path.read_text(), path.with_suffix(".json").read_text()
+    assert claims.write_ledger(path, holds) == []
+    (change,) = claims.write_ledger(path, fails)
+    figure = "✗ 1.5 (1.48 to 1.52) against 2 (1.98 to 2.02) cm"
+    assert change == f"Q13 by our records: was 'holds', is 'does not hold' ({figure})"
+    assert path.read_text() == page and path.with_suffix(".json").read_text() == verdicts
+    claims.write_ledger(path, fails, accept=True)
+    assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
+    assert claims.write_ledger(path, fails) == []
+    with pytest.raises(ValueError, match="must end in .md"):
+        claims.write_ledger(tmp_path / "claims.csv", fails)
+
+
+def test_the_command_tells_by_its_status(tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO", logger="f3amd")
+    monkeypatch.setattr(claims, "repository_root", lambda: tmp_path)
+    monkeypatch.setattr(claims, "CLAIMS", (claims.find_claim("Q13"),))
+    results = keep(tmp_path / "paper_figures", CASES["Q13"][0])
+    assert claims.main([]) == 1 and "Nothing was written" in caplog.text
+    assert claims.main(["--accept"]) == 0 and claims.main([]) == 0
+    assert "Q13 by our records" in caplog.text
+    assert (results / "claims.md").read_text().count("| Q13 |") == 1
+    (results / "bandai" / "laptop" / "records" / "quality.json").unlink()
+    assert claims.main([]) == 2
+
+
+def test_markdown_shows_verdict_figure_and_record(tmp_path):
+    judgement = judge(keep(tmp_path, CASES["Q13"][0]), "Q13")
+    text = claims.ledger_markdown([judgement])
+    (row,) = [line for line in text.splitlines() if line.startswith("| Q13 |")]
+    assert "holds: ✓ 4 (3.96 to 4.04) against 2 (1.98 to 2.02) cm" in row
+    assert "| no figures | bandai | Test GPU | bandai/laptop/records/quality.csv (" in row
+    table = claims.statement_table(judgement)
+    assert table.columns.tolist() == ["statement", "ours", "the paper's tables"]
+    assert table.loc[0, "ours"].endswith("· holds")
+    assert table.loc[0, "the paper's tables"].startswith("not measured (the paper prints no")
