@@ -4,9 +4,11 @@ import json
 
 import pytest
 
+from f3amd_lib.models.camdm import CAMDMConfig
 from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.models.zoo import find_preset
 from f3amd_lib.report.equation_map import EQUATIONS, equation_map, mentioned_equations
-from f3amd_lib.report.readings import readings_table
+from f3amd_lib.report.readings import READINGS, Reading, readings_table
 
 
 @pytest.mark.parametrize(
@@ -63,7 +65,31 @@ def test_open_points_show_the_codes_own_defaults():
     table = readings_table().set_index("open point")["here"]
     assert table["kernel size k of Eq. 3"] == str(F3AMDConfig(1, 1).kernel_size)
     assert table["scale of the noisy input"].startswith("input_scaling = True")
+    assert table["attention heads"] == str(CAMDMConfig(1, 1).num_heads)
+    assert f"D x {F3AMDConfig(1, 1).spectral_rank} times" in table["“rank = 8”"]
     assert not table.str.contains("{", regex=False).any()
     assert set(readings_table("data")["topic"]) == {"data"}
     with pytest.raises(ValueError, match="unknown topic"):
         readings_table("weather")
+
+
+def test_open_points_show_what_a_preset_sets():
+    table = readings_table("CAMDM").set_index("open point")["here"]
+    code = find_preset("CAMDM-code")
+    assert table["dropout in `CAMDM-code`"] == str(code.network["dropout"])
+    share = table["history masked in training, `CAMDM-code`"]
+    assert share == f"a share of {code.training['history_dropout']}"
+    assert table["IRD in its loss"].startswith(f"weight {code.training['loss']['ird']};")
+
+
+@pytest.mark.parametrize("field", ["F3AMDConfig.colour", "CAMDM-code.colour", "CAMDM-9.dropout"])
+def test_an_open_point_cannot_name_a_setting_that_is_not_there(field):
+    with pytest.raises(KeyError):
+        Reading("data", "point", "text", "{}", "reason", field).filling()
+
+
+def test_open_points_are_told_once_with_a_reason():
+    assert len({reading.point for reading in READINGS}) == len(READINGS)
+    for reading in READINGS:
+        assert reading.paper and reading.why
+        assert bool(reading.field) == ("{" in reading.ours), reading.point
