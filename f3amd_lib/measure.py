@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import logging
 import sys
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -25,13 +26,21 @@ from f3amd_lib.evaluation.protocol import (
     measure_model,
     measure_real,
     summarise,
+    windows_that_fit,
 )
 from f3amd_lib.evaluation.quality import row_label
 from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.models import zoo
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir
-from f3amd_lib.report.records import read_table, record_hash, run_record, write_table
+from f3amd_lib.report.records import (
+    read_table,
+    record_hash,
+    run_record,
+    set_aside_table,
+    write_table,
+)
+from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.family import SHORT_RUN, learning_curves
 from f3amd_lib.training.pipeline import (
     PreparedData,
@@ -46,13 +55,20 @@ log = logging.getLogger("f3amd")
 
 
 def _kept_rows(path: Path, record: dict) -> pd.DataFrame | None:
-    """Return the rows of an earlier run that asked for the same; None if there are none."""
+    """Return the rows of an earlier run that asked for the same; None if there are none.
+
+    A table that asked for something else is kept under another name.
+    """
     if not path.exists():
         return None
     rows, earlier = read_table(path)
+    if record_hash(earlier) != record_hash(record):
+        kept = set_aside_table(path)
+        log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
+        return None
     if "unit" in rows:
         rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
-    return rows if record_hash(earlier) == record_hash(record) else None
+    return rows
 
 
 def measure_learning(
@@ -77,24 +93,27 @@ def measure_learning(
     kept = _kept_rows(path, record)
     measured = set() if kept is None else set(kept["model"])
     todo = list(models) if models else [name for name in zoo.PRESETS if name not in measured]
-    tables = [] if kept is None else [kept[~kept["model"].isin(todo)]]
     for curve in learning_curves(prepared, todo, seed=profile.seed):
-        tables.append(curve)
-        write_table(path, pd.concat(tables), record)
+        if kept is not None:
+            curve = pd.concat([kept[kept["model"] != curve["model"].iloc[0]], curve])
+        kept = curve
+        write_table(path, kept, record)
     return path
 
 
 def measure_quality(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
 ) -> Path:
-    """Run the evaluation protocol for every trained model, at 8, 4, 2 and 1 steps, and for real
-    and deliberately broken motion (see `evaluation.protocol`).
+    """Run the evaluation protocol: real and broken motion, and models at 8, 4, 2 and 1 steps.
+
+    See `evaluation.protocol`. A row takes about a minute on 2 cores; its seconds are in the table.
 
     Args:
       prepared: the data.
       profile: says how long rollouts are, and where models and results lie.
       models: presets; by default all that have weights for this data set and window, shipped or in
-        `runs/`. One that is asked for by name is measured again, and trained if it has none.
+        `runs/`. One that is asked for by name is measured again, and trained if it has none. Rows
+        of weights that have changed since are measured again as well.
 
     Returns:
       The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
@@ -108,19 +127,29 @@ def measure_quality(
         num_frames=profile.rollout_rounds * profile.window,
         **_PROTOCOL.get(profile.name, {}),
     )
+    fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
+    protocol = dataclasses.replace(protocol, windows_per_style=fitting)
     record = run_record(
         profile=profile, dataset=packed, seed=protocol.path_seed, measurement="quality",
         protocol=dataclasses.asdict(protocol), classifier=classifier.record["classifier_training"],
+        classifier_weights=weights_digest(classifier.params),
         classifier_accuracy=classifier.accuracy,
     )  # fmt: skip
     paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
     kept = {name: _kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
-    chosen = list(models) if models else available_models(profile)
+    asked = [zoo.find_preset(name).name for name in models or ()]
+    chosen = asked or available_models(profile)
+    if not chosen:
+        log.warning(
+            "no trained model of %s at %s: only real motion is measured; name models with --model",
+            profile.dataset, profile.name,
+        )  # fmt: skip
 
-    def keep(name: str, rows: pd.DataFrame) -> None:
+    def keep(name: str, rows: pd.DataFrame, weights: str) -> None:
         """Put rows in place of those of the same model, window and steps, and write the table."""
-        earlier, keys = kept[name], ["model", "window_frames", "steps"]
+        rows, keys = rows.assign(weights=weights), ["model", "window_frames", "steps"]
+        earlier = kept[name]
         if earlier is not None:
             now = set(map(tuple, rows[keys].to_numpy().tolist()))
             old = [tuple(row) not in now for row in earlier[keys].to_numpy().tolist()]
@@ -128,39 +157,45 @@ def measure_quality(
         kept[name] = rows
         write_table(paths[name], rows, record)
 
-    def measured(model: str, steps: int) -> bool:
+    def measured(model: str, steps: int, weights: str) -> bool:
         rows = kept["quality_by_seed"]
-        if rows is None or (models and model in chosen):
+        if rows is None or model in asked:
             return False
         mine = rows[(rows["model"] == model) & (rows["window_frames"] == profile.window)]
-        return steps in set(mine["steps"])
+        mine = mine[mine["steps"] == steps]
+        return len(mine) > 0 and set(mine["weights"]) == {weights}
 
-    todo = [(model, 0) for model in REFERENCE_MODELS if not measured(model, 0)]
+    trained = {model: obtain_model(prepared, profile, preset=model)[0] for model in chosen}
+    digests = {model: weights_digest(trained[model].params) for model in chosen}
+    # Real motion has no weights, but it is seen through the classifier's.
+    digests |= dict.fromkeys(REFERENCE_MODELS, record["classifier_weights"])
+    todo = [(model, 0) for model in REFERENCE_MODELS]
     for model in chosen:
-        levels = len(getattr(prepared.model_config(model), "noise_levels", ())) or max(STEPS)
-        todo += [(model, n) for n in STEPS if n <= levels and not measured(model, n)]
+        levels = len(getattr(trained[model].config, "noise_levels", ())) or max(STEPS)
+        todo += [(model, steps) for steps in STEPS if steps <= levels]
+    todo = [row for row in todo if not measured(*row, digests[row[0]])]
     with tqdm(todo, unit="row") as bar:
         for model, steps in bar:
             bar.set_postfix_str(row_label(model, steps) if steps else model)
-            if not steps:
-                keep(
-                    "quality_by_seed",
-                    measure_real(packed, classifier, protocol, window=profile.window, model=model),
+            started = time.perf_counter()
+            if steps:
+                generator = MotionGenerator(trained[model], steps)
+                rows, rounds = measure_model(generator, packed, classifier, protocol, held_out)
+                keep("quality_by_round", rounds, digests[model])
+            else:
+                rows = measure_real(
+                    packed, classifier, protocol, window=profile.window, model=model
                 )
-                continue
-            trained, _, _ = obtain_model(prepared, profile, preset=model)
-            generator = MotionGenerator(trained, steps)
-            rows, rounds = measure_model(generator, packed, classifier, protocol, held_out)
-            keep("quality_by_round", rounds)
-            keep("quality_by_seed", rows)
-    write_table(folder / "quality.csv", summarise(kept["quality_by_seed"]), record)
+            rows = rows.assign(seconds=round(time.perf_counter() - started, 1))
+            keep("quality_by_seed", rows, digests[model])
+            write_table(folder / "quality.csv", summarise(kept["quality_by_seed"]), record)
     return folder / "quality.csv"
 
 
 STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
-_PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2, "num_windows": 3}}
+_PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
 
 MEASUREMENTS: dict[str, Callable] = {"learning": measure_learning, "quality": measure_quality}
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""
@@ -200,7 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name in options.names or MEASUREMENTS:
             path = MEASUREMENTS[name](prepared, profile, models)
             log.info("%-12s %s", name, path)
-    except ValueError as error:
+    except (ValueError, ArithmeticError, RuntimeError) as error:
         log.error("Stopped: %s", error)
         return 2
     return 0

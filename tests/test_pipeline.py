@@ -65,16 +65,39 @@ def test_changed_settings_set_the_old_files_aside(trained_once, same_runs, monke
     )
     pipeline.obtain_model(prepared, dataclasses.replace(profile, seed=5), progress=False)
     assert asked
-    kept = files.model.with_name(files.model.name + ".old1")
+    name = profile.preset
+    kept = files.model.with_name(f"{name}.old1.safetensors")
     assert kept.read_bytes() == before
+    history, record = read_table(files.history.with_name(f"{name}.old1.history.csv"))
+    assert record["model"] == name and len(history)
+    put_back(files)
+
+
+def put_back(files):
+    """Undo setting aside."""
+    for path in files.model.parent.glob("*.old1.*"):
+        path.rename(path.with_name(path.name.replace(".old1", "")))
+
+
+def test_a_finished_model_without_its_state_is_not_overwritten(trained_once, same_runs):
+    _, prepared, profile, model = trained_once
+    files = pipeline.model_files(profile)
+    before = files.model.read_bytes()
+    files.state.rename(files.state.with_name("elsewhere"))
+    pipeline.train(prepared, profile, progress=False)
+    kept = files.model.with_name(f"{profile.preset}.old1.safetensors")
+    assert kept.read_bytes() == before and files.model.exists()
     for path in dataclasses.astuple(files):
-        path.with_name(path.name + ".old1").rename(path)
+        path.unlink()
+    files.state.with_name("elsewhere").rename(files.state)
+    put_back(files)
+    assert files.model.read_bytes() == before
 
 
 def test_models_of_an_earlier_version_are_set_aside(trained_once, same_runs, monkeypatch):
     _, prepared, profile, _ = trained_once
     files = pipeline.model_files(profile)
-    kept = files.model.with_name(files.model.name + ".old1")
+    kept = files.model.with_name(f"{profile.preset}.old1.safetensors")
 
     def outdated(path):
         raise pipeline.OutdatedFile(f"{path}: written by version 0.1")
@@ -83,8 +106,7 @@ def test_models_of_an_earlier_version_are_set_aside(trained_once, same_runs, mon
     monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
     *_, origin = pipeline.obtain_model(prepared, profile, progress=False)
     assert origin == "trained now" and kept.exists() and not files.model.exists()
-    for path in dataclasses.astuple(files):
-        path.with_name(path.name + ".old1").rename(path)
+    put_back(files)
 
 
 def test_presets_may_be_called_by_the_papers_names(trained_once):

@@ -24,6 +24,7 @@ from f3amd_lib.evaluation.protocol import (
     measure_real,
     path_statistics,
     summarise,
+    windows_that_fit,
 )
 from f3amd_lib.evaluation.quality import sideways_share
 from f3amd_lib.evaluation.rollout import MotionGenerator
@@ -37,7 +38,7 @@ from f3amd_lib.training.pipeline import PreparedData
 
 STYLES = ("ArmsOverhead", "Zombie")
 SIZES = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
-SMALL = Protocol(STYLES, num_frames=96, num_seeds=2, num_diversity_seeds=2, num_windows=6)
+SMALL = Protocol(STYLES, num_frames=96, num_seeds=2, num_diversity_seeds=2, windows_per_style=3)
 
 
 @pytest.fixture(scope="module")
@@ -118,15 +119,15 @@ def test_section_4_4_all_nine_metrics_are_measured_under_the_papers_names(measur
 def test_a_models_rows_are_tidy(measured):
     rows, rounds = measured
     assert list(rows) == [
-        *("model", "window_frames", "steps", "seed", "metric", "unit", "better", "value")
+        *("model", "window_frames", "steps", "varies", "seed", "metric", "unit", "better", "value")
     ]
     assert not rows.duplicated(["model", "steps", "seed", "metric"]).any()
     assert set(rows["model"]) == {"F3AMD-FNO-8"} and set(rows["window_frames"]) == {32}
     assert np.isfinite(rows["value"]).all()
-    per_seed = rows[~rows["metric"].isin(module._NOISE)]
-    assert set(per_seed["seed"]) == {0, 1}
-    assert len(per_seed) == 2 * per_seed["metric"].nunique()
-    # Seeds differ in noise and starting pose.
+    assert set(rows["varies"]) == {"seed"} and set(rows["metric"]) == set(PROTOCOL_METRICS)
+    assert len(rows) == 2 * len(PROTOCOL_METRICS)
+    # Seeds differ in path, noise and starting pose.
+    assert one(rows, "diversity", 0) != one(rows, "diversity", 1)
     assert one(rows, "joint_acceleration", 0) != one(rows, "joint_acceleration", 1)
     assert list(rounds) == ["model", "window_frames", "steps", "metric", "round", "value"]
     assert set(rounds["round"]) == {1, 2, 3}
@@ -139,7 +140,8 @@ def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, cl
     for metric in ("FID", "EMD", "joint_acceleration", "trajectory_error", "IRD_excess"):
         assert one(rows, metric) > 1.5 * one(real, metric), metric
     assert one(real, "style_accuracy") == 100.0
-    assert not {"diversity", "x0_error_ratio"} & set(real["metric"])
+    assert not {"diversity", "x0_error_ratio", "path_drift"} & set(real["metric"])
+    assert set(real["varies"]) == {"clips"} and set(real["seed"]) == set(range(20))
 
 
 def test_bad_generators_are_told_apart(packed, classifier):
@@ -158,10 +160,10 @@ def test_bad_generators_are_told_apart(packed, classifier):
         measure_real(packed, classifier, SMALL, window=32, model="frozen")
 
 
-def test_real_rows_differ_from_seed_to_seed(packed, classifier):
+def test_real_rows_differ_from_half_to_half(packed, classifier):
     rows = measure_real(packed, classifier, SMALL, window=32)
-    # Other clips in the bootstrap, other windows in FID; the same every time it is asked.
-    assert one(rows, "FID", 0) != one(rows, "FID", 1)
+    for metric in ("FID", "EMD", "CAMDM_FID", "foot_sliding", "IRD"):
+        assert rows[rows["metric"] == metric]["value"].nunique() > 1, metric
     again = measure_real(packed, classifier, SMALL, window=32)
     pd.testing.assert_frame_equal(rows, again)
 
@@ -194,8 +196,8 @@ def test_path_statistics_of_a_line_and_of_a_circle():
 def test_seeds_become_means_with_intervals():
     rows = pd.DataFrame(
         [
-            {"model": "A", "window_frames": 32, "steps": 8, "seed": seed, "metric": "FID",
-             "unit": "", "better": "down", "value": value}
+            {"model": "A", "window_frames": 32, "steps": 8, "varies": "seed", "seed": seed,
+             "metric": "FID", "unit": "", "better": "down", "value": value}
             for seed, value in enumerate((1.0, 2.0, 3.0))
         ]
     )  # fmt: skip
@@ -204,6 +206,9 @@ def test_seeds_become_means_with_intervals():
     # Student's t with 2 degrees of freedom: 4.303 * 1 / sqrt(3).
     assert row["high"] - row["value"] == pytest.approx(4.303 / np.sqrt(3), rel=1e-3)
     assert row["low"] == pytest.approx(4.0 - row["high"])
+    # Halves of the clips scatter as the figure does: averaging over them narrows nothing.
+    (halves,) = summarise(rows.assign(varies="clips")).to_dict("records")
+    assert halves["high"] - halves["value"] == pytest.approx(4.303, rel=1e-3)
     single = summarise(rows[:1])
     assert np.isnan(single["low"][0]) and single["value"][0] == 1.0
 
@@ -222,7 +227,8 @@ def test_a_classifier_that_cannot_tell_styles_gives_no_fid(generator, packed, pr
         ({"styles": ()}, "at least one style"),
         ({"num_frames": 40}, "num_frames must be at least 66"),
         ({"num_seeds": 0}, "num_seeds must be at least 1"),
-        ({"num_windows": 1}, "num_windows must be at least 2"),
+        ({"windows_per_style": 0}, "windows_per_style must be at least 1"),
+        ({"styles": ("Zombie",), "windows_per_style": 1}, "windows_per_style must be at least 2"),
     ],
 )
 def test_impossible_protocols_are_refused(changes, message):
@@ -231,12 +237,27 @@ def test_impossible_protocols_are_refused(changes, message):
 
 
 def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
-    many = dataclasses.replace(SMALL, num_windows=1000)
-    with pytest.raises(ValueError, match="1000"):
+    many = dataclasses.replace(SMALL, windows_per_style=1000)
+    with pytest.raises(ValueError, match="want 1000 windows of a style"):
         measure_real(packed, classifier, many, window=32)
+    # One rollout of 96 frames holds 4 windows of 20; half the held-out clips hold 9.
+    assert windows_that_fit(packed, classifier, many, window=32) == 4
+    longer = dataclasses.replace(many, num_frames=960)
+    assert windows_that_fit(packed, classifier, longer, window=32) == 9
     unknown = dataclasses.replace(SMALL, styles=("Zombi",))
     with pytest.raises(ValueError, match="'?Zombi'?"):
         measure_real(packed, classifier, unknown, window=32)
+
+
+def test_classes_that_nobody_walks_do_not_count(generator, packed, prepared, classifier):
+    alone = dataclasses.replace(SMALL, styles=STYLES[:1])
+    real = module._real_features(packed, classifier, alone.styles, 32)
+    assert list(real) == [classifier.style_index(STYLES[0])]
+    rows = measure_real(packed, classifier, alone, window=32)
+    both = measure_real(packed, classifier, SMALL, window=32)
+    assert one(rows, "style_coverage") == 100.0
+    # Two styles lie far apart: pooled, their cloud is wider than either.
+    assert one(rows, "FID") < one(both, "FID") + 1.0
 
 
 def test_the_measurement_keeps_its_rows_and_goes_on(
@@ -272,3 +293,15 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     measure.measure_quality(prepared, profile, [name])
     assert calls == [2, 1]
     assert len(read_table(path)[0]) == len(table)
+    # Other weights under the same name are another model.
+    trained = dataclasses.replace(
+        trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params)
+    )
+    measure.measure_quality(prepared, profile)
+    assert calls == [2, 1, 2, 1]
+    # Other settings start anew, and lose nothing.
+    monkeypatch.setattr(measure, "_PROTOCOL", {"smoke": {"num_seeds": 1, "num_diversity_seeds": 2}})
+    before = read_table(path.with_name("quality_by_seed.csv"))[0]
+    measure.measure_quality(prepared, profile)
+    kept, _ = read_table(path.with_name("quality_by_seed.old1.csv"))
+    pd.testing.assert_frame_equal(kept, before)

@@ -145,13 +145,17 @@ def noise_use(
     """Say whether a model uses its noisy input.
 
     Returns:
-      x0_error_ratio: x0 error at `low_sigma` over that at sigma_max; near 1 the input is ignored.
+      x0_error_ratio: x0 error at `low_sigma` over that at sigma_max; near 1 the input is ignored. A
+        network that is told the number of a step is asked at its lowest level, if that is higher;
+        one with a single level has no such ratio, NaN.
       seed_spread_cm: see `seed_spread`; near 0 every seed gives the same motion.
     """
-    table = x0_error_by_sigma(
-        generator.trained, windows, [low_sigma, float(generator.sigmas[0])], seed=seed
-    )
-    low, high = table["x0_error"]
+    top = float(generator.sigmas[0])
+    lowest = max(low_sigma, min(getattr(generator.trained.config, "noise_levels", ()) or (0.0,)))
+    low, high = float("nan"), 1.0
+    if lowest < top:
+        table = x0_error_by_sigma(generator.trained, windows, [lowest, top], seed=seed)
+        low, high = table["x0_error"]
     return {
         "x0_error_ratio": float(low / high),
         "seed_spread_cm": seed_spread(generator, windows, seed=seed),

@@ -53,8 +53,8 @@ CONTACT_HEIGHT = 0.01
 METRICS = {
     "trajectory_error_m": ("trajectory_error", "m", "down"),
     "direction_error_deg": ("direction_error", "deg", "down"),
-    "smoothness": ("smoothness", "", "down"),
-    "coherence": ("coherence", "", "down"),
+    "smoothness": ("smoothness", "", "near real"),
+    "coherence": ("coherence", "", "near real"),
     "foot_sliding": ("foot_sliding", "", "down"),
     "contact_share": ("contact_share", "", "near real"),
     "ird_cm": ("IRD", "cm", "near real"),

@@ -1,12 +1,18 @@
 """The evaluation protocol: long rollouts of every style, repeated, beside real and broken motion.
 
 Paper section 4.4: each model makes 2,560 frames (80 rounds of 32, or 40 of 64) on a complex path
-with varied speeds, turns and directions, in every style. Here each style is walked several times
-with noise and starting pose of its own, so that every figure has an interval; held-out real clips
-and three deliberately bad generators are scored by the same code.
+with varied speeds, turns and directions, in every style. Here that is repeated over seeds, each
+with a path, noise and starting poses of its own; held-out real clips and three deliberately bad
+generators are scored by the same code.
 
-Rows are tidy: model, window_frames, steps, seed, metric, unit, better, value. A seed's figure is
-the mean over styles; `summarise` turns seeds into means with 95 % intervals.
+Rows are tidy: model, window_frames, steps, varies, seed, metric, unit, better, value. A row's value
+is a mean over styles. `varies` says what the repeats differ in: "seed" for models, "clips" for real
+motion, where every repeat takes another half of the clips. `summarise` turns repeats into means
+with 95 % intervals. One training of each model is behind its rows: what another training would have
+given is not in the interval.
+
+FID, EMD and coverage see posture and style through one classifier. They say little of whether
+somebody walks or glides: read them beside foot alternation, acceleration and contact.
 """
 
 from __future__ import annotations
@@ -18,6 +24,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.evaluation import distributions
 from f3amd_lib.evaluation.classifier import StyleClassifier, require_telling_styles
@@ -39,6 +46,7 @@ from f3amd_lib.evaluation.quality import (
 )
 from f3amd_lib.evaluation.rollout import MotionGenerator, Rollout
 from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.names import nearest_hint
 
 __all__ = [
     "PROTOCOL_METRICS",
@@ -49,6 +57,7 @@ __all__ = [
     "measure_model",
     "measure_real",
     "summarise",
+    "windows_that_fit",
 ]
 
 REFERENCE_MODELS = ("real", *CORRUPTIONS)
@@ -64,11 +73,17 @@ _DISTRIBUTION = {
 }
 
 _NOISE = {
-    "diversity": ("cm", "near real"),
-    "rollout_diversity": ("cm", "near real"),
+    "diversity": ("cm", "up"),
+    "rollout_diversity": ("cm", "up"),
     "x0_error_ratio": ("", "down"),
     "seed_spread": ("cm", "up"),
 }
+
+_DIVERSITY_ROUNDS = 4
+"""Rounds after which samples of one start are compared once more (`rollout_diversity`)."""
+
+_GROWS_WITH_LENGTH = ("path_drift", "CAMDM_trajectory_error", "CAMDM_orientation_error")
+"""Figures whose size hangs on the length of a motion: no yardstick between clips and rollouts."""
 
 PROTOCOL_METRICS = (
     {name: (unit, better) for name, unit, better in (METRICS | CAMDM_METRICS).values()}
@@ -92,9 +107,9 @@ class Protocol:
       num_frames: length of each rollout (paper: 2,560).
       num_seeds: rollouts of each style, each with noise and starting pose of its own.
       num_diversity_seeds: samples of one fixed condition.
-      num_windows: windows of 60 frames on either side of FID and EMD; the same for all rows, since
-        both fall as windows are added.
-      path_seed: of the complex path, the same for all.
+      windows_per_style: windows of 60 frames of each style on either side of FID and EMD; the same
+        for all rows, since both fall as windows are added (see `windows_that_fit`).
+      path_seed: seed k walks the complex path of seed path_seed + k.
 
     Raises:
       ValueError: for no style or numbers that are too small.
@@ -104,13 +119,14 @@ class Protocol:
     num_frames: int = 2560
     num_seeds: int = 5
     num_diversity_seeds: int = 10
-    num_windows: int = 150
+    windows_per_style: int = 12
     path_seed: int = 0
 
     def __post_init__(self):
         if not self.styles:
             raise ValueError("a protocol needs at least one style")
-        limits = {"num_frames": 66, "num_seeds": 1, "num_diversity_seeds": 2, "num_windows": 2}
+        limits = {"num_frames": 66, "num_seeds": 1, "num_diversity_seeds": 2}
+        limits["windows_per_style"] = 1 if len(self.styles) > 1 else 2
         for name, least in limits.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
@@ -202,32 +218,138 @@ def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
     return table.groupby(np.asarray(styles)).mean().mean().to_dict()
 
 
-def _distribution_figures(
-    classifier: StyleClassifier, windows: np.ndarray, asked: np.ndarray, count: int, seed: int
-) -> dict:
-    """Score windows [N, 60, 45] of known styles [N] against the real training windows.
+@dataclass(frozen=True)
+class _Seen:
+    """What the classifier says of the windows of some motions.
 
-    FID and EMD compare `count` windows with as many real ones.
+    Attributes:
+      features: [N, D].
+      predicted: class of each window, [N].
+      style: class that was asked for, [N].
+      source: number of the motion that a window was cut from, [N].
     """
-    features, predicted = classifier.features(windows), classifier.predict(windows)
-    reference = classifier.reference("train")
-    drawn = distributions.draw_windows(features, count, seed)
-    real = distributions.draw_windows(reference, count, seed + 1)
-    number = len(classifier.styles)
-    moments = {
-        index: distributions.moments(classifier.reference("train", classifier.styles[index]))
-        for index in np.unique(asked)
-    }
+
+    features: np.ndarray
+    predicted: np.ndarray
+    style: np.ndarray
+    source: np.ndarray
+
+    def of(self, sources: Iterable[int]) -> _Seen:
+        """Return the windows of some of the motions, motion by motion in that order."""
+        order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
+        parts = (self.features, self.predicted, self.style, self.source)
+        return _Seen(*(part[order] for part in parts))
+
+
+def _seen(classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]) -> _Seen:
+    """Show motions to the classifier; those shorter than its window hold none."""
+    windows, asked, source = [], [], []
+    for number, (motion, style) in enumerate(zip(motions, styles, strict=True)):
+        if motion.num_frames >= classifier.config.window:
+            cut = classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
+            windows.append(cut)
+            asked += [classifier.style_index(style)] * len(cut)
+            source += [number] * len(cut)
+    if not windows:
+        raise ValueError(
+            f"no motion of {', '.join(dict.fromkeys(styles))} has the {classifier.config.window} "
+            "frames that the style classifier looks at"
+        )
+    windows = np.concatenate(windows)
+    return _Seen(
+        classifier.features(windows),
+        classifier.predict(windows),
+        np.array(asked),
+        np.array(source),
+    )
+
+
+def _real_features(
+    packed: PackedMotion, classifier: StyleClassifier, styles: Sequence[str], window: int
+) -> dict[int, np.ndarray]:
+    """Return features of real training windows by class, at the speeds that are asked for."""
+    clips = reference_clips(packed, styles, window=window, split="train")
+    known = classifier.references["train"]
+    kept = np.isin(known.clips, clips)
     return {
-        "FID": distributions.frechet_distance(drawn, real),
-        "FID_per_dimension": distributions.frechet_distance_per_dimension(drawn, real),
-        "CAMDM_FID": distributions.camdm_frechet_distance(features, asked, moments),
-        "EMD": distributions.earth_movers_distance(drawn, real),
+        number: known.features[kept & (known.styles == number)].astype(np.float32)
+        for number in map(classifier.style_index, styles)
+    }
+
+
+def windows_that_fit(
+    packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol, *, window: int
+) -> int:
+    """Return how many windows of each style every row of a table can have in FID and EMD.
+
+    Args:
+      packed: the data set.
+      classifier: cuts windows and holds those of the training clips.
+      protocol: its styles and length; at most its `windows_per_style` is returned.
+      window: frames of a round.
+
+    Returns:
+      The smallest number, over styles, of windows in the training clips, in half of the held-out
+      clips and in one rollout.
+
+    Raises:
+      ValueError: if some style has none.
+    """
+    span = classifier.config.window
+    counts = [protocol.windows_per_style, protocol.num_frames // span]
+    real = _real_features(packed, classifier, protocol.styles, window)
+    counts += [len(features) for features in real.values()]
+    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    lengths = np.diff(packed.clip_start)[clips] // span
+    counts += [int(lengths[labels == style].sum()) // 2 for style in protocol.styles]
+    if min(counts) < 1:
+        raise ValueError(
+            f"some style of {', '.join(protocol.styles)} has no window of {span} frames for FID "
+            "and EMD: make longer rollouts, or take more data"
+        )
+    return min(counts)
+
+
+def _held_out_clips(
+    packed: PackedMotion, styles: Sequence[str], window: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return clips of both held-out splits at the speeds that are asked for, and their styles."""
+    present = set(np.asarray(packed.clip_split).tolist())
+    clips = [
+        clip
+        for split in ("test", "validation")
+        if SPLITS.index(split) in present
+        for clip in reference_clips(packed, styles, window=window, split=split)
+    ]
+    return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
+
+
+def _distribution_figures(
+    seen: _Seen, real: dict[int, np.ndarray], count: int, rng: np.random.Generator
+) -> dict:
+    """Score windows against real ones of the same styles, `count` of each style on either side."""
+    drawn, wanted, by_style = [], [], []
+    for number, reference in real.items():
+        mine = seen.features[seen.style == number]
+        for cloud, part in ((mine, drawn), (reference, wanted)):
+            if len(cloud) < count:
+                raise ValueError(f"FID and EMD want {count} windows of a style, got {len(cloud)}")
+            part.append(cloud[rng.choice(len(cloud), count, replace=False)])
+        if len(mine) > 1 and len(reference) > 1:
+            by_style.append(distributions.frechet_distance_per_dimension(mine, reference))
+    features, reference = np.concatenate(drawn), np.concatenate(wanted)
+    distance = distributions.frechet_distance(features, reference)
+    return {
+        "FID": distance,
+        "FID_per_dimension": distance / features.shape[1],
+        # The mean over styles of CAMDM's code, with all windows of the motion.
+        "CAMDM_FID": float(np.mean(by_style)) if len(by_style) == len(real) else float("nan"),
+        "EMD": distributions.earth_movers_distance(features, reference),
         "style_coverage": distributions.style_coverage(
-            distributions.style_counts(predicted, number),
-            distributions.style_counts(asked, number),
+            np.bincount(seen.predicted, minlength=max(real) + 1)[list(real)],
+            np.bincount(seen.style, minlength=max(real) + 1)[list(real)],
         ),
-        "style_accuracy": distributions.style_accuracy(predicted, asked),
+        "style_accuracy": distributions.style_accuracy(seen.predicted, seen.style),
     }
 
 
@@ -251,7 +373,8 @@ def measure_model(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Run the whole protocol for one model and number of steps.
 
-    All styles and seeds are walked in one batch; seed k takes the k-th starting pose and noise.
+    All styles and seeds are walked in one batch. Seeds differ in path, noise and, as far as there
+    are enough stored ones, starting pose.
 
     Args:
       generator: the model and its sampler.
@@ -262,69 +385,80 @@ def measure_model(
       name: of the model in the rows; by default the trained model's.
 
     Returns:
-      (rows, rounds). Rows: model, window_frames, steps, seed, metric, unit, better, value. Figures
-      that are not of one seed (diversity, use of noise) stand once, with seed 0. Rounds: model,
-      window_frames, steps, metric, round, value.
+      (rows, rounds). Rows: model, window_frames, steps, varies, seed, metric, unit, better, value.
+      Rounds: model, window_frames, steps, metric, round, value, means over styles and seeds.
 
     Raises:
       ValueError: if the classifier cannot tell styles apart, or does not know one of them.
     """
     require_telling_styles(classifier)
-    trained, seeds = generator.trained, protocol.num_seeds
+    trained, seeds = generator.trained, range(protocol.num_seeds)
     columns = {
         "model": name or trained.name,
         "window_frames": trained.config.window,
         "steps": generator.num_steps,
     }
     styles = list(protocol.styles)
-    paths = evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed)
+    real = _real_features(packed, classifier, styles, trained.config.window)
+    paths = [
+        evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed)
+        for seed in seeds
+    ]
     floors = {style: style_floor(packed, style) for style in styles}
-    rollout = generator.rollout(paths * seeds, styles * seeds, seed=protocol.path_seed)
-    rows, positions = [], []
-    for seed in range(seeds):
-        mine = range(seed * len(styles), (seed + 1) * len(styles))
-        motions = [rollout.motion(character) for character in mine]
+    rollout = generator.rollout(
+        [path for walk in paths for path in walk],
+        styles * protocol.num_seeds,
+        seed=protocol.path_seed,
+    )
+    rows = []
+    for seed in seeds:
+        motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
         figures = _style_means(
             [
                 _motion_figures(motion, path, rollout.window, floors[style])
-                for motion, path, style in zip(motions, paths, styles, strict=True)
+                for motion, path, style in zip(motions, paths[seed], styles, strict=True)
             ],
             styles,
         )
-        positions.append(np.stack([np.asarray(motion.positions) for motion in motions]))
-        windows = classifier.windows_of(positions[-1], trained.skeleton)
-        asked = np.repeat([classifier.style_index(style) for style in styles], windows.shape[1])
-        windows = windows.reshape(-1, *windows.shape[2:])
-        figures |= _distribution_figures(classifier, windows, asked, protocol.num_windows, seed)
-        rows += _rows(figures, **columns, seed=seed)
-    once = noise_use(generator, held_out)
-    once = {
-        "x0_error_ratio": once["x0_error_ratio"],
-        "seed_spread": once["seed_spread_cm"],
-        "diversity": _first_round_diversity(generator, paths, styles, protocol),
-    }
-    if seeds > 1:
-        # [style, seed, frame, joint, 3]
-        once["rollout_diversity"] = distributions.diversity(np.stack(positions, axis=1))
-    rows += _rows(once, **columns, seed=0)
+        rng = np.random.default_rng([protocol.path_seed, seed])
+        seen = _seen(classifier, motions, styles)
+        figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
+        figures |= _diversities(generator, paths[seed], styles, protocol, seed)
+        use = noise_use(generator, held_out, seed=seed)
+        figures["x0_error_ratio"] = use["x0_error_ratio"]
+        figures["seed_spread"] = use["seed_spread_cm"]
+        rows += _rows(figures, **columns, varies="seed", seed=seed)
     return pd.DataFrame(rows), _rounds(rollout, columns)
 
 
-def _first_round_diversity(
-    generator: MotionGenerator, paths: Sequence[RootPath], styles: Sequence[str], protocol: Protocol
-) -> float:
-    """Diversity of Appendix C: noise seeds under one fixed condition a style, first round."""
+def _diversities(
+    generator: MotionGenerator,
+    paths: Sequence[RootPath],
+    styles: Sequence[str],
+    protocol: Protocol,
+    seed: int,
+) -> dict:
+    """Diversity of Appendix C under one fixed condition a style: first round, and some rounds on.
+
+    `diversity` compares samples of the first round. `rollout_diversity` lets them walk on, each
+    from its own history, and compares all frames of some rounds: it holds differences of phase.
+    """
     window, repeats = generator.trained.config.window, protocol.num_diversity_seeds
-    short = [path.slice(0, window) for path in paths]
-    poses = generator.rollout(short, styles, seed=protocol.path_seed).history
+    frames = min(_DIVERSITY_ROUNDS * window, protocol.num_frames)
+    short = [path.slice(0, frames) for path in paths]
+    poses = generator.rollout(short, styles, seed=protocol.path_seed + seed).history
     made = generator.rollout(
         [path for path in short for _ in range(repeats)],
         [style for style in styles for _ in range(repeats)],
-        seed=protocol.path_seed + 1,
+        seed=protocol.path_seed + seed + protocol.num_seeds,
         history=np.repeat(poses, repeats, axis=0),
     )
     samples = np.stack([made.motion(k).positions for k in range(len(made.styles))])
-    return distributions.diversity(samples.reshape(len(styles), repeats, *samples.shape[1:]))
+    samples = samples.reshape(len(styles), repeats, *samples.shape[1:])
+    return {
+        "diversity": distributions.diversity(samples[:, :, :window]),
+        "rollout_diversity": distributions.diversity(samples),
+    }
 
 
 def _rounds(rollout: Rollout, columns: dict) -> pd.DataFrame:
@@ -340,78 +474,83 @@ def measure_real(
     *,
     window: int,
     model: str = "real",
-    split: str = "test",
+    repeats: int = 20,
 ) -> pd.DataFrame:
     """Score held-out clips, as they are or broken by a recipe, as if they were rollouts.
 
-    A clip follows the smoothed path of the motion that it came from. Every seed draws the noise of
-    a recipe anew, averages over clips drawn with replacement (a bootstrap, so that an interval
-    tells what other clips would have given), and compares other windows in FID and EMD.
+    A clip follows the smoothed path of the motion that it came from. Every repeat takes another
+    half of each style's clips, drawn without replacement: figures of halves scatter about as much
+    as figures of all clips would between one recording and another (half-sampling), and no window
+    counts twice.
 
     Args:
       packed: the data set.
       classifier: as for `measure_model`.
-      protocol: its styles and number of seeds.
+      protocol: its styles and windows.
       window: where the seams of a rollout would lie, frames.
       model: one of `REFERENCE_MODELS`.
-      split: the clips' split.
+      repeats: halves to draw.
 
     Returns:
-      Rows as from `measure_model`, with steps 0; without diversity and use of noise, which real
-      motion does not have.
+      Rows as from `measure_model`, with steps 0 and varies "clips"; without diversity and use of
+      noise, which real motion does not have, and without figures whose size hangs on length.
 
     Raises:
       ValueError: for an unknown model, or as `measure_model`.
     """
     if model not in REFERENCE_MODELS:
-        raise ValueError(f"unknown reference {model!r}: use one of {', '.join(REFERENCE_MODELS)}")
+        raise ValueError(f"unknown reference {model!r}{nearest_hint(model, REFERENCE_MODELS)}")
     require_telling_styles(classifier)
-    clips = reference_clips(packed, protocol.styles, window=window, split=split)
-    labels = np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
-    columns = {"model": model, "window_frames": window, "steps": 0}
+    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    motions, figures = [], []
+    for clip in clips:
+        whole = packed.motion(int(clip))
+        seen = whole if model == "real" else corrupt(model, whole, seed=int(clip))
+        motions.append(seen)
+        floor = float(packed.floor_shift[clip])
+        found = _motion_figures(seen, own_path(whole), window, floor)
+        figures.append({k: v for k, v in found.items() if k not in _GROWS_WITH_LENGTH})
+    seen = _seen(classifier, motions, labels)
+    real = _real_features(packed, classifier, protocol.styles, window)
+    columns = {"model": model, "window_frames": window, "steps": 0, "varies": "clips"}
     rows = []
-    for seed in range(protocol.num_seeds):
-        rng = np.random.default_rng([protocol.path_seed, seed])
-        figures, windows, asked = [], [], []
-        for clip, style in zip(clips, labels, strict=True):
-            whole = packed.motion(clip)
-            seen = whole
-            if model != "real":
-                seen = corrupt(model, whole, seed=int(rng.integers(2**31)))
-            floor = float(packed.floor_shift[clip])
-            figures.append(_motion_figures(seen, own_path(whole), window, floor))
-            if seen.num_frames >= classifier.config.window:
-                windows.append(classifier.windows_of(seen.positions, packed.skeleton))
-                asked += [classifier.style_index(style)] * len(windows[-1])
-        if not windows:
-            raise ValueError(
-                f"no {split} clip of {', '.join(protocol.styles)} holds the "
-                f"{classifier.config.window} frames that the classifier looks at"
-            )
-        drawn = np.concatenate(
-            [rng.choice(mine, len(mine)) for style in protocol.styles
-             if len(mine := np.flatnonzero(labels == style))]
-        )  # fmt: skip
-        means = _style_means([figures[place] for place in drawn], labels[drawn])
-        windows, asked = np.concatenate(windows), np.array(asked)
-        means |= _distribution_figures(classifier, windows, asked, protocol.num_windows, seed)
-        rows += _rows(means, **columns, seed=seed)
+    for repeat in range(repeats):
+        rng = np.random.default_rng([protocol.path_seed, repeat])
+        half, shown = [], []
+        for style in protocol.styles:
+            mine = rng.permutation(np.flatnonzero(labels == style))
+            half += mine[: max(1, len(mine) // 2)].tolist()
+            # Halves of few clips may hold too few windows: then one clip more is looked at.
+            held = np.cumsum([np.count_nonzero(seen.source == clip) for clip in mine])
+            enough = 1 + int(np.searchsorted(held, protocol.windows_per_style))
+            shown += mine[: max(len(mine) // 2, enough)].tolist()
+        means = _style_means([figures[place] for place in half], labels[half])
+        means |= _distribution_figures(seen.of(shown), real, protocol.windows_per_style, rng)
+        rows += _rows(means, **columns, seed=repeat)
     return pd.DataFrame(rows)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
-    """Turn figures of single seeds into means with 95 % intervals.
+    """Turn the figures of single repeats into means with 95 % intervals.
+
+    Repeats over seeds are draws of their own: the interval is that of their mean. Repeats over
+    halves of the clips scatter as the figure itself does: the interval is that of one of them.
 
     Args:
       rows: from `measure_model` and `measure_real`.
 
     Returns:
-      Columns model, window_frames, steps, metric, unit, better, value, low, high, repeats, in the
-      order of the rows; a figure without repeats has NaN for bounds.
+      Columns model, window_frames, steps, metric, unit, better, varies, value, low, high, repeats,
+      in the order of the rows; a figure without repeats has NaN for bounds.
     """
-    keys = ["model", "window_frames", "steps", "metric", "unit", "better"]
+    keys = ["model", "window_frames", "steps", "metric", "unit", "better", "varies"]
     out = []
     for key, group in rows.groupby(keys, sort=False):
+        row = dict(zip(keys, key, strict=True))
         interval = distributions.mean_and_interval(group["value"].to_numpy())
-        out.append(dict(zip(keys, key, strict=True)) | interval)
+        if row["varies"] == "clips":
+            wider = np.sqrt(interval["repeats"])
+            for bound in ("low", "high"):
+                interval[bound] = interval["value"] + wider * (interval[bound] - interval["value"])
+        out.append(row | interval)
     return pd.DataFrame(out)

@@ -218,14 +218,18 @@ class MotionGenerator:
         )
 
     def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
-        generator = np.random.default_rng(seed)
+        """Pick a stored pose for each character; those of one style take others in turn."""
+        taken = dict.fromkeys(styles, 0)
         poses = []
         for character, style in enumerate(styles):
             if style not in self.trained.seeds:
                 raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
             choices = self.trained.seeds[style]
             choices = choices[_as_fast_as(choices, speed[character])]
-            pose = turn_frames(choices[generator.integers(len(choices))], yaw[character])
+            order = np.random.default_rng([seed, self.trained.style_index(style)])
+            number = order.permutation(len(choices))[taken[style] % len(choices)]
+            taken[style] += 1
+            pose = turn_frames(choices[number], yaw[character])
             poses.append(center_window(pose, -start[character]))
         return np.stack(poses).astype(np.float32)
 

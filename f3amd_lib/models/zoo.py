@@ -220,8 +220,11 @@ def find_preset(name: str) -> Preset:
     for suffix in ("-raw", "-plus"):
         base = PRESETS.get(name.removesuffix(suffix))
         if name.endswith(suffix) and base is not None:
-            if base.family != "F3AMD" or base.source == "ours":
-                raise ValueError(f"{base.name} has no {suffix!r} form: only the paper's F3AMD have")
+            if base.family != "F3AMD" or base.source == "ours" or base.training:
+                raise ValueError(
+                    f"{base.name} has no {suffix!r} form: only the paper's F3AMD with the paper's "
+                    "losses have"
+                )
             return _suffixed(base, suffix)
     raise ValueError(f"unknown model {name!r}{nearest_hint(name, [*PRESETS, *_PAPER_NAMES])}")
 

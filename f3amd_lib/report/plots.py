@@ -123,16 +123,18 @@ def paper_tradeoff(times: pd.DataFrame, quality: pd.DataFrame):
 
 @styled
 def road_map():
-    """Draw the road from BVH text to a walking character, with the notebooks along it."""
+    """Draw the road from BVH text to a verdict, with the notebooks along it."""
     stations = (
         ("BVH text", "01", "motion/bvh"),
-        ("features\nand windows", "01", "data/"),
-        ("noise and\nsampler", "02", "diffusion/"),
-        ("FNO, FiLM,\nnetwork", "03", "models/"),
-        ("losses and\ntraining", "04", "training/"),
-        ("rollout and\nmetrics", "05", "evaluation/"),
+        ("features,\nwindows", "01", "data/"),
+        ("noise,\nsampler", "02", "diffusion/"),
+        ("networks,\nvariants", "03, 06", "models/"),
+        ("losses,\ntraining", "04", "training/"),
+        ("rollout", "05", "evaluation/"),
+        ("metrics,\nprotocol", "07", "evaluation/"),
+        ("claims,\nverdicts", "08", "report/"),
     )
-    figure, axis = new_figure(8.6, 1.7)
+    figure, axis = new_figure(9.6, 1.7)
     for place, (title, notebook, folder) in enumerate(stations):
         axis.text(
             place, 0.0, title, ha="center", va="center", fontsize=9.5, fontweight="bold",

@@ -23,7 +23,7 @@ import pandas as pd
 
 from f3amd_lib.files import whole_file
 
-__all__ = ["run_record", "record_hash", "write_table", "read_table"]
+__all__ = ["run_record", "record_hash", "write_table", "read_table", "set_aside_table"]
 
 _LIBRARY = Path(__file__).resolve().parents[1]
 _REPOSITORY = _LIBRARY.parent
@@ -311,3 +311,25 @@ def _num_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def set_aside_table(path) -> Path:
+    """Rename a table and its record to the first free number, so that it can still be read.
+
+    Args:
+      path: of the CSV.
+
+    Returns:
+      Where it lies now, such as `quality.old1.csv`.
+    """
+    path = Path(path)
+    number = 1
+    while True:
+        aside = path.with_name(f"{path.stem}.old{number}.csv")
+        if not aside.exists() and not aside.with_suffix(".json").exists():
+            break
+        number += 1
+    for suffix in (".csv", ".json"):
+        if path.with_suffix(suffix).exists():
+            path.with_suffix(suffix).rename(aside.with_suffix(suffix))
+    return aside

@@ -33,6 +33,7 @@ __all__ = [
     "save_tree",
     "describe",
     "load_tree",
+    "weights_digest",
     "errors_name",
     "describe_skeleton",
     "described_skeleton",
@@ -132,6 +133,11 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
             )
     leaves = [arrays[name].astype(leaf.dtype) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
+
+
+def weights_digest(params: Any) -> str:
+    """Return 12 hex digits that tell one set of weights from another."""
+    return _checksum({name: leaf for name, leaf in _named_leaves(params).items()}, "")[:12]
 
 
 @contextlib.contextmanager

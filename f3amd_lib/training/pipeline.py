@@ -12,6 +12,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +49,8 @@ __all__ = [
     "available_models",
     "find_model",
 ]
+
+log = logging.getLogger("f3amd")
 
 WEIGHTS_DIR = Path(__file__).resolve().parents[1] / "weights"
 
@@ -225,7 +229,9 @@ def train(
         num_train_windows=int(prepared.windows("train").num_windows),
     )
     state, rows = None, []
-    if files.state.exists():
+    if not files.state.exists():
+        _set_aside(files)  # a finished model without its state cannot be gone on with
+    else:
         if not files.history.exists():
             raise ValueError(
                 f"{files.state}: its loss history {files.history.name} is missing; put it back "
@@ -319,8 +325,7 @@ def obtain_model(
     state = describe(files.state) if files.state.exists() else {}
     unfinished = files.history.exists() and not files.model.exists()
     if not unfinished or any(state.get(name) != value for name, value in mine.items()):
-        for path in dataclasses.astuple(files):
-            _set_aside(path)
+        _set_aside(files)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
@@ -334,7 +339,7 @@ def available_models(profile: Profile) -> list[str]:
     if profile.name == "laptop":
         folders.append(WEIGHTS_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
-    names = [*zoo.PRESETS, *(f"{name}-plus" for name in zoo.PRESETS)]
+    names = [name + end for end in ("", "-raw", "-plus") for name in zoo.PRESETS]
     return [
         name
         for name in dict.fromkeys(names)
@@ -365,20 +370,41 @@ def find_model(dataset: str) -> Path:
         ("laptop", WEIGHTS_DIR / dataset),
     ):
         first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
-        found = [path for path in folder.glob("*.safetensors") if ".state." not in path.name]
-        if found:
-            return first if first in found else max(found, key=lambda path: path.stat().st_mtime)
+        found = [
+            path
+            for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stat().st_mtime)
+            if not re.search(r"\.state\.|\.old\d+\.", path.name)
+        ]
+        for path in sorted(reversed(found), key=lambda path: path != first):
+            try:
+                load_model(path)
+            except OutdatedFile as error:
+                log.warning("left aside: %s", error)
+            else:
+                return path
     raise ValueError(
         f"no trained model for data set {dataset!r}: run `python -m f3amd_lib train --data "
         f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
     )
 
 
-def _set_aside(path: Path) -> None:
-    """Rename a file to the first free name with a number, so that nothing a user made is lost."""
-    if not path.exists():
+def _set_aside(files: ModelFiles) -> None:
+    """Rename what lies there to the first free number, so that nothing a user made is lost."""
+    name = files.model.name.removesuffix(".safetensors")
+    present = [
+        path
+        for path in (*dataclasses.astuple(files), files.history.with_suffix(".json"))
+        if path.exists()
+    ]
+    if not present:
         return
+
+    def aside(path: Path, number: int) -> Path:
+        return path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
+
     number = 1
-    while (target := path.with_name(f"{path.name}.old{number}")).exists():
+    while any(aside(path, number).exists() for path in present):
         number += 1
-    path.rename(target)
+    for path in present:
+        path.rename(aside(path, number))
+    log.warning("earlier files of %s are kept as %s.old%d", name, name, number)
