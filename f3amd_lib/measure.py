@@ -19,16 +19,18 @@ from pathlib import Path
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_lib.evaluation.classifier import obtain_classifier
+from f3amd_lib.evaluation import sensitivity
+from f3amd_lib.evaluation.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.evaluation.protocol import (
     REFERENCE_MODELS,
     Protocol,
+    evaluation_paths,
     measure_model,
     measure_real,
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.evaluation.quality import row_label
+from f3amd_lib.evaluation.quality import reference_clips, row_label
 from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.models import zoo
 from f3amd_lib.names import nearest_hint
@@ -49,7 +51,14 @@ from f3amd_lib.training.pipeline import (
     prepare,
 )
 
-__all__ = ["MEASUREMENTS", "STEPS", "measure_learning", "measure_quality", "main"]
+__all__ = [
+    "MEASUREMENTS",
+    "STEPS",
+    "measure_learning",
+    "measure_quality",
+    "measure_sensitivity",
+    "main",
+]
 
 log = logging.getLogger("f3amd")
 
@@ -101,6 +110,28 @@ def measure_learning(
     return path
 
 
+def _protocol(
+    prepared: PreparedData, profile: Profile, measurement: str
+) -> tuple[StyleClassifier, Protocol, dict]:
+    """Return the style classifier, the protocol of a profile and the record of a measurement."""
+    packed = prepared.packed
+    classifier, _ = obtain_classifier(packed, profile)
+    protocol = Protocol(
+        tuple(profile.evaluation_styles or packed.primary_styles[: profile.num_characters]),
+        num_frames=profile.rollout_rounds * profile.window,
+        **_PROTOCOL.get(profile.name, {}),
+    )
+    fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
+    protocol = dataclasses.replace(protocol, windows_per_style=fitting)
+    record = run_record(
+        profile=profile, dataset=packed, seed=protocol.path_seed, measurement=measurement,
+        protocol=dataclasses.asdict(protocol), classifier=classifier.record["classifier_training"],
+        classifier_weights=weights_digest(classifier.params),
+        classifier_accuracy=classifier.accuracy,
+    )  # fmt: skip
+    return classifier, protocol, record
+
+
 def measure_quality(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
 ) -> Path:
@@ -121,20 +152,7 @@ def measure_quality(
     """
     folder = results_dir(profile.dataset, profile.name) / "records"
     packed = prepared.packed
-    classifier, _ = obtain_classifier(packed, profile)
-    protocol = Protocol(
-        tuple(profile.evaluation_styles or packed.primary_styles[: profile.num_characters]),
-        num_frames=profile.rollout_rounds * profile.window,
-        **_PROTOCOL.get(profile.name, {}),
-    )
-    fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
-    protocol = dataclasses.replace(protocol, windows_per_style=fitting)
-    record = run_record(
-        profile=profile, dataset=packed, seed=protocol.path_seed, measurement="quality",
-        protocol=dataclasses.asdict(protocol), classifier=classifier.record["classifier_training"],
-        classifier_weights=weights_digest(classifier.params),
-        classifier_accuracy=classifier.accuracy,
-    )  # fmt: skip
+    classifier, protocol, record = _protocol(prepared, profile, "quality")
     paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
     kept = {name: _kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
@@ -192,12 +210,62 @@ def measure_quality(
     return folder / "quality.csv"
 
 
+def measure_sensitivity(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Ask the metrics themselves (see `evaluation.sensitivity`), some minutes in all.
+
+    Whether FID and EMD order graded corruptions, how many windows they need before they settle, and
+    how lively feet are in each band of frequency, real and generated with the profile's steps.
+
+    Args:
+      prepared, profile: as for `measure_quality`.
+      models: presets whose feet are looked at; by default all that have weights.
+
+    Returns:
+      The table `records/corruptions.csv`; beside it `settling.csv` and `foot_spectrum.csv`. All
+      three are measured anew.
+    """
+    folder = results_dir(profile.dataset, profile.name) / "records"
+    packed = prepared.packed
+    classifier, protocol, record = _protocol(prepared, profile, "sensitivity")
+    graded = sensitivity.graded_corruptions(packed, classifier, protocol, progress=True)
+    tables = {
+        "corruptions": sensitivity.summarise_corruptions(graded),
+        "settling": sensitivity.settling(classifier),
+    }
+    styles = list(protocol.styles)
+    paths = evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed)
+    clips = reference_clips(packed, styles, window=profile.window)
+    feet = {
+        ("real", profile.window, 0): [
+            (packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips
+        ]
+    }
+    asked = [zoo.find_preset(name).name for name in models or available_models(profile)]
+    for model in tqdm(asked, unit="model"):
+        trained, _, _ = obtain_model(prepared, profile, preset=model)
+        generator = MotionGenerator(trained, profile.num_steps)
+        rollout = generator.rollout(paths, styles, seed=protocol.path_seed)
+        motions = [rollout.motion(character) for character in range(len(styles))]
+        key = (model, profile.window, profile.num_steps)
+        feet[key] = list(zip(styles, motions, strict=True))
+    tables["foot_spectrum"] = sensitivity.foot_spectrum(feet)
+    for name, table in tables.items():
+        write_table(folder / f"{name}.csv", table, record)
+    return folder / "corruptions.csv"
+
+
 STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
 _PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
 
-MEASUREMENTS: dict[str, Callable] = {"learning": measure_learning, "quality": measure_quality}
+MEASUREMENTS: dict[str, Callable] = {
+    "learning": measure_learning,
+    "quality": measure_quality,
+    "sensitivity": measure_sensitivity,
+}
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""
 
 

@@ -1,0 +1,177 @@
+"""The paper's quality tables with ours under each row, on made-up figures."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from f3amd_lib.models import zoo
+from f3amd_lib.report.papers import load_paper_table
+from f3amd_lib.report.quality_tables import (
+    FIGURES,
+    NOT_MEASURED,
+    NOTE,
+    PAPER_SOURCE,
+    QUALITY_TABLES,
+    beside_paper,
+    figure_text,
+    quality_markdown,
+    wide_rows,
+)
+
+UNITS = {
+    "style_coverage": "%",
+    "trajectory_error": "m",
+    "direction_error": "deg",
+    "diversity": "cm",
+    "IRD": "cm",
+}
+
+
+def figures(model="F3AMD-FNO-96", steps=8, window_frames=32, value=10.0, half=1.0, metrics=None):
+    """Rows of one system, as `protocol.summarise` makes them."""
+    rows = [
+        {
+            "model": model,
+            "window_frames": window_frames,
+            "steps": steps,
+            "metric": metric,
+            "unit": UNITS.get(metric, ""),
+            "better": "near real",
+            "value": value + number,
+            "low": value + number - half,
+            "high": value + number + half,
+            "repeats": 5,
+        }
+        for number, metric in enumerate(metrics or FIGURES)
+    ]
+    return pd.DataFrame(rows)
+
+
+def table_of(*parts):
+    return pd.concat(parts, ignore_index=True)
+
+
+LABEL = "tiny, smoke"
+REAL = figures("real", 0, metrics=[metric for metric in FIGURES if metric != "diversity"])
+QUALITY = table_of(
+    REAL, figures("frozen pose", 0, value=3.0), figures(), figures(steps=1, value=20.0),
+    figures("CAMDM-code", value=30.0), figures("F3AMD-FNO-96-plus", value=77.0),
+)  # fmt: skip
+
+
+def line_of(rows, source, **where):
+    for column, wanted in where.items():
+        rows = rows[rows[column] == wanted]
+    return rows[rows["source"] == source].set_index("metric")
+
+
+@pytest.mark.parametrize("number", QUALITY_TABLES)
+def test_every_row_of_the_paper_is_there_as_printed_with_ours_below(number):
+    printed = load_paper_table(number)
+    printed = printed[printed["metric"].isin(FIGURES)]
+    rows = beside_paper(number, QUALITY, LABEL)
+    assert (rows.groupby("line").size() == 9).all()
+    papers = rows[rows["source"] == PAPER_SOURCE]
+    columns = ["model", "window_frames", "steps", "metric", "unit", "better", "printed", "value"]
+    pd.testing.assert_frame_equal(
+        papers[columns].reset_index(drop=True), printed[columns].reset_index(drop=True)
+    )
+    for line, cells in papers.groupby("line"):
+        ours = rows[rows["line"] == line + 1]
+        assert set(ours["source"]) == {LABEL}
+        assert set(ours["model"]) == {zoo.find_preset(cells["model"].iloc[0]).name}
+        assert set(ours["steps"]) == set(cells["steps"])
+        assert set(ours["window_frames"]) == set(cells["window_frames"])
+
+
+def test_table_5_ours_are_means_with_intervals_and_the_rest_is_not_measured():
+    rows = beside_paper(5, QUALITY, LABEL)
+    one_step = line_of(rows, LABEL, model="F3AMD-FNO-96", steps=1)
+    assert one_step.loc["EMD", "value"] == 21.0
+    assert (one_step.loc["EMD", "low"], one_step.loc["EMD", "high"]) == (20.0, 22.0)
+    assert one_step.loc["EMD", "printed"] == "21.00 ± 1.00"
+    # The paper's arrow, not ours.
+    assert one_step.loc["IRD", "better"] == "down"
+    for steps in (4, 2):
+        assert (line_of(rows, LABEL, model="F3AMD-FNO-96", steps=steps)["printed"]
+                == NOT_MEASURED).all()  # fmt: skip
+    assert np.isnan(line_of(rows, LABEL, model="CAMDM", steps=8)["value"]).all()
+
+
+def test_real_and_bad_generators_stand_on_top():
+    rows = beside_paper(10, QUALITY, LABEL)
+    first = rows[rows["line"] < 2]
+    assert list(first["model"].unique()) == ["real", "frozen pose"]
+    assert set(first["steps"]) == {0} and set(first["source"]) == {LABEL}
+    assert line_of(first, LABEL, model="real").loc["diversity", "printed"] == ""
+    assert line_of(first, LABEL, model="real").loc["FID", "printed"] == "10.00 ± 1.00"
+
+
+def test_a_data_set_without_a_real_row_says_so():
+    rows = beside_paper(12, figures(), LABEL)
+    assert (rows[rows["line"] == 0]["model"] == "real").all()
+    assert (rows[rows["line"] == 0]["printed"] == NOT_MEASURED).all()
+    assert wide_rows(rows)["source"][0] == f"{LABEL}: {NOT_MEASURED}"
+
+
+def test_the_papers_names_are_ours_by_find_preset_and_ours_alone_are_in_no_row_of_the_paper():
+    pytorch = line_of(beside_paper(6, QUALITY, LABEL), LABEL, model="CAMDM-code")
+    assert pytorch.loc["FID", "value"] == 30.0
+    many = beside_paper(10, QUALITY, LABEL)
+    assert line_of(many, LABEL, model="F3AMD-FNO-96").loc["FID", "value"] == 10.0
+    for number in QUALITY_TABLES:
+        assert "F3AMD-FNO-96-plus" not in set(beside_paper(number, QUALITY, LABEL)["model"])
+
+
+def test_wide_rows_say_what_is_missing_in_the_papers_own_line():
+    wide = wide_rows(beside_paper(5, QUALITY, LABEL))
+    assert list(wide)[:3] == ["model", "steps", "source"]  # all windows have 32 frames
+    assert list(wide)[3:6] == ["FID ↓", "EMD ↓", "Style (%) ↑"] and len(list(wide)) == 12
+    fno = wide[wide["model"] == "F3AMD-FNO-96"]
+    assert fno["steps"].tolist() == ["8", "8", "4", "2", "1", "1"]
+    missing = f"{PAPER_SOURCE}; ours {NOT_MEASURED}"
+    assert fno["source"].tolist() == [PAPER_SOURCE, LABEL, missing, missing, PAPER_SOURCE, LABEL]
+    assert fno["FID ↓"].tolist() == [
+        *("0.189", "10.00 ± 1.00", "0.189", "0.184", "0.184", "20.00 ± 1.00")
+    ]
+    assert "frames" in wide_rows(beside_paper(3, QUALITY, LABEL))
+
+
+def test_markdown_has_a_title_the_table_and_the_note():
+    text = quality_markdown(5, QUALITY, LABEL)
+    assert text.startswith("**Table 5.** Motion quality by steps, windows of 32 frames.\n")
+    assert NOTE in text and "absolute values do not compare" in text
+    assert text.count(f"| {LABEL} ") == 4 and "20.00 ± 1.00" in text
+    assert "published were not run" in quality_markdown(6, QUALITY, LABEL)
+    assert "windows of" not in quality_markdown(3, QUALITY, LABEL).splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    "value, low, high, text",
+    [
+        (7.3861, 7.2651, 7.5071, "7.386 ± 0.121"),
+        (32.66, 26.72, 38.6, "32.66 ± 5.94"),
+        (106.04, 96.2, 115.88, "106.0 ± 9.8"),
+        (2237.7, 2041.7, 2433.7, "2238 ± 196"),
+        (0.531, np.nan, np.nan, "0.531"),
+        (np.nan, np.nan, np.nan, "–"),
+    ],
+)
+def test_figures_have_four_digits_and_as_many_decimals_in_the_interval(value, low, high, text):
+    assert figure_text(value, low, high) == text
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ValueError, match="quality tables are 3, 5, .* not 4"):
+        beside_paper(4, QUALITY, LABEL)
+    for label in ("", PAPER_SOURCE):
+        with pytest.raises(ValueError, match="dataset_label must say"):
+            beside_paper(3, QUALITY, label)
+    with pytest.raises(ValueError, match="no column 'low'"):
+        beside_paper(3, QUALITY.drop(columns="low"), LABEL)
+    with pytest.raises(ValueError, match="two rows of F3AMD-FNO-96, 32, 8, FID"):
+        beside_paper(3, table_of(QUALITY, figures()), LABEL)
+    with pytest.raises(ValueError, match="IRD is in m here and in cm in the paper"):
+        beside_paper(3, QUALITY.assign(unit=QUALITY["unit"].replace("cm", "m")), LABEL)
+    with pytest.raises(ValueError, match="middle of its interval"):
+        figure_text(5.0, 4.0, 9.0)
