@@ -305,3 +305,22 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     measure.measure_quality(prepared, profile)
     kept, _ = read_table(path.with_name("quality_by_seed.old1.csv"))
     pd.testing.assert_frame_equal(kept, before)
+
+
+def test_the_metrics_own_sensitivity_is_measured(
+    prepared, classifier, generator, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    profile = load_profile("smoke", "synthetic", rollout_rounds=3, num_steps=1)
+    name = "F3AMD-FNO-32"
+    trained = dataclasses.replace(generator.trained, name=name)
+    monkeypatch.setattr(measure, "obtain_classifier", lambda *a, **k: (classifier, "earlier run"))
+    monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "earlier run"))
+    monkeypatch.setattr(measure, "available_models", lambda *a: [name])
+    graded, record = read_table(measure.measure_sensitivity(prepared, profile))
+    assert set(graded["corruption"]) == set(REFERENCE_MODELS[1:])
+    assert {0.0, 1.0} <= set(graded["strength"]) and record["measurement"] == "sensitivity"
+    feet, _ = read_table(tmp_path / "synthetic" / "smoke" / "records" / "foot_spectrum.csv")
+    assert set(feet["model"]) == {"real", name}
+    settled, _ = read_table(tmp_path / "synthetic" / "smoke" / "records" / "settling.csv")
+    assert {"FID", "EMD"} <= set(settled["metric"])

@@ -365,7 +365,7 @@ def graded_distances(table: pd.DataFrame):
     Args:
       table: from `sensitivity.summarise_corruptions`.
     """
-    panels = (("FID", "FID ↓"), ("EMD", "EMD ↓"), ("style_accuracy", "style still recognised (%)"))
+    panels = (("FID", "FID ↓"), ("EMD", "EMD ↓"), ("style_accuracy", "style recognised (%)"))
     figure, axes = new_figure(7.2, 2.7, 1, 3)
     for axis, (metric, title) in zip(axes, panels, strict=True):
         mine = table[table["metric"] == metric]
@@ -376,7 +376,7 @@ def graded_distances(table: pd.DataFrame):
             axis.plot(rows["strength"], rows["value"], ".-", color=_color(name), label=name)
         axis.set_ylim(0, min(1.4 * mine["value"].max(), 1.05 * np.nanmax(mine["high"])))
         axis.set_title(title)
-        axis.set_xlabel("strength (0: real, 1: the recipe)")
+        axis.set_xlabel("strength of the recipe")
     axes[2].set_ylim(0, 105)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
