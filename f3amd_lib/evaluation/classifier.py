@@ -505,28 +505,12 @@ class StyleClassifier:
             return known.features
         return known.features[known.styles == self.style_index(style)]
 
-    def reference_moments(
-        self, split: str, style: str | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean [D] and covariance [D, D] of `reference`, float64; the covariance over N - 1.
-
-        Raises:
-          ValueError: for an unknown split or style, or fewer than two windows.
-        """
-        features = self.reference(split, style).astype(np.float64)
-        if len(features) < 2:
-            whose = "" if style is None else f" of style {style!r}"
-            raise ValueError(
-                f"{len(features)} {split} window{whose}: a covariance needs at least two"
-            )
-        return features.mean(axis=0), np.cov(features, rowvar=False)
-
 
 def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BAR) -> None:
     """Refuse a classifier that cannot tell styles apart on clips it was not trained on.
 
-    Coverage of real motion is at least the classifier's accuracy a, so that up to 1 - a of a
-    coverage figure is the classifier's own error; and features that mix styles up let FID and EMD
+    With as much real motion of each style, coverage is at least the accuracy a, so that up to 1 - a
+    of a coverage figure is the classifier's own error; and features that mix styles up let FID and EMD
     take one style for another. The bar of 0.8 keeps that error within a fifth, and lies far from
     guessing (1 / S) and from what a whole training reaches (0.98 and more on our data sets).
 

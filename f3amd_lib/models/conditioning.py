@@ -208,6 +208,8 @@ class AdaLNZero(nnx.Module):
     """Adaptive layer normalisation, which starts as the identity (Peebles and Xie 2023, DiT).
 
     The condition scales and shifts what the base block reads, and gates what it adds to its input.
+    One modulation goes around the whole base block. DiT's SiLU before the linear layer is left out,
+    as c enters by a linear layer alone in FiLM too (Eq. 5).
     """
 
     def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):

@@ -143,7 +143,8 @@ def _list_presets() -> list[Preset]:
     baselines = [
         _camdm("CAMDM", "Tables 1-7, section 6", paper_names=("CAMDM (JAX)",), windows=(32, 64)),
         _camdm("CAMDM-96", "Table 12", network={"latent_width": 96}),
-        # F3AMD measures it with 8 steps, so that it gets K = 8; the code's own default is 4.
+        # The network of the released code, trained as all others are. F3AMD measures it with 8
+        # steps, so that it gets K = 8; the code's own default is 4.
         _camdm(
             "CAMDM-code",
             "Tables 6, 7",

@@ -231,6 +231,13 @@ READINGS = (
     ),
     Reading(
         "variants",
+        "which blocks m cuts (Table 10)",
+        "“FNO blocks use 17 frequency modes” (4.5), “in FNO backbone” (App. E)",
+        "all FNO blocks, encoder and decoder too, unlike Table 8's variants",
+        "m is introduced for the FNO block as such (Eq. 2); App. E can be read either way",
+    ),
+    Reading(
+        "variants",
         "modes and weights of DCT",
         "not said",
         "all T cosine modes (32), real weights",
@@ -351,6 +358,14 @@ READINGS = (
         "normalise = {}",
         "the same features for all models",
         "CAMDMConfig.normalise",
+    ),
+    Reading(
+        "CAMDM",
+        "training of `CAMDM-code`",
+        "“CAMDM (PyTorch)” (Tables 6, 7): the published code",
+        "the network, its dropout and its masking; features, losses, optimiser and average of the "
+        "weights are this project's",
+        "so it is no row of Table 6, which took the published weights",
     ),
     Reading(
         "CAMDM",
