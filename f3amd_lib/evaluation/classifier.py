@@ -510,9 +510,9 @@ def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BA
     """Refuse a classifier that cannot tell styles apart on clips it was not trained on.
 
     With as much real motion of each style, coverage is at least the accuracy a, so that up to 1 - a
-    of a coverage figure is the classifier's own error; and features that mix styles up let FID and EMD
-    take one style for another. The bar of 0.8 keeps that error within a fifth, and lies far from
-    guessing (1 / S) and from what a whole training reaches (0.98 and more on our data sets).
+    of a coverage figure is the classifier's own error; and features that mix styles up let FID and
+    EMD take one style for another. The bar of 0.8 keeps that error within a fifth, and lies far
+    from guessing (1 / S) and from what a whole training reaches (0.98 and more on our data sets).
 
     Args:
       classifier: a trained one.

@@ -179,9 +179,9 @@ READINGS = (
     Reading(
         "architecture",
         "which blocks keep m modes",
-        "“FNO blocks use 17 frequency modes” (4.5)",
+        "“FNO blocks use 17 frequency modes” (4.5), “in FNO backbone” (App. E)",
         "encoder and decoder too, if they have so many",
-        "they are FNO blocks",
+        "they are FNO blocks, and m belongs to the block (Eq. 2); App. E can be read either way",
     ),
     Reading(
         "architecture",
@@ -228,13 +228,6 @@ READINGS = (
         "“FNO backbone variants” (App. E)",
         "the backbone's; encoder and decoder stay as they are",
         "as worded",
-    ),
-    Reading(
-        "variants",
-        "which blocks m cuts (Table 10)",
-        "“FNO blocks use 17 frequency modes” (4.5), “in FNO backbone” (App. E)",
-        "all FNO blocks, encoder and decoder too, unlike Table 8's variants",
-        "m is introduced for the FNO block as such (Eq. 2); App. E can be read either way",
     ),
     Reading(
         "variants",
