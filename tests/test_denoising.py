@@ -1,12 +1,15 @@
 """Figures about one window, on denoisers whose answers are known."""
 
 import dataclasses
+import math
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
-from builders import tiny_trained, tiny_windows
+from builders import tiny_camdm, tiny_trained, tiny_windows
 
+from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.evaluation import denoising
 from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -57,6 +60,26 @@ def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
     use = denoising.noise_use(MotionGenerator(trained, 1), windows)
     assert use["x0_error_ratio"] == pytest.approx(1.0)
     assert use["seed_spread_cm"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
+    windows, asked = tiny_windows(), []
+
+    def spy(trained, windows, sigmas, **settings):
+        asked.append(tuple(sigmas))
+        return pd.DataFrame({"x0_error": [1.0, 2.0]})
+
+    monkeypatch.setattr(denoising, "x0_error_by_sigma", spy)
+    monkeypatch.setattr(denoising, "seed_spread", lambda *a, **k: 0.0)
+    four, one = VariancePreservingCosine(4), VariancePreservingCosine(1)
+    for schedule in (four, one):
+        config = tiny_camdm(noise_levels=tuple(schedule.sigmas.tolist()))
+        generator = MotionGenerator(tiny_trained(config=config, diffusion=schedule), 1)
+        ratio = denoising.noise_use(generator, windows)["x0_error_ratio"]
+        assert ratio == 0.5 if schedule is four else math.isnan(ratio)
+    # 0.425 is the lowest of the four levels; with a single one there is nothing to compare.
+    ((lowest, highest),) = asked
+    assert lowest == pytest.approx(four.sigmas[0]) and highest == pytest.approx(four.sigma_max)
 
 
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
