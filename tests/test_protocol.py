@@ -269,12 +269,12 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     monkeypatch.setattr(measure, "obtain_classifier", lambda *a, **k: (classifier, "earlier run"))
     monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "earlier run"))
     monkeypatch.setattr(measure, "available_models", lambda *a: [name])
-    monkeypatch.setattr(measure, "STEPS", (2, 1))
+    monkeypatch.setattr(measure, "STEPS", (1,))
     trained = dataclasses.replace(generator.trained, name=name)
     path = measure.measure_quality(prepared, profile)
     table, record = read_table(path)
     rows = set(zip(table["model"], table["steps"], strict=True))
-    assert rows == {*((model, 0) for model in REFERENCE_MODELS), (name, 2), (name, 1)}
+    assert rows == {*((model, 0) for model in REFERENCE_MODELS), (name, 1)}
     assert record["measurement"] == "quality" and record["protocol"]["num_seeds"] == 2
     for other in ("quality_by_seed", "quality_by_round"):
         kept, _ = read_table(path.with_name(f"{other}.csv"))
@@ -291,14 +291,14 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     assert calls == []
     pd.testing.assert_frame_equal(read_table(path)[0], table)
     measure.measure_quality(prepared, profile, [name])
-    assert calls == [2, 1]
+    assert calls == [1]
     assert len(read_table(path)[0]) == len(table)
     # Other weights under the same name are another model.
     trained = dataclasses.replace(
         trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params)
     )
     measure.measure_quality(prepared, profile)
-    assert calls == [2, 1, 2, 1]
+    assert calls == [1, 1]
     # Other settings start anew, and lose nothing.
     monkeypatch.setattr(measure, "_PROTOCOL", {"smoke": {"num_seeds": 1, "num_diversity_seeds": 2}})
     before = read_table(path.with_name("quality_by_seed.csv"))[0]
