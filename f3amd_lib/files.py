@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["whole_file"]
+__all__ = ["whole_file", "set_aside"]
 
 
 @contextlib.contextmanager
@@ -36,3 +36,28 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def set_aside(paths: Iterable[Path], name: str) -> str | None:
+    """Rename files that belong together to the first free number, so that none is overwritten.
+
+    Args:
+      paths: files whose names begin with `name`; those that do not exist are left out.
+      name: what their names share.
+
+    Returns:
+      What the names begin with now, such as "quality.old1"; None if there was no file.
+    """
+    present = [path for path in paths if path.exists()]
+    if not present:
+        return None
+
+    def aside(path: Path, number: int) -> Path:
+        return path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
+
+    number = 1
+    while any(aside(path, number).exists() for path in present):
+        number += 1
+    for path in present:
+        path.rename(aside(path, number))
+    return f"{name}.old{number}"

@@ -251,7 +251,7 @@ def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
 
 def test_classes_that_nobody_walks_do_not_count(generator, packed, prepared, classifier):
     alone = dataclasses.replace(SMALL, styles=STYLES[:1])
-    real = module._real_features(packed, classifier, alone.styles, 32)
+    real = module.real_features(packed, classifier, alone.styles, 32)
     assert list(real) == [classifier.style_index(STYLES[0])]
     rows = measure_real(packed, classifier, alone, window=32)
     both = measure_real(packed, classifier, SMALL, window=32)

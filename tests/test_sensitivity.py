@@ -54,6 +54,9 @@ class PlainClassifier:
         # "proud" clips are those whose joints move faster.
         return (self.features(windows)[:, :18].mean(axis=1) > 3.0).astype(int)
 
+    def features_and_classes(self, windows):
+        return self.features(windows), self.predict(windows)
+
     def reference(self, split, style):
         known = self.references[split]
         return known.features[known.styles == self.style_index(style)]

@@ -460,6 +460,11 @@ class StyleClassifier:
         answers = _answers(self.config, self.params, self.statistics, flat)
         return tuple(answer.reshape(*windows.shape[:-2], -1) for answer in answers)
 
+    def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
+        """Return what `features` and `predict` return, with one run of the network for both."""
+        features, scores = self._run(windows)
+        return features, np.argmax(scores, axis=-1)
+
     def features(self, windows) -> np.ndarray:
         """Return the features of windows, for FID and EMD.
 
@@ -486,7 +491,7 @@ class StyleClassifier:
         Raises:
           ValueError: for another shape, no windows, or numbers not finite.
         """
-        return np.argmax(self._run(windows)[1], axis=-1)
+        return self.features_and_classes(windows)[1]
 
     def reference(self, split: str, style: str | None = None) -> np.ndarray:
         """Return the features of real windows, [N, feature_width], float32.

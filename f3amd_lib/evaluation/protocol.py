@@ -17,6 +17,7 @@ somebody walks or glides: read them beside foot alternation, acceleration and co
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -52,10 +53,13 @@ __all__ = [
     "PROTOCOL_METRICS",
     "REFERENCE_MODELS",
     "Protocol",
+    "Seen",
     "evaluation_paths",
     "path_statistics",
     "measure_model",
     "measure_real",
+    "real_features",
+    "see_windows",
     "summarise",
     "windows_that_fit",
 ]
@@ -158,10 +162,16 @@ def evaluation_paths(
         named_path("complex", num_frames, speed=style_pace(packed, style), seed=seed)
         for style in styles
     ]
-    clips = [clip for style in styles for clip in training_clips(packed, style)]
-    known = np.mean([sideways_share(path_from_motion(packed.motion(clip))) for clip in clips])
+    known = _sideways_in_training(packed, tuple(styles))
     asked = np.mean([sideways_share(path) for path in paths])
     return [facing_ahead(path) for path in paths] if known < 0.02 < asked else paths
+
+
+@functools.lru_cache(maxsize=8)
+def _sideways_in_training(packed: PackedMotion, styles: tuple[str, ...]) -> float:
+    """Return the share of sideways steps in the training clips; every seed's paths ask for it."""
+    clips = [clip for style in styles for clip in training_clips(packed, style)]
+    return float(np.mean([sideways_share(path_from_motion(packed.motion(clip))) for clip in clips]))
 
 
 def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
@@ -219,7 +229,7 @@ def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """What the classifier says of the windows of some motions.
 
     Attributes:
@@ -234,15 +244,26 @@ class _Seen:
     style: np.ndarray
     source: np.ndarray
 
-    def of(self, sources: Iterable[int]) -> _Seen:
+    def of(self, sources: Iterable[int]) -> Seen:
         """Return the windows of some of the motions, motion by motion in that order."""
         order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
         parts = (self.features, self.predicted, self.style, self.source)
-        return _Seen(*(part[order] for part in parts))
+        return Seen(*(part[order] for part in parts))
 
 
-def _seen(classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]) -> _Seen:
-    """Show motions to the classifier; those shorter than its window hold none."""
+def see_windows(
+    classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]
+) -> Seen:
+    """Show motions to the classifier; those shorter than its window hold no window.
+
+    Args:
+      classifier: whose features and classes are wanted.
+      motions: of the classifier's skeleton.
+      styles: what each was asked to look like.
+
+    Raises:
+      ValueError: if no motion is long enough, or for an unknown style.
+    """
     windows, asked, source = [], [], []
     for number, (motion, style) in enumerate(zip(motions, styles, strict=True)):
         if motion.num_frames >= classifier.config.window:
@@ -255,24 +276,29 @@ def _seen(classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequen
             f"no motion of {', '.join(dict.fromkeys(styles))} has the {classifier.config.window} "
             "frames that the style classifier looks at"
         )
-    windows = np.concatenate(windows)
-    return _Seen(
-        classifier.features(windows),
-        classifier.predict(windows),
-        np.array(asked),
-        np.array(source),
-    )
+    features, predicted = classifier.features_and_classes(np.concatenate(windows))
+    return Seen(features, predicted, np.array(asked), np.array(source))
 
 
-def _real_features(
+def real_features(
     packed: PackedMotion, classifier: StyleClassifier, styles: Sequence[str], window: int
 ) -> dict[int, np.ndarray]:
-    """Return features of real training windows by class, at the speeds that are asked for."""
+    """Return features of real training windows by class, at the speeds that are asked for.
+
+    Args:
+      packed: the data set.
+      classifier: holds the features.
+      styles: labels of it.
+      window: see `quality.reference_clips`.
+
+    Returns:
+      Class number -> [N, D], in the order of `styles`.
+    """
     clips = reference_clips(packed, styles, window=window, split="train")
     known = classifier.references["train"]
     kept = np.isin(known.clips, clips)
     return {
-        number: known.features[kept & (known.styles == number)].astype(np.float32)
+        number: known.features[kept & (known.styles == number)]
         for number in map(classifier.style_index, styles)
     }
 
@@ -297,7 +323,7 @@ def windows_that_fit(
     """
     span = classifier.config.window
     counts = [protocol.windows_per_style, protocol.num_frames // span]
-    real = _real_features(packed, classifier, protocol.styles, window)
+    real = real_features(packed, classifier, protocol.styles, window)
     counts += [len(features) for features in real.values()]
     clips, labels = _held_out_clips(packed, protocol.styles, window)
     lengths = np.diff(packed.clip_start)[clips] // span
@@ -325,7 +351,7 @@ def _held_out_clips(
 
 
 def _distribution_figures(
-    seen: _Seen, real: dict[int, np.ndarray], count: int, rng: np.random.Generator
+    seen: Seen, real: dict[int, np.ndarray], count: int, rng: np.random.Generator
 ) -> dict:
     """Score windows against real ones of the same styles, `count` of each style on either side."""
     drawn, wanted, by_style = [], [], []
@@ -399,7 +425,7 @@ def measure_model(
         "steps": generator.num_steps,
     }
     styles = list(protocol.styles)
-    real = _real_features(packed, classifier, styles, trained.config.window)
+    real = real_features(packed, classifier, styles, trained.config.window)
     paths = [
         evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed)
         for seed in seeds
@@ -421,7 +447,7 @@ def measure_model(
             styles,
         )
         rng = np.random.default_rng([protocol.path_seed, seed])
-        seen = _seen(classifier, motions, styles)
+        seen = see_windows(classifier, motions, styles)
         figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
         figures |= _diversities(generator, paths[seed], styles, protocol, seed)
         use = noise_use(generator, held_out, seed=seed)
@@ -510,8 +536,8 @@ def measure_real(
         floor = float(packed.floor_shift[clip])
         found = _motion_figures(seen, own_path(whole), window, floor)
         figures.append({k: v for k, v in found.items() if k not in _GROWS_WITH_LENGTH})
-    seen = _seen(classifier, motions, labels)
-    real = _real_features(packed, classifier, protocol.styles, window)
+    seen = see_windows(classifier, motions, labels)
+    real = real_features(packed, classifier, protocol.styles, window)
     columns = {"model": model, "window_frames": window, "steps": 0, "varies": "clips"}
     rows = []
     for repeat in range(repeats):

@@ -19,7 +19,7 @@ from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.evaluation import distributions
 from f3amd_lib.evaluation.classifier import StyleClassifier, require_telling_styles
 from f3amd_lib.evaluation.corruptions import CORRUPTIONS, corrupt
-from f3amd_lib.evaluation.protocol import Protocol
+from f3amd_lib.evaluation.protocol import Protocol, real_features, see_windows
 from f3amd_lib.evaluation.quality import reference_clips
 from f3amd_lib.motion.skeleton import Motion
 
@@ -105,12 +105,8 @@ def graded_corruptions(
     clips = [clip for split in splits for clip in clips_of(split)]
     motions = [packed.motion(clip) for clip in clips]
     names = [packed.styles[packed.clip_style[clip]] for clip in clips]
-    known = classifier.references["train"]
-    usual = np.isin(known.clips, clips_of("train"))
-    real = {
-        style: known.features[usual & (known.styles == classifier.style_index(style))]
-        for style in protocol.styles
-    }
+    by_class = real_features(packed, classifier, protocol.styles, classifier.config.window)
+    real = {classifier.styles[number]: cloud for number, cloud in by_class.items()}
     todo = [
         (name, strength, seed)
         for name in corruptions
@@ -120,20 +116,15 @@ def graded_corruptions(
     rows = []
     for name, strength, seed in tqdm(todo, unit="set", disable=not progress):
         rng = np.random.default_rng([protocol.path_seed, seed, round(1e6 * strength)])
-        windows, asked = [], []
-        for motion, style in zip(motions, names, strict=True):
-            broken = corrupt(name, motion, strength=strength, seed=int(rng.integers(2**31)))
-            windows.append(classifier.windows_of(broken.positions, packed.skeleton))
-            asked += [style] * len(windows[-1])
-        windows, asked = np.concatenate(windows), np.array(asked)
-        features = classifier.features(windows)
-        made = {style: features[asked == style] for style in protocol.styles}
+        broken = [
+            corrupt(name, motion, strength=strength, seed=int(rng.integers(2**31)))
+            for motion in motions
+        ]
+        seen = see_windows(classifier, broken, names)
+        made = {style: seen.features[seen.style == classifier.style_index(style)] for style in real}
         drawn = [_draw_alike(side, protocol.windows_per_style, rng) for side in (made, real)]
         figures = {metric: distance(*drawn) for metric, distance in _DISTANCES.items()}
-        wanted = np.array([classifier.style_index(style) for style in asked])
-        figures["style_accuracy"] = distributions.style_accuracy(
-            classifier.predict(windows), wanted
-        )
+        figures["style_accuracy"] = distributions.style_accuracy(seen.predicted, seen.style)
         named = {"corruption": name, "strength": float(strength), "seed": seed}
         rows += [{**named, "metric": metric, "value": value} for metric, value in figures.items()]
     return pd.DataFrame(rows)

@@ -21,7 +21,7 @@ from pathlib import Path, PurePath
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.files import whole_file
+from f3amd_lib.files import set_aside, whole_file
 
 __all__ = ["run_record", "record_hash", "write_table", "read_table", "set_aside_table"]
 
@@ -323,13 +323,5 @@ def set_aside_table(path) -> Path:
       Where it lies now, such as `quality.old1.csv`.
     """
     path = Path(path)
-    number = 1
-    while True:
-        aside = path.with_name(f"{path.stem}.old{number}.csv")
-        if not aside.exists() and not aside.with_suffix(".json").exists():
-            break
-        number += 1
-    for suffix in (".csv", ".json"):
-        if path.with_suffix(suffix).exists():
-            path.with_suffix(suffix).rename(aside.with_suffix(suffix))
-    return aside
+    kept = set_aside((path, path.with_suffix(".json")), path.stem)
+    return path.with_name(f"{kept}.csv") if kept else path

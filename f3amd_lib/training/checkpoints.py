@@ -137,7 +137,7 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
 
 def weights_digest(params: Any) -> str:
     """Return 12 hex digits that tell one set of weights from another."""
-    return _checksum({name: leaf for name, leaf in _named_leaves(params).items()}, "")[:12]
+    return _checksum(_named_leaves(params), "")[:12]
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_lib.training.loop import Trainer, TrainingConfig, short_recipe
+from f3amd_lib.training.loop import short_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
 __all__ = ["SHORT_RUN", "learning_curve", "learning_curves", "learning_table"]
@@ -37,7 +37,7 @@ def learning_curve(
       TrainingDiverged: if the loss stops being a number.
     """
     recipe = short_recipe(preset, seed=seed, **{**SHORT_RUN, **settings})
-    trainer = _trainer(prepared, preset, recipe)
+    trainer = prepared.trainer(preset, recipe)
     held_out = prepared.windows(prepared.held_out_split)
     chunk = max(1, recipe.num_steps // 10)
     state = trainer.initial_state()
@@ -51,17 +51,6 @@ def learning_curve(
         for row in history
     ]
     return pd.DataFrame(rows)
-
-
-def _trainer(prepared: PreparedData, preset: str, recipe: TrainingConfig) -> Trainer:
-    return Trainer(
-        prepared.model_config(preset),
-        recipe,
-        prepared.packed.skeleton,
-        prepared.normaliser,
-        prepared.windows("train"),
-        dataset_fingerprint=prepared.packed.fingerprint,
-    )
 
 
 def learning_curves(

@@ -25,6 +25,7 @@ from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
+from f3amd_lib.files import set_aside
 from f3amd_lib.models import zoo
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.profiles import Profile, load_profile, runs_dir
@@ -105,6 +106,17 @@ class PreparedData:
             window=self.window,
             num_history=self.num_history,
             **settings,
+        )
+
+    def trainer(self, preset: str, config: TrainingConfig) -> Trainer:
+        """Return what trains a preset on this data set's training windows."""
+        return Trainer(
+            self.model_config(preset),
+            config,
+            self.packed.skeleton,
+            self.normaliser,
+            self.windows("train"),
+            dataset_fingerprint=self.packed.fingerprint,
         )
 
 
@@ -209,15 +221,7 @@ def train(
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
     packed = prepared.packed
-    model_config = prepared.model_config(preset)
-    trainer = Trainer(
-        model_config,
-        config,
-        packed.skeleton,
-        prepared.normaliser,
-        prepared.windows("train"),
-        dataset_fingerprint=packed.fingerprint,
-    )
+    trainer = prepared.trainer(preset, config)
     held_out = prepared.windows(prepared.held_out_split)
     record = run_record(
         profile=profile,
@@ -258,7 +262,7 @@ def train(
     history = pd.DataFrame(rows)
     trained = TrainedModel(
         name=preset,
-        config=model_config,
+        config=trainer.model_config,
         params=state.ema,
         normaliser=trainer.normaliser,
         skeleton=packed.skeleton,
@@ -391,20 +395,6 @@ def find_model(dataset: str) -> Path:
 def _set_aside(files: ModelFiles) -> None:
     """Rename what lies there to the first free number, so that nothing a user made is lost."""
     name = files.model.name.removesuffix(".safetensors")
-    present = [
-        path
-        for path in (*dataclasses.astuple(files), files.history.with_suffix(".json"))
-        if path.exists()
-    ]
-    if not present:
-        return
-
-    def aside(path: Path, number: int) -> Path:
-        return path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
-
-    number = 1
-    while any(aside(path, number).exists() for path in present):
-        number += 1
-    for path in present:
-        path.rename(aside(path, number))
-    log.warning("earlier files of %s are kept as %s.old%d", name, name, number)
+    paths = (*dataclasses.astuple(files), files.history.with_suffix(".json"))
+    if kept := set_aside(paths, name):
+        log.warning("earlier files of %s are kept as %s", name, kept)
