@@ -4,6 +4,7 @@ data      open a data set, build its packed cache, say what is in it
 presets   list the models
 train     train a model (goes on where an earlier run stopped)
 rollout   animate one character: BVH, film strip PNG and GIF
+bench     time synthesis and training, write records, compare with what is asked
 """
 
 from __future__ import annotations
@@ -109,6 +110,19 @@ def _rollout(arguments) -> None:
         log.info("wrote        %s", target)
 
 
+def _bench(arguments) -> int:
+    """Run the benchmarks in a process whose environment tells XLA how to be fast."""
+    import subprocess
+
+    from f3amd_lib.benchmarking.machine import fast_xla_flags
+
+    environment = dict(os.environ)
+    if "XLA_FLAGS" not in environment:
+        environment["XLA_FLAGS"] = fast_xla_flags()
+    command = [sys.executable, "-m", "f3amd_lib.benchmarking", *arguments.words[1:]]
+    return subprocess.run(command, env=environment, check=False).returncode
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="f3amd", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
@@ -140,6 +154,9 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=int)
     train.add_argument("--out", help="folder for the model instead of runs/DATA/PROFILE/models")
 
+    bench = add("bench", _bench, "time synthesis and training (bench --help tells more)")
+    bench.add_argument("words", nargs=argparse.REMAINDER, help="options of the benchmarks")
+
     rollout = add(
         "rollout", _rollout, "animate one character: BVH, film strip and GIF (its first 12 s)"
     )
@@ -167,13 +184,15 @@ def main(argv: list[str] | None = None) -> int:
     for noisy in ("jax", "absl", "matplotlib", "PIL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     os.environ.setdefault("MPLBACKEND", "Agg")
-    arguments = _parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["bench"]:  # its options are those of another program
+        words = ["bench", "--", *words[1:]]
+    arguments = _parser().parse_args(words)
     try:
-        arguments.action(arguments)
+        return arguments.action(arguments) or 0
     except (ValueError, OSError, ArithmeticError) as error:
         print(f"f3amd {arguments.command}: {error}", file=sys.stderr)
         return 2
-    return 0
 
 
 if __name__ == "__main__":

@@ -151,14 +151,15 @@ class ConditionEncoder(nnx.Module):
         noise = noise_features(jnp.asarray(sigma, dtype), self.width)
         noise = self.noise_second(nnx.silu(self.noise_first(noise)))
         code = jnp.asarray(position_code(0, self.window, self.width), dtype)
+        # One noise level for all characters asks one question for all of them.
         asked = noise[..., None, :] + code
-        asked = jnp.broadcast_to(asked, (context.keys.shape[0], self.window, self.width))
+        shape = (context.keys.shape[0], self.window, self.width)
         answer = attention(
-            split_heads(self.query(asked), self.num_heads),
+            split_heads(jnp.broadcast_to(self.query(asked), shape), self.num_heads),
             split_heads(context.keys, self.num_heads),
             split_heads(context.values, self.num_heads),
         )
-        return asked + self.output(answer.reshape(asked.shape))
+        return asked + self.output(answer.reshape(shape))
 
 
 def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:

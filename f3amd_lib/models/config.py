@@ -126,12 +126,12 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
     Args:
       config: says whether, and with which sigma_data.
       x_noisy: variance-exploding state, [B, T, C].
-      sigma: noise levels, [B].
+      sigma: noise levels, [B], or one for all.
     """
     if not config.input_scaling:
         return x_noisy
     scale = (sigma**2 + config.sigma_data**2) ** -0.5
-    return x_noisy * scale[:, None, None]
+    return x_noisy * scale.reshape(-1, 1, 1)
 
 
 class Denoiser(nnx.Module):

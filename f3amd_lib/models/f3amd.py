@@ -26,7 +26,14 @@ from f3amd_lib.models.conditioning import (
     conditioning_layer,
 )
 from f3amd_lib.models.config import Denoiser, NetworkConfig, scaled_input
-from f3amd_lib.models.spectral import SPECTRAL_VARIANTS, FNOBlock, cosine_basis, count_modes
+from f3amd_lib.models.spectral import (
+    SPECTRAL_VARIANTS,
+    FNOBlock,
+    FrameLayer,
+    cosine_basis,
+    count_modes,
+    frames_first,
+)
 
 __all__ = ["F3AMDConfig", "F3AMD"]
 
@@ -111,6 +118,11 @@ class F3AMDConfig(NetworkConfig):
     def count_block_modes(self) -> int:
         """Return how many modes the backbone's transform has; as many can be kept."""
         return count_modes(self.spectral_variant, self.block_frames)
+
+
+def _applied(layer, turned: bool):
+    """Return how a layer is called, on [T, B, D] if turned; a linear one cares for neither."""
+    return layer.frames_first if turned and isinstance(layer, FrameLayer) else layer
 
 
 class F3AMD(Denoiser):
@@ -206,31 +218,42 @@ class F3AMD(Denoiser):
         config = self.config
         config.check_state(x_noisy)
         tokens, last_frame = context
-        sigma = jnp.broadcast_to(jnp.asarray(sigma, x_noisy.dtype), x_noisy.shape[:1])
+        sigma = jnp.asarray(sigma, x_noisy.dtype)
         c = self.condition(tokens, sigma)
         yield "c", c
-        z = self.encoder(scaled_input(config, x_noisy, sigma))
-        yield "encoder", z
+        z = scaled_input(config, x_noisy, sigma)
+        # Fourier blocks are faster with frames first, and so from encoder to decoder; attention
+        # wants the batch first.
+        attends = config.conditioning == "cross_attention"
+        turned = not attends and all(isinstance(block, FrameLayer) for block in self.blocks)
+        turn = frames_first if turned else lambda array: array
+        z, c, frames = turn(z), turn(c), 0 if turned else 1
+        z = _applied(self.encoder, turned)(z)
+        yield "encoder", turn(z)
         if config.conditioning == "concatenation":
-            z = jnp.concatenate([c, z], axis=1)
+            z = jnp.concatenate([c, z], axis=frames)
         if config.base_block == "transformer":
             # Attention has no sense of order of its own (section 3.4.1).
             z = z + jnp.asarray(position_code(0, config.block_frames, z.shape[-1]), z.dtype)
         layers = zip(self.blocks, self.conditionings, strict=True)
         for number, (block, conditioning) in enumerate(layers):
-            if key is not None:
-                block = partial(block, key=jax.random.fold_in(key, number))
-            update = conditioning(block, z, c)
+            base = _applied(block, turned)
+            if key is not None and not turned:
+                base = partial(base, key=jax.random.fold_in(key, number))
+            update = conditioning(base, z, c)
             z = z + update if config.block_residual else update
-            yield f"block {number + 1}", z
-        x0_hat = self.decoder(z[:, -config.window :])
+            yield f"block {number + 1}", turn(z)
+        last = jax.lax.slice_in_dim(
+            z, z.shape[frames] - config.window, z.shape[frames], axis=frames
+        )
+        x0_hat = turn(_applied(self.decoder, turned)(last))
         yield "decoder", x0_hat
         if config.history_anchor:
             x0_hat = x0_hat + self.anchor[...] * last_frame[:, None, :]
         if config.residual_prior:
             basis = jnp.asarray(cosine_basis(config.window), x_noisy.dtype)
             variance = jnp.exp(10.0 * self.residual_variance[...])
-            gain = variance / (variance + sigma[:, None, None] ** 2)
+            gain = variance / (variance + sigma.reshape(-1, 1, 1) ** 2)
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)
         yield "x0_hat", x0_hat

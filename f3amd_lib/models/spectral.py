@@ -1,6 +1,10 @@
 """The Fourier Neural Operator block (paper section 3.4.2, Eqs 2-4) and its variants (Table 8).
 
-The paper writes channels first, z in R^{D x t}; arrays here are [batch, frames, channels].
+The paper writes channels first, z in R^{D x t}; arrays here are [batch, frames, channels]. Inside a
+block they are [frames, batch, channels]: a transform over frames is then one matrix product for the
+whole batch, and neighbouring frames are neighbouring blocks of memory. Every layer can be called in
+both orders.
+
 Windows are short (32 or 64 frames), so the real Fourier transform is a product with a small cosine
 and sine matrix: the same numbers as an FFT, and faster on the hardware this was measured on. So is
 the cosine transform.
@@ -22,8 +26,10 @@ __all__ = [
     "count_modes",
     "fourier_matrices",
     "cosine_basis",
+    "frames_first",
     "spectral_convolution",
     "cosine_convolution",
+    "FrameLayer",
     "SpectralConvolution",
     "TemporalConvolution",
     "FNOBlock",
@@ -119,20 +125,30 @@ def cosine_basis(num_frames: int, num_kept_modes: int | None = None) -> np.ndarr
     return basis
 
 
+def frames_first(z):
+    """Map [B, T, D] to [T, B, D], or back."""
+    return jnp.swapaxes(z, 0, 1)
+
+
+def _over_frames(matrix, z):
+    """Multiply a constant matrix [F, T] with the frames of z [T, B, D]: [F, B, D]."""
+    return (jnp.asarray(matrix, z.dtype) @ z.reshape(len(z), -1)).reshape(-1, *z.shape[1:])
+
+
 def _spectrum(z, modes: int):
-    """Map [B, T, D] to its first Fourier modes, [m, 2, B, D]: real part, then imaginary part."""
-    batch, num_frames, width = z.shape
+    """Map [T, B, D] to its first Fourier modes, [m, 2, B, D]: real part, then imaginary part."""
+    num_frames, batch, width = z.shape
     analysis, _ = fourier_matrices(num_frames, modes)
-    analysis = jnp.asarray(analysis.reshape(2 * modes, num_frames), z.dtype)
-    return jnp.einsum("ft,btc->fbc", analysis, z).reshape(modes, 2, batch, width)
+    flat = _over_frames(analysis.reshape(2 * modes, num_frames), z)
+    return flat.reshape(modes, 2, batch, width)
 
 
 def _signal(spectrum, num_frames: int):
-    """Map Fourier modes [m, 2, B, D] back to [B, T, D]."""
+    """Map Fourier modes [m, 2, B, D] back to [T, B, D]."""
     modes, _, batch, width = spectrum.shape
     _, synthesis = fourier_matrices(num_frames, modes)
-    synthesis = jnp.asarray(synthesis.reshape(num_frames, 2 * modes), spectrum.dtype)
-    return jnp.einsum("tf,fbd->btd", synthesis, spectrum.reshape(2 * modes, batch, width))
+    flat = spectrum.reshape(2 * modes, batch, width)
+    return _over_frames(synthesis.reshape(num_frames, 2 * modes), flat)
 
 
 def _complex_product(spectrum, weight_real, weight_imag):
@@ -161,13 +177,19 @@ def spectral_convolution(z, weight_real, weight_imag, *factors, gain=None):
     Returns:
       [B, T, D1].
     """
+    weights = weight_real, weight_imag, *factors
+    return frames_first(_fourier_layer(frames_first(z), *weights, gain=gain))
+
+
+def _fourier_layer(z, weight_real, weight_imag, *factors, gain=None):
+    """Do the work of `spectral_convolution` on z [T, B, D0]."""
     spectrum = _spectrum(z, len(weight_real))
     if gain is not None:
         spectrum = spectrum * gain[:, None, None, None]
     spectrum = _complex_product(spectrum, weight_real, weight_imag)
     for real, imag in zip(factors[::2], factors[1::2], strict=True):
         spectrum = _complex_product(spectrum, real, imag)
-    return _signal(spectrum, z.shape[1])
+    return _signal(spectrum, len(z))
 
 
 def cosine_convolution(z, weight):
@@ -182,12 +204,32 @@ def cosine_convolution(z, weight):
     Returns:
       [B, T, D1].
     """
-    basis = jnp.asarray(cosine_basis(z.shape[1], len(weight)), z.dtype)
-    mixed = jnp.einsum("kt,btc->kbc", basis, z) @ weight
-    return jnp.einsum("kt,kbd->btd", basis, mixed)
+    return frames_first(_cosine_layer(frames_first(z), weight))
 
 
-class SpectralConvolution(nnx.Module):
+def _cosine_layer(z, weight):
+    """Do the work of `cosine_convolution` on z [T, B, D0]."""
+    basis = cosine_basis(len(z), len(weight))
+    return _over_frames(basis.T, _over_frames(basis, z) @ weight)
+
+
+class FrameLayer(nnx.Module):
+    """A layer over frames that can be called in both orders of axes.
+
+    A subclass has `frames_first`, which maps [T, B, D0] to [T, B, D1].
+    """
+
+    def __call__(self, z, key=None):
+        """Map [B, T, D0] to [B, T, D1].
+
+        Args:
+          z: [B, T, D0].
+          key: not used; every base block takes one, and only Transformers drop anything.
+        """
+        return frames_first(self.frames_first(frames_first(z)))
+
+
+class SpectralConvolution(FrameLayer):
     """Learned weights on the first m modes (Eq. 2), in the variants of Table 8.
 
     Args:
@@ -241,23 +283,24 @@ class SpectralConvolution(nnx.Module):
         if variant == "weighted":
             self.gain = nnx.Param(jnp.full(num_kept_modes, initial_gain, jnp.float32))
 
-    def __call__(self, z):
-        """Map [B, T, D0] to [B, T, D1]."""
+    def frames_first(self, z):
+        """Map [T, B, D0] to [T, B, D1]."""
         if self.variant == "cosine":
-            return cosine_convolution(z, self.weight[...])
+            return _cosine_layer(z, self.weight[...])
         if self.variant == "reduced_rank":
             first = self.first_real[...], self.first_imag[...]
             second = self.second_real[...], self.second_imag[...]
-            return spectral_convolution(z, *first, *second)
+            return _fourier_layer(z, *first, *second)
         gain = self.gain[...] if self.variant == "weighted" else None
-        return spectral_convolution(z, self.weight_real[...], self.weight_imag[...], gain=gain)
+        return _fourier_layer(z, self.weight_real[...], self.weight_imag[...], gain=gain)
 
 
-class TemporalConvolution(nnx.Module):
+class TemporalConvolution(FrameLayer):
     """Convolution over frames, zeros beyond the window's ends (Conv_k of Eq. 3).
 
-    Written as neighbouring frames side by side and one matrix product: the numbers of `nnx.Conv`,
-    whose gradient XLA runs some twenty times slower on a CPU once training steps are scanned.
+    Written as one matrix product for all taps, whose results are shifted and added: the numbers of
+    `nnx.Conv`, whose gradient XLA runs some twenty times slower on a CPU once training steps are
+    scanned.
     """
 
     def __init__(self, width_in: int, width_out: int, kernel_size: int, *, rngs: nnx.Rngs):
@@ -265,18 +308,19 @@ class TemporalConvolution(nnx.Module):
         self.kernel = nnx.Param(initial(rngs.params(), (kernel_size, width_in, width_out)))
         self.bias = nnx.Param(jnp.zeros(width_out))
 
-    def __call__(self, z):
-        """Map [B, T, D0] to [B, T, D1]."""
+    def frames_first(self, z):
+        """Map [T, B, D0] to [T, B, D1]."""
         kernel = self.kernel[...]
         taps, width_in, width_out = kernel.shape
-        frames = z.shape[1]
+        side_by_side = jnp.moveaxis(kernel, 0, 1).reshape(width_in, taps * width_out)
+        answers = jnp.split(z @ side_by_side, taps, axis=-1)
         before = (taps - 1) // 2
-        padded = jnp.pad(z, ((0, 0), (before, taps - 1 - before), (0, 0)))
-        beside = jnp.concatenate([padded[:, k : k + frames] for k in range(taps)], axis=-1)
-        return beside @ kernel.reshape(taps * width_in, width_out) + self.bias[...]
+        beyond = ((before, taps - 1 - before), (0, 0), (0, 0))
+        shifted = [jnp.pad(a, beyond)[tap : tap + len(z)] for tap, a in enumerate(answers)]
+        return sum(shifted) + self.bias[...]
 
 
-class FNOBlock(nnx.Module):
+class FNOBlock(FrameLayer):
     """Spectral branch plus local branch (Eqs 2-4); encoder or decoder if the widths differ.
 
     Args:
@@ -304,14 +348,14 @@ class FNOBlock(nnx.Module):
         self.local_second = TemporalConvolution(width_in, width_out, kernel_size, rngs=rngs)
 
     def local(self, z):
-        """Return the local branch, SiLU(Conv(SiLU(Conv(SiLU(z))))) (Eq. 3)."""
-        return nnx.silu(self.local_second(nnx.silu(self.local_first(nnx.silu(z)))))
+        """Return the local branch, SiLU(Conv(SiLU(Conv(SiLU(z))))), of z [B, T, D0] (Eq. 3)."""
+        return frames_first(self.local_frames_first(frames_first(z)))
 
-    def __call__(self, z, key=None):
-        """Map [B, T, D0] to [B, T, D1] (Eq. 4).
+    def local_frames_first(self, z):
+        """Do the work of `local` on z [T, B, D0]."""
+        inner = nnx.silu(self.local_first.frames_first(nnx.silu(z)))
+        return nnx.silu(self.local_second.frames_first(inner))
 
-        Args:
-          z: [B, T, D0].
-          key: not used; every base block takes one, and only Transformers drop anything.
-        """
-        return self.spectral(z) + self.local(z)
+    def frames_first(self, z):
+        """Map [T, B, D0] to [T, B, D1] (Eq. 4)."""
+        return self.spectral.frames_first(z) + self.local_frames_first(z)

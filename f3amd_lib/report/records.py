@@ -12,6 +12,7 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import logging
 import os
 import platform
 import subprocess
@@ -23,7 +24,16 @@ import pandas as pd
 
 from f3amd_lib.files import set_aside, whole_file
 
-__all__ = ["run_record", "record_hash", "write_table", "read_table", "set_aside_table"]
+__all__ = [
+    "run_record",
+    "record_hash",
+    "write_table",
+    "read_table",
+    "kept_rows",
+    "set_aside_table",
+]
+
+log = logging.getLogger("f3amd")
 
 _LIBRARY = Path(__file__).resolve().parents[1]
 _REPOSITORY = _LIBRARY.parent
@@ -44,6 +54,7 @@ _CIRCUMSTANCES = (
     "num_devices",
     "cores",
     "date_utc",
+    "not_possible",
     "table",
 )
 
@@ -325,3 +336,31 @@ def set_aside_table(path) -> Path:
     path = Path(path)
     kept = set_aside((path, path.with_suffix(".json")), path.stem)
     return path.with_name(f"{kept}.csv") if kept else path
+
+
+def kept_rows(path, record: dict) -> pd.DataFrame | None:
+    """Return the rows of an earlier run that asked for the same, so that a stopped run goes on.
+
+    A table that asked for something else is kept under another name.
+
+    Args:
+      path: of the CSV.
+      record: of the run that wants to go on.
+
+    Returns:
+      The rows; None if there are none.
+
+    Raises:
+      ValueError: if the table there is broken.
+    """
+    path = Path(path)
+    if not path.exists():
+        return None
+    rows, earlier = read_table(path)
+    if record_hash(earlier) != record_hash(record):
+        kept = set_aside_table(path)
+        log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
+        return None
+    if "unit" in rows:
+        rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
+    return rows

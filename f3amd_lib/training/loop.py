@@ -405,6 +405,30 @@ class Trainer:
 
         return jax.lax.scan(one_step, state, None, length=length)
 
+    def advance(self, state: TrainingState, length: int) -> tuple[TrainingState, dict]:
+        """Train some steps in one program, without checkpoints or checks (see `run`).
+
+        Args:
+          state: where to start; its arrays are given away.
+          length: steps.
+
+        Returns:
+          (state, every loss term of every step, [length] each).
+        """
+        return self._chunk(state, self.windows, length=length)
+
+    def plan_memory(self, length: int = 1) -> int:
+        """Return the bytes that the compiler plans for some steps: state, windows, between values.
+
+        Args:
+          length: steps in one program.
+        """
+        state = jax.eval_shape(self.initial_state)
+        plan = self._chunk.lower(state, self.windows, length=length).compile().memory_analysis()
+        shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
+        sizes = plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes
+        return int(sizes - shared)
+
     def _held_out_terms(self, params, windows: WindowSet, key, num_samples: int):
         batch = spread_windows(windows, num_samples)
         size = batch.future.shape[0]
@@ -508,7 +532,7 @@ class Trainer:
             while done < total:
                 # Chunks end on multiples, so that a resumed run makes the same ones.
                 length = min(chunk - done % chunk, total - done)
-                state, terms = self._chunk(state, self.windows, length)
+                state, terms = self.advance(state, length)
                 terms = {name: np.asarray(value) for name, value in terms.items()}
                 self._check_finite(done, terms, state, checkpoint)
                 passed = (done + length) // checkpoint_every > done // checkpoint_every

@@ -97,13 +97,13 @@ class PreparedData:
         wanted = ("validation", "test", "train")
         return next(split for split in wanted if SPLITS.index(split) in present)
 
-    def model_config(self, preset: str, **settings):
-        """Return a preset's config for this data set's channels and styles."""
+    def model_config(self, preset: str, *, window: int | None = None, **settings):
+        """Return a preset's config for this data set's channels and styles, and its window."""
         return zoo.build_config(
             preset,
             channels=num_channels(self.packed.skeleton),
             num_styles=len(self.packed.styles),
-            window=self.window,
+            window=window or self.window,
             num_history=self.num_history,
             **settings,
         )

@@ -1,0 +1,1 @@
+"""How fast: timing, machines, ahead-of-time export, and the baseline in other frameworks."""

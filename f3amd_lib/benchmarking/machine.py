@@ -1,0 +1,153 @@
+"""The machine that times are taken on: what it is, and how fast it multiplies matrices at best."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+__all__ = [
+    "PRECISIONS",
+    "describe_machine",
+    "device_name",
+    "matmul_precision",
+    "matmul_probe",
+    "fast_xla_flags",
+]
+
+PRECISIONS = {
+    "float32": ("float32", jnp.float32),
+    "tf32": ("tensorfloat32", jnp.float32),
+    "bfloat16": ("default", jnp.bfloat16),
+}
+"""Name -> (JAX's matmul precision, type of arrays). tf32: GPU only; float32 in memory, products of
+10-bit mantissas."""
+
+
+def matmul_precision(precision: str):
+    """Return a context in which matrix products have a precision of `PRECISIONS`.
+
+    Raises:
+      ValueError: for an unknown precision.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"unknown precision {precision!r}: use one of {', '.join(PRECISIONS)}")
+    return jax.default_matmul_precision(PRECISIONS[precision][0])
+
+
+def device_name() -> str:
+    """Return "CPU", "GPU" or "TPU" for the device that JAX computes on."""
+    return {"cuda": "GPU", "rocm": "GPU"}.get(
+        jax.devices()[0].platform, jax.devices()[0].platform.upper()
+    )
+
+
+def _processor() -> str:
+    """Return the processor's name, which `platform.processor` leaves out on Linux."""
+    try:
+        told = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor() or platform.machine()
+    found = re.search(r"^model name\s*:\s*(.+)$", told, flags=re.MULTILINE)
+    return found.group(1).strip() if found else platform.machine()
+
+
+def _graphics_clocks() -> str | None:
+    """Return what nvidia-smi tells of clocks now and at most, in MHz; None where there is none."""
+    if shutil.which("nvidia-smi") is None:
+        return None
+    asked = "--query-gpu=name,clocks.sm,clocks.max.sm,clocks.mem,power.limit"
+    done = subprocess.run(
+        ["nvidia-smi", asked, "--format=csv,noheader"],
+        capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    return done.stdout.strip() or None
+
+
+def describe_machine() -> dict:
+    """Describe the machine as far as it decides how fast things run.
+
+    Returns:
+      A dict ready for a run record: processor, cores (that this process may use), physical_cores,
+      clock_mhz and clock_max_mhz (None where the system does not tell), memory_gib, load (mean of
+      the last minute: what else was running), system, xla_flags, graphics_clocks.
+    """
+    import psutil
+
+    clock = psutil.cpu_freq()
+    return {
+        "processor": _processor(),
+        "cores": len(psutil.Process().cpu_affinity())
+        if sys.platform == "linux"
+        else os.cpu_count(),
+        "physical_cores": psutil.cpu_count(logical=False),
+        "clock_mhz": round(clock.current) if clock and clock.current else None,
+        "clock_max_mhz": round(clock.max) if clock and clock.max else None,
+        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        "graphics_clocks": _graphics_clocks(),
+    }
+
+
+def matmul_probe(
+    precision: str = "float32", size: int | None = None
+) -> tuple[Callable[[], object], int]:
+    """Return a product of two square matrices to time, the yardstick for what a machine can do.
+
+    Args:
+      precision: of `PRECISIONS`.
+      size: rows of a matrix; by default 2048, and 8192 on a GPU.
+
+    Returns:
+      (function that multiplies and waits, its operations 2 size^3).
+
+    Raises:
+      ValueError: for an unknown precision or a size below 1.
+    """
+    context = matmul_precision(precision)
+    size = (2048 if device_name() == "CPU" else 8192) if size is None else size
+    if size < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+    matrix = jax.random.normal(jax.random.key(0), (size, size), PRECISIONS[precision][1])
+    with context:
+        multiply = jax.jit(jnp.matmul).lower(matrix, matrix).compile()
+    return lambda: multiply(matrix, matrix).block_until_ready(), 2 * size**3
+
+
+_FAST_FLAGS = ("--xla_cpu_experimental_ynn_fusion_type=",)
+"""XLA's flags that made rounds faster on a CPU: without fusion into YNNPACK's products a step of
+F3AMD-FNO-96 took 0.8 of the time."""
+
+
+def fast_xla_flags(num_devices: int | None = None) -> str:
+    """Return XLA_FLAGS for the fastest rounds on a CPU: one device a core, and what helped besides.
+
+    They must be in the environment before JAX starts. A flag that this release of XLA does not know
+    would end the process, so each is tried in a process of its own.
+
+    Args:
+      num_devices: CPU devices that JAX shall see; by default one for each core.
+    """
+    if num_devices is None:
+        affinity = getattr(os, "sched_getaffinity", None)
+        num_devices = len(affinity(0)) if affinity else os.cpu_count() or 1
+    flags = f"--xla_force_host_platform_device_count={num_devices}"
+    for flag in _FAST_FLAGS:
+        tried = subprocess.run(
+            [sys.executable, "-c", "import jax; jax.devices()"],
+            env=os.environ | {"XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"},
+            capture_output=True, timeout=120, check=False,
+        )  # fmt: skip
+        if tried.returncode == 0:
+            flags += f" {flag}"
+    return flags

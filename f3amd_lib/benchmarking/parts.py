@@ -1,0 +1,140 @@
+"""Where does a round's time go? The round is timed again with one part left out at a time.
+
+Compilers mix parts, so that a stopwatch around each would disturb what it measures. What a round
+saves without a part is what the part costs, as far as costs add up.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from flax import nnx
+
+from f3amd_lib.benchmarking.machine import device_name
+from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.benchmarking.ways import Task, random_condition
+from f3amd_lib.diffusion.rounds import sample_round
+from f3amd_lib.models import zoo
+from f3amd_lib.models.f3amd import F3AMD
+from f3amd_lib.models.spectral import FNOBlock, FrameLayer
+
+__all__ = ["PARTS", "without", "time_parts"]
+
+PARTS = ("spectral branches", "local branches", "FiLM", "conditioning signal", "noise")
+"""What can be left out of a round of an F3AMD network with Fourier blocks and FiLM."""
+
+
+class _OneBranch(FrameLayer):
+    """An `FNOBlock` that has lost one of its branches."""
+
+    def __init__(self, block: FNOBlock, lost: str):
+        self.spectral, self.lost = block.spectral, lost
+        self.local_first, self.local_second = block.local_first, block.local_second
+
+    def frames_first(self, z):
+        if self.lost == "local branches":
+            return self.spectral.frames_first(z)
+        return FNOBlock.local_frames_first(self, z)
+
+
+class _NoFiLM(nnx.Module):
+    def __call__(self, base, z, c):
+        return base(z)
+
+
+class _NoSignal(nnx.Module):
+    """Gives the code of frames for c, and encodes a condition to nothing."""
+
+    def __init__(self, encoder):
+        self.window, self.width = encoder.window, encoder.width
+
+    def encode(self, condition):
+        return condition.path
+
+    def __call__(self, context, sigma):
+        return jnp.ones((context.shape[0], self.window, self.width), context.dtype) * sigma
+
+
+def without(network: F3AMD, part: str) -> F3AMD:
+    """Return a copy of a network that lacks a part; its answers mean nothing.
+
+    Args:
+      network: of Fourier blocks with FiLM.
+      part: of `PARTS`, but "noise", which is no part of a network.
+
+    Raises:
+      ValueError: for another network or part.
+    """
+    config = network.config
+    if (
+        not isinstance(network, F3AMD)
+        or config.base_block != "fno"
+        or config.conditioning != "film"
+    ):
+        raise ValueError("parts are known of F3AMD networks of Fourier blocks with FiLM only")
+    if part not in PARTS[:-1]:
+        raise ValueError(f"unknown part {part!r}: use one of {', '.join(PARTS[:-1])}")
+    left = nnx.clone(network)
+    if part == "FiLM":
+        left.conditionings = nnx.List([_NoFiLM() for _ in left.conditionings])
+    elif part == "conditioning signal":
+        left.condition = _NoSignal(left.condition)
+    else:
+        left.blocks = nnx.List([_OneBranch(block, part) for block in left.blocks])
+        if config.encoder_decoder == "fno":
+            left.encoder = _OneBranch(left.encoder, part)
+            left.decoder = _OneBranch(left.decoder, part)
+    return left
+
+
+def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
+    """Time a round whole and without each of its parts, by turns.
+
+    Args:
+      task: a model of Fourier blocks with FiLM, under jit on one device.
+      progress: show a bar.
+      **turns: settings of `take_turns`.
+
+    Returns:
+      A row each: model, steps, characters, device, without ("" for the whole round), unit, value,
+      low and high in ms, rounds, and saved: the share of the whole round's time.
+    """
+    network = zoo.build_from_config(task.config, jax.random.key(0))
+    condition = jax.device_put(random_condition(task.config, task.characters))
+    shape = (task.characters, task.config.window, task.config.channels)
+    noise = jax.random.normal(jax.random.key(1), shape)
+    networks = {"": network} | {part: without(network, part) for part in PARTS[:-1]}
+
+    def compiled(model, *noise):
+        def run(condition, key, *noise):
+            given = {"noise": noise[0]} if noise else {}
+            return sample_round(model, condition, task.sigmas, key, sampler=task.sampler, **given)
+
+        key = jax.random.key(0)
+        program = jax.jit(run).lower(condition, key, *noise).compile()
+        return lambda: program(condition, key, *noise).block_until_ready()
+
+    calls = {part: compiled(model) for part, model in networks.items()}
+    calls["noise"] = compiled(network, noise)
+    timings = take_turns(calls, progress=progress, **turns)
+    whole = timings[""].median
+    return pd.DataFrame(
+        [
+            {
+                "model": task.model,
+                "steps": task.steps,
+                "characters": task.characters,
+                "device": device_name(),
+                "without": part,
+                "unit": "ms",
+                "value": 1e3 * timing.median,
+                "low": 1e3 * timing.low,
+                "high": 1e3 * timing.high,
+                "rounds": timing.rounds,
+                "saved": np.nan if part == "" else 1.0 - timing.median / whole,
+            }
+            for part, timing in timings.items()
+        ]
+    )

@@ -1,0 +1,102 @@
+"""Timing by turns: every candidate runs once, then every candidate again.
+
+A machine that others use, or that grows warm, is slower for some seconds. By turns (A B A B) such a
+spell hits all candidates alike, so that ratios keep their meaning where single times do not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+__all__ = ["Timing", "take_turns"]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long one call takes, in seconds.
+
+    Attributes:
+      median: over the timed rounds.
+      low, high: their 5 % and 95 % quantiles.
+      rounds: how many were timed.
+      first: the first call of all, which also compiles; not among the rounds.
+    """
+
+    median: float
+    low: float
+    high: float
+    rounds: int
+    first: float
+
+
+def take_turns(
+    candidates: Mapping[str, Callable[[], object]],
+    *,
+    min_rounds: int = 100,
+    min_seconds: float = 10.0,
+    fewest_rounds: int = 5,
+    warmup: int = 3,
+    clock: Callable[[], float] = time.perf_counter,
+    progress: bool = False,
+) -> dict[str, Timing]:
+    """Time functions by turns until each has had enough rounds or seconds.
+
+    Args:
+      candidates: name -> function without arguments that comes back when its work is done (JAX
+        calls must block until ready). The first call of each is reported apart.
+      min_rounds: a candidate is done after this many rounds,
+      min_seconds: or once its own rounds have taken this long,
+      fewest_rounds: but not before it has had this many.
+      warmup: calls before the first timed round, one of them the first.
+      clock: seconds, rising.
+      progress: show a bar.
+
+    Returns:
+      Name -> timing, in the order of `candidates`.
+
+    Raises:
+      ValueError: for no candidates, or counts that would time nothing.
+    """
+    if not candidates:
+        raise ValueError("there is nothing to time")
+    if min(min_rounds, fewest_rounds, warmup) < 1 or not min_seconds >= 0:
+        raise ValueError(
+            "min_rounds, fewest_rounds and warmup must be at least 1 and min_seconds at least 0, "
+            f"got {min_rounds}, {fewest_rounds}, {warmup} and {min_seconds}"
+        )
+
+    def timed(call) -> float:
+        started = clock()
+        call()
+        return clock() - started
+
+    first = {name: timed(call) for name, call in candidates.items()}
+    for _ in range(warmup - 1):
+        for call in candidates.values():
+            call()
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    with tqdm(total=len(candidates), unit="candidate", disable=not progress) as bar:
+        waiting = dict(candidates)
+        while waiting:
+            for name, call in list(waiting.items()):
+                rounds = seconds[name]
+                rounds.append(timed(call))
+                enough = len(rounds) >= min_rounds or sum(rounds) >= min_seconds
+                if enough and len(rounds) >= min(fewest_rounds, min_rounds):
+                    del waiting[name]
+                    bar.update()
+    return {
+        name: Timing(
+            median=float(np.median(rounds)),
+            low=float(np.quantile(rounds, 0.05)),
+            high=float(np.quantile(rounds, 0.95)),
+            rounds=len(rounds),
+            first=first[name],
+        )
+        for name, rounds in seconds.items()
+    }

@@ -1,0 +1,271 @@
+"""Ways to run one round: jit, jit over all devices, the plain form, IREE, and PyTorch's.
+
+Whatever the way, a timed call does what `decisions` of the companion count as synthesis: it draws
+noise, encodes the condition and walks all steps. Compilation, kinematics and transfers of the
+condition are outside.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+from flax import nnx
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision
+from f3amd_lib.benchmarking.plain import plain_form
+from f3amd_lib.diffusion.rounds import sample_round, sample_round_on_devices
+from f3amd_lib.diffusion.samplers import num_evaluations
+from f3amd_lib.models import zoo
+from f3amd_lib.models.camdm import CAMDMConfig
+from f3amd_lib.models.conditioning import PATH_CHANNELS, Condition
+from f3amd_lib.models.config import NetworkConfig
+from f3amd_lib.names import nearest_hint
+
+__all__ = [
+    "framework_probe",
+    "WAYS",
+    "NotPossible",
+    "Round",
+    "Task",
+    "prepare_round",
+    "random_condition",
+    "round_flops",
+]
+
+
+class NotPossible(RuntimeError):
+    """A way that does not work here; the message says why."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked for, in whichever way it is done.
+
+    Attributes:
+      model: a preset's name.
+      config: its sizes.
+      steps: N.
+      characters: B.
+      precision: of `machine.PRECISIONS`.
+    """
+
+    model: str
+    config: NetworkConfig
+    steps: int
+    characters: int
+    precision: str = "float32"
+
+    @property
+    def sampler(self) -> str:
+        """The sampler that belongs to the model: DDIM for F3AMD, DDPM for CAMDM."""
+        return zoo.find_preset(self.model).diffusion.sampler
+
+    @property
+    def sigmas(self) -> np.ndarray:
+        """Noise levels of the steps, [N + 1]."""
+        return np.asarray(zoo.find_preset(self.model).diffusion.grid(self.steps), np.float32)
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round that is ready to run.
+
+    Attributes:
+      call: runs it and waits; returns the clean features, [B, T, C].
+      compile_seconds: what making it ready took.
+      bytes_accessed: the compiler's own estimate of memory traffic; None where it tells none.
+    """
+
+    call: Callable[[], object]
+    compile_seconds: float
+    bytes_accessed: int | None = None
+
+
+def round_flops(task: Task) -> int:
+    """Return the operations of one round for all characters (see `models.counting`)."""
+    encode, evaluate = zoo.count_flops(task.config)
+    return task.characters * (encode + evaluate * num_evaluations(task.sampler, task.steps))
+
+
+def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> Condition:
+    """Return a condition of random numbers; times do not depend on what it says."""
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: rng.standard_normal((characters, *shape), dtype=np.float32)
+    style = np.eye(config.num_styles, dtype=np.float32)
+    return Condition(
+        history=draw(config.num_history, config.channels),
+        path=draw(config.window, PATH_CHANNELS),
+        style=style[rng.integers(0, config.num_styles, characters)],
+    )
+
+
+def _network(task: Task):
+    """Return the network with random weights, in the task's precision."""
+    network = zoo.build_from_config(task.config, jax.random.key(0))
+    dtype = PRECISIONS[task.precision][1]
+    graph, state = nnx.split(network)
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(dtype), state))
+
+
+def _compiled(task: Task, run, condition) -> Round:
+    """Compile run(condition, key) ahead of time."""
+    dtype = PRECISIONS[task.precision][1]
+    condition = jax.tree.map(lambda leaf: leaf.astype(dtype), condition)
+    key = jax.random.key(0)
+    started = time.perf_counter()
+    with matmul_precision(task.precision):
+        compiled = jax.jit(run).lower(condition, key).compile()
+    seconds = time.perf_counter() - started
+    costs = compiled.cost_analysis() or {}
+    accessed = costs.get("bytes accessed")
+    return Round(
+        lambda: compiled(condition, key).block_until_ready(),
+        seconds,
+        None if accessed is None else int(accessed),
+    )
+
+
+def _jit(task: Task, form=lambda network: network) -> Round:
+    network, sigmas = form(_network(task)), task.sigmas
+    run = lambda condition, key: sample_round(network, condition, sigmas, key, sampler=task.sampler)
+    condition = jax.device_put(random_condition(task.config, task.characters))
+    return _compiled(task, run, condition)
+
+
+def _plain_jit(task: Task) -> Round:
+    try:
+        return _jit(task, plain_form)
+    except ValueError as error:
+        raise NotPossible(str(error)) from error
+
+
+def _all_devices(task: Task) -> Round:
+    devices = jax.local_devices()
+    if len(devices) < 2:
+        raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
+    if task.characters % len(devices):
+        raise NotPossible(f"{task.characters} characters on {len(devices)} devices do not divide")
+    mesh = Mesh(np.array(devices), ("characters",))
+    network, sigmas = _network(task), task.sigmas
+    run = lambda condition, key: sample_round_on_devices(
+        network, condition, sigmas, key, mesh=mesh, sampler=task.sampler
+    )
+    rows = NamedSharding(mesh, PartitionSpec("characters"))
+    condition = jax.device_put(random_condition(task.config, task.characters), rows)
+    return _compiled(task, run, condition)
+
+
+def _iree(task: Task) -> Round:
+    """Compile ahead of time for this CPU; noise is drawn by numpy, inside the timed call."""
+    if device_name() != "CPU" or task.precision != "float32":
+        raise NotPossible("IREE is timed on a CPU in float32 only")
+    try:
+        from f3amd_lib.benchmarking.artefact import load_artefact
+        from f3amd_lib.benchmarking.export import export_round, save_artefact
+
+        started = time.perf_counter()
+        exported = export_round(_network(task), task.sigmas, task.characters, task.sampler)
+        with tempfile.TemporaryDirectory() as folder:
+            saved = Path(folder) / "artefact"
+            save_artefact(saved, exported, name=task.model)
+            artefact = load_artefact(saved)
+        seconds = time.perf_counter() - started
+    except ImportError as error:
+        raise NotPossible(str(error)) from error
+    given = [artefact.put(part) for part in random_condition(task.config, task.characters)]
+    shapes = [shape for name, shape in exported.inputs.items() if name.endswith("noise")]
+    rng = np.random.default_rng(0)
+    draw = lambda shape: artefact.put(rng.standard_normal(shape, dtype=np.float32))
+    return Round(lambda: artefact(*given, *map(draw, shapes)), seconds)
+
+
+def _check_baseline(task: Task, framework: str) -> None:
+    if not isinstance(task.config, CAMDMConfig):
+        raise NotPossible(f"only CAMDM is written for {framework}")
+    if device_name() != "CPU" or task.precision != "float32":
+        raise NotPossible(f"{framework} is timed on a CPU in float32 only")
+
+
+def _torch(task: Task, *, compiled: bool = False, products: str = "blas") -> Round:
+    _check_baseline(task, "PyTorch")
+    try:
+        from f3amd_lib.benchmarking import torch_camdm
+    except ImportError as error:
+        raise NotPossible(str(error)) from error
+    module = torch_camdm.torch_camdm(_network(task), products=products)
+    run = torch_camdm.torch_round(module, task.sigmas, task.sampler, compiled=compiled)
+    condition = torch_camdm.torch_condition(random_condition(task.config, task.characters))
+    started = time.perf_counter()
+    try:
+        run(condition)
+    except RuntimeError as error:
+        raise NotPossible(str(error)) from error
+    return Round(lambda: run(condition), time.perf_counter() - started)
+
+
+def _onnx(task: Task) -> Round:
+    _check_baseline(task, "ONNX Runtime")
+    try:
+        from f3amd_lib.benchmarking.onnx_camdm import onnx_round
+    except ImportError as error:
+        raise NotPossible(str(error)) from error
+    started = time.perf_counter()
+    run = onnx_round(_network(task), task.sigmas, task.sampler)
+    seconds = time.perf_counter() - started
+    condition = random_condition(task.config, task.characters)
+    rng = np.random.default_rng(0)
+    return Round(lambda: run(condition, rng), seconds)
+
+
+WAYS: dict[str, tuple[str, Callable[[Task], Round]]] = {
+    "jit": ("jax", _jit),
+    "jit, all devices": ("jax", _all_devices),
+    "jit, FFT": ("jax", _plain_jit),
+    "IREE": ("iree", _iree),
+    "PyTorch": ("torch", _torch),
+    "PyTorch, oneDNN": ("torch", partial(_torch, products="onednn")),
+    "PyTorch, compiled": ("torch", partial(_torch, compiled=True)),
+    "ONNX Runtime": ("onnx", _onnx),
+}
+"""Way -> (framework, function that makes a task's round ready or raises `NotPossible`)."""
+
+
+def prepare_round(way: str, task: Task) -> Round:
+    """Make a round ready to run in a way.
+
+    Args:
+      way: of `WAYS`.
+      task: what is asked for.
+
+    Raises:
+      ValueError: for an unknown way.
+      NotPossible: if this way does not work for the task or on this machine.
+    """
+    if way not in WAYS:
+        raise ValueError(f"unknown way {way!r}{nearest_hint(way, WAYS)}")
+    return WAYS[way][1](task)
+
+
+def framework_probe(framework: str, precision: str):
+    """Return a framework's own matrix product to time, or None where JAX's stands for it.
+
+    Args:
+      framework: as in `WAYS`.
+      precision: of `machine.PRECISIONS`.
+
+    Returns:
+      (function that multiplies and waits, its operations), or None.
+    """
+    if framework != "torch" or precision != "float32":
+        return None
+    from f3amd_lib.benchmarking.torch_camdm import torch_matmul_probe
+
+    return torch_matmul_probe()

@@ -1,0 +1,132 @@
+"""The stopwatch and the yardstick: they count right, whatever the machine is."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from f3amd_lib.benchmarking.machine import (
+    describe_machine,
+    fast_xla_flags,
+    matmul_precision,
+    matmul_probe,
+)
+from f3amd_lib.benchmarking.timing import take_turns
+
+
+class Clock:
+    """A clock that moves only when somebody works."""
+
+    def __init__(self):
+        self.now = 0.0
+        self.calls = []
+
+    def work(self, name, durations):
+        durations = iter(durations)
+
+        def call():
+            self.calls.append(name)
+            self.now += next(durations)
+
+        return call
+
+    def __call__(self):
+        return self.now
+
+
+def test_median_spread_and_first_call_are_told_apart():
+    clock = Clock()
+    call = clock.work("a", [9.0, 9.0, 9.0, *range(1, 102)])
+    timing = take_turns({"a": call}, min_rounds=101, min_seconds=1e9, clock=clock)["a"]
+    assert timing.median == 51.0
+    assert (timing.low, timing.high) == (6.0, 96.0)
+    assert timing.rounds == 101
+    assert timing.first == 9.0
+
+
+def test_candidates_run_by_turns():
+    clock = Clock()
+    calls = {name: clock.work(name, [1.0] * 9) for name in "ab"}
+    take_turns(calls, min_rounds=3, warmup=2, min_seconds=1e9, clock=clock)
+    assert "".join(clock.calls) == "abab" + "ababab"
+
+
+def test_a_slow_candidate_stops_by_its_seconds_and_the_quick_one_goes_on():
+    clock = Clock()
+    calls = {"slow": clock.work("slow", [4.0] * 99), "quick": clock.work("quick", [0.01] * 999)}
+    found = take_turns(calls, min_rounds=100, min_seconds=10.0, fewest_rounds=2, clock=clock)
+    assert found["slow"].rounds == 3
+    assert found["quick"].rounds == 100
+
+
+def test_even_the_slowest_gets_its_fewest_rounds():
+    clock = Clock()
+    found = take_turns(
+        {"slow": clock.work("slow", [100.0] * 99)}, fewest_rounds=5, min_seconds=10.0, clock=clock
+    )
+    assert found["slow"].rounds == 5
+
+
+def test_a_sleep_of_known_length():
+    timing = take_turns({"nap": lambda: time.sleep(0.02)}, min_rounds=5)["nap"]
+    assert timing.low >= 0.02  # a sleep may last longer, never shorter
+    assert timing.rounds == 5
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"min_rounds": 0}, {"fewest_rounds": 0}, {"warmup": 0}, {"min_seconds": -1.0}]
+)
+def test_counts_that_would_time_nothing_are_refused(wrong):
+    with pytest.raises(ValueError, match="at least"):
+        take_turns({"a": lambda: None}, **wrong)
+
+
+def test_nothing_to_time_is_refused():
+    with pytest.raises(ValueError, match="nothing to time"):
+        take_turns({})
+
+
+def test_machine_is_described_for_a_record():
+    machine = describe_machine()
+    assert json.loads(json.dumps(machine)) == machine
+    assert machine["cores"] >= 1 and machine["memory_gib"] > 0
+    assert machine["processor"]
+
+
+def test_matmul_probe_counts_its_operations_and_multiplies():
+    multiply, flops = matmul_probe(size=16)
+    assert flops == 2 * 16 * 16 * 16
+    matrix = np.asarray(jax.random.normal(jax.random.key(0), (16, 16)))
+    np.testing.assert_allclose(np.asarray(multiply()), matrix @ matrix, rtol=1e-4, atol=1e-4)
+
+
+def test_matmul_probe_has_the_type_of_its_precision():
+    assert matmul_probe("bfloat16", size=8)[0]().dtype == "bfloat16"
+    assert matmul_probe("float32", size=8)[0]().dtype == "float32"
+
+
+def test_unknown_precision_and_size_are_refused():
+    with pytest.raises(ValueError, match="tf32"):
+        matmul_precision("fp8")
+    with pytest.raises(ValueError, match="size"):
+        matmul_probe(size=0)
+
+
+def test_fast_flags_start_jax_with_as_many_devices():
+    flags = fast_xla_flags(3)
+    asked = subprocess.run(
+        [sys.executable, "-c", "import jax; print(len(jax.devices()))"],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert asked.stdout.split()[-1] == "3"
+
+
+def test_a_flag_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr("f3amd_lib.benchmarking.machine._FAST_FLAGS", ("--xla_no_such_flag=1",))
+    assert "no_such_flag" not in fast_xla_flags(2)
