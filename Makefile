@@ -6,6 +6,7 @@ DATA ?= synthetic
 PROFILE ?= laptop
 LAB_OPTIONS ?=
 MEASURE ?=
+BENCH ?=
 PYTEST_OPTIONS ?=
 
 SHELL := /bin/bash
@@ -17,11 +18,11 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke measure test lint lab clean
+.PHONY: help install figures smoke measure bench bench-tools test lint lab clean
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
-	@awk -F ': .*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ': .*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
 	@echo "Settings: MEASURE=name of one measurement; DATA=synthetic|bandai|100style|folder  PROFILE=smoke|laptop|gpu"
 	@echo "          F3AMD_PYTHON=python3.12   F3AMD_DATA_DIR=folder or zip with the motion data"
 
@@ -43,6 +44,15 @@ PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durat
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
 	  $(PYTHON) -m f3amd_lib.measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
+
+bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=options; bench-tools adds peers)
+	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
+	  $(PYTHON) -m f3amd_lib bench --data $(DATA) --profile $(PROFILE) $(BENCH)
+
+# Optional: benchmarks and tests that need one of these say so and go on without.
+bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more)
+	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
+	  -q -r requirements-bench.txt
 
 test: lint ## Lint, run the tests and check the notebooks' committed outputs
 	$(PYTEST) tests $(PYTEST_OPTIONS)

@@ -26,8 +26,26 @@ MACHINES = ("x86_64", "aarch64")
 CONDA_NAMES = {"matplotlib": "matplotlib-base"}
 """What conda-forge calls a package that PyPI calls otherwise."""
 
-IMPORT_NAMES = {"ipython": "IPython", "pillow": "PIL", "pot": "ot", "pyyaml": "yaml"}
+IMPORT_NAMES = {
+    "iree-base-compiler": "iree",
+    "iree-base-runtime": "iree",
+    "ipython": "IPython",
+    "pillow": "PIL",
+    "pot": "ot",
+    "pyyaml": "yaml",
+}
 """What Python imports where it is not the package's name."""
+
+
+def read_apart() -> dict[str, set[str]]:
+    """Packages of requirements-bench.txt -> their pinned versions, which may differ by system."""
+    pinned: dict[str, set[str]] = {}
+    for line in (ROOT / "requirements-bench.txt").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith(("#", "-")):
+            item = Requirement(line)
+            (pin,) = item.specifier
+            pinned.setdefault(canonicalize_name(item.name), set()).add(pin.version)
+    return pinned
 
 
 def read_pyproject() -> dict:
@@ -35,6 +53,13 @@ def read_pyproject() -> dict:
 
 
 def direct_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
+    """Every direct dependency that the lock holds, of whatever part, with its range."""
+    apart = read_apart()
+    ranges = all_requirements(pyproject)
+    return {name: found for name, found in ranges.items() if name not in apart}
+
+
+def all_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
     """Every direct dependency, of whatever part, with its range."""
     lines = [
         *pyproject["project"]["dependencies"],
@@ -91,7 +116,7 @@ def test_no_dependency_is_listed_twice():
         PYPROJECT["build-system"]["requires"],
         *PYPROJECT["project"]["optional-dependencies"].values(),
     ]
-    assert sum(map(len, parts)) == len(DIRECT)
+    assert sum(map(len, parts)) == len(all_requirements(PYPROJECT))
 
 
 def test_the_lock_sees_what_builds_the_package():
@@ -213,7 +238,7 @@ def imported_packages(paths) -> set[str]:
 def test_what_is_imported_is_declared():
     own = {"f3amd_lib", "tests", "conftest"}
     own |= {path.stem for path in (ROOT / "tests").glob("*.py")}
-    declared = {IMPORT_NAMES.get(name, name) for name in DIRECT}
+    declared = {IMPORT_NAMES.get(name, name) for name in all_requirements(PYPROJECT)}
     files = [*(ROOT / "f3amd_lib").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
     undeclared = imported_packages(files) - own - declared - set(sys.stdlib_module_names)
     assert undeclared == set()
@@ -224,3 +249,16 @@ def test_the_version_is_the_same_everywhere():
     assert str(citation["version"]) == f3amd_lib.__version__
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(rf"^## \[{re.escape(f3amd_lib.__version__)}\]", changelog, re.M)
+
+
+def test_what_is_installed_apart_is_pinned_within_its_range():
+    ranges = all_requirements(read_pyproject())
+    bench = {
+        canonicalize_name(Requirement(line).name)
+        for line in read_pyproject()["project"]["optional-dependencies"]["bench"]
+    }
+    apart = read_apart()
+    assert set(apart) == bench - {"psutil"}
+    for name, versions in apart.items():
+        for version in versions:
+            assert ranges[name].contains(version.split("+")[0]), f"{name} {version}"

@@ -9,7 +9,11 @@ import argparse
 import logging
 import sys
 
-from f3amd_lib.benchmarking.measurements import measure_synthesis_time, measure_training_time
+from f3amd_lib.benchmarking.measurements import (
+    measure_round_parts,
+    measure_synthesis_time,
+    measure_training_time,
+)
 from f3amd_lib.profiles import load_profile
 from f3amd_lib.report.records import read_table
 from f3amd_lib.report.speed_tables import speed_bars
@@ -31,6 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
         prepared = prepare(profile, path=options.source)
         if not options.training_only:
             path = measure_synthesis_time(prepared, profile, options.suite, again=options.again)
+            log.info("parts        %s", measure_round_parts(prepared, profile))
             ways = path.with_name("synthesis_ways.csv")
             log.info("\n%s\n", markdown_table(speed_bars(read_table(ways)[0]), digits=3))
             log.info("every way    %s\nfastest      %s", ways, path)

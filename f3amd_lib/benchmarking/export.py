@@ -14,11 +14,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import importlib.util
 import json
 import os
 import platform
 import re
 import shutil
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -269,27 +273,35 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
         return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
     """
     settings = _find_target(target)
-    compiler = _import_compiler()
     if settings.driver == "local-task" and "stablehlo.while" in _operations(program):
         raise ValueError(
             f"the program has a loop (stablehlo.while), and on {target} IREE's local-task driver "
             "returns NaN or garbage from such programs now and then: export it with unroll=True, "
             "and give it its noise instead of a random key"
         )
-    try:
-        return compiler.compile_str(
-            program,
-            input_type="stablehlo",
-            target_backends=[settings.backend],
-            strip_source_map=True,
-            extra_args=settings.flags,
-        )
-    except compiler.CompilerToolError as error:
-        found = re.findall(r"error: (.*)", str(error))
-        raise ValueError(
-            f"IREE {iree_version()} cannot compile this program for {target}: "
-            f"{found[0] if found else error}. Targets known to work are {', '.join(TARGETS)}"
-        ) from None
+    if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
+        raise ImportError('compiling needs IREE: pip install "f3amd_lib[bench]"')
+    with tempfile.TemporaryDirectory() as folder:
+        source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
+        source.write_bytes(program)
+        # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
+        # process that holds both dies when it ends.
+        command = [
+            *(sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile"),
+            *(str(source), "-o", str(compiled)),
+            "--iree-input-type=stablehlo",
+            f"--iree-hal-target-backends={settings.backend}",
+            "--iree-vm-bytecode-module-strip-source-map",
+            *settings.flags,
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return compiled.read_bytes()
+    found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
+    raise ValueError(
+        f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}. "
+        f"Targets known to work are {', '.join(TARGETS)}"
+    )
 
 
 def _find_target(name: str) -> Target:
@@ -300,16 +312,6 @@ def _find_target(name: str) -> Target:
         flags = tuple(flag.replace("sm_80", name.removeprefix("cuda-")) for flag in like.flags)
         return dataclasses.replace(like, flags=flags)
     raise ValueError(f"unknown target {name!r}{nearest_hint(name, TARGETS)}")
-
-
-def _import_compiler():
-    try:
-        import iree.compiler
-    except ImportError as error:
-        raise ImportError(
-            f'compiling needs IREE ({error}): pip install "f3amd_lib[bench]"'
-        ) from None
-    return iree.compiler
 
 
 def save_artefact(

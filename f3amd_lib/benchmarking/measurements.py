@@ -11,15 +11,22 @@ import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.benchmarking.machine import describe_machine, device_name
+from f3amd_lib.benchmarking.parts import time_parts
 from f3amd_lib.benchmarking.synthesis import Candidate, fastest_ways, plan, time_group
 from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.benchmarking.ways import Task
 from f3amd_lib.models import zoo
 from f3amd_lib.profiles import Profile, results_dir
 from f3amd_lib.report.records import kept_rows, read_table, run_record, write_table
 from f3amd_lib.training.loop import short_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
-__all__ = ["DEFAULT_SUITES", "measure_synthesis_time", "measure_training_time"]
+__all__ = [
+    "DEFAULT_SUITES",
+    "measure_round_parts",
+    "measure_synthesis_time",
+    "measure_training_time",
+]
 
 log = logging.getLogger("f3amd")
 
@@ -130,6 +137,31 @@ def measure_synthesis_time(
             write_table(path, kept, record)
             write_table(folder / "synthesis_time.csv", fastest_ways(kept), record)
     return folder / "synthesis_time.csv"
+
+
+def measure_round_parts(
+    prepared: PreparedData, profile: Profile, counts: Iterable[int] = (1, 32)
+) -> Path:
+    """Time F3AMD-FNO-96 with 1 step whole and without each of its parts (see `parts`).
+
+    Args:
+      prepared: its channels and styles are the network's.
+      profile: names the results' folder.
+      counts: numbers of characters.
+
+    Returns:
+      The table `records/round_parts.csv`.
+    """
+    model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
+    config = prepared.model_config(model)
+    rows = [
+        time_parts(Task(model, config, 1, characters), progress=True, **turns)
+        for characters in counts
+    ]
+    path = results_dir(profile.dataset, profile.name) / "records" / "round_parts.csv"
+    record = _record(prepared, profile, "round_parts", **_circumstances())
+    write_table(path, pd.concat(rows), record)
+    return path
 
 
 def measure_training_time(

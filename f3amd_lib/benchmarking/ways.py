@@ -16,7 +16,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from flax import nnx
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision
@@ -26,7 +25,7 @@ from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.models import zoo
 from f3amd_lib.models.camdm import CAMDMConfig
 from f3amd_lib.models.conditioning import PATH_CHANNELS, Condition
-from f3amd_lib.models.config import NetworkConfig
+from f3amd_lib.models.config import NetworkConfig, cast_network
 from f3amd_lib.names import nearest_hint
 
 __all__ = [
@@ -55,6 +54,9 @@ class Task:
       steps: N.
       characters: B.
       precision: of `machine.PRECISIONS`.
+
+    Raises:
+      ValueError: for an unknown precision.
     """
 
     model: str
@@ -62,6 +64,9 @@ class Task:
     steps: int
     characters: int
     precision: str = "float32"
+
+    def __post_init__(self):
+        matmul_precision(self.precision)
 
     @property
     def sampler(self) -> str:
@@ -110,9 +115,7 @@ def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> C
 def _network(task: Task):
     """Return the network with random weights, in the task's precision."""
     network = zoo.build_from_config(task.config, jax.random.key(0))
-    dtype = PRECISIONS[task.precision][1]
-    graph, state = nnx.split(network)
-    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(dtype), state))
+    return cast_network(network, PRECISIONS[task.precision][1])
 
 
 def _compiled(task: Task, run, condition) -> Round:

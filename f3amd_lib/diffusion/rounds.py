@@ -45,7 +45,10 @@ def sample_round(
     if noise is None:
         if key is None:
             raise ValueError("a round starts from noise: give it a key, or the noise itself")
-        noise = jax.random.normal(key_init, shape, condition.history.dtype)
+        # Drawn with all digits and then cut: one seed, one noise, whatever the precision.
+        dtype = condition.history.dtype
+        drawn = jax.random.normal(key_init, shape, jnp.promote_types(dtype, jnp.float32))
+        noise = drawn.astype(dtype)
     elif noise.shape != shape:
         raise ValueError(f"noise must have shape {shape}, got {noise.shape}")
     context = network.encode(condition)

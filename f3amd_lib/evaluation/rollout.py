@@ -22,15 +22,17 @@ from f3amd_lib.data.features import (
     path_condition,
     turn_frames,
 )
-from f3amd_lib.diffusion.samplers import SAMPLERS, sample
+from f3amd_lib.diffusion.rounds import sample_round
+from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.models.config import cast_network
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.training.checkpoints import TrainedModel
 
-__all__ = ["MotionGenerator", "Rollout"]
+__all__ = ["MotionGenerator", "Rollout", "as_fast_as", "path_start", "pose_speed"]
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class MotionGenerator:
       spacing: where the steps lie, see the schedule's `grid`.
       sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule (F3AMD
         DDIM, CAMDM ancestral DDPM).
+      dtype: of the network's arithmetic; jnp.bfloat16 is faster where the hardware has it.
     """
 
     def __init__(
@@ -81,6 +84,7 @@ class MotionGenerator:
         schedule: NoiseSchedule | None = None,
         spacing: str = "endpoints",
         sampler: str | None = None,
+        dtype=jnp.float32,
     ):
         self.trained = trained
         self.num_steps = num_steps
@@ -91,23 +95,23 @@ class MotionGenerator:
                 f"unknown sampler {self.sampler!r}{nearest_hint(self.sampler, SAMPLERS)}"
             )
         self.sigmas = schedule.grid(num_steps, spacing)
-        self._network = trained.network()
+        self._dtype = dtype
+        self._network = cast_network(trained.network(), dtype)
         self._run = jax.jit(self._rounds)
 
     def sample_window(self, key, condition: Condition):
         """Sample one window, [B, T, C] in network units, for an already normalised condition."""
-        config = self.trained.config
-        context = self._network.encode(condition)
-        shape = (condition.history.shape[0], config.window, config.channels)
-        key_init, key_steps = jax.random.split(key)
-        x_init = self.sigmas[0].astype(np.float32) * jax.random.normal(key_init, shape)
-        return sample(
-            self.sampler,
-            lambda x_noisy, sigma: self._network(x_noisy, sigma, context),
-            x_init,
-            self.sigmas,
-            key=key_steps,
-        )
+        condition = jax.tree.map(lambda leaf: leaf.astype(self._dtype), condition)
+        x0_hat = sample_round(self._network, condition, self.sigmas, key, sampler=self.sampler)
+        return x0_hat.astype(jnp.float32)
+
+    def sample_window_each(self, keys, condition: Condition):
+        """Sample one window for each character as if it were alone, [B, T, C]; keys [B]."""
+
+        def alone(key, condition):
+            return self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], condition))[0]
+
+        return jax.vmap(alone)(keys, condition)
 
     def _rounds(self, history, positions, yaws, before, style, key):
         normaliser = self.trained.normaliser
@@ -122,7 +126,11 @@ class MotionGenerator:
                 path=normaliser.normalise_path(path_condition(position, yaw)),
                 style=style,
             )
-            x0_hat = self.sample_window(jax.random.fold_in(key, number), condition)
+            if key.ndim:
+                keys = jax.vmap(jax.random.fold_in, (0, None))(key, number)
+                x0_hat = self.sample_window_each(keys, condition)
+            else:
+                x0_hat = self.sample_window(jax.random.fold_in(key, number), condition)
             future = orthonormalise(normaliser.denormalise(x0_hat))
             future = center_window(future, -origin)
             history = jnp.concatenate([history, future], axis=1)[:, -history.shape[1] :]
@@ -132,6 +140,46 @@ class MotionGenerator:
         _, futures = jax.lax.scan(one_round, history, (positions, yaws, before, numbers))
         rounds, batch, frames, channels = futures.shape
         return jnp.moveaxis(futures, 0, 1).reshape(batch, rounds * frames, channels)
+
+    def generate(self, position, yaw, style_index, history, key) -> np.ndarray:
+        """Run all rounds on arrays; `rollout` and `evaluation.crowd` check and prepare them.
+
+        Compiled once per number of characters and of rounds.
+
+        Args:
+          position: targets on the ground, [B, F, 2], metres, float64. The last round walks on as
+            the last step went, and is cut to F frames.
+          yaw: facing, [B, F], radians, float64.
+          style_index: places in the one-hot vector, [B].
+          history: world frames to start from, [B, H, C].
+          key: JAX random key of the noise: one for the batch, or one a character, [B]. With the
+            latter a character's noise does not depend on who else is there.
+
+        Returns:
+          World frames, [B, F, C], float32.
+        """
+        window = self.trained.config.window
+        batch, num_frames = yaw.shape
+        rounds = -(-num_frames // window)
+        start = path_start(position)
+        missing = rounds * window - num_frames
+        if missing:
+            ahead = np.arange(1, missing + 1)[None, :, None]
+            pace = position[:, -1:] - position[:, -2:-1]
+            position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
+            yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
+        shape = (batch, rounds, window)
+        targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
+        before = np.concatenate([start[None], targets[:-1, :, -1]])
+        frames = self._run(
+            jnp.asarray(history, jnp.float32),
+            jnp.asarray(targets, jnp.float32),
+            jnp.asarray(np.moveaxis(yaw.reshape(shape), 1, 0), jnp.float32),
+            jnp.asarray(before, jnp.float32),
+            jax.nn.one_hot(style_index, len(self.trained.styles)),
+            key,
+        )
+        return np.asarray(frames)[:, :num_frames]
 
     def rollout(
         self,
@@ -178,16 +226,9 @@ class MotionGenerator:
         if num_frames < 2:
             raise ValueError("a path needs at least 2 frames")
         indices = np.array([trained.style_index(style) for style in styles])
-        rounds = -(-num_frames // config.window)
         position = np.stack([path.position for path in paths]).astype(np.float64)
         yaw = np.stack([np.unwrap(path.yaw) for path in paths]).astype(np.float64)
-        missing = rounds * config.window - num_frames
-        if missing:
-            ahead = np.arange(1, missing + 1)[None, :, None]
-            pace = position[:, -1:] - position[:, -2:-1]
-            position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
-            yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
-        start = 2.0 * position[:, 0] - position[:, 1]
+        start = path_start(position)
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
             history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
@@ -197,20 +238,9 @@ class MotionGenerator:
             raise ValueError(f"history must have shape {expected}, got {history.shape}")
         if not np.isfinite(history).all():
             raise ValueError("history holds a number that is not finite")
-        shape = (batch, rounds, config.window)
-        targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
-        before = np.concatenate([start[None], targets[:-1, :, -1]])
-        frames = self._run(
-            jnp.asarray(history, jnp.float32),
-            jnp.asarray(targets, jnp.float32),
-            jnp.asarray(np.moveaxis(yaw.reshape(shape), 1, 0), jnp.float32),
-            jnp.asarray(before, jnp.float32),
-            jax.nn.one_hot(indices, len(trained.styles)),
-            jax.random.key(seed),
-        )
         return Rollout(
             skeleton=trained.skeleton,
-            frames=np.asarray(frames)[:, :num_frames],
+            frames=self.generate(position, yaw, indices, history, jax.random.key(seed)),
             history=np.asarray(history),
             paths=tuple(paths),
             styles=tuple(styles),
@@ -225,7 +255,7 @@ class MotionGenerator:
             if style not in self.trained.seeds:
                 raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
             choices = self.trained.seeds[style]
-            choices = choices[_as_fast_as(choices, speed[character])]
+            choices = choices[as_fast_as(choices, speed[character])]
             order = np.random.default_rng([seed, self.trained.style_index(style)])
             number = order.permutation(len(choices))[taken[style] % len(choices)]
             taken[style] += 1
@@ -234,8 +264,26 @@ class MotionGenerator:
         return np.stack(poses).astype(np.float32)
 
 
-def _as_fast_as(poses: np.ndarray, speed: float) -> np.ndarray:
-    """Return which starting poses [K, H, C] move about as fast as a path, metres a frame."""
+def path_start(position):
+    """Return where a path [..., F, 2] would have been one frame before its first, [..., 2]."""
+    return 2.0 * position[..., 0, :] - position[..., 1, :]
+
+
+def as_fast_as(poses: np.ndarray, speed) -> np.ndarray:
+    """Tell which starting poses move about as fast as a path.
+
+    Args:
+      poses: [K, H, C], metres.
+      speed: of the path, [...], metres a frame.
+
+    Returns:
+      Booleans, [..., K]; at least one is true for each speed.
+    """
+    gap = np.abs(pose_speed(poses) - np.asarray(speed)[..., None])
+    return gap <= gap.min(axis=-1, keepdims=True) + 0.1 / 30.0
+
+
+def pose_speed(poses: np.ndarray) -> np.ndarray:
+    """Return how fast starting poses [K, H, C] move over the ground, [K], metres a frame."""
     travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
-    gap = np.abs(travelled / max(1, poses.shape[1] - 1) - speed)
-    return np.flatnonzero(gap <= gap.min() + 0.1 / 30.0)
+    return travelled / max(1, poses.shape[1] - 1)

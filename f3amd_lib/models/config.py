@@ -7,11 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import jax
 from flax import nnx
 
 from f3amd_lib.names import nearest_hint, refuse_unknown
 
-__all__ = ["NetworkConfig", "Denoiser", "scaled_input"]
+__all__ = ["NetworkConfig", "Denoiser", "scaled_input", "cast_network"]
 
 _TYPES = {"int": int, "float": float, "bool": bool, "str": str}
 _TUPLE = "tuple[float, ...]"
@@ -158,3 +159,14 @@ class Denoiser(nnx.Module):
         """
         *_, (_, x0_hat) = self.stages(x_noisy, sigma, context, key)
         return x0_hat
+
+
+def cast_network(network: nnx.Module, dtype) -> nnx.Module:
+    """Return a network whose weights, and with them its arithmetic, are of another type.
+
+    Args:
+      network: any; left as it is.
+      dtype: of floating-point numbers. Condition and state must be given in it, too.
+    """
+    graph, state = nnx.split(network)
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(dtype), state))

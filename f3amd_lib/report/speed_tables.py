@@ -6,7 +6,7 @@ import pandas as pd
 
 from f3amd_lib.report.papers import load_paper_table
 
-__all__ = ["speed_bars", "times_beside_paper", "training_beside_paper"]
+__all__ = ["speed_bars", "speedups", "times_beside_paper", "training_beside_paper"]
 
 _FAST = ("jit", "jit, all devices", "IREE")
 _TORCH = ("PyTorch", "PyTorch, oneDNN", "PyTorch, compiled")
@@ -138,3 +138,29 @@ def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
         quotient = joined[minutes] / joined["window_frames"].map(camdm)
         joined.insert(joined.columns.get_loc(minutes) + 1, f"{name}_over_camdm", quotient)
     return joined
+
+
+def speedups(times: pd.DataFrame, *, window: int = 32) -> pd.DataFrame:
+    """Return how many times faster than CAMDM with 8 steps each row is (Figures 3 and 4).
+
+    Args:
+      times: columns model, window_frames, steps, device, characters and value (ms), one framework;
+        a table of the paper, or rows of `synthesis_time`.
+      window: frames; both sides have it.
+
+    Returns:
+      The rows of that window but CAMDM's with 8 steps, with the column speedup; rows without a
+      CAMDM at as many characters are left out.
+
+    Raises:
+      ValueError: if CAMDM is timed twice for one device and number of characters.
+    """
+    mine = times[times["window_frames"] == window]
+    is_camdm = (mine["model"] == "CAMDM") & (mine["steps"] == 8)
+    camdm = mine[is_camdm].set_index(["device", "characters"])["value"]
+    if not camdm.index.is_unique:
+        raise ValueError("CAMDM is timed twice for one number of characters: keep one framework")
+    others = mine[~is_camdm]
+    keys = pd.MultiIndex.from_frame(others[["device", "characters"]])
+    slow = camdm.reindex(keys).to_numpy()
+    return others.assign(speedup=slow / others["value"]).dropna(subset=["speedup"])

@@ -1,0 +1,70 @@
+"""Fewer digits change the numbers a little, and the comparison says how much."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import (
+    CHANNELS,
+    WINDOW,
+    draw,
+    make_condition,
+    network_of,
+    tiny_config,
+    tiny_packed,
+    tiny_trained,
+)
+
+from f3amd_lib.evaluation import precision
+from f3amd_lib.evaluation.paths import named_path
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.models.config import cast_network
+
+
+def test_a_cast_network_computes_in_the_other_type_and_leaves_the_first_alone():
+    network = network_of(tiny_config())
+    half = cast_network(network, jnp.bfloat16)
+    given = make_condition()
+    x_noisy = draw(2, WINDOW, CHANNELS)
+    lower = [leaf.astype(jnp.bfloat16) for leaf in (x_noisy, *given)]
+    answer = half(lower[0], 1.0, half.encode(type(given)(*lower[1:])))
+    expected = network(x_noisy, 1.0, network.encode(given))
+    assert answer.dtype == jnp.bfloat16 and expected.dtype == jnp.float32
+    gap = np.abs(np.asarray(answer, np.float32) - np.asarray(expected)).max()
+    assert 1e-5 < gap < 0.1 * np.abs(expected).max()
+
+
+def test_rollouts_in_bfloat16_stay_near_and_come_as_float32():
+    path = named_path("straight", 2 * WINDOW, speed=1.0)
+    run = lambda dtype, seed=0: (
+        MotionGenerator(tiny_trained(), 2, dtype=dtype).rollout(path, "calm", seed=seed).frames
+    )
+    full, half, other = run(jnp.float32), run(jnp.bfloat16), run(jnp.float32, seed=1)
+    assert half.dtype == np.float32
+    assert 0.0 < np.abs(full - half).mean() < 0.3 * np.abs(full - other).mean()
+
+
+def test_comparison_tells_change_and_its_yardstick(monkeypatch):
+    packed = tiny_packed()
+    monkeypatch.setattr(
+        precision,
+        "evaluation_paths",
+        lambda packed, styles, frames, *, seed: [
+            named_path("straight", frames, speed=1.0 + 0.1 * seed) for _ in styles
+        ],
+    )
+    table = precision.compare_precisions(
+        tiny_trained(), packed, packed.styles, steps=1, num_frames=3 * WINDOW, seeds=(0, 1)
+    ).set_index("metric")
+    known = table.dropna(subset=["float32"])
+    np.testing.assert_allclose(known["change"], known["bfloat16"] - known["float32"])
+    assert 0.0 < table.loc["joint distance (cm)", "bfloat16"] < 100.0
+    assert table["seed_deviation"].drop("joint distance (cm)").max() > 0.0
+    assert set(table["model"]) == {"F3AMD-FNO-8"} and set(table["steps"]) == {1}
+
+
+def test_measurement_without_weights_is_refused(monkeypatch):
+    monkeypatch.setattr(precision, "available_models", lambda profile: [])
+    profile = type("P", (), {"seed": 0, "evaluation_styles": ("calm",), "dataset": "tiny"})
+    prepared = type("D", (), {"packed": tiny_packed()})
+    with pytest.raises(ValueError, match="no model of tiny has weights"):
+        precision.measure_precision(prepared, profile)

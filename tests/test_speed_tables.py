@@ -1,0 +1,129 @@
+"""Speed tables: quotients by hand, and the paper's cells beside ours."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from f3amd_lib.report import plots_speed
+from f3amd_lib.report.papers import load_paper_table
+from f3amd_lib.report.speed_tables import (
+    speed_bars,
+    speedups,
+    times_beside_paper,
+    training_beside_paper,
+)
+
+
+def measured(*rows):
+    columns = ["model", "steps", "way", "characters", "value", "share_of_peak"]
+    table = pd.DataFrame(rows, columns=columns)
+    return table.assign(
+        window_frames=32, precision="float32", device="CPU", framework="jax",
+        low=0.9 * table["value"], high=1.2 * table["value"],
+    )  # fmt: skip
+
+
+GOOD = (
+    ("F3AMD-FNO-96", 1, "jit", 32, 12.0, 0.5),
+    ("F3AMD-FNO-96", 1, "jit, all devices", 32, 10.0, 0.7),
+    ("F3AMD-FNO-96", 1, "jit, FFT", 32, 1.0, 9.0),
+    ("F3AMD-FNO-96", 8, "jit", 32, 80.0, 0.6),
+    ("CAMDM", 8, "jit", 32, 600.0, 0.8),
+    ("CAMDM", 8, "PyTorch", 32, 500.0, 0.9),
+    ("F3AMD-FNO-96", 1, "jit", 1, 2.0, 0.1),
+    ("F3AMD-FNO-96", 1, "jit, FFT", 1, 4.0, 0.1),
+)
+
+
+def test_bars_take_the_fastest_way_and_say_what_is_met():
+    bars = speed_bars(measured(*GOOD)).set_index("what")
+    by_place = bars["measured"].tolist()
+    np.testing.assert_allclose(by_place, [0.7, 0.6, 0.8, 0.9, 60.0, 7.5, 50.0, 0.5])
+    assert bars["met"].tolist() == ["yes", "no", "yes", "yes", "yes", "yes", "yes", "no"]
+
+
+def test_bars_without_a_row_are_not_measured():
+    bars = speed_bars(measured(*GOOD[:2]))
+    assert bars["met"].tolist() == ["yes"] + ["not measured"] * 7
+
+
+def test_speedup_is_over_camdm_of_as_many_characters():
+    table = measured(*GOOD[:1], *GOOD[3:5], ("F3AMD-FNO-96", 1, "jit", 2, 1.0, 0.1))
+    found = speedups(table)
+    assert list(found["speedup"]) == [50.0, 7.5]
+    twice = pd.concat([table, table])
+    with pytest.raises(ValueError, match="timed twice"):
+        speedups(twice)
+
+
+def test_speedups_of_the_paper_are_those_of_figure_4():
+    paper = speedups(load_paper_table(4))
+    one = paper[(paper["model"] == "F3AMD-FNO-96") & (paper["steps"] == 1)]
+    gains = one.set_index(["device", "characters"])["speedup"]
+    assert 24 < gains["GPU", 1024] < 27  # "25 times faster for 1024 characters on GPU"
+    assert 3.5 < gains["GPU", 16] < 4.5  # "4 times faster for 16 characters"
+
+
+def test_ours_stand_beside_the_papers_cells():
+    table = measured(("CAMDM", 8, "jit", 32, 600.0, 0.8), ("F3AMD-FNO-96", 8, "jit", 32, 80.0, 0.6))
+    beside = times_beside_paper(table, 1, "CPU")
+    assert len(beside) == (load_paper_table(1)["device"] == "CPU").sum()
+    ours = beside.dropna(subset=["ours"]).set_index("model")
+    assert ours.loc["CAMDM", "ours"] == 600.0 and ours.loc["F3AMD-FNO-96", "ours"] == 80.0
+    assert ours.loc["CAMDM", "paper"] == 1036.66
+    with pytest.raises(ValueError, match="use 1, 4 or 7"):
+        times_beside_paper(table, 3, "CPU")
+
+
+def test_frameworks_are_not_confused():
+    jax, torch = (
+        ("CAMDM", 8, way, 8, value, 0.5) for way, value in (("jit", 10.0), ("PyTorch", 7.0))
+    )
+    table = measured(jax, torch)
+    table["framework"] = ["jax", "torch"]
+    beside = times_beside_paper(table, 7, "CPU").query("characters == 8").set_index("model")
+    assert beside.loc["CAMDM (JAX)", "ours"] == 10.0
+    assert beside.loc["CAMDM (PyTorch)", "ours"] == 7.0
+
+
+def test_training_is_compared_by_quotients():
+    table = pd.DataFrame(
+        {
+            "model": ["F3AMD-FNO-96", "CAMDM"], "window_frames": 32, "epoch_minutes": [2.0, 8.0],
+            "value": [0.1, 0.4], "batch_size": 64, "device": "CPU",
+        }
+    )  # fmt: skip
+    beside = training_beside_paper(table)
+    fno = beside[(beside["model"] == "F3AMD-FNO-96") & (beside["window_frames"] == 32)].iloc[0]
+    assert fno["our_over_camdm"] == 0.25
+    np.testing.assert_allclose(fno["paper_over_camdm"], 5.07 / 12.50)
+
+
+def test_figures_draw_what_they_are_given():
+    paper = load_paper_table(1).query("device == 'CPU'")
+    figure = plots_speed.speedup_panels({"paper": speedups(paper), "again": speedups(paper)})
+    assert len(figure.axes) == 2
+    # Ten sizes, and the line at 1.
+    assert len(figure.axes[0].lines) == 11
+    line = next(line for line in figure.axes[0].lines if line.get_label() == "FNO-96")
+    expected = speedups(paper).query("model == 'F3AMD-FNO-96'").sort_values("characters")
+    np.testing.assert_allclose(line.get_ydata(), expected["speedup"])
+
+    by_steps = speedups(load_paper_table(4).query("device == 'CPU'")).query("model != 'CAMDM'")
+    figure = plots_speed.speedup_panels({"paper": by_steps}, by="steps")
+    labels = [line.get_label() for line in figure.axes[0].lines[:-1]]
+    assert labels == ["8 steps", "4 steps", "2 steps", "1 step"]
+
+    figure = plots_speed.way_bars(measured(*GOOD[:5]))
+    assert len(figure.axes) == 3
+    widths = [bar.get_width() for bar in figure.axes[1].patches]
+    np.testing.assert_allclose(widths, [60.0])
+
+    figure = plots_speed.time_curves(measured(*GOOD[:1]).assign(label="one"))
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), [12.0])
+
+    table = pd.DataFrame(
+        {"characters": 1, "without": ["", "FiLM"], "value": [2.0, 1.5], "saved": [np.nan, 0.25]}
+    )
+    figure = plots_speed.part_bars(table)
+    np.testing.assert_allclose([bar.get_width() for bar in figure.axes[0].patches], [25.0])

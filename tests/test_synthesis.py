@@ -1,0 +1,211 @@
+"""Benchmarks: what is timed does what is said, and its table counts right."""
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from builders import CHANNELS, WINDOW, network_of, tiny_camdm, tiny_config
+
+from f3amd_lib.benchmarking import measurements, parts, synthesis, ways
+from f3amd_lib.benchmarking.parts import PARTS, time_parts, without
+from f3amd_lib.benchmarking.synthesis import Candidate, fastest_ways, plan, time_group
+from f3amd_lib.benchmarking.ways import NotPossible, Task, prepare_round, random_condition
+from f3amd_lib.diffusion.rounds import sample_round
+from f3amd_lib.diffusion.samplers import num_evaluations
+from f3amd_lib.models import zoo
+from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.records import read_table
+
+QUICK = {"min_rounds": 3, "min_seconds": 0.0, "fewest_rounds": 2, "warmup": 1}
+
+
+def tiny(model, window=WINDOW):
+    return tiny_camdm() if model.startswith("CAMDM") else tiny_config()
+
+
+def task(model="F3AMD-FNO-96", **changes):
+    return Task(model, tiny(model), **{"steps": 2, "characters": 2, **changes})
+
+
+def test_operations_of_a_round():
+    for model in ("F3AMD-FNO-96", "CAMDM"):
+        encode, evaluate = zoo.count_flops(tiny(model))
+        asked = task(model, steps=4, characters=3)
+        calls = num_evaluations(asked.sampler, 4)
+        assert ways.round_flops(asked) == 3 * (encode + calls * evaluate)
+
+
+def test_each_model_is_timed_with_its_own_sampler_and_levels():
+    assert task("F3AMD-FNO-96").sampler == "ddim"
+    assert task("CAMDM").sampler == "ddpm"
+    assert task("CAMDM", steps=4).sigmas.shape == (5,)
+
+
+@pytest.mark.parametrize("model", ["F3AMD-FNO-96", "CAMDM"])
+def test_jit_runs_the_round(model):
+    asked = task(model)
+    network = zoo.build_from_config(asked.config, jax.random.key(0))
+    given = Condition(*map(jax.numpy.asarray, random_condition(asked.config, 2)))
+    expected = sample_round(network, given, asked.sigmas, jax.random.key(0), sampler=asked.sampler)
+    ready = prepare_round("jit", asked)
+    np.testing.assert_allclose(ready.call(), expected, atol=1e-4)
+    assert ready.compile_seconds > 0 and ready.bytes_accessed > 0
+
+
+def test_plain_form_runs_the_same_round():
+    results = [np.asarray(prepare_round(way, task()).call()) for way in ("jit", "jit, FFT")]
+    np.testing.assert_allclose(*results, atol=1e-4)
+
+
+@pytest.mark.parametrize("model", ["F3AMD-FNO-96", "CAMDM"])
+def test_iree_runs_a_round_of_finite_numbers(model):
+    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
+    found = np.asarray(prepare_round("IREE", task(model)).call())
+    assert found.shape == (2, WINDOW, CHANNELS) and np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("way", ["PyTorch", "PyTorch, oneDNN"])
+def test_pytorch_runs_a_round_of_finite_numbers(way):
+    pytest.importorskip("torch", reason="PyTorch is in the extra bench")
+    found = np.asarray(prepare_round(way, task("CAMDM")).call())
+    assert found.shape == (2, WINDOW, CHANNELS) and np.isfinite(found).all()
+
+
+def test_what_cannot_be_done_says_why():
+    with pytest.raises(NotPossible, match="Fourier blocks"):
+        prepare_round("jit, FFT", task("CAMDM"))
+    with pytest.raises(NotPossible, match="one device"):
+        prepare_round("jit, all devices", task())
+    with pytest.raises(ValueError, match="did you mean.*jit"):
+        prepare_round("jitt", task())
+    with pytest.raises(ValueError, match="tf32"):
+        prepare_round("jit", task(precision="tf23"))
+
+
+def test_a_group_is_timed_and_counted():
+    candidates = [Candidate("F3AMD-FNO-96", steps, 2, "jit", WINDOW) for steps in (1, 2)] + [
+        Candidate("CAMDM", 2, 2, way, WINDOW) for way in ("jit", "jit, FFT")
+    ]
+    table, failed = time_group(candidates, tiny, **QUICK)
+    assert list(table["steps"]) == [1, 2, 2] and (table["rounds"] >= 2).all()
+    assert list(failed) == [str(candidates[-1])]
+    assert (table["low"] <= table["value"]).all() and (table["value"] <= table["high"]).all()
+    np.testing.assert_allclose(table["gflops"], table["flops"] / table["value"] / 1e6)
+    np.testing.assert_allclose(table["share_of_peak"], table["gflops"] / table["peak_gflops"])
+    assert table["peak_gflops"].nunique() == 1
+    assert table["flops"].iloc[0] == ways.round_flops(task(steps=1))
+
+
+def test_groups_are_not_mixed():
+    mixed = [Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW) for count in (1, 2)]
+    with pytest.raises(ValueError, match="2 groups"):
+        time_group(mixed, tiny)
+
+
+def test_plans_name_presets_and_ways_that_exist_each_once():
+    for suite in synthesis.SUITES:
+        members = [c for group in plan([suite]).values() for c in group]
+        assert members and len(members) == len(set(members))
+        for candidate in members:
+            assert zoo.find_preset(candidate.model).name == candidate.model
+            assert candidate.way in ways.WAYS
+    both = plan(["bars", "main"])
+    assert sum(map(len, both.values())) < sum(
+        len(group) for suite in ("bars", "main") for group in plan([suite]).values()
+    )
+    with pytest.raises(ValueError, match="unknown suite"):
+        plan(["bar"])
+
+
+def rows(*values):
+    columns = ["model", "steps", "framework", "way", "characters", "value", "precision"]
+    table = pd.DataFrame(values, columns=columns)
+    return table.assign(window_frames=32, device="CPU")
+
+
+def test_fastest_way_of_each_framework_in_float32():
+    table = rows(
+        ("CAMDM", 8, "jax", "jit", 1, 3.0, "float32"),
+        ("CAMDM", 8, "jax", "jit, all devices", 1, 2.0, "float32"),
+        ("CAMDM", 8, "jax", "jit", 1, 1.0, "bfloat16"),
+        ("CAMDM", 8, "torch", "PyTorch", 1, 4.0, "float32"),
+        ("F3AMD-FNO-96", 1, "jax", "jit, FFT", 1, 0.5, "float32"),
+        ("F3AMD-FNO-96", 1, "jax", "jit", 1, 0.7, "float32"),
+    )
+    table.index = [0] * len(table)  # as pieces of several runs have
+    found = fastest_ways(table)
+    assert list(found["value"]) == [2.0, 4.0, 0.7]
+    assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
+
+
+@pytest.fixture
+def quick_suite(monkeypatch, tmp_path):
+    """A suite of two groups on tiny networks; returns how often each group was timed."""
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    timed = []
+
+    def two_groups():
+        for count in (1, 2):
+            yield Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW)
+        yield Candidate("CAMDM", 1, 2, "jit, FFT", WINDOW)
+
+    def counted(candidates, build_config, **settings):
+        timed.append(candidates[0].characters)
+        return time_group(candidates, tiny, **QUICK)
+
+    monkeypatch.setitem(synthesis.SUITES, "smoke", two_groups)
+    monkeypatch.setattr(measurements, "time_group", counted)
+    return timed
+
+
+class Prepared:
+    class packed:
+        name, fingerprint, licence, credit = "synthetic", "abc", "none", "none"
+
+    model_config = staticmethod(lambda model, window: tiny(model))
+
+
+def test_measurement_writes_both_tables_and_goes_on_where_it_was(quick_suite):
+    profile = load_profile("smoke", "synthetic")
+    path = measurements.measure_synthesis_time(Prepared, profile)
+    assert quick_suite == [1, 2]
+    table, record = read_table(path)
+    assert list(table["characters"]) == [1, 2]
+    (reason,) = record["not_possible"].values()
+    assert "Fourier blocks" in reason
+    assert record["timed_on"]["cores"] >= 1 and record["turns"]["min_rounds"] == 10
+    measurements.measure_synthesis_time(Prepared, profile)
+    assert quick_suite == [1, 2]  # known, and known to be impossible
+    measurements.measure_synthesis_time(Prepared, profile, again=True)
+    assert quick_suite == [1, 2, 1, 2]
+    every, _ = read_table(path.with_name("synthesis_ways.csv"))
+    assert len(every) == 2
+
+
+def test_parts_are_left_out():
+    network = network_of(tiny_config())
+    given = random_condition(network.config, 2)
+    x_noisy = np.asarray(random_condition(network.config, 2, seed=1).history[:, :1])
+    x_noisy = np.repeat(x_noisy, WINDOW, axis=1)
+    counts = {}
+    for part in ("", *PARTS[:-1]):
+        left = without(network, part) if part else network
+        program = jax.make_jaxpr(lambda x, left=left: left(x, 1.0, left.encode(Condition(*given))))
+        counts[part] = str(program(x_noisy)).count("dot_general")
+        assert left(x_noisy, 1.0, left.encode(Condition(*given))).shape == x_noisy.shape
+    assert all(counts[part] < counts[""] for part in PARTS[:-1])
+    assert network(x_noisy, 1.0, network.encode(Condition(*given))).shape == x_noisy.shape
+    with pytest.raises(ValueError, match="unknown part"):
+        without(network, "noise")
+    with pytest.raises(ValueError, match="Fourier blocks with FiLM"):
+        without(network_of(tiny_config(base_block="transformer")), "FiLM")
+
+
+def test_time_of_parts_is_a_share_of_the_whole():
+    table = time_parts(task(steps=1), **QUICK)
+    assert list(table["without"]) == ["", *PARTS]
+    whole = table["value"].iloc[0]
+    np.testing.assert_allclose(table["saved"].iloc[1:], 1 - table["value"].iloc[1:] / whole)
+    assert np.isnan(table["saved"].iloc[0])
+    assert parts.PARTS[-1] == "noise"

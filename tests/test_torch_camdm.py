@@ -1,0 +1,349 @@
+"""CAMDM in PyTorch and in ONNX Runtime gives the numbers of CAMDM in JAX."""
+
+import functools
+import importlib
+import itertools
+import shutil
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import (
+    CHANNELS,
+    WINDOW,
+    draw,
+    evaluate,
+    make_condition,
+    network_of,
+    tiny_camdm,
+    tiny_config,
+)
+from flax import nnx
+
+from f3amd_lib.benchmarking.timing import Timing
+from f3amd_lib.diffusion.rounds import sample_round
+from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.models import zoo
+from f3amd_lib.models.conditioning import Condition
+
+torch = pytest.importorskip("torch", reason="PyTorch comes with the extra 'bench'")
+torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
+
+SIGMAS = VariancePreservingCosine(4).grid(4)
+KEY = jax.random.key(3)
+TOLERANCE = 1e-4
+LAYOUTS = {
+    "one path token a frame": {},
+    "two path tokens a frame": {"split_path": True},
+    "told sigma, not its number": {"noise_levels": ()},
+    "raw input, one head": {"input_scaling": False, "num_heads": 1},
+    "sigma_data of a half": {"sigma_data": 0.5},
+}
+
+
+@pytest.fixture
+def onnx_camdm():
+    for package in ("onnx", "onnxruntime"):
+        pytest.importorskip(package, reason=f"{package} comes with the extra 'bench'")
+    return importlib.import_module("f3amd_lib.benchmarking.onnx_camdm")
+
+
+@functools.cache
+def lively(config):
+    """A network without the zeros and ones that biases and norms start from."""
+    network = network_of(config)
+    graph, state = nnx.split(network)
+    leaves, tree = jax.tree.flatten(state)
+    rng = np.random.default_rng(0)
+    stirred = [leaf + 0.1 * rng.standard_normal(leaf.shape).astype(np.float32) for leaf in leaves]
+    return nnx.merge(graph, jax.tree.unflatten(tree, stirred))
+
+
+def small(**changes):
+    return tiny_camdm(**{"latent_width": 32, "depth": 2, "num_heads": 4, **changes})
+
+
+def as_tensor(array):
+    return torch.from_numpy(np.array(array))
+
+
+def in_torch(module, x_noisy, sigma, condition):
+    """Encode and denoise in PyTorch."""
+    context = module.encode(torch_camdm.torch_condition(condition))
+    return module(as_tensor(x_noisy), sigma, context).numpy()
+
+
+def given_noise(batch: int, num_steps: int, config):
+    """The numbers that `sample_round` draws from KEY: at the start, and for each step."""
+    key_init, key_steps = jax.random.split(KEY)
+    shape = (batch, config.window, config.channels)
+    steps = [jax.random.normal(key, shape) for key in jax.random.split(key_steps, num_steps)]
+    return np.array(jax.random.normal(key_init, shape)), np.array(steps)
+
+
+def jax_round(network, condition, sigmas, sampler):
+    run = lambda condition: sample_round(network, condition, sigmas, KEY, sampler=sampler)
+    return np.asarray(jax.jit(run)(condition))
+
+
+@pytest.mark.parametrize("products", torch_camdm.PRODUCTS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_denoiser_gives_the_numbers_of_jax(layout, products):
+    network = lively(small(**LAYOUTS[layout]))
+    module = torch_camdm.torch_camdm(network, products=products)
+    condition, noise = make_condition(3), draw(3, WINDOW, CHANNELS)
+    for sigma in (*SIGMAS[:-1], 0.3, np.array([0.2, 1.0, 9.0], np.float32)):
+        x_noisy = noise * jnp.reshape(jnp.asarray(sigma, jnp.float32), (-1, 1, 1))
+        expected = evaluate(network, x_noisy, jnp.asarray(sigma, jnp.float32), condition)
+        found = in_torch(module, x_noisy, sigma, condition)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_context_is_that_of_jax(layout):
+    network, condition = lively(small(**LAYOUTS[layout])), make_condition()
+    found = torch_camdm.torch_camdm(network).encode(torch_camdm.torch_condition(condition))
+    np.testing.assert_allclose(found.numpy(), network.encode(condition), atol=1e-5)
+
+
+@pytest.mark.parametrize("sampler", torch_camdm.ROUND_SAMPLERS)
+@pytest.mark.parametrize("layout", list(LAYOUTS)[:3])
+def test_round_gives_the_numbers_of_jax(layout, sampler, onnx_camdm):
+    network = lively(small(**LAYOUTS[layout]))
+    condition = make_condition(3)
+    noise, step_noise = given_noise(3, 4, network.config)
+    expected = jax_round(network, condition, SIGMAS, sampler)
+    for products in torch_camdm.PRODUCTS:
+        module = torch_camdm.torch_camdm(network, products=products)
+        found = torch_camdm.torch_round(module, SIGMAS, sampler)(
+            torch_camdm.torch_condition(condition),
+            noise=as_tensor(noise),
+            step_noise=as_tensor(step_noise),
+        )
+        np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
+    run = onnx_camdm.onnx_round(network, SIGMAS, sampler)
+    found = run(Condition(*map(np.asarray, condition)), noise=noise, step_noise=step_noise)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+
+
+def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round(onnx_camdm):
+    preset = zoo.find_preset("CAMDM")
+    network = lively(zoo.build_config("CAMDM", channels=135, num_styles=100))
+    config, sigmas = network.config, preset.diffusion.grid(2)
+    condition = Condition(
+        draw(1, config.num_history, config.channels, seed=1),
+        draw(1, config.window, 8, seed=2),
+        jnp.eye(100)[7:8],
+    )
+    noise, step_noise = given_noise(1, 2, config)
+    expected = jax_round(network, condition, sigmas, preset.diffusion.sampler)
+    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), sigmas)
+    found = run(
+        torch_camdm.torch_condition(condition),
+        noise=as_tensor(noise),
+        step_noise=as_tensor(step_noise),
+    )
+    np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
+    run = onnx_camdm.onnx_round(network, sigmas)
+    found = run(Condition(*map(np.asarray, condition)), noise=noise, step_noise=step_noise)
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+
+
+def test_round_draws_its_start_and_all_steps_but_the_last(onnx_camdm):
+    network, shape = lively(small()), (2, WINDOW, CHANNELS)
+    condition = torch_camdm.torch_condition(make_condition())
+    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, "ddpm")
+    seeded = lambda seed: torch.Generator().manual_seed(seed)
+    drawn, generator = run(condition, seeded(1)), seeded(1)
+    noise = torch.randn(shape, generator=generator)
+    steps = torch.stack([torch.randn(shape, generator=generator) for _ in range(3)])
+    steps = torch.cat([steps, torch.full((1, *shape), torch.nan)])
+    torch.testing.assert_close(run(condition, noise=noise, step_noise=steps), drawn)
+    assert float((run(condition, seeded(2)) - drawn).abs().max()) > 1e-3
+    condition = Condition(*map(np.asarray, make_condition()))
+    run = onnx_camdm.onnx_round(network, SIGMAS, "ddpm")
+    drawn, rng = run(condition, np.random.default_rng(1)), np.random.default_rng(1)
+    noise, *steps = (rng.standard_normal(shape, np.float32) for _ in range(4))
+    steps = np.stack([*steps, np.full(shape, np.nan, np.float32)])
+    np.testing.assert_array_equal(run(condition, noise=noise, step_noise=steps), drawn)
+
+
+def test_given_arrays_stay_as_they_are():
+    network = lively(small())
+    module, condition = torch_camdm.torch_camdm(network), make_condition()
+    given = torch_camdm.torch_condition(condition)
+    noise, step_noise = map(as_tensor, given_noise(2, 4, network.config))
+    first = noise.clone(), step_noise.clone()
+    run = torch_camdm.torch_round(module, SIGMAS)
+    once = run(given, noise=noise, step_noise=step_noise)
+    torch.testing.assert_close(run(given, noise=noise, step_noise=step_noise), once)
+    context = module.encode(given)
+    before = context.clone()
+    module(noise, 1.0, context)
+    for now, then in ((noise, first[0]), (step_noise, first[1]), (context, before)):
+        assert torch.equal(now, then)
+    for now, then in zip(given, condition, strict=True):
+        np.testing.assert_array_equal(now.numpy(), then)
+
+
+def test_every_weight_counts_and_is_a_copy():
+    network = lively(small(split_path=True))
+    module = torch_camdm.torch_camdm(network)
+    condition, x_noisy = make_condition(), draw(2, WINDOW, CHANNELS)
+    base = in_torch(module, x_noisy, 1.0, condition)
+    expected = evaluate(network, x_noisy, jnp.float32(1.0), condition)
+    parameters = dict(module.named_parameters())
+    assert sum(p.numel() for p in parameters.values()) == zoo.count_parameters(network.config)
+    for name, parameter in parameters.items():
+        before = parameter.clone()
+        # Not the same everywhere: softmax and norms do not see a shift.
+        parameter += 0.5 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0))
+        moved = np.abs(in_torch(module, x_noisy, 1.0, condition) - base).max()
+        assert moved > 1e-4, name
+        parameter.copy_(before)
+    np.testing.assert_allclose(in_torch(module, x_noisy, 1.0, condition), expected, atol=TOLERANCE)
+    np.testing.assert_array_equal(evaluate(network, x_noisy, jnp.float32(1.0), condition), expected)
+
+
+@pytest.fixture
+def eager_compiler(monkeypatch):
+    """torch.compile without its code generator: it traces, guards and counts variants as ever."""
+    torch._dynamo.reset()
+    compile_lazily = functools.partial(torch.compile, backend="eager")
+    monkeypatch.setattr(torch, "compile", compile_lazily)
+    yield
+    torch._dynamo.reset()
+
+
+def test_compiled_round_takes_more_batch_sizes_than_pytorch_allows_by_default(eager_compiler):
+    module = torch_camdm.torch_camdm(lively(small()))
+    quick = torch_camdm.torch_round(module, SIGMAS, compiled=True)
+    plain = torch_camdm.torch_round(module, SIGMAS)
+    for batch in range(1, torch._dynamo.config.recompile_limit + 3):
+        condition = torch_camdm.torch_condition(make_condition(batch))
+        found, expected = (
+            run(condition, torch.Generator().manual_seed(batch)) for run in (quick, plain)
+        )
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
+
+
+def test_compiler_that_fails_says_why(monkeypatch):
+    def refuse(graph, inputs):
+        raise OSError("there is no C++ compiler\nand much more")
+
+    torch._dynamo.reset()
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=refuse))
+    run = torch_camdm.torch_round(torch_camdm.torch_camdm(lively(small())), SIGMAS, compiled=True)
+    with pytest.raises(RuntimeError, match=r"torch.compile does not work here: .*no C\+\+ compi"):
+        run(torch_camdm.torch_condition(make_condition()))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not any(map(shutil.which, ("g++", "clang++"))), reason="torch.compile needs a C++ compiler"
+)
+def test_compiled_code_gives_the_numbers_of_jax():
+    network, condition = lively(small()), make_condition()
+    noise, step_noise = given_noise(2, 4, network.config)
+    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, compiled=True)
+    found = run(
+        torch_camdm.torch_condition(condition),
+        noise=as_tensor(noise),
+        step_noise=as_tensor(step_noise),
+    )
+    expected = jax_round(network, condition, SIGMAS, "ddpm")
+    np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
+
+
+def test_number_of_threads_is_lent_and_given_back(monkeypatch):
+    before, seen = torch.get_num_threads(), []
+    monkeypatch.setattr(torch_camdm, "usable_cores", lambda: 5)
+    with torch_camdm.torch_threads() as threads:
+        assert threads == torch.get_num_threads() == 5
+        with pytest.raises(RuntimeError, match="halt"), torch_camdm.torch_threads(1):
+            assert torch.get_num_threads() == 1
+            raise RuntimeError("halt")
+        assert torch.get_num_threads() == 5
+    module = torch_camdm.torch_camdm(lively(small()))
+    denoise = module.denoise
+    monkeypatch.setattr(
+        module, "denoise", lambda *given: seen.append(torch.get_num_threads()) or denoise(*given)
+    )
+    for threads, expected in ((None, 5), (3, 3)):
+        run = torch_camdm.torch_round(module, SIGMAS[-2:], threads=threads)
+        run(torch_camdm.torch_condition(make_condition()))
+        assert seen.pop() == expected and not seen
+        assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("products", torch_camdm.PRODUCTS)
+def test_probe_multiplies_and_counts(products, monkeypatch):
+    multiply, operations = torch_camdm.torch_matmul_probe(48, products=products, threads=1)
+    matrix = torch.randn(48, 48, generator=torch.Generator().manual_seed(0)).numpy()
+    np.testing.assert_allclose(multiply().numpy(), matrix @ matrix, atol=1e-4)
+    assert operations == 2 * 48**3
+
+    def two_seconds(candidates, *, min_rounds):
+        (name,) = candidates
+        candidates[name]()
+        return {name: Timing(2.0, 1.0, 9.0, min_rounds, 9.0)}
+
+    monkeypatch.setattr(torch_camdm, "take_turns", two_seconds)
+    peak = torch_camdm.torch_matmul_peak(1, 48, products=products)
+    assert peak == pytest.approx(2 * 48**3 / 2.0 / 1e9)
+
+
+def test_bad_input_is_refused(onnx_camdm):
+    network, stranger = lively(small()), network_of(tiny_config())
+    module = torch_camdm.torch_camdm(network)
+    make, prepare = torch_camdm.torch_camdm, torch_camdm.torch_round
+    for call, message in {
+        lambda: make(stranger): "only CAMDM has a form in PyTorch, got a F3AMD",
+        lambda: make(network, products="onedn"): "did you mean 'onednn'",
+        lambda: prepare(module, SIGMAS, "ddmp"): "unknown sampler 'ddmp'.*'ddpm'",
+        lambda: prepare(module, SIGMAS[:1]): r"at least one step, got shape \(1,\)",
+        lambda: prepare(module, SIGMAS, threads=0): "at least 1 thread, got threads=0",
+        lambda: prepare(make(network, products="onednn"), SIGMAS, compiled=True): "'blas'",
+        lambda: torch_camdm.torch_matmul_probe(0): "size must be at least 1, got 0",
+        lambda: torch_camdm.torch_matmul_probe(products="mkl"): "unknown products 'mkl'",
+        lambda: onnx_camdm.onnx_denoiser(stranger): "only CAMDM has an ONNX form",
+        lambda: onnx_camdm.onnx_encoder(stranger): "only CAMDM has an ONNX form",
+        lambda: onnx_camdm.onnx_round(stranger, SIGMAS): "only CAMDM has an ONNX form",
+        lambda: onnx_camdm.onnx_round(network, SIGMAS, "heun"): "unknown sampler 'heun'",
+        lambda: onnx_camdm.onnx_round(network, SIGMAS, threads=0): "at least 1 thread, got",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_wrong_shapes_are_refused_by_name(onnx_camdm):
+    network = lively(small())
+    module, condition = torch_camdm.torch_camdm(network), make_condition()
+    given = torch_camdm.torch_condition(condition)
+    with pytest.raises(ValueError, match=rf"\[B, {WINDOW}, {CHANNELS}\]"):
+        module(torch.zeros(2, WINDOW + 1, CHANNELS), 1.0, module.encode(given))
+    arrays = Condition(*map(np.asarray, condition))
+    runs = (
+        (torch_camdm.torch_round(module, SIGMAS), given, torch.zeros),
+        (onnx_camdm.onnx_round(network, SIGMAS), arrays, np.zeros),
+    )
+    for (run, fitting, zeros), name in itertools.product(runs, ("noise", "step_noise")):
+        with pytest.raises(ValueError, match=f"^{name} must have shape"):
+            run(fitting, **{name: zeros((2, WINDOW, CHANNELS + 1))})
+        with pytest.raises(ValueError, match="condition path must have shape"):
+            run(fitting._replace(path=fitting.path[..., :7]))
+
+
+@pytest.mark.parametrize(
+    ("missing", "module"), [("torch", "torch_camdm"), ("onnxruntime", "onnx_camdm")]
+)
+def test_what_is_not_installed_is_named_with_its_extra(missing, module, monkeypatch):
+    name = f"f3amd_lib.benchmarking.{module}"
+    monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(ImportError, match=r'pip install "f3amd_lib\[bench\]"'):
+        importlib.import_module(name)
