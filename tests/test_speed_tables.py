@@ -123,7 +123,12 @@ def test_figures_draw_what_they_are_given():
     np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), [12.0])
 
     table = pd.DataFrame(
-        {"characters": 1, "without": ["", "FiLM"], "value": [2.0, 1.5], "saved": [np.nan, 0.25]}
+        {
+            "characters": 1,
+            "without": ["nothing", "FiLM"],
+            "value": [2.0, 1.5],
+            "saved": [np.nan, 0.25],
+        }
     )
     figure = plots_speed.part_bars(table)
     np.testing.assert_allclose([bar.get_width() for bar in figure.axes[0].patches], [25.0])

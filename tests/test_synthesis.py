@@ -204,7 +204,7 @@ def test_parts_are_left_out():
 
 def test_time_of_parts_is_a_share_of_the_whole():
     table = time_parts(task(steps=1), **QUICK)
-    assert list(table["without"]) == ["", *PARTS]
+    assert list(table["without"]) == ["nothing", *PARTS]
     whole = table["value"].iloc[0]
     np.testing.assert_allclose(table["saved"].iloc[1:], 1 - table["value"].iloc[1:] / whole)
     assert np.isnan(table["saved"].iloc[0])

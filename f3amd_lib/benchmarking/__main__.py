@@ -14,6 +14,7 @@ from f3amd_lib.benchmarking.measurements import (
     measure_synthesis_time,
     measure_training_time,
 )
+from f3amd_lib.benchmarking.synthesis import SUITES
 from f3amd_lib.profiles import load_profile
 from f3amd_lib.report.records import read_table
 from f3amd_lib.report.speed_tables import speed_bars
@@ -33,13 +34,14 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         profile = load_profile(options.profile, options.data)
         prepared = prepare(profile, path=options.source)
-        if not options.training_only:
+        if options.suite or not (options.training or options.parts):
             path = measure_synthesis_time(prepared, profile, options.suite, again=options.again)
-            log.info("parts        %s", measure_round_parts(prepared, profile))
             ways = path.with_name("synthesis_ways.csv")
             log.info("\n%s\n", markdown_table(speed_bars(read_table(ways)[0]), digits=3))
             log.info("every way    %s\nfastest      %s", ways, path)
-        if options.training or options.training_only:
+        if options.parts:
+            log.info("parts        %s", measure_round_parts(prepared, profile))
+        if options.training:
             log.info("training     %s", measure_training_time(prepared, profile))
     except (ValueError, OSError) as error:
         print(f"f3amd bench: {error}", file=sys.stderr)
@@ -54,12 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", default="synthetic", choices=DATASETS, help="its sizes are taken")
     parser.add_argument("--profile", default="laptop", choices=PROFILES)
     parser.add_argument("--source", help="folder or archive, for data sets that need one")
-    parser.add_argument(
-        "--suite", action="append", help="smoke, bars, main, family, curve or gpu; repeatable"
-    )
+    parser.add_argument("--suite", action="append", help=f"{', '.join(SUITES)}; repeatable")
     parser.add_argument("--again", action="store_true", help="time anew what is in the table")
-    parser.add_argument("--training", action="store_true", help="time training steps as well")
-    parser.add_argument("--training-only", action="store_true", help="time training steps alone")
+    parser.add_argument("--training", action="store_true", help="time training steps (Table 2)")
+    parser.add_argument("--parts", action="store_true", help="time a round without each part")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,11 @@ __all__ = [
 
 log = logging.getLogger("f3amd")
 
-DEFAULT_SUITES = {"smoke": ["smoke"], "laptop": ["bars", "main", "family", "curve"], "gpu": ["gpu"]}
+DEFAULT_SUITES = {
+    "smoke": ["smoke"],
+    "laptop": ["bars", "main", "family", "windows", "curve"],
+    "gpu": ["gpu"],
+}
 """What a profile times."""
 
 _TURNS = {"smoke": {"min_rounds": 10, "min_seconds": 1.0, "fewest_rounds": 3}}

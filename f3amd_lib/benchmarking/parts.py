@@ -98,14 +98,14 @@ def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
       **turns: settings of `take_turns`.
 
     Returns:
-      A row each: model, steps, characters, device, without ("" for the whole round), unit, value,
+      A row each: model, steps, characters, device, without ("nothing" for the whole round), unit, value,
       low and high in ms, rounds, and saved: the share of the whole round's time.
     """
     network = zoo.build_from_config(task.config, jax.random.key(0))
     condition = jax.device_put(random_condition(task.config, task.characters))
     shape = (task.characters, task.config.window, task.config.channels)
     noise = jax.random.normal(jax.random.key(1), shape)
-    networks = {"": network} | {part: without(network, part) for part in PARTS[:-1]}
+    networks = {"nothing": network} | {part: without(network, part) for part in PARTS[:-1]}
 
     def compiled(model, *noise):
         def run(condition, key, *noise):
@@ -119,7 +119,7 @@ def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
     calls = {part: compiled(model) for part, model in networks.items()}
     calls["noise"] = compiled(network, noise)
     timings = take_turns(calls, progress=progress, **turns)
-    whole = timings[""].median
+    whole = timings["nothing"].median
     return pd.DataFrame(
         [
             {
@@ -133,7 +133,7 @@ def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
                 "low": 1e3 * timing.low,
                 "high": 1e3 * timing.high,
                 "rounds": timing.rounds,
-                "saved": np.nan if part == "" else 1.0 - timing.median / whole,
+                "saved": np.nan if part == "nothing" else 1.0 - timing.median / whole,
             }
             for part, timing in timings.items()
         ]

@@ -139,8 +139,8 @@ def part_bars(table: pd.DataFrame):
     figure, axes = new_figure(8.0, 2.6, 1, len(counts), sharex=True, sharey=True, squeeze=False)
     for axis, characters in zip(axes[0], counts, strict=True):
         mine = table[table["characters"] == characters]
-        whole = mine.loc[mine["without"] == "", "value"].iloc[0]
-        parts = mine[mine["without"] != ""].iloc[::-1]
+        whole = mine.loc[mine["without"] == "nothing", "value"].iloc[0]
+        parts = mine[mine["without"] != "nothing"].iloc[::-1]
         axis.barh(parts["without"], 100 * parts["saved"], color=PALETTE["purple"], height=0.7)
         for place, saved in enumerate(parts["saved"]):
             axis.text(
