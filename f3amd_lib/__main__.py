@@ -4,6 +4,8 @@ data      open a data set, build its packed cache, say what is in it
 presets   list the models
 train     train a model (goes on where an earlier run stopped)
 rollout   animate one character: BVH, film strip PNG and GIF
+crowd     animate any number of characters, streamed to a folder
+export    make a round that runs without the model code: StableHLO, jax.export, IREE
 bench     time synthesis and training, write records, compare with what is asked
 """
 
@@ -13,6 +15,7 @@ import argparse
 import logging
 import os
 import sys
+import time
 from pathlib import Path
 
 log = logging.getLogger("f3amd")
@@ -77,11 +80,8 @@ def _path(text: str, num_frames: int, speed: float, seed: int):
     return named_path(text, num_frames, speed=speed, seed=seed)
 
 
-def _rollout(arguments) -> None:
-    from f3amd_lib.evaluation.rollout import MotionGenerator
-    from f3amd_lib.motion.bvh import write_bvh
-    from f3amd_lib.report.figures import save_figure
-    from f3amd_lib.report.pictures import film_strip, write_gif
+def _trained(arguments):
+    """Load the model that a command asks for, and say what it is."""
     from f3amd_lib.training.checkpoints import load_model
     from f3amd_lib.training.pipeline import find_model
 
@@ -89,6 +89,16 @@ def _rollout(arguments) -> None:
     trained = load_model(weights)
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
     log.info("terms        %s", trained.record.get("dataset_licence"))
+    return trained
+
+
+def _rollout(arguments) -> None:
+    from f3amd_lib.evaluation.rollout import MotionGenerator
+    from f3amd_lib.motion.bvh import write_bvh
+    from f3amd_lib.report.figures import save_figure
+    from f3amd_lib.report.pictures import film_strip, write_gif
+
+    trained = _trained(arguments)
     if not 0.1 <= arguments.seconds <= 3600.0:
         raise ValueError(f"--seconds must be between 0.1 and 3600, got {arguments.seconds}")
     num_frames = max(2, round(arguments.seconds * 30))
@@ -108,6 +118,46 @@ def _rollout(arguments) -> None:
     write_gif(targets[2], motion, target_paths=path, titles=[title], max_seconds=12.0)
     for target in targets:
         log.info("wrote        %s", target)
+
+
+def _crowd(arguments) -> None:
+    from f3amd_lib.evaluation.crowd import generate_crowd
+    from f3amd_lib.evaluation.rollout import MotionGenerator
+
+    generator = MotionGenerator(_trained(arguments), arguments.steps, sampler=arguments.sampler)
+    started = time.perf_counter()
+    crowd = generate_crowd(
+        generator,
+        arguments.characters,
+        max(2, round(arguments.seconds * 30)),
+        arguments.out,
+        styles=arguments.style,
+        seed=arguments.seed,
+        chunk=arguments.chunk,
+        overwrite=arguments.overwrite,
+        progress=True,
+    )
+    seconds = time.perf_counter() - started
+    log.info(
+        "wrote        %s: %d characters of %d frames", arguments.out, len(crowd), crowd.num_frames
+    )
+    log.info("took         %.0f s", seconds)
+
+
+def _export(arguments) -> None:
+    from f3amd_lib.benchmarking.export import export_model
+
+    folder = export_model(
+        _trained(arguments),
+        arguments.out,
+        num_steps=arguments.steps,
+        batch=arguments.characters,
+        sampler=arguments.sampler,
+        targets=arguments.target or ("llvm-cpu",),
+        overwrite=arguments.overwrite,
+    )
+    for file in sorted(Path(folder).iterdir()):
+        log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)
 
 
 def _bench(arguments) -> int:
@@ -154,6 +204,32 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=int)
     train.add_argument("--out", help="folder for the model instead of runs/DATA/PROFILE/models")
 
+    def with_model(command):
+        command.add_argument("--steps", type=int, default=8, help="denoising steps a round")
+        command.add_argument(
+            "--sampler", help="ddim, ddpm, euler, heun; by default the model's own"
+        )
+        command.add_argument("--data", default="synthetic", help="use the model of this data set")
+        command.add_argument("--weights", help="a weights file, instead of the data set's own")
+        command.add_argument("--overwrite", action="store_true", help="replace what lies there")
+
+    crowd = add("crowd", _crowd, "animate any number of characters; goes on where it was stopped")
+    with_model(crowd)
+    crowd.add_argument("--characters", type=int, default=1024)
+    crowd.add_argument("--seconds", type=float, default=32 / 30, help="of each character")
+    crowd.add_argument("--style", action="append", help="taken in turn; repeatable; default: all")
+    crowd.add_argument("--seed", type=int, default=0)
+    crowd.add_argument("--chunk", type=int, help="characters at once")
+    crowd.add_argument("--out", default="out/crowd", help="folder to write to")
+
+    export = add("export", _export, "make a round that runs without the model code")
+    with_model(export)
+    export.add_argument("--characters", type=int, default=1, help="of one call")
+    export.add_argument(
+        "--target", action="append", help="llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable"
+    )
+    export.add_argument("--out", default="out/round", help="folder to write to")
+
     bench = add("bench", _bench, "time synthesis and training (bench --help tells more)")
     bench.add_argument("words", nargs=argparse.REMAINDER, help="options of the benchmarks")
 
@@ -169,12 +245,8 @@ def _parser() -> argparse.ArgumentParser:
     rollout.add_argument(
         "--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own"
     )
-    rollout.add_argument("--steps", type=int, default=8, help="denoising steps a round")
-    rollout.add_argument("--sampler", help="ddim, ddpm, euler, heun; by default the model's own")
-    rollout.add_argument("--data", default="synthetic", help="use the model of this data set")
-    rollout.add_argument("--weights", help="a weights file, instead of the data set's own")
+    with_model(rollout)
     rollout.add_argument("--out", default="out", help="folder to write to")
-    rollout.add_argument("--overwrite", action="store_true", help="replace files of the same name")
     return parser
 
 

@@ -7,8 +7,10 @@ import pytest
 from f3amd_lib.report import plots_speed
 from f3amd_lib.report.papers import load_paper_table
 from f3amd_lib.report.speed_tables import (
+    fastest_ways,
     speed_bars,
     speedups,
+    speedups_by_turns,
     times_beside_paper,
     training_beside_paper,
 )
@@ -18,7 +20,7 @@ def measured(*rows):
     columns = ["model", "steps", "way", "characters", "value", "share_of_peak"]
     table = pd.DataFrame(rows, columns=columns)
     return table.assign(
-        window_frames=32, precision="float32", device="CPU", framework="jax",
+        window_frames=32, precision="float32", device="CPU", framework="jax", suite="main",
         low=0.9 * table["value"], high=1.2 * table["value"],
     )  # fmt: skip
 
@@ -43,8 +45,51 @@ def test_bars_take_the_fastest_way_and_say_what_is_met():
 
 
 def test_bars_without_a_row_are_not_measured():
-    bars = speed_bars(measured(*GOOD[:2]))
+    quicker = measured(("F3AMD-FNO-96", 1, "jit", 32, 1.0, 9.9)).assign(suite="bars")
+    bars = speed_bars(pd.concat([measured(*GOOD[:2]), quicker]))
+    assert bars["measured"].iloc[0] == 0.7  # other turns do not count
     assert bars["met"].tolist() == ["yes"] + ["not measured"] * 7
+
+
+def rows(*values):
+    columns = ["model", "steps", "framework", "way", "characters", "value", "precision"]
+    table = pd.DataFrame(values, columns=columns)
+    return table.assign(window_frames=32, device="CPU", suite="main")
+
+
+def test_fastest_way_of_each_framework_in_float32():
+    table = rows(
+        ("CAMDM", 8, "jax", "jit", 1, 3.0, "float32"),
+        ("CAMDM", 8, "jax", "jit, all devices", 1, 2.0, "float32"),
+        ("CAMDM", 8, "jax", "jit", 1, 1.0, "bfloat16"),
+        ("CAMDM", 8, "torch", "PyTorch", 1, 4.0, "float32"),
+        ("F3AMD-FNO-96", 1, "jax", "jit, FFT", 1, 0.5, "float32"),
+        ("F3AMD-FNO-96", 1, "jax", "jit", 1, 0.7, "float32"),
+    )
+    table.index = [0] * len(table)  # as pieces of several runs have
+    found = fastest_ways(table)
+    assert list(found["value"]) == [2.0, 4.0, 0.7]
+    assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
+
+
+def test_what_two_suites_have_timed_counts_once():
+    table = rows(
+        ("CAMDM", 8, "jax", "jit", 1, 1.0, "float32"),
+        ("CAMDM", 8, "jax", "jit", 1, 3.0, "float32"),
+        ("CAMDM", 8, "jax", "jit", 1, 2.0, "float32"),
+    )
+    table["suite"] = ["bars", "main", "family"]
+    assert list(fastest_ways(table)["value"]) == [3.0]
+    assert list(fastest_ways(table[table["suite"] != "main"])["value"]) == [2.0]
+
+
+def test_speedups_take_both_times_from_the_same_turns():
+    main = measured(("CAMDM", 8, "jit", 32, 600.0, 0.8), ("F3AMD-FNO-96", 8, "jit", 32, 60.0, 0.6))
+    bars = measured(("CAMDM", 8, "jit", 32, 900.0, 0.8), ("F3AMD-FNO-96", 8, "jit", 32, 30.0, 0.6))
+    family = measured(("CAMDM", 8, "jit", 32, 500.0, 0.8), ("F3AMD-FNO-64", 8, "jit", 32, 50.0, 0))
+    table = pd.concat([bars.assign(suite="bars"), family.assign(suite="family"), main])
+    found = speedups_by_turns(table).set_index("model")["speedup"]
+    assert found.to_dict() == {"F3AMD-FNO-96": 10.0, "F3AMD-FNO-64": 10.0}
 
 
 def test_speedup_is_over_camdm_of_as_many_characters():

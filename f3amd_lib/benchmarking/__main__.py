@@ -35,9 +35,18 @@ def main(arguments: list[str] | None = None) -> int:
         profile = load_profile(options.profile, options.data)
         prepared = prepare(profile, path=options.source)
         if options.suite or not (options.training or options.parts):
-            path = measure_synthesis_time(prepared, profile, options.suite, again=options.again)
+            path = measure_synthesis_time(
+                prepared,
+                profile,
+                options.suite,
+                characters=options.characters,
+                again=options.again,
+            )
             ways = path.with_name("synthesis_ways.csv")
-            log.info("\n%s\n", markdown_table(speed_bars(read_table(ways)[0]), digits=3))
+            suite = "bars" if options.suite == ["bars"] else "main"
+            log.info(
+                "\n%s\n", markdown_table(speed_bars(read_table(ways)[0], suite=suite), digits=3)
+            )
             log.info("every way    %s\nfastest      %s", ways, path)
         if options.parts:
             log.info("parts        %s", measure_round_parts(prepared, profile))
@@ -57,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", default="laptop", choices=PROFILES)
     parser.add_argument("--source", help="folder or archive, for data sets that need one")
     parser.add_argument("--suite", action="append", help=f"{', '.join(SUITES)}; repeatable")
+    parser.add_argument("--characters", type=int, action="append", help="these numbers only")
     parser.add_argument("--again", action="store_true", help="time anew what is in the table")
     parser.add_argument("--training", action="store_true", help="time training steps (Table 2)")
     parser.add_argument("--parts", action="store_true", help="time a round without each part")

@@ -12,12 +12,13 @@ from tqdm import tqdm
 
 from f3amd_lib.benchmarking.machine import describe_machine, device_name
 from f3amd_lib.benchmarking.parts import time_parts
-from f3amd_lib.benchmarking.synthesis import Candidate, fastest_ways, plan, time_group
+from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.benchmarking.ways import Task
 from f3amd_lib.models import zoo
 from f3amd_lib.profiles import Profile, results_dir
 from f3amd_lib.report.records import kept_rows, read_table, run_record, write_table
+from f3amd_lib.report.speed_tables import fastest_ways
 from f3amd_lib.training.loop import short_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -32,7 +33,7 @@ log = logging.getLogger("f3amd")
 
 DEFAULT_SUITES = {
     "smoke": ["smoke"],
-    "laptop": ["bars", "main", "family", "windows", "curve"],
+    "laptop": ["main", "family", "windows", "curve"],
     "gpu": ["gpu"],
 }
 """What a profile times."""
@@ -83,6 +84,7 @@ def measure_synthesis_time(
     profile: Profile,
     suites: Iterable[str] | None = None,
     *,
+    characters: Iterable[int] | None = None,
     again: bool = False,
 ) -> Path:
     """Time rounds of the family in every way there is (see `benchmarking.synthesis`).
@@ -91,6 +93,7 @@ def measure_synthesis_time(
       prepared: its channels and styles are the networks'.
       profile: names the results' folder and, without `suites`, what is timed.
       suites: keys of `synthesis.SUITES`.
+      characters: time groups of these numbers of characters only.
       again: time groups anew that an earlier run with the same settings has timed.
 
     Returns:
@@ -102,7 +105,13 @@ def measure_synthesis_time(
       ValueError: for an unknown suite.
     """
     suites = list(suites) if suites else DEFAULT_SUITES[profile.name]
-    groups = plan(suites)
+    wanted = None if characters is None else set(characters)
+    todo = [
+        (suite, *group)
+        for suite in suites
+        for group in plan(suite).items()
+        if wanted is None or group[1][0].characters in wanted
+    ]
     folder = results_dir(profile.dataset, profile.name) / "records"
     turns = {"fewest_rounds": _FEWEST_ROUNDS, **_TURNS.get(profile.name, {})}
     path = folder / "synthesis_ways.csv"
@@ -110,16 +119,17 @@ def measure_synthesis_time(
     kept = kept_rows(path, record)
     failed = {} if kept is None else read_table(path)[1].get("not_possible", {})
 
-    def is_known(candidate: Candidate) -> bool:
+    def is_known(suite: str, candidate: Candidate) -> bool:
         if again or kept is None:
             return False
-        here = kept[list(_CANDIDATE)] == [getattr(candidate, name) for name in _CANDIDATE.values()]
-        return str(candidate) in failed or bool(here.all(axis=1).any())
+        told = [suite, *(getattr(candidate, name) for name in _CANDIDATE.values())]
+        here = (kept[["suite", *_CANDIDATE]] == told).all(axis=1)
+        return str(candidate) in failed or bool(here.any())
 
-    with tqdm(groups.items(), unit="group") as bar:
-        for group, candidates in bar:
-            bar.set_postfix_str("{} frames, {} characters, {}".format(*group))
-            if all(map(is_known, candidates)):
+    with tqdm(todo, unit="group") as bar:
+        for suite, group, candidates in bar:
+            bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *group))
+            if all(is_known(suite, candidate) for candidate in candidates):
                 continue
             circumstances = _circumstances()
             rows, not_possible = time_group(
@@ -133,10 +143,10 @@ def measure_synthesis_time(
             failed |= not_possible
             if rows.empty:
                 continue
-            rows = rows.assign(**circumstances)
-            # New rows replace those of the same candidates.
+            rows = rows.assign(suite=suite, **circumstances)
+            # New rows replace those of the same suite and candidates.
             kept = rows if kept is None else pd.concat([kept, rows])
-            kept = kept.drop_duplicates(list(_CANDIDATE), keep="last")
+            kept = kept.drop_duplicates(["suite", *_CANDIDATE], keep="last")
             record |= {"not_possible": failed}
             write_table(path, kept, record)
             write_table(folder / "synthesis_time.csv", fastest_ways(kept), record)

@@ -98,8 +98,8 @@ def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
       **turns: settings of `take_turns`.
 
     Returns:
-      A row each: model, steps, characters, device, without ("nothing" for the whole round), unit, value,
-      low and high in ms, rounds, and saved: the share of the whole round's time.
+      A row each: model, steps, characters, device, without ("nothing" for the whole round), unit,
+      value, low and high in ms, rounds, and saved: the share of the whole round's time.
     """
     network = zoo.build_from_config(task.config, jax.random.key(0))
     condition = jax.device_put(random_condition(task.config, task.characters))

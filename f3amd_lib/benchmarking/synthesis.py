@@ -7,10 +7,9 @@ row can say which share of the machine's arithmetic it used.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
@@ -31,7 +30,6 @@ __all__ = [
     "group_key",
     "plan",
     "time_group",
-    "fastest_ways",
 ]
 
 
@@ -165,23 +163,20 @@ SUITES = {
 """Name -> what it times; see the functions' first lines."""
 
 
-def plan(suites: list[str]) -> dict[tuple, list[Candidate]]:
-    """Return what to time, by group, each candidate once.
+def plan(suite: str) -> dict[tuple, list[Candidate]]:
+    """Return what a suite times, by group, each candidate once.
 
     Args:
-      suites: keys of `SUITES`.
+      suite: a key of `SUITES`.
 
     Raises:
       ValueError: for an unknown suite.
     """
+    if suite not in SUITES:
+        raise ValueError(f"unknown suite {suite!r}: use some of {', '.join(SUITES)}")
     groups: dict[tuple, list[Candidate]] = {}
-    for name in suites:
-        if name not in SUITES:
-            raise ValueError(f"unknown suite {name!r}: use some of {', '.join(SUITES)}")
-        for candidate in SUITES[name]():
-            members = groups.setdefault(group_key(candidate), [])
-            if candidate not in members:
-                members.append(candidate)
+    for candidate in dict.fromkeys(SUITES[suite]()):
+        groups.setdefault(group_key(candidate), []).append(candidate)
     return groups
 
 
@@ -280,30 +275,3 @@ def _shares(task: Task, timing: Timing, peak: float) -> dict:
         "peak_gflops": peak,
         "share_of_peak": reached / peak,
     }
-
-
-def fastest_ways(table: pd.DataFrame, precision: Mapping[str, str] | None = None) -> pd.DataFrame:
-    """Keep the fastest way of each framework, for tables that have one number a cell.
-
-    The plain form is left out: it is there to be compared with, not to be used.
-
-    Args:
-      table: of `time_group`.
-      precision: device -> the precision to keep; by default float32 on a CPU, and on a GPU tf32,
-        which JAX takes by itself.
-
-    Returns:
-      The rows, one for each model, window, steps, framework, device and number of characters.
-    """
-    precision = precision or {"CPU": "float32", "GPU": "tf32"}
-    wanted = table["device"].map(precision).fillna("float32")
-    kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
-    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
-    kept = kept.reset_index(drop=True)
-    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
-    order = {model: place for place, model in enumerate(dict.fromkeys(table["model"]))}
-    place = fastest["model"].map(order).to_numpy()
-    sorting = np.lexsort(
-        (fastest["characters"], -fastest["steps"], fastest["window_frames"], place)
-    )
-    return fastest.iloc[sorting].reset_index(drop=True)

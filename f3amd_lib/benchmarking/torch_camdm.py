@@ -418,9 +418,10 @@ def _compiled(function):
             with torch._dynamo.config.patch(recompile_limit=_MAX_COMPILED):
                 answer = fast(*arguments)
         except Exception as error:
-            told = str(error).strip().partition("\n")[0]
+            # The first line may only tell who spoke; advice on debugging comes after the second.
+            told = [line for line in str(error).splitlines() if line.strip()][:2]
             raise RuntimeError(
-                f"torch.compile does not work here: {type(error).__name__}: {told}"
+                f"torch.compile does not work here: {type(error).__name__}: {' '.join(told)}"
             ) from error
         known.add(shape)
         return answer

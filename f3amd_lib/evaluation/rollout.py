@@ -99,19 +99,37 @@ class MotionGenerator:
         self._network = cast_network(trained.network(), dtype)
         self._run = jax.jit(self._rounds)
 
-    def sample_window(self, key, condition: Condition):
-        """Sample one window, [B, T, C] in network units, for an already normalised condition."""
+    def sample_window(self, key, condition: Condition, noise=None):
+        """Sample one window, [B, T, C] in network units, for an already normalised condition.
+
+        Args:
+          key: of all random numbers; None if `noise` is given and the sampler draws none.
+          condition: normalised.
+          noise: standard normal numbers to start from, [B, T, C].
+        """
         condition = jax.tree.map(lambda leaf: leaf.astype(self._dtype), condition)
-        x0_hat = sample_round(self._network, condition, self.sigmas, key, sampler=self.sampler)
+        noise = None if noise is None else noise.astype(self._dtype)
+        x0_hat = sample_round(
+            self._network, condition, self.sigmas, key, noise=noise, sampler=self.sampler
+        )
         return x0_hat.astype(jnp.float32)
 
     def sample_window_each(self, keys, condition: Condition):
         """Sample one window for each character as if it were alone, [B, T, C]; keys [B]."""
+        if self.sampler == "ddpm":
 
-        def alone(key, condition):
-            return self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], condition))[0]
+            def alone(key, condition):
+                return self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], condition))[0]
 
-        return jax.vmap(alone)(keys, condition)
+            return jax.vmap(alone)(keys, condition)
+
+        # Where only the start is drawn, all can walk together from noise of their own.
+        config = self.trained.config
+
+        def draw(key):
+            return jax.random.normal(jax.random.split(key)[0], (config.window, config.channels))
+
+        return self.sample_window(None, condition, noise=jax.vmap(draw)(keys))
 
     def _rounds(self, history, positions, yaws, before, style, key):
         normaliser = self.trained.normaliser

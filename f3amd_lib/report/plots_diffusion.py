@@ -463,7 +463,7 @@ def two_updates(sigmas, shown: Mapping[str, np.ndarray], noise_left: Mapping[int
         axis.set_ylim(-2.2, 2.2)
         axis.set_title(f"{update}, N = {len(sigmas)}")
         axis.set_xlabel("noise level σ that it is told")
-    axes[0].set_ylabel("what the network sees, × 1/√(1+σ²)", fontsize=9)
+    axes[0].set_ylabel("what it is shown, × 1/√(1+σ²)")
     looks = zip(("orange", "green", "black"), "^sD", strict=True)
     for (steps, left), (color, marker) in zip(noise_left.items(), looks, strict=False):
         axes[2].plot(np.arange(1, steps + 1), left, marker=marker, color=PALETTE[color],
@@ -472,11 +472,12 @@ def two_updates(sigmas, shown: Mapping[str, np.ndarray], noise_left: Mapping[int
     axes[2].annotate("rescaled", (0.98, 1.0), (0, 3), xycoords=("axes fraction", "data"),
                      textcoords="offset points", ha="right", fontsize=9)  # fmt: skip
     axes[2].set_yscale("log")
-    axes[2].set_ylim(1e-9, 10)
+    axes[2].set_ylim(top=20)
+    axes[2].set_xticks(range(1, max(noise_left) + 1))
     axes[2].set_title("noise left, literal")
     axes[2].set_xlabel("evaluation")
     axes[2].set_ylabel("share of the right noise")
-    axes[2].legend(loc="lower left")
+    axes[2].legend(loc="center right")
     return figure
 
 
@@ -516,7 +517,7 @@ def noticing_figure(table: pd.DataFrame):
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("width of the data, given the conditions (feature units)")
-    axis.set_ylabel("literal from rescaled")
+    axis.set_ylabel("distance, literal from rescaled")
     axis.legend(loc="upper left")
     return figure
 

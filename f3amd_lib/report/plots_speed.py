@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import matplotlib
 import numpy as np
 import pandas as pd
 
@@ -19,7 +20,7 @@ def _characters(axis, counts) -> None:
     ticks = sorted(set(counts))
     axis.set_xticks(ticks[:: 2 if len(ticks) > 7 else 1])
     axis.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
-    axis.minorticks_off()
+    axis.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
     axis.set_xlabel("characters")
 
 
@@ -119,7 +120,13 @@ def way_bars(table: pd.DataFrame):
         colors = np.where(fastest, PALETTE["purple"], PALETTE["sky"])
         axis.barh(places, 100 * mine["share_of_peak"], color=colors, height=0.72)
         for place, (share, value) in enumerate(mine[["share_of_peak", "value"]].to_numpy()):
-            axis.text(100 * share + 1, place, f"{value:.3g} ms", va="center", fontsize=8.5)
+            axis.text(
+                100 * share + 1,
+                place,
+                f"{value:,.0f} ms" if value >= 100 else f"{value:.3g} ms",
+                va="center",
+                fontsize=8.5,
+            )
         axis.set_yticks(places, mine["way"], fontsize=9)
         axis.set_title(system, fontsize=10)
         axis.grid(False, axis="y")

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import pandas as pd
 
 from f3amd_lib.report.papers import load_paper_table
 
-__all__ = ["speed_bars", "speedups", "times_beside_paper", "training_beside_paper"]
+__all__ = [
+    "fastest_ways",
+    "speed_bars",
+    "speedups",
+    "speedups_by_turns",
+    "times_beside_paper",
+    "training_beside_paper",
+]
 
 _FAST = ("jit", "jit, all devices", "IREE")
 _TORCH = ("PyTorch", "PyTorch, oneDNN", "PyTorch, compiled")
@@ -25,7 +35,7 @@ def _best(table: pd.DataFrame, model: str, steps: int, characters: int, ways) ->
     return None if mine.empty else mine.loc[mine["value"].idxmin()]
 
 
-def speed_bars(ways: pd.DataFrame) -> pd.DataFrame:
+def speed_bars(ways: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
     """Compare what was measured on a CPU with what the library asks of itself.
 
     Shares are of the machine's own matrix product, timed by turns with the rounds. Each system has
@@ -33,10 +43,12 @@ def speed_bars(ways: pd.DataFrame) -> pd.DataFrame:
 
     Args:
       ways: the table `synthesis_ways`.
+      suite: "main" or "bars", one of both, so that all comes from the same turns.
 
     Returns:
       Columns what, characters, asked, measured, way, met ("yes", "no" or "not measured").
     """
+    ways = ways[ways["suite"] == suite]
     one, eight, camdm = ("F3AMD-FNO-96", 1), ("F3AMD-FNO-96", 8), ("CAMDM", 8)
     rows = []
 
@@ -76,6 +88,53 @@ def speed_bars(ways: pd.DataFrame) -> pd.DataFrame:
     quotient(one, one, 1, "time of FNO-96, 1 step, over its plain form under jit", "<= 0.35",
              _FAST, ("jit, FFT",), lambda value: value <= 0.35)  # fmt: skip
     return pd.DataFrame(rows)
+
+
+def fastest_ways(table: pd.DataFrame, precision: Mapping[str, str] | None = None) -> pd.DataFrame:
+    """Keep the fastest way of each framework, for tables that have one number a cell.
+
+    The plain form is left out: it is there to be compared with, not to be used.
+
+    Args:
+      table: `synthesis_ways`. What several suites have timed counts as it is in the first of them,
+        "main" before the others and "bars" last, so that neighbours in a table come from the same
+        turns where that can be.
+      precision: device -> the precision to keep; by default float32 on a CPU, and on a GPU tf32,
+        which JAX takes by itself.
+
+    Returns:
+      The rows, one for each model, window, steps, framework, device and number of characters.
+    """
+    precision = precision or {"CPU": "float32", "GPU": "tf32"}
+    wanted = table["device"].map(precision).fillna("float32")
+    kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
+    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
+    turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
+    kept = kept.assign(turn=turn).reset_index(drop=True)
+    kept = kept[kept["turn"] == kept.groupby(keys)["turn"].transform("min")].drop(columns="turn")
+    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
+    models = {model: place for place, model in enumerate(dict.fromkeys(table["model"]))}
+    place = fastest["model"].map(models).to_numpy()
+    sorting = np.lexsort(
+        (fastest["characters"], -fastest["steps"], fastest["window_frames"], place)
+    )
+    return fastest.iloc[sorting].reset_index(drop=True)
+
+
+def speedups_by_turns(ways: pd.DataFrame) -> pd.DataFrame:
+    """Return the speedups over CAMDM of our own rounds, both from the same turns.
+
+    Args:
+      ways: `synthesis_ways`; JAX's rows count.
+
+    Returns:
+      As `speedups`; what two suites have timed counts once, as in `fastest_ways`.
+    """
+    suites = sorted(set(ways["suite"]), key=lambda name: (name == "bars", name != "main"))
+    mine = ways[ways["framework"] == "jax"]
+    tables = [speedups(fastest_ways(mine[mine["suite"] == suite])) for suite in suites]
+    keys = ["model", "window_frames", "steps", "device", "characters"]
+    return pd.concat(tables).drop_duplicates(keys).reset_index(drop=True)
 
 
 def times_beside_paper(table: pd.DataFrame, number: int, device: str) -> pd.DataFrame:

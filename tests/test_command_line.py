@@ -1,0 +1,67 @@
+"""Commands that hand a model's work out: crowds, exports, benchmarks."""
+
+import numpy as np
+import pytest
+from builders import WINDOW, tiny_trained
+
+from f3amd_lib.__main__ import main
+from f3amd_lib.benchmarking.__main__ import main as bench
+from f3amd_lib.evaluation.crowd import read_crowd
+from f3amd_lib.training.checkpoints import save_model
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "tiny.safetensors"
+    save_model(path, tiny_trained({"dataset": "tiny", "dataset_licence": "none"}))
+    return str(path)
+
+
+def test_crowd_is_written_as_asked_and_never_over_another(weights, tmp_path, capsys):
+    out = tmp_path / "crowd"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--chunk", "2"]
+    seconds = ["--seconds", str(WINDOW / 30)]
+    assert main([*words, *seconds, "--characters", "3", "--style", "proud"]) == 0
+    crowd = read_crowd(out)
+    assert len(crowd) == 3 and crowd.num_frames == WINDOW
+    assert {crowd.style(k) for k in range(3)} == {"proud"}
+    assert main([*words, *seconds, "--characters", "4"]) == 2
+    assert "crowd" in capsys.readouterr().err
+    assert len(read_crowd(out)) == 3
+    assert main([*words, *seconds, "--characters", "4", "--overwrite"]) == 0
+    assert len(read_crowd(out)) == 4
+
+
+def test_export_is_an_artefact_that_loads(weights, tmp_path):
+    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
+    from f3amd_lib.benchmarking.artefact import load_artefact
+
+    out = tmp_path / "round"
+    words = ["export", "--weights", weights, "--out", str(out), "--steps", "2"]
+    assert main([*words, "--characters", "3"]) == 0
+    artefact = load_artefact(out)
+    shapes = artefact.input_shapes
+    assert shapes["noise"][0] == 3 and artefact.manifest["model"] == "F3AMD-FNO-8"
+    answer = artefact(*(np.zeros(shape, np.float32) for shape in shapes.values()))
+    assert np.isfinite(answer).all()
+    assert main([*words, "--target", "cuda-sm_90"]) == 2
+
+
+def test_bench_refuses_what_it_does_not_know(capsys):
+    assert bench(["--profile", "smoke", "--suite", "bar"]) == 2
+    assert "unknown suite 'bar'" in capsys.readouterr().err
+
+
+def test_bench_hands_its_options_on(monkeypatch):
+    seen = {}
+
+    def run(command, env, check):
+        seen.update(command=command, flags=env["XLA_FLAGS"])
+        return type("Done", (), {"returncode": 7})
+
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.setattr("f3amd_lib.benchmarking.machine.fast_xla_flags", lambda: "--fast")
+    assert main(["bench", "--suite", "bars", "--again"]) == 7
+    assert seen["command"][2:] == ["f3amd_lib.benchmarking", "--suite", "bars", "--again"]
+    assert seen["flags"] == "--fast"

@@ -1,0 +1,567 @@
+"""Crowds in chunks: who is in them, what is on disk, what happens when a run is stopped."""
+
+import functools
+import json
+import tracemalloc
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_trained
+from scipy.spatial import cKDTree
+from test_rollout import obedient
+
+from f3amd_lib.data.features import frame_yaw, motion_from_frames, turn_frames
+from f3amd_lib.evaluation import crowd as crowds
+from f3amd_lib.evaluation.crowd import PATHS, crowd_paths, generate_crowd, read_crowd
+from f3amd_lib.evaluation.paths import NAMES, named_path
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.motion.rotations import wrap_angle
+from f3amd_lib.training.checkpoints import weights_digest
+
+FRAMES = WINDOW + 3
+FILES = ("root.npy", "rotations.npy", "path.npy", "styles.npy", "crowd.json")
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return tiny_trained({"dataset": "tiny", "dataset_licence": "none", "dataset_credit": "nobody"})
+
+
+@pytest.fixture(scope="module")
+def generator(trained):
+    return MotionGenerator(trained, num_steps=2)
+
+
+@pytest.fixture(scope="module")
+def eleven(generator, tmp_path_factory):
+    """A crowd of eleven in chunks of four: two whole ones and one that is cut."""
+    return generate_crowd(generator, 11, FRAMES, tmp_path_factory.mktemp("crowd"), chunk=4)
+
+
+@pytest.fixture
+def still(trained):
+    """A generator that takes no time: everybody stands where their history ends."""
+
+    def generate(position, yaw, style_index, history, key):
+        return np.repeat(history[:, -1:], yaw.shape[1], axis=1)
+
+    return SimpleNamespace(
+        trained=trained, sampler="ddim", sigmas=np.array([1.0, 0.0]), generate=generate
+    )
+
+
+def content(folder):
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def close(first, second, characters=slice(None)):
+    """Whether two crowds hold the same characters, to the rounding of their arithmetic."""
+    for name in ("root", "rotations", "path", "style_index"):
+        one, two = (np.asarray(getattr(crowd, name)[characters]) for crowd in (first, second))
+        # A step of float16 below 1 is at most 5e-4; the rest is float32 arithmetic.
+        atol = {"root": 1e-4, "rotations": 2e-3}.get(name, 0.0)
+        np.testing.assert_allclose(one.astype(float), two.astype(float), rtol=0, atol=atol)
+
+
+# --- who a character is ------------------------------------------------------------------------
+
+
+def test_characters_do_not_depend_on_the_chunk(generator, eleven, tmp_path):
+    close(generate_crowd(generator, 11, FRAMES, tmp_path, chunk=7), eleven)
+
+
+def test_characters_do_not_depend_on_the_size_of_the_crowd(generator, eleven, tmp_path):
+    few = generate_crowd(generator, 6, FRAMES, tmp_path, chunk=4)
+    close(few, eleven, slice(0, 6))
+
+
+def test_each_character_is_the_one_generated_alone_with_its_key(trained, tmp_path):
+    # One character with one key goes through the plain batched code, of which others have tests.
+    # This sampler draws fresh noise at every step.
+    generator = MotionGenerator(trained, num_steps=2, sampler="ddpm")
+    asked = []
+    generate = generator.generate
+    generator.generate = lambda *given: asked.append(given) or generate(*given)
+    crowd = generate_crowd(generator, 3, FRAMES, tmp_path, chunk=2, seed=5)
+    for character in range(3):
+        *arrays, _ = asked[character // 2]
+        place = slice(character % 2, character % 2 + 1)
+        key = jax.random.fold_in(jax.random.key(5), character)
+        alone = generate(*(array[place] for array in arrays), key)[0]
+        np.testing.assert_allclose(crowd.root[character], alone[:, :3], atol=1e-4)
+        sixes = np.asarray(crowd.rotations[character], float).reshape(FRAMES, -1)
+        np.testing.assert_allclose(sixes, alone[:, 3:], atol=2e-3)
+
+
+def same_way(characters, pace, num_frames, seed):
+    """Everybody walks the same line, in the same place."""
+    path = named_path("straight", num_frames)
+    shape = (len(characters), num_frames)
+    return np.broadcast_to(path.position, (*shape, 2)), np.broadcast_to(path.yaw, shape)
+
+
+def test_noise_differs_between_characters_and_seeds(tmp_path):
+    # Style, starting pose and path are the same: what differs is the noise.
+    trained = tiny_trained_with({"calm": tiny_trained().seeds["calm"][:1]})
+    generator = MotionGenerator(trained, num_steps=1)
+    made = [
+        generate_crowd(generator, 4, WINDOW, tmp_path / str(seed), paths=same_way, seed=seed)
+        for seed in (0, 1)
+    ]
+    rotations = np.concatenate([crowd.rotations for crowd in made]).astype(float)
+    for first in range(8):
+        for second in range(first):
+            assert np.abs(rotations[first] - rotations[second]).max() > 0.02
+
+
+def tiny_trained_with(seeds):
+    trained = tiny_trained()
+    trained.seeds.clear()
+    trained.seeds.update(seeds)
+    return trained
+
+
+def test_styles_go_in_turn(still, tmp_path):
+    def styles(name, **how):
+        crowd = generate_crowd(still, 5, 2, tmp_path / name, chunk=2, **how)
+        return [crowd.style(character) for character in range(5)]
+
+    assert styles("default") == ["calm", "proud", "calm", "proud", "calm"]
+    assert styles("one", styles="proud") == ["proud"] * 5
+    three = ["proud", "proud", "calm"]
+    assert styles("three", styles=three) == [*three, "proud", "proud"]
+    still.trained = tiny_trained_with({"proud": still.trained.seeds["proud"]})
+    assert styles("with poses") == ["proud"] * 5
+
+
+def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
+    histories, generate = [], still.generate
+    still.generate = lambda *given: histories.append(given) or generate(*given)
+    generate_crowd(still, 60, 5, tmp_path, chunk=20)
+    used = {style: set() for style in still.trained.styles}
+    for position, yaw, style_index, history, _ in histories:
+        for k in range(20):
+            start = 2 * position[k, 0] - position[k, 1]
+            np.testing.assert_allclose(history[k, -1, [0, 2]], start, atol=1e-5)
+            facing = frame_yaw(SKELETON, history[k, -1].astype(float))
+            np.testing.assert_allclose(wrap_angle(facing - yaw[k, 0]), 0.0, atol=1e-5)
+            back = history[k].astype(float)
+            back[:, [0, 2]] -= start
+            back = turn_frames(back, -yaw[k, 0])
+            style = still.trained.styles[style_index[k]]
+            poses = still.trained.seeds[style]
+            gap = np.abs(poses - back).max(axis=(1, 2))
+            assert gap.min() < 1e-4
+            speeds = np.linalg.norm(np.diff(poses[:, [0, -1]][..., [0, 2]], axis=1), axis=-1)[:, 0]
+            off = np.abs(speeds / (HISTORY - 1) - np.linalg.norm(position[k, 1] - position[k, 0]))
+            assert off[gap.argmin()] <= off.min() + 0.1 / 30 + 1e-9
+            used[style].add(int(gap.argmin()))
+    assert used == {style: set(range(len(still.trained.seeds[style]))) for style in used}
+
+
+# --- paths -------------------------------------------------------------------------------------
+
+
+def test_paths_of_some_are_a_part_of_the_paths_of_all():
+    pace = np.linspace(0.4, 4.0, 40)
+    for names in (PATHS, ("complex",)):
+        everybody = crowd_paths(range(40), pace, 20, 3, names=names)
+        some = crowd_paths(range(17, 29), pace[17:29], 20, 3, names=names)
+        other = crowd_paths(range(40), pace, 20, 4, names=names)
+        for whole, part, else_where in zip(everybody, some, other, strict=True):
+            np.testing.assert_array_equal(whole[17:29], part)
+            assert np.abs(whole - else_where).max() > 0.1
+
+
+def test_a_crowd_on_circles_walks_the_named_circle_left_and_right():
+    # A circle looks the same wherever it is entered, so the path is known but for its side.
+    position, yaw = crowd_paths(range(30), np.full(30, 1.2), 90, 0, names=("circle",))
+    sides = []
+    for place, facing in zip(position, yaw, strict=True):
+        left = named_path("circle", 90).placed(place[0], facing[0])
+        side = np.sign(facing[-1] - facing[0])
+        sides.append(side)
+        if side > 0:
+            np.testing.assert_allclose(place, left.position, atol=1e-5)
+            np.testing.assert_allclose(facing, left.yaw, atol=1e-9)
+        else:  # mirrored in the line of sight of the first frame
+            ahead = np.array([np.sin(facing[0]), np.cos(facing[0])])
+            off = left.position - place[0]
+            mirrored = place[0] + 2 * (off @ ahead)[:, None] * ahead - off
+            np.testing.assert_allclose(place, mirrored, atol=1e-5)
+            np.testing.assert_allclose(facing, 2 * facing[0] - left.yaw, atol=1e-9)
+    assert 5 < sides.count(1.0) < 25
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_paths_are_walked_at_the_pace_with_the_turns_of_a_walk(name):
+    pace = np.array([0.5, 1.2, 4.0])
+    position, yaw = crowd_paths(range(7, 10), pace, 300, 0, names=(name,))
+    step = np.diff(position, axis=1)
+    ratio = np.linalg.norm(step, axis=-1) * 30 / pace[:, None]
+    np.testing.assert_allclose(ratio, 1.0, rtol=2e-3)
+    heading = np.arctan2(step[..., 0], step[..., 1])
+    middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
+    assert np.abs(wrap_angle(heading - middle)).max() < np.deg2rad(0.5)
+    fastest = np.abs(np.diff(named_path(name, 2100).yaw)).max()
+    assert np.abs(np.diff(yaw, axis=1)).max() <= fastest + 1e-9
+
+
+def test_paths_are_entered_anywhere_and_all_names_are_drawn():
+    count = 600
+    _, yaw = crowd_paths(range(count), np.full(count, 1.2), 60, 0)
+    turned = np.abs(np.diff(yaw, axis=1))
+    straight = np.isclose(turned.max(axis=1), 0.0, atol=1e-12)
+    circle = ~straight & np.isclose(turned, 1.2 / 30 / 2.5).all(axis=1)
+    for share in (straight.mean(), circle.mean()):
+        # A straight minute of a square counts too, so a little more than 1 / 6 is possible.
+        assert abs(share - 1 / len(PATHS)) < 0.06
+    rest = turned[~straight & ~circle]
+    # Some paths repeat themselves after few seconds, so that two may enter one in the same place.
+    assert len(np.unique(rest.round(9), axis=0)) > 0.7 * len(rest)
+    facing = np.histogram(wrap_angle(yaw[:, 0]), bins=6, range=(-np.pi, np.pi))[0]
+    assert facing.min() > count / 6 * 0.6
+
+
+def test_starting_places_are_evenly_apart_in_crowds_of_any_size():
+    position, _ = crowd_paths(range(3000), np.ones(3000), 2, 0)
+    distance, _ = cKDTree(position[:, 0]).query(position[:, 0], k=2)
+    assert 1.5 < distance[1:, 1].min() and np.median(distance[:, 1]) < 2.0
+    # One character per pi square metres.
+    np.testing.assert_allclose(np.linalg.norm(position[:, 0], axis=-1).max() ** 2, 3000, rtol=1e-2)
+
+
+def test_a_perfect_network_follows_every_path_of_the_crowd(trained, tmp_path):
+    crowd = generate_crowd(
+        obedient(trained), 9, 3 * WINDOW - 2, tmp_path, chunk=4, paths=list(NAMES)
+    )
+    for character in range(9):
+        motion, target = crowd.motion(character), crowd.target(character)
+        np.testing.assert_allclose(motion.root_position[:, [0, 2]], target.position, atol=1e-4)
+        # Rotations are kept in half precision.
+        np.testing.assert_allclose(wrap_angle(motion.yaw - target.yaw), 0.0, atol=2e-3)
+
+
+def test_paths_may_come_from_a_function(still, tmp_path):
+    asked = []
+
+    def rows(characters, pace, num_frames, seed):
+        asked.append((characters, pace.shape, num_frames, seed))
+        time = np.arange(num_frames) / 30
+        x = np.array(characters)[:, None] + 0 * time
+        z = pace[:, None] * time
+        return np.stack([x, z], axis=-1), 0 * z
+
+    crowd = generate_crowd(still, 5, 6, tmp_path, chunk=2, seed=7, paths=rows)
+    expected = [range(0, 2), range(2, 4), range(4, 5)]
+    assert asked == [(part, (len(part),), 6, 7) for part in expected]
+    np.testing.assert_array_equal(crowd.path[:, :, 0], np.arange(5)[:, None] + np.zeros(6))
+    assert crowd.settings["paths"].endswith("rows")
+
+
+# --- memory ------------------------------------------------------------------------------------
+
+
+def test_all_chunks_run_in_one_compilation(trained, tmp_path):
+    generator = obedient(trained)
+    traced, rounds = [], generator._rounds
+    generator._run = jax.jit(lambda *given: traced.append(given[0].shape) or rounds(*given))
+    generate_crowd(generator, 11, FRAMES, tmp_path, chunk=4)
+    assert traced == [(4, HISTORY, CHANNELS)]
+
+
+def test_memory_does_not_grow_with_the_crowd(still, tmp_path):
+    def peak(count):
+        tracemalloc.start()
+        try:
+            generate_crowd(still, count, 30, tmp_path / str(count), chunk=32)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(32)  # whatever is made once
+    small, large = peak(64), peak(640)
+    one_chunk = 32 * 30 * CHANNELS * 4
+    assert large < small + one_chunk
+
+
+def test_the_default_chunk_shrinks_with_the_length():
+    assert crowds.default_chunk(32, 129) == crowds.default_chunk(900, 129)
+    for num_frames in (20_000, 200_000, 2_000_000):
+        chunk = crowds.default_chunk(num_frames, 129)
+        assert chunk * num_frames * 129 * 4 <= 2**28 or chunk == 1
+        assert (chunk + 1) * num_frames * 129 * 4 > 2**28
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
+    crowd = generate_crowd(generator, 5, FRAMES, tmp_path / "new" / "crowd", chunk=4, seed=3)
+    folder = tmp_path / "new" / "crowd"
+    assert sorted(item.name for item in folder.iterdir()) == sorted(FILES)
+    root, rotations, path, styles = (np.load(folder / name) for name in FILES[:4])
+    joints = SKELETON.num_joints
+    assert (root.shape, root.dtype) == ((5, FRAMES, 3), np.float32)
+    assert (rotations.shape, rotations.dtype) == ((5, FRAMES, joints, 6), np.float16)
+    assert (path.shape, path.dtype) == ((5, FRAMES, 3), np.float32)
+    assert (styles.shape, styles.dtype) == ((5,), np.int32)
+    said = json.loads((folder / "crowd.json").read_text(encoding="utf-8"))
+    assert (said["num_characters"], said["num_finished"], said["num_frames"]) == (5, 5, FRAMES)
+    assert (said["fps"], said["seed"], said["styles"]) == (30.0, 3, ["calm", "proud"])
+    assert said["joints"] == list(SKELETON.names) and said["parents"] == list(SKELETON.parents)
+    np.testing.assert_allclose(said["offsets"], SKELETON.offsets)
+    trained = generator.trained
+    assert said["model"] == {
+        "name": trained.name,
+        "weights": weights_digest(trained.params),
+        "sampler": "ddim",
+        "sigmas": generator.sigmas.tolist(),
+        "dataset": "tiny",
+        "dataset_licence": "none",
+        "dataset_credit": "nobody",
+    }
+    assert len(crowd) == 5 and crowd.num_frames == FRAMES and crowd.skeleton == SKELETON
+    motion = crowd.motion(3)
+    assert motion.name == crowd.style(3) == said["styles"][styles[3]]
+    flat = np.concatenate([root[3], rotations[3].reshape(FRAMES, -1)], axis=-1)
+    expected = motion_from_frames(SKELETON, flat)
+    np.testing.assert_array_equal(motion.root_position, expected.root_position)
+    np.testing.assert_array_equal(motion.rotations, expected.rotations)
+    np.testing.assert_array_equal(crowd.target(3).position, path[3, :, :2])
+
+
+@pytest.mark.parametrize("writes", [0, 1, 4, 5, 6, 7, 11])
+def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(
+    generator, eleven, tmp_path, monkeypatch, writes
+):
+    append, left = crowds._append, [writes]
+
+    def stop(file, rows):
+        left[0] -= 1
+        if left[0] < 0:
+            file.write(np.ascontiguousarray(rows).tobytes()[: rows.nbytes // 2])
+            file.flush()
+            raise KeyboardInterrupt
+        append(file, rows)
+
+    call = functools.partial(generate_crowd, generator, 11, FRAMES, tmp_path, chunk=4)
+    with monkeypatch.context() as patched:
+        patched.setattr(crowds, "_append", stop)
+        with pytest.raises(KeyboardInterrupt):
+            call()
+    with pytest.raises(ValueError, match=f"only {writes // 4 * 4} of 11 characters"):
+        read_crowd(tmp_path)
+    made, make = [], crowds.crowd_paths
+    monkeypatch.setattr(
+        crowds, "crowd_paths", lambda *given, **how: made.append(given[0]) or make(*given, **how)
+    )
+    resumed = call()
+    assert made[0].start == writes // 4 * 4  # what was finished is not made again
+    close(resumed, eleven)
+    folder = tmp_path.with_name(tmp_path.name + "-whole")
+    generate_crowd(generator, 11, FRAMES, folder, chunk=4)
+    assert content(tmp_path) == content(folder)
+
+
+def test_a_finished_crowd_is_replaced_only_if_asked(still, tmp_path):
+    def call(count, **how):
+        return generate_crowd(still, count, 5, tmp_path / "here", chunk=4, **how)
+
+    call(9)
+    before = content(tmp_path / "here")
+    with pytest.raises(ValueError, match="here: holds this crowd already, finished.*overwrite"):
+        call(9)
+    with pytest.raises(ValueError, match="made with num_characters 9, not 6"):
+        call(6)
+    assert content(tmp_path / "here") == before
+    call(6, overwrite=True)
+    generate_crowd(still, 6, 5, tmp_path / "fresh", chunk=4)
+    assert content(tmp_path / "here") == content(tmp_path / "fresh")
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"seed": 1}, "seed 0, not 1"),
+        ({"num_frames": 6}, "num_frames 5, not 6"),
+        ({"chunk": 3}, "chunk 2, not 3"),
+        ({"paths": "circle"}, "paths"),
+        ({"styles": "calm"}, "styles_in_turn"),
+    ],
+)
+def test_a_stopped_run_does_not_go_on_with_other_settings(
+    still, tmp_path, monkeypatch, changed, named
+):
+    settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
+    stopped = stop_after(still, 1)
+    with pytest.raises(KeyboardInterrupt):
+        generate_crowd(stopped, **settings)
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match=f"{tmp_path}: holds a crowd made with {named}"):
+        generate_crowd(still, **settings | changed)
+    assert content(tmp_path) == before
+
+
+def stop_after(still, chunks):
+    """The same generator, which is stopped after some chunks."""
+    left, generate = [chunks], still.generate
+
+    def limited(*given):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return generate(*given)
+
+    return SimpleNamespace(**vars(still) | {"generate": limited})
+
+
+def test_a_stopped_run_whose_files_were_cut_is_refused(still, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        generate_crowd(stop_after(still, 2), 6, 5, tmp_path, chunk=2)
+    path = tmp_path / "rotations.npy"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"rotations.npy: cut short.* the 4 characters"):
+        generate_crowd(still, 6, 5, tmp_path, chunk=2)
+    path.unlink()
+    with pytest.raises(ValueError, match=r"rotations.npy: missing"):
+        generate_crowd(still, 6, 5, tmp_path, chunk=2)
+    generate_crowd(still, 6, 5, tmp_path, chunk=2, overwrite=True)
+    assert len(read_crowd(tmp_path)) == 6
+
+
+def test_folders_with_other_things_are_left_alone(still, tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=r"holds other files \(thesis.txt\)"):
+            generate_crowd(still, 2, 5, tmp_path, overwrite=overwrite)
+    (tmp_path / "crowd.json").write_text('{"format": "ours", "num_finished": 0}')
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=r"crowd.json: not written by this project"):
+            generate_crowd(still, 2, 5, tmp_path, overwrite=overwrite)
+    with pytest.raises(ValueError, match=r"thesis.txt: not a folder"):
+        generate_crowd(still, 2, 5, tmp_path / "thesis.txt")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "crowd.json").unlink(), "holds no crowd"),
+        (lambda folder: (folder / "crowd.json").write_text('{"format"'), r"crowd.json: "),
+        (lambda folder: (folder / "crowd.json").write_text("[]"), "not written by this project"),
+        (lambda folder: edit(folder, drop="offsets"), "crowd.json: offsets is missing"),
+        (lambda folder: edit(folder, num_finished=9), "says that 9 of 3 characters"),
+        (lambda folder: edit(folder, num_frames=6), r"root.npy: holds float32 \(3, 5, 3\)"),
+        (lambda folder: cut(folder / "root.npy"), r"root.npy: has \d+ bytes, should have \d+"),
+        (lambda folder: cut(folder / "path.npy", more=True), r"path.npy: has \d+ bytes"),
+        (lambda folder: (folder / "styles.npy").write_bytes(b"\x93NUM"), r"styles.npy: "),
+        (lambda folder: (folder / "styles.npy").unlink(), r"styles.npy: missing"),
+        (
+            lambda folder: np.save(folder / "rotations.npy", np.zeros((3, 5, 6, 6))),
+            r"rotations.npy: holds float64",
+        ),
+    ],
+)
+def test_damaged_and_foreign_crowds_are_refused(still, tmp_path, damage, message):
+    generate_crowd(still, 3, 5, tmp_path)
+    assert len(read_crowd(tmp_path)) == 3
+    damage(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        read_crowd(tmp_path)
+
+
+def edit(folder, drop=None, **changes):
+    settings = json.loads((folder / "crowd.json").read_text()) | changes
+    settings.pop(drop, None)
+    (folder / "crowd.json").write_text(json.dumps(settings))
+
+
+def cut(path, more=False):
+    content = path.read_bytes()
+    path.write_bytes(content + b"0" if more else content[:-1])
+
+
+def test_too_small_a_disk_is_noticed_before_anything_is_written(still, tmp_path, monkeypatch):
+    row = 5 * (3 * 4 + SKELETON.num_joints * 6 * 2 + 3 * 4) + 4
+    headers = 4 * 128
+    asked = []
+
+    def disk(free):
+        def usage(path):
+            asked.append(path)
+            return SimpleNamespace(total=2 * free, used=free, free=free)
+
+        monkeypatch.setattr(crowds.shutil, "disk_usage", usage)
+
+    folder = tmp_path / "not" / "there"
+    disk(8 * row + headers - 1)
+    with pytest.raises(ValueError, match=r"there: this crowd takes .* GB more, .* GB free"):
+        generate_crowd(still, 8, 5, folder)
+    assert asked == [tmp_path] and not folder.parent.exists()
+    disk(8 * row + headers)
+    generate_crowd(still, 8, 5, folder)
+    assert sum((folder / name).stat().st_size for name in FILES[:4]) == 8 * row + headers
+    # What a replaced crowd takes is there to be used again.
+    disk(0)
+    generate_crowd(still, 8, 5, folder, overwrite=True)
+    with pytest.raises(ValueError, match="GB more"):
+        generate_crowd(still, 9, 5, folder, overwrite=True)
+    assert len(read_crowd(folder)) == 8
+
+
+def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, tmp_path):
+    generate = still.generate
+
+    def breaks_down(*given):
+        frames = generate(*given)
+        broken.append(None)
+        if len(broken) == 2:
+            frames[1, 3, 7] = np.nan
+        return frames
+
+    broken = []
+    still.generate = breaks_down
+    with pytest.raises(ArithmeticError, match="not finite for character 4"):
+        generate_crowd(still, 7, 5, tmp_path, chunk=3)
+    assert json.loads((tmp_path / "crowd.json").read_text())["num_finished"] == 3
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"num_characters": 0}, "num_characters must be a whole number of 1 or more, got 0"),
+        ({"num_characters": 2.5}, "num_characters .* got 2.5"),
+        ({"num_frames": 1}, "num_frames must be a whole number of 2 or more, got 1"),
+        ({"chunk": 0}, "chunk .* got 0"),
+        ({"seed": -1}, "seed .* got -1"),
+        ({"styles": "prowd"}, "unknown style 'prowd'.*calm, proud"),
+        ({"styles": []}, "at least one style"),
+        ({"paths": ["circle", "cirkle"]}, "unknown path 'cirkle'; did you mean 'circle'"),
+        ({"paths": []}, "at least one path"),
+        ({"paths": lambda c, p, f, s: (np.zeros((1, f, 2)), np.zeros((1, f)))}, r"\(3, 5, 2\)"),
+        ({"paths": lambda c, p, f, s: (np.full((3, f, 2), np.nan), np.zeros((3, f)))}, "finite"),
+    ],
+)
+def test_bad_input_is_refused(still, tmp_path, changed, message):
+    call = {"num_characters": 3, "num_frames": 5, "out": tmp_path / "crowd"}
+    with pytest.raises(ValueError, match=message):
+        generate_crowd(still, **call | changed)
+
+
+def test_styles_without_a_starting_pose_are_refused(still, tmp_path):
+    still.trained = tiny_trained_with({"proud": still.trained.seeds["proud"]})
+    with pytest.raises(ValueError, match="starting pose is stored for style 'calm'"):
+        generate_crowd(still, 3, 5, tmp_path, styles=["proud", "calm"])
+
+
+def test_the_bar_counts_characters_and_starts_where_the_run_was_stopped(still, tmp_path, capsys):
+    with pytest.raises(KeyboardInterrupt):
+        generate_crowd(stop_after(still, 1), 6, 5, tmp_path, chunk=4)
+    assert capsys.readouterr().err == ""
+    generate_crowd(still, 6, 5, tmp_path, chunk=4, progress=True)
+    shown = capsys.readouterr().err
+    assert "4/6" in shown and "6/6" in shown and "characters/s" in shown

@@ -1,0 +1,409 @@
+"""A round compiled ahead of time gives the numbers of jit, run after run, without the library.
+
+Tests of IREE skip where it is not installed; those of `jax.export` never do.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import builders
+import jax
+import numpy as np
+import pytest
+
+from f3amd_lib.benchmarking import artefact as artefact_module
+from f3amd_lib.benchmarking import export as export_module
+from f3amd_lib.benchmarking.artefact import load_artefact, manifest_digest
+from f3amd_lib.benchmarking.export import (
+    compile_iree,
+    export_model,
+    export_round,
+    save_artefact,
+)
+from f3amd_lib.diffusion.rounds import sample_round
+from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.models.conditioning import Condition
+
+BATCH = 2
+SIGMAS = VarianceExploding().grid(2)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    record = {"dataset": "tiny", "dataset_licence": "CC BY 4.0", "dataset_credit": "nobody"}
+    return builders.tiny_trained(record=record, latent_width=16)
+
+
+@pytest.fixture(scope="module")
+def exported(trained):
+    return export_round(trained.network(), SIGMAS, BATCH)
+
+
+@pytest.fixture(scope="module")
+def jit_round(trained):
+    """The same round under jit, which is what every other way is compared with."""
+    network = trained.network()
+
+    @jax.jit
+    def run(history, path, style, noise):
+        return sample_round(network, Condition(history, path, style), SIGMAS, noise=noise)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def jax_folder(trained, exported, tmp_path_factory) -> Path:
+    """An artefact for JAX alone, made from a trained model."""
+    folder = tmp_path_factory.mktemp("artefact") / "round"
+    return save_artefact(folder, exported, name=trained.name, targets=(), trained=trained)
+
+
+@pytest.fixture(scope="module")
+def iree_folder(exported, tmp_path_factory) -> Path:
+    """An artefact for IREE on this CPU, made from a bare network."""
+    skip_without_iree()
+    return save_artefact(tmp_path_factory.mktemp("artefact") / "round", exported, name="tiny")
+
+
+def skip_without_iree() -> None:
+    reason = 'IREE is not installed: pip install "f3amd_lib[bench]"'
+    pytest.importorskip("iree.runtime", reason=reason)
+
+
+def inputs_of(shapes, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.standard_normal(shape, dtype=np.float32) for shape in shapes.values()]
+
+
+def altered(folder: Path, copy: Path, change) -> Path:
+    """Copy an artefact and change its manifest, checksum included."""
+    shutil.copytree(folder, copy)
+    manifest = json.loads((copy / "manifest.json").read_text(encoding="utf-8"))
+    change(manifest)
+    manifest["sha256"] = manifest_digest(manifest)
+    (copy / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return copy
+
+
+def test_an_exported_round_equals_jit(jax_folder, jit_round):
+    artefact = load_artefact(jax_folder, runtime="jax")
+    for seed in range(5):
+        given = inputs_of(artefact.input_shapes, seed)
+        np.testing.assert_allclose(artefact(*given), jit_round(*given), atol=1e-5)
+
+
+def test_a_ddpm_round_takes_the_noise_that_the_sampler_would_draw(tmp_path):
+    network = builders.network_of(builders.tiny_camdm())
+    sigmas = VariancePreservingCosine(4).grid(3)
+    exported = export_round(network, sigmas, BATCH, "ddpm")
+    assert exported.inputs["step_noise"] == (3, *exported.inputs["noise"])
+    folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())
+    condition, key = builders.make_condition(BATCH), jax.random.key(3)
+    key_init, key_steps = jax.random.split(key)
+    shape = exported.inputs["noise"]
+    noise = jax.random.normal(key_init, shape)
+    step_noise = np.stack([jax.random.normal(k, shape) for k in jax.random.split(key_steps, 3)])
+    artefact = load_artefact(folder, runtime="jax")
+    wanted = jax.jit(lambda: sample_round(network, condition, sigmas, key, sampler="ddpm"))()
+    np.testing.assert_allclose(artefact(*condition, noise, step_noise), wanted, atol=1e-5)
+    with pytest.raises(ValueError, match="samples with 'ddpm' and needs step_noise"):
+        artefact(*condition, noise)
+
+
+def test_iree_equals_jit_over_a_hundred_runs(iree_folder, jit_round):
+    artefact = load_artefact(iree_folder)
+    assert artefact.runtime == "iree"
+    runs = [inputs_of(artefact.input_shapes, seed) for seed in range(100)]
+    answers = [artefact(*given) for given in runs]
+    # Compared only now: an answer must outlive the runs after it.
+    for given, answer in zip(runs, answers, strict=True):
+        assert np.isfinite(answer).all()
+        np.testing.assert_allclose(answer, jit_round(*given), atol=1e-3)
+
+
+def test_the_same_inputs_give_the_same_answer_again_and_again(iree_folder):
+    artefact = load_artefact(iree_folder)
+    placed = [artefact.put(item) for item in inputs_of(artefact.input_shapes, 0)]
+    first = artefact(*placed)
+    for _ in range(100):
+        np.testing.assert_array_equal(artefact(*placed), first)
+
+
+def test_one_thread_gives_the_numbers_of_many(iree_folder):
+    many, one = load_artefact(iree_folder), load_artefact(iree_folder, driver="local-sync")
+    given = inputs_of(many.input_shapes, 7)
+    np.testing.assert_allclose(one(*given), many(*given), atol=1e-5)
+
+
+_ALONE = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {refused}:
+            raise ImportError(f"{{name}} is not to be had here")
+
+sys.meta_path.insert(0, Refuse())
+try:
+    import f3amd_lib
+except ImportError:
+    pass
+else:
+    sys.exit("f3amd_lib could be imported after all")
+import numpy as np
+from artefact import load_artefact
+
+artefact = load_artefact({folder!r}, runtime={runtime!r})
+rng = np.random.default_rng(11)
+given = [rng.standard_normal(s, dtype=np.float32) for s in artefact.input_shapes.values()]
+np.save("answer.npy", artefact(*given))
+"""
+
+
+@pytest.mark.parametrize("runtime", ["iree", "jax"])
+def test_an_artefact_runs_without_the_library(runtime, request, tmp_path, jit_round):
+    folder = request.getfixturevalue(f"{runtime}_folder")
+    shutil.copy(artefact_module.__file__, tmp_path / "artefact.py")
+    refused = ("f3amd_lib", "flax") + (("jax",) if runtime == "iree" else ())
+    script = _ALONE.format(refused=refused, folder=str(folder), runtime=runtime)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    shapes = {item: tuple(shape) for item, shape in load_shapes(folder).items()}
+    np.testing.assert_allclose(
+        np.load(tmp_path / "answer.npy"), jit_round(*inputs_of(shapes, 11)), atol=1e-3
+    )
+
+
+def load_shapes(folder: Path) -> dict:
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    return {item["name"]: item["shape"] for item in manifest["inputs"]}
+
+
+def test_a_program_with_a_loop_is_refused_and_an_unrolled_one_has_none(trained, exported):
+    looped = export_round(trained.network(), SIGMAS, BATCH, unroll=False)
+    with pytest.raises(ValueError, match=r"has a loop \(stablehlo\.while\).*unroll=True"):
+        compile_iree(looped.stablehlo, "llvm-cpu")
+    assert "stablehlo.while" not in export_module._operations(exported.stablehlo)
+
+
+def test_a_program_does_not_say_which_files_made_it(exported):
+    for program in (exported.stablehlo, exported.exported.serialize()):
+        assert b".py" not in program
+
+
+def test_scales_and_styles_travel_with_a_trained_model(trained, jax_folder):
+    artefact = load_artefact(jax_folder, runtime="jax")
+    normaliser = trained.normaliser
+    frames = builders.draw(3, trained.config.channels, seed=1)
+    path = builders.draw(3, 8, seed=2)
+    same = lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-6)
+    same(artefact.normalise(frames), normaliser.normalise(frames))
+    same(artefact.denormalise(frames), normaliser.denormalise(frames))
+    same(artefact.normalise_path(path), normaliser.normalise_path(path))
+    assert artefact.styles == trained.styles
+    np.testing.assert_array_equal(artefact.one_hot(["proud", "calm"]), [[0, 1], [1, 0]])
+    with pytest.raises(ValueError, match="unknown style 'prowd'; this artefact knows calm, proud"):
+        artefact.one_hot(["prowd"])
+    record = artefact.manifest["record"]
+    assert record["dataset"] == "tiny" and record["dataset_licence"] == "CC BY 4.0"
+
+
+def test_a_bare_network_has_no_scales(exported, tmp_path):
+    folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())
+    artefact = load_artefact(folder, runtime="jax")
+    with pytest.raises(ValueError, match="exported from a bare network"):
+        artefact.normalise(np.zeros((1, 39)))
+    with pytest.raises(ValueError, match="exported from a bare network"):
+        artefact.one_hot(["calm"])
+
+
+@pytest.mark.parametrize("runtime", ["iree", "jax"])
+def test_a_wrong_input_is_named(runtime, request):
+    artefact = load_artefact(request.getfixturevalue(f"{runtime}_folder"), runtime=runtime)
+    given = inputs_of(artefact.input_shapes, 0)
+    for number, name in enumerate(("history", "path", "style", "noise")):
+        for wrong in (given[number][:1], artefact.put(given[number][:1])):
+            bad = [*given[:number], wrong, *given[number + 1 :]]
+            with pytest.raises(ValueError, match=rf"{name} must have shape \(2, .*got \(1, "):
+                artefact(*bad)
+    with pytest.raises(ValueError, match="samples with 'ddim' and takes no step_noise"):
+        artefact(*given, given[3][None])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"batch": 0}, "batch must be a whole number"),
+        ({"batch": 1.0}, "batch must be a whole number"),
+        ({"sigmas": [1.0]}, "sigmas must be"),
+        ({"sigmas": [np.inf, 0.0]}, "sigmas must be"),
+        ({"sampler": "ddin"}, "unknown sampler 'ddin'; did you mean 'ddim'"),
+    ],
+)
+def test_what_makes_no_round_is_refused(trained, settings, message):
+    with pytest.raises(ValueError, match=message):
+        export_round(trained.network(), **{"sigmas": SIGMAS, "batch": BATCH, **settings})
+
+
+@pytest.mark.parametrize("file", ["round.jax_export", "features.json"])
+def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path, file):
+    copy = shutil.copytree(jax_folder, tmp_path / "copy")
+    content = (copy / file).read_bytes()
+    (copy / file).write_bytes(content[:-1])
+    with pytest.raises(ValueError, match=rf"{file}: has \d+ bytes and should have \d+; .*cut"):
+        load_artefact(copy, runtime="jax")
+    (copy / file).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(ValueError, match=f"{file}: content does not match its checksum"):
+        load_artefact(copy, runtime="jax")
+    (copy / file).unlink()
+    with pytest.raises(ValueError, match=f"{file}: no such file, but manifest.json speaks of it"):
+        load_artefact(copy, runtime="jax")
+
+
+def test_a_garbled_or_altered_manifest_is_refused(jax_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"manifest\.json: no such file, so this folder is no"):
+        load_artefact(tmp_path)
+    copy = shutil.copytree(jax_folder, tmp_path / "copy")
+    path = copy / "manifest.json"
+    text = path.read_text(encoding="utf-8")
+    for content, message in (
+        (text[: len(text) // 2], "not readable as JSON"),
+        ("[]", "not the manifest of an artefact"),
+        (text.replace('"batch": 2', '"batch": 3'), "does not match its checksum"),
+    ):
+        assert content != text
+        path.write_text(content, encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            load_artefact(copy, runtime="jax")
+
+
+def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
+    def change(**values):
+        return lambda manifest: manifest["targets"]["llvm-cpu"].update(values)
+
+    def other_cpu(manifest):
+        manifest["targets"]["llvm-cpu"]["cpu"]["features"].append("imaginary")
+
+    def other_machine(manifest):
+        manifest["targets"]["llvm-cpu"]["cpu"]["machine"] = "pdp11"
+
+    for number, (alter, message) in enumerate(
+        (
+            (change(iree_version="2.0.0"), r"compiled by IREE 2\.0\.0, .*iree-base-runtime==2\.0"),
+            (other_cpu, "another CPU .* lacks imaginary: compile it here"),
+            (other_machine, r"another CPU \(pdp11\)"),
+            (change(driver="abacus"), "IREE has no driver 'abacus' here"),
+        )
+    ):
+        copy = altered(iree_folder, tmp_path / str(number), alter)
+        with pytest.raises(ValueError, match=message):
+            load_artefact(copy)
+    with pytest.raises(ValueError, match="no program for target 'vmvx' .*there are llvm-cpu"):
+        load_artefact(iree_folder, target="vmvx")
+    cut = shutil.copytree(iree_folder, tmp_path / "cut") / "round.llvm-cpu.vmfb"
+    cut.write_bytes(cut.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="has 1000 bytes and should have"):
+        load_artefact(cut.parent)
+
+
+def test_a_missing_runtime_is_named_with_the_remedy(jax_folder, exported, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="unknown runtime 'tvm'"):
+        load_artefact(jax_folder, runtime="tvm")
+    with pytest.raises(ValueError, match="'llvm-cpu' .*compile some, or pass runtime='jax'"):
+        load_artefact(jax_folder)
+    target = {"iree_version": "3.13.0"}
+    copy = altered(
+        jax_folder, tmp_path / "copy", lambda manifest: manifest["targets"].update(x=target)
+    )
+    monkeypatch.setitem(sys.modules, "iree", None)
+    monkeypatch.setitem(sys.modules, "iree.runtime", None)
+    with pytest.raises(ImportError, match=r"f3amd_lib\[bench\].*iree-base-runtime==3\.13\.0"):
+        load_artefact(copy, target="x")
+    monkeypatch.setattr(export_module.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"f3amd_lib\[bench\]"):
+        compile_iree(exported.stablehlo)
+
+
+def test_nothing_of_a_user_is_overwritten(exported, tmp_path):
+    folder = tmp_path / "round"
+    save = lambda **settings: save_artefact(
+        folder, exported, targets=(), **{"name": "tiny", **settings}
+    )
+    save()
+    with pytest.raises(ValueError, match="exists already; .*overwrite=True"):
+        save()
+    save(name="other", overwrite=True)
+    assert load_artefact(folder, runtime="jax").manifest["model"] == "other"
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"holds notes\.txt, which is no part of the artefact"):
+        save(overwrite=True)
+    (folder / "manifest.json").write_text("{}")
+    with pytest.raises(ValueError, match="not the manifest of an artefact"):
+        save(overwrite=True)
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_a_failure_leaves_the_old_artefact_and_nothing_else(exported, tmp_path, monkeypatch):
+    folder = save_artefact(tmp_path / "round", exported, name="old", targets=())
+
+    def no_space(self, content):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_bytes", no_space)
+    for target in (folder, tmp_path / "new"):
+        with pytest.raises(OSError, match="no space left"):
+            save_artefact(target, exported, name="new", targets=(), overwrite=True)
+    assert load_artefact(folder, runtime="jax").manifest["model"] == "old"
+    assert [item.name for item in tmp_path.iterdir()] == ["round"]
+
+
+def test_weights_of_another_model_are_not_passed_off_as_a_trained_one(exported, tmp_path):
+    other = builders.tiny_trained(latent_width=8)
+    with pytest.raises(ValueError, match="does not hold the weights of the trained model"):
+        save_artefact(tmp_path / "round", exported, name="tiny", targets=(), trained=other)
+
+
+def test_a_trained_model_is_exported_with_its_own_schedule(trained, tmp_path):
+    folder = export_model(trained, tmp_path / "round", num_steps=1, batch=3, targets=())
+    manifest = load_artefact(folder, runtime="jax").manifest
+    assert manifest["sigmas"] == trained.diffusion.grid(1).tolist()
+    assert (manifest["sampler"], manifest["batch"], manifest["num_steps"]) == ("ddim", 3, 1)
+    with pytest.raises(ValueError, match="unknown target 'lvm-cpu'; did you mean 'llvm-cpu'"):
+        export_model(trained, tmp_path / "new", targets=("lvm-cpu",))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["cuda-sm_80", "vulkan-spirv", "vmvx"])
+def test_other_devices_are_compiled_for_without_being_there(exported, target, tmp_path, jit_round):
+    skip_without_iree()
+    folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=(target,))
+    described = load_shapes(folder)
+    assert list(described) == ["history", "path", "style", "noise"]
+    code = (folder / f"round.{target}.vmfb").read_bytes()
+    if target == "vmvx":
+        artefact = load_artefact(folder, target=target)
+        given = inputs_of(artefact.input_shapes, 0)
+        np.testing.assert_allclose(artefact(*given), jit_round(*given), atol=1e-3)
+    else:
+        mark = {"cuda-sm_80": b".target sm_80", "vulkan-spirv": b"\x03\x02\x23\x07"}[target]
+        assert mark in code
+
+
+@pytest.mark.slow
+def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
+    skip_without_iree()
+    with pytest.raises(ValueError, match=r"IREE .* cannot compile .* for cuda-sm_20: .*Targets"):
+        compile_iree(exported.stablehlo, "cuda-sm_20")
