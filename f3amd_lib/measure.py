@@ -16,11 +16,14 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_lib.evaluation import sensitivity
+from f3amd_lib.evaluation import literal_update, sensitivity
 from f3amd_lib.evaluation.classifier import StyleClassifier, obtain_classifier
+from f3amd_lib.evaluation.denoising import x0_error_by_sigma
+from f3amd_lib.evaluation.precision import measure_precision
 from f3amd_lib.evaluation.protocol import (
     REFERENCE_MODELS,
     Protocol,
@@ -35,13 +38,7 @@ from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.models import zoo
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir
-from f3amd_lib.report.records import (
-    read_table,
-    record_hash,
-    run_record,
-    set_aside_table,
-    write_table,
-)
+from f3amd_lib.report.records import kept_rows, run_record, write_table
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.family import SHORT_RUN, learning_curves
 from f3amd_lib.training.pipeline import (
@@ -55,6 +52,7 @@ __all__ = [
     "MEASUREMENTS",
     "STEPS",
     "measure_learning",
+    "measure_literal_update",
     "measure_quality",
     "measure_sensitivity",
     "main",
@@ -63,21 +61,13 @@ __all__ = [
 log = logging.getLogger("f3amd")
 
 
-def _kept_rows(path: Path, record: dict) -> pd.DataFrame | None:
-    """Return the rows of an earlier run that asked for the same; None if there are none.
-
-    A table that asked for something else is kept under another name.
-    """
-    if not path.exists():
-        return None
-    rows, earlier = read_table(path)
-    if record_hash(earlier) != record_hash(record):
-        kept = set_aside_table(path)
-        log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
-        return None
-    if "unit" in rows:
-        rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
-    return rows
+def _with_rows(earlier: pd.DataFrame | None, rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    """Put rows in place of those that have the same keys, after all others."""
+    if earlier is None:
+        return rows
+    now = set(map(tuple, rows[keys].to_numpy().tolist()))
+    old = [tuple(row) not in now for row in earlier[keys].to_numpy().tolist()]
+    return pd.concat([earlier[old], rows])
 
 
 def measure_learning(
@@ -99,7 +89,7 @@ def measure_learning(
         profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="learning",
         **SHORT_RUN,
     )  # fmt: skip
-    kept = _kept_rows(path, record)
+    kept = kept_rows(path, record)
     measured = set() if kept is None else set(kept["model"])
     todo = list(models) if models else [name for name in zoo.PRESETS if name not in measured]
     for curve in learning_curves(prepared, todo, seed=profile.seed):
@@ -154,7 +144,7 @@ def measure_quality(
     packed = prepared.packed
     classifier, protocol, record = _protocol(prepared, profile, "quality")
     paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
-    kept = {name: _kept_rows(path, record) for name, path in paths.items()}
+    kept = {name: kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
     asked = [zoo.find_preset(name).name for name in models or ()]
     chosen = asked or available_models(profile)
@@ -166,14 +156,9 @@ def measure_quality(
 
     def keep(name: str, rows: pd.DataFrame, weights: str) -> None:
         """Put rows in place of those of the same model, window and steps, and write the table."""
-        rows, keys = rows.assign(weights=weights), ["model", "window_frames", "steps"]
-        earlier = kept[name]
-        if earlier is not None:
-            now = set(map(tuple, rows[keys].to_numpy().tolist()))
-            old = [tuple(row) not in now for row in earlier[keys].to_numpy().tolist()]
-            rows = pd.concat([earlier[old], rows])
-        kept[name] = rows
-        write_table(paths[name], rows, record)
+        keys = ["model", "window_frames", "steps"]
+        kept[name] = _with_rows(kept[name], rows.assign(weights=weights), keys)
+        write_table(paths[name], kept[name], record)
 
     def measured(model: str, steps: int, weights: str) -> bool:
         rows = kept["quality_by_seed"]
@@ -256,13 +241,107 @@ def measure_sensitivity(
     return folder / "corruptions.csv"
 
 
+def measure_literal_update(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Walk trained models with the printed update, rescaled and taken literally, side by side.
+
+    See `evaluation.literal_update` and Appendix F of the paper. Rollouts by the evaluation protocol
+    with 8, 4, 2 and 1 steps on both readings of the grid, and single windows from the same noise.
+    One step is the same in all four; it is walked once. A rollout takes about a minute on 2 cores,
+    13 of them a model.
+
+    Args:
+      prepared, profile: as for `measure_quality`.
+      models: presets; by default all that have weights. Of one whose own sampler is not DDIM only
+        the x0 error against the noise level is measured, at the levels that it was told. One that
+        is asked for by name is measured again, and trained if it has none.
+
+    Returns:
+      The table of means and intervals, `records/literal_update.csv`; beside it
+      `literal_update_by_seed.csv`, `literal_update_windows.csv` and `x0_by_sigma.csv`.
+    """
+    folder = results_dir(profile.dataset, profile.name) / "records"
+    packed = prepared.packed
+    classifier, protocol, record = _protocol(prepared, profile, "literal_update")
+    names = ("literal_update_by_seed", "literal_update_windows", "x0_by_sigma")
+    kept = {name: kept_rows(folder / f"{name}.csv", record) for name in names}
+    held_out = prepared.windows(prepared.held_out_split)
+    asked = [zoo.find_preset(name).name for name in models or ()]
+
+    def keep(name: str, rows: pd.DataFrame, *keys: str) -> None:
+        """Put rows in place of those with the same model and keys, and write the table."""
+        kept[name] = _with_rows(kept[name], rows, ["model", *keys])
+        write_table(folder / f"{name}.csv", kept[name], record)
+
+    def measured(name: str, weights: str, **row) -> bool:
+        mine = kept[name]
+        if mine is None or row["model"] in asked:
+            return False
+        for column, value in row.items():
+            mine = mine[mine[column] == value]
+        return len(mine) > 0 and set(mine["weights"]) == {weights}
+
+    for model in asked or available_models(profile):
+        trained, _, _ = obtain_model(prepared, profile, preset=model)
+        weights = weights_digest(trained.params)
+        if not measured("x0_by_sigma", weights, model=model):
+            levels = getattr(trained.config, "noise_levels", ()) or SIGMAS
+            errors = x0_error_by_sigma(trained, held_out, levels).assign(
+                model=model, noise=trained.diffusion.kind, weights=weights
+            )
+            keep("x0_by_sigma", errors)
+        if trained.diffusion.sampler != literal_update.UPDATES["rescaled"]:
+            continue
+        for spacing in SPACINGS:
+            if not measured("literal_update_windows", weights, model=model, spacing=spacing):
+                walks = literal_update.walk_windows(trained, held_out, STEPS, spacing=spacing)
+                figures = literal_update.window_figures(walks).assign(
+                    model=model, spacing=spacing, weights=weights
+                )
+                keep("literal_update_windows", figures, "spacing")
+        todo = [
+            {"model": model, "spacing": spacing, "update": update, "steps": steps}
+            for spacing in SPACINGS
+            for update in literal_update.UPDATES
+            for steps in STEPS
+            if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
+        ]
+        todo = [row for row in todo if not measured("literal_update_by_seed", weights, **row)]
+        for row in tqdm(todo, unit="row", desc=model):
+            generator = MotionGenerator(
+                trained,
+                row["steps"],
+                spacing=row["spacing"],
+                sampler=literal_update.UPDATES[row["update"]],
+            )
+            rows, _ = measure_model(generator, packed, classifier, protocol, held_out, name=model)
+            rows = rows.assign(spacing=row["spacing"], update=row["update"], weights=weights)
+            keep("literal_update_by_seed", rows, "spacing", "update", "steps")
+        ways = kept["literal_update_by_seed"].groupby(["spacing", "update"], sort=False)
+        summary = pd.concat(
+            summarise(rows).assign(spacing=spacing, update=update)
+            for (spacing, update), rows in ways
+        )
+        write_table(folder / "literal_update.csv", summary, record)
+    return folder / "literal_update.csv"
+
+
 STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
+
+SPACINGS = ("endpoints", "uniform")
+"""Both readings of where N steps lie, ours first (see `VarianceExploding.grid`)."""
+
+SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
+"""Noise levels at which an x0 error is measured, for networks that take any level."""
 
 _PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
 
 MEASUREMENTS: dict[str, Callable] = {
     "learning": measure_learning,
+    "precision": measure_precision,
+    "literal_update": measure_literal_update,
     "quality": measure_quality,
     "sensitivity": measure_sensitivity,
 }

@@ -10,6 +10,7 @@ from f3amd_lib.diffusion.samplers import (
     SAMPLERS,
     add_noise,
     ddim_step,
+    ddim_step_literal,
     ddim_step_vp,
     ddpm_posterior,
     ddpm_step,
@@ -17,6 +18,7 @@ from f3amd_lib.diffusion.samplers import (
     probability_flow_slope,
     sample,
     sample_ddim,
+    sample_ddim_literal,
     sample_ddim_vp,
     sample_ddpm,
     sample_euler,
@@ -183,6 +185,51 @@ def test_appendix_f_without_rescaling_collapses():
     assert spread[8][1] == pytest.approx(0.711, abs=0.04)
     assert spread[16][1] == pytest.approx(0.933, abs=0.03)
     assert spread[256][1] == pytest.approx(0.997, abs=0.02)
+
+
+def test_appendix_f_literal_step_is_the_right_one_made_smaller():
+    # ddim_step gives 1 + 2 * 1 = 3 at sigma 2, see above; 3 / sqrt(5) is the VP state of it.
+    assert ddim_step_literal(5.0, 1.0, 4.0, 2.0) == pytest.approx(3.0 / np.sqrt(5.0))
+    x_noisy, x0_hat = np.random.default_rng(4).standard_normal((2, 50))
+    for sigma, sigma_next in ((128.0, 40.4), (6.0, 0.7), (0.7, 0.01)):
+        literal = ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next)
+        right = ddim_step(x_noisy, x0_hat, sigma, sigma_next)
+        np.testing.assert_allclose(literal * np.hypot(1.0, sigma_next), right, rtol=1e-12)
+        z = ddim_step_vp(
+            x_noisy / np.hypot(1.0, sigma),
+            x0_hat,
+            alpha_bar_from_sigma(sigma),
+            alpha_bar_from_sigma(sigma_next),
+        )
+        np.testing.assert_allclose(literal, z, atol=1e-12)
+    np.testing.assert_array_equal(ddim_step_literal(x_noisy, x0_hat, 0.01, 0.0), x0_hat)
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 8])
+def test_appendix_f_literal_walk_feeds_the_state_back_as_it_is(num_steps):
+    sigmas = SCHEDULE.grid(num_steps)
+    with jax.enable_x64(True):
+        x = np.asarray(sample_ddim_literal(two_modes(), jnp.asarray(start(64)), sigmas))
+        right = np.asarray(sample_ddim(two_modes(), jnp.asarray(start(64)), sigmas))
+        by_hand = literal_appendix_f(two_modes(), start(64), sigmas)
+    np.testing.assert_allclose(x, by_hand, atol=1e-10)
+    # Nothing is fed back in a single step. Two end at sigma_min, where little is lost.
+    apart = np.abs(x - right).max()
+    assert apart == 0.0 if num_steps == 1 else apart < 1e-3 if num_steps == 2 else apart > 0.5
+
+
+@pytest.mark.parametrize("num_steps", [2, 4, 8])
+def test_appendix_f_literal_walk_loses_its_noise_factor_by_factor(num_steps):
+    # A denoiser that ignores its input leaves the state linear in the noise: of the right amount
+    # there is left the product of 1 / sqrt(1 + sigma^2) over the levels that were reached.
+    sigmas = SCHEDULE.grid(num_steps)[:-1]
+    with jax.enable_x64(True):
+        low, high = (
+            sample_ddim_literal(lambda x, sigma: 0.0 * x + 0.3, jnp.full((1, 1), start), sigmas)
+            for start in (0.0, 128.0)
+        )
+    left = float((high - low)[0, 0]) / sigmas[-1]
+    assert left == pytest.approx(np.prod(1.0 / np.hypot(1.0, sigmas[1:])), rel=1e-9)
 
 
 def test_both_modes_are_reached_and_keep_their_width():
@@ -447,7 +494,9 @@ def test_samplers_go_by_name_and_take_traced_levels(name):
     direct = SAMPLERS[name](two_modes(), x_init, grid, *arguments)
     walk = jax.jit(lambda x, sigmas: sample(name, two_modes(), x, sigmas, key=key))
     np.testing.assert_allclose(walk(x_init, jnp.asarray(grid)), direct, atol=1e-4)
-    assert float(jnp.abs(walk(x_init, 0.5 * grid) - direct).max()) > 0.01
+    # The literal walk ends near 0 whatever the levels, but not in the same place.
+    least = 1e-4 if name == "ddim_literal" else 0.01
+    assert float(jnp.abs(walk(x_init, 0.5 * grid) - direct).max()) > least
 
 
 def test_every_schedule_asks_for_a_sampler_that_is_there():

@@ -6,7 +6,8 @@ no concern of this module.
 
 The paper prints the DDIM update in variance-preserving form (Appendix F). Its state is
 `z = sqrt(alpha_bar) x`, and a network trained on `x` must be shown `z / sqrt(alpha_bar)`. Both
-forms are here and walk the same path; feeding `z` to the network unrescaled does not.
+forms are here and walk the same path; feeding `z` to the network unrescaled does not. That third
+walk is here as well, to be studied (`ddim_step_literal`).
 
 The same rescaling lets one denoiser serve both kinds of schedule: DDPM, too, is written for the
 variance-exploding state, in which its update has no alpha_bar at all. Every sampler takes any
@@ -28,6 +29,7 @@ __all__ = [
     "SAMPLERS",
     "add_noise",
     "ddim_step",
+    "ddim_step_literal",
     "ddim_step_vp",
     "ddpm_posterior",
     "ddpm_step",
@@ -35,6 +37,7 @@ __all__ = [
     "probability_flow_slope",
     "sample",
     "sample_ddim",
+    "sample_ddim_literal",
     "sample_ddim_vp",
     "sample_ddpm",
     "sample_euler",
@@ -81,6 +84,29 @@ def ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next):
     """
     xp = array_module(z, x0_hat, alpha_bar, alpha_bar_next)
     eps_hat = (z - xp.sqrt(alpha_bar) * x0_hat) / xp.sqrt(1.0 - alpha_bar)
+    return xp.sqrt(alpha_bar_next) * x0_hat + xp.sqrt(1.0 - alpha_bar_next) * eps_hat
+
+
+def ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next):
+    """Take the printed update as it stands: a variance-exploding state in, a preserving one out.
+
+    The answer is that of `ddim_step` times 1 / sqrt(1 + sigma_next^2). Whoever hands it to the
+    network as the state at `sigma_next` shows it a state that is too small by this factor.
+
+    Args:
+      x_noisy, x0_hat: state and clean estimate, any equal shape.
+      sigma: current noise level, > 0, broadcasting.
+      sigma_next: next level, 0 <= sigma_next < sigma; at 0 nothing is lost, the answer is `x0_hat`.
+
+    Returns:
+      sqrt(ab') x0_hat + sqrt(1 - ab') eps_hat, with ab' = 1 / (1 + sigma_next^2).
+
+    Source: paper Appendix F, to the letter; the text does not say what happens to the state before
+    the next step.
+    """
+    xp = array_module(x_noisy, x0_hat, sigma, sigma_next)
+    alpha_bar_next = alpha_bar_from_sigma(sigma_next)
+    eps_hat = (x_noisy - x0_hat) / sigma
     return xp.sqrt(alpha_bar_next) * x0_hat + xp.sqrt(1.0 - alpha_bar_next) * eps_hat
 
 
@@ -229,6 +255,28 @@ def sample_ddim_vp(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
     return z / jnp.sqrt(alpha_bars[-1])
 
 
+def sample_ddim_literal(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
+    """Walk with the printed update and never rescale: what Appendix F says if taken to the letter.
+
+    No sampler to use: an exact denoiser's samples collapse onto its mean. It is here to find out
+    who would notice, see `evaluation.literal_update`.
+
+    Args:
+      denoise, x_init, sigmas, unroll: as in `sample_ddim`.
+
+    Returns:
+      State after the last step, [B, T, C]; one step alone is `sample_ddim`'s.
+
+    Raises:
+      ValueError: if `sigmas` is not a list of at least two levels.
+    """
+
+    def step(x_noisy, sigma, sigma_next):
+        return ddim_step_literal(x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
+
+    return _walk(step, x_init, _noise_levels(sigmas, x_init), unroll)
+
+
 def sample_ddpm(denoise: Denoiser, x_init, sigmas, key, *, unroll: bool = False):
     """Walk a variance-exploding state down the noise levels with DDPM's ancestral sampling.
 
@@ -312,8 +360,10 @@ SAMPLERS: dict[str, Callable] = {
     "ddpm": sample_ddpm,
     "euler": sample_euler,
     "heun": sample_heun,
+    "ddim_literal": sample_ddim_literal,
 }
-"""Samplers by name; a noise schedule's `sampler` is one of these."""
+"""Samplers by name; a noise schedule's `sampler` is one of these. The last is there to be studied,
+under a name because rollouts choose their sampler by name; no schedule asks for it."""
 
 _STOCHASTIC = ("ddpm",)
 

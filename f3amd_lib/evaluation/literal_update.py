@@ -1,0 +1,146 @@
+"""Two readings of the printed update, walked side by side by trained networks.
+
+Appendix F prints a DDIM step that takes a variance-exploding state and returns a preserving one. To
+rescale it before the next step gives plain DDIM ("rescaled"); to leave it as it is gives another
+walk ("literal", see `samplers.ddim_step_literal`). Which of the two a table was measured with can
+only show where a network uses its noise. These functions look at single windows, all from the same
+noise; long rollouts choose the update by the name of its sampler, `UPDATES[...]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.data.features import frame_positions
+from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
+from f3amd_lib.evaluation.denoising import held_out_batch
+from f3amd_lib.evaluation.distributions import diversity
+from f3amd_lib.evaluation.metrics import joint_acceleration
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.loop import network_inputs
+
+__all__ = ["UPDATES", "WINDOW_METRICS", "WindowWalks", "walk_windows", "window_figures"]
+
+UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
+"""Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""
+
+WINDOW_METRICS = {
+    "joint_error": "cm",
+    "joint_acceleration": "cm/frame^2",
+    "seed_spread": "cm",
+    "from_rescaled": "cm",
+    "from_half_the_steps": "cm",
+}
+"""Metric of `window_figures` -> unit."""
+
+CM = 100.0
+
+_STEP = {"rescaled": ddim_step, "literal": ddim_step_literal}
+
+
+@dataclass(frozen=True, eq=False)
+class WindowWalks:
+    """Windows that one network made from the same noise in several ways.
+
+    Attributes:
+      real: joints as captured, [B, T, J, 3], metres.
+      made: (update, steps) -> joints, [S, B, T, J, 3]; seed s has the same noise in all of them.
+    """
+
+    real: np.ndarray
+    made: dict[tuple[str, int], np.ndarray]
+
+
+def walk_windows(
+    trained: TrainedModel,
+    windows: WindowSet,
+    steps: Sequence[int] = (8, 4, 2, 1),
+    *,
+    spacing: str = "endpoints",
+    num_windows: int = 64,
+    num_seeds: int = 8,
+    seed: int = 0,
+) -> WindowWalks:
+    """Sample held-out windows with both updates and several numbers of steps.
+
+    Args:
+      trained: the model; its own schedule gives the noise levels.
+      windows: held-out windows.
+      steps: numbers of steps.
+      spacing: where the steps lie, see the schedule's `grid`.
+      num_windows: conditions, spread evenly over the windows.
+      num_seeds: draws of noise for each.
+      seed: of the noise.
+
+    Returns:
+      The walks.
+
+    Raises:
+      ValueError: for windows of another length, or fewer than 2 seeds, which have no spread.
+    """
+    if num_seeds < 2:
+        raise ValueError(f"num_seeds must be at least 2 for a spread over seeds, got {num_seeds}")
+    batch = held_out_batch(windows, trained, num_windows)
+    x0, condition = network_inputs(batch, trained.normaliser)
+    network = trained.network()
+    context = jax.jit(network.encode)(condition)
+    # One compiled evaluation serves every update and number of steps.
+    denoise = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, context))
+    joints = jax.jit(lambda x: frame_positions(trained.skeleton, trained.normaliser.denormalise(x)))
+    grids = {number: trained.diffusion.grid(number, spacing).astype(np.float32) for number in steps}
+    made = {(update, number): [] for number in steps for update in UPDATES}
+    for key in jax.random.split(jax.random.key(seed), num_seeds):
+        noise = jax.random.normal(key, x0.shape)
+        for (update, number), draws in made.items():
+            x_noisy = grids[number][0] * noise
+            for sigma, sigma_next in zip(grids[number][:-1], grids[number][1:], strict=True):
+                x_noisy = _STEP[update](x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
+            draws.append(np.asarray(joints(x_noisy)))
+    return WindowWalks(
+        real=np.asarray(frame_positions(trained.skeleton, batch.future)),
+        made={way: np.stack(draws) for way, draws in made.items()},
+    )
+
+
+def _distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the mean distance of joints, cm."""
+    return float(CM * np.mean(np.linalg.norm(first - second, axis=-1)))
+
+
+def window_figures(walks: WindowWalks) -> pd.DataFrame:
+    """Measure what walks from the same noise made.
+
+    Args:
+      walks: from `walk_windows`.
+
+    Returns:
+      Columns update, steps, metric, unit, value, means over windows and seeds; update "real" with
+      0 steps is what was captured. Metrics:
+        joint_error: distance of joints from what was captured;
+        joint_acceleration: see `metrics.joint_acceleration`;
+        seed_spread: `diversity` over the seeds of one condition;
+        from_rescaled: distance of joints from the rescaled walk of as many steps;
+        from_half_the_steps: distance of joints from the same update with half the steps, where
+          that was walked.
+    """
+    rows = [("real", 0, "joint_acceleration", float(np.mean(joint_acceleration(walks.real))))]
+    for (update, number), joints in walks.made.items():
+        figures = {
+            "joint_error": _distance(joints, walks.real),
+            "joint_acceleration": float(np.mean(joint_acceleration(joints))),
+            "seed_spread": diversity(np.swapaxes(joints, 0, 1)),
+            "from_rescaled": _distance(joints, walks.made["rescaled", number]),
+        }
+        half = walks.made.get((update, number // 2)) if number % 2 == 0 else None
+        if half is not None:
+            figures["from_half_the_steps"] = _distance(joints, half)
+        rows += [(update, number, name, value) for name, value in figures.items()]
+    table = pd.DataFrame(rows, columns=["update", "steps", "metric", "value"])
+    table.insert(3, "unit", table["metric"].map(WINDOW_METRICS))
+    return table

@@ -1,0 +1,207 @@
+"""Both readings of Appendix F on networks whose answers are known, and the measurement of them."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
+
+from f3amd_lib import measure
+from f3amd_lib.data.features import frame_positions
+from f3amd_lib.diffusion.samplers import SAMPLERS
+from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.evaluation import literal_update
+from f3amd_lib.evaluation.denoising import held_out_batch
+from f3amd_lib.evaluation.literal_update import (
+    UPDATES,
+    WINDOW_METRICS,
+    WindowWalks,
+    walk_windows,
+    window_figures,
+)
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.records import read_table, run_record
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.pipeline import PreparedData
+
+FEW = {"num_windows": 3, "num_seeds": 2}
+
+
+class Fake:
+    """A network that answers by a rule, `answer(x_noisy, sigma)`."""
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def encode(self, condition):
+        return condition
+
+    def __call__(self, x_noisy, sigma, context):
+        return self.answer(x_noisy, sigma)
+
+
+@pytest.fixture
+def model_that(monkeypatch):
+    def make(answer):
+        monkeypatch.setattr(TrainedModel, "network", lambda self: Fake(answer))
+        return tiny_trained()
+
+    return make
+
+
+def one(table, update, steps, metric):
+    chosen = table[(table["update"] == update) & (table["steps"] == steps)]
+    (value,) = chosen.loc[chosen["metric"] == metric, "value"]
+    return value
+
+
+@pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
+def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, spacing):
+    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy + 0.2)
+    walks = walk_windows(trained, tiny_windows(), (4, 2), spacing=spacing, **FEW)
+    table = window_figures(walks)
+    for steps in (4, 2):
+        for metric in ("from_rescaled", "seed_spread"):
+            assert one(table, "literal", steps, metric) == pytest.approx(0.0, abs=1e-4)
+    assert one(table, "literal", 4, "from_half_the_steps") == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_network_that_uses_its_input_shows_it(model_that):
+    # The exact denoiser of features that are normal: it keeps the share 1 / (1 + sigma^2).
+    trained = model_that(lambda x_noisy, sigma: x_noisy / (1.0 + sigma**2))
+    table = window_figures(walk_windows(trained, tiny_windows(), (8, 1), **FEW))
+    assert one(table, "literal", 1, "from_rescaled") == 0.0
+    assert one(table, "literal", 8, "from_rescaled") > 1.0
+    assert one(table, "literal", 8, "seed_spread") < 0.2 * one(table, "rescaled", 8, "seed_spread")
+
+
+def test_the_walks_are_those_of_the_samplers_by_name():
+    trained, windows = tiny_trained(), tiny_windows()
+    walks = walk_windows(trained, windows, (4,), seed=3, **FEW)
+    x0, condition = network_inputs(held_out_batch(windows, trained, 3), trained.normaliser)
+    network, grid = trained.network(), trained.diffusion.grid(4)
+    noise = jax.random.normal(jax.random.split(jax.random.key(3), 2)[1], x0.shape)
+    for update, name in UPDATES.items():
+        sample = SAMPLERS[name]
+        x = jax.jit(
+            lambda noise, condition, sample=sample: sample(
+                lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)),
+                128.0 * noise,
+                grid,
+            )
+        )(noise, condition)
+        joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
+        np.testing.assert_allclose(walks.made[update, 4][1], joints, atol=1e-4)
+    assert np.abs(walks.made["literal", 4] - walks.made["rescaled", 4]).max() > 1e-3
+
+
+def test_figures_by_hand():
+    # One window, two joints; two seeds that differ in the second joint's place, 2 cm apart.
+    real = np.zeros((1, 4, 2, 3))
+    apart = np.zeros((2, 1, 4, 2, 3))
+    apart[1, ..., 1, 0] = 0.02
+    made = {("rescaled", 2): apart, ("rescaled", 1): 0.0 * apart, ("literal", 2): apart + 0.03}
+    table = window_figures(WindowWalks(real, made))
+    found = lambda *row: one(table, *row)
+    assert found("rescaled", 2, "joint_error") == pytest.approx(0.5)  # 2 cm, one of two joints
+    assert found("rescaled", 1, "joint_error") == 0.0
+    # The unbiased variance of 0 and 2 cm is 2 cm^2; the other joint, the root, has none.
+    assert found("rescaled", 2, "seed_spread") == pytest.approx(1.0)
+    assert found("literal", 2, "from_rescaled") == pytest.approx(3.0 * np.sqrt(3.0))
+    assert found("rescaled", 2, "from_half_the_steps") == pytest.approx(0.5)
+    assert found("real", 0, "joint_acceleration") == 0.0
+    # One step has no half, and the literal walk of one step is not there.
+    halves = table[table["metric"] == "from_half_the_steps"]
+    assert list(zip(halves["update"], halves["steps"], strict=True)) == [("rescaled", 2)]
+    assert dict(zip(table["metric"], table["unit"], strict=True)) == WINDOW_METRICS
+
+
+def test_a_single_seed_has_no_spread():
+    with pytest.raises(ValueError, match="num_seeds must be at least 2"):
+        walk_windows(tiny_trained(), tiny_windows(), num_seeds=1)
+
+
+@pytest.fixture
+def measurement(tmp_path, monkeypatch):
+    """`measure_literal_update` on tiny models, with rollouts of a made-up value."""
+    prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
+    schedule = VariancePreservingCosine(4)
+    models = {
+        "F3AMD-FNO-32": tiny_trained(),
+        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=schedule),
+    }
+    calls = []
+
+    def measure_model(generator, *arguments, name):
+        calls.append((name, generator.sampler, generator.num_steps, float(generator.sigmas[-2])))
+        row = {"model": name, "window_frames": WINDOW, "steps": generator.num_steps}
+        row |= {"varies": "seed", "metric": "IRD", "unit": "cm", "better": "near real"}
+        return pd.DataFrame([row | {"seed": seed, "value": 1.0 + seed} for seed in (0, 1)]), None
+
+    def protocol(prepared, profile, measurement):
+        return None, None, run_record(profile=profile, dataset="synthetic", seed=0, size="tiny")
+
+    walk = lambda *arguments, **settings: walk_windows(*arguments, **settings, **FEW)
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(measure, "_protocol", protocol)
+    monkeypatch.setattr(measure, "measure_model", measure_model)
+    monkeypatch.setattr(measure, "obtain_model", lambda *a, preset: (models[preset], None, ""))
+    monkeypatch.setattr(measure, "available_models", lambda profile: list(models))
+    monkeypatch.setattr(measure, "STEPS", (2, 1))
+    monkeypatch.setattr(measure, "SIGMAS", (0.1, 128.0))
+    monkeypatch.setattr(literal_update, "walk_windows", walk)
+    profile = load_profile("smoke", "synthetic")
+
+    def run(asked=None):
+        calls.clear()
+        return measure.measure_literal_update(prepared, profile, asked), list(calls)
+
+    return run, models
+
+
+def test_the_measurement_walks_both_updates_on_both_grids(measurement):
+    run, _ = measurement
+    path, calls = run()
+    table, _ = read_table(path)
+    # One step is the same walk in all four ways; a model of DDPM has no printed update.
+    middle = measure.MotionGenerator(tiny_trained(), 2, spacing="uniform").sigmas[-2]
+    assert calls == [
+        ("F3AMD-FNO-32", "ddim", 2, pytest.approx(0.01)),
+        ("F3AMD-FNO-32", "ddim", 1, pytest.approx(128.0)),
+        ("F3AMD-FNO-32", "ddim_literal", 2, pytest.approx(0.01)),
+        ("F3AMD-FNO-32", "ddim", 2, pytest.approx(middle)),
+        ("F3AMD-FNO-32", "ddim_literal", 2, pytest.approx(middle)),
+    ]
+    ways = set(zip(table["spacing"], table["update"], table["steps"], strict=True))
+    assert len(table) == len(ways) == 5
+    assert ("uniform", "literal", 2) in ways and ("uniform", "literal", 1) not in ways
+    assert set(table["value"]) == {1.5} and (table["low"] < 1.5).all()
+    windows, _ = read_table(path.with_name("literal_update_windows.csv"))
+    assert set(windows["model"]) == {"F3AMD-FNO-32"}
+    assert set(windows["spacing"]) == {"endpoints", "uniform"}
+    errors, _ = read_table(path.with_name("x0_by_sigma.csv"))
+    levels = errors.groupby("model")["sigma"].apply(list)
+    assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
+    # A network that is told the number of a step is asked at its own levels.
+    assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
+    assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
+
+
+def test_the_measurement_goes_on_and_notices_other_weights(measurement):
+    run, models = measurement
+    path, first = run()
+    before = {name: read_table(path.with_name(name))[0] for name in ("literal_update.csv",)}
+    assert len(first) == 5
+    assert run()[1] == []
+    assert run(["F3AMD-FNO-32"])[1] == first
+    pd.testing.assert_frame_equal(read_table(path)[0], before["literal_update.csv"])
+    trained = models["F3AMD-FNO-32"]
+    models["F3AMD-FNO-32"] = dataclasses.replace(
+        trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params)
+    )
+    assert run()[1] == first
+    assert len(read_table(path)[0]) == 5
+    assert len(read_table(path.with_name("x0_by_sigma.csv"))[0]) == 2 + 4
