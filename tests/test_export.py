@@ -407,3 +407,23 @@ def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
     skip_without_iree()
     with pytest.raises(ValueError, match=r"IREE .* cannot compile .* for cuda-sm_20: .*Targets"):
         compile_iree(exported.stablehlo, "cuda-sm_20")
+
+
+def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatch):
+    seen = []
+
+    def run(command, **settings):
+        seen.append(command)
+        tiled = any(flag in export_module._DATA_TILING for flag in command)
+        if not tiled:
+            Path(command[command.index("-o") + 1]).write_bytes(b"module")
+        return subprocess.CompletedProcess(command, int(tiled), "", "error: large vector sizes")
+
+    monkeypatch.setattr(export_module.subprocess, "run", run)
+    monkeypatch.setattr(export_module, "_operations", lambda program: set())
+    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
+    assert compile_iree(b"program", "llvm-cpu") == b"module"
+    assert len(seen) == 2
+    with pytest.raises(ValueError, match="large vector sizes"):
+        monkeypatch.setattr(export_module, "_attempts", lambda flags: [flags])
+        compile_iree(b"program", "llvm-cpu")

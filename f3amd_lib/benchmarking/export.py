@@ -272,6 +272,11 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
         program with a loop for a target that runs on the CPU: IREE's local-task driver was seen to
         return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
     """
+    return _compile(program, target)[0]
+
+
+def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
+    """Do the work of `compile_iree`; also return the flags that it compiled with."""
     settings = _find_target(target)
     if settings.driver == "local-task" and "stablehlo.while" in _operations(program):
         raise ValueError(
@@ -284,24 +289,31 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
-        # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
-        # process that holds both dies when it ends.
-        command = [
-            *(sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile"),
-            *(str(source), "-o", str(compiled)),
-            "--iree-input-type=stablehlo",
-            f"--iree-hal-target-backends={settings.backend}",
-            "--iree-vm-bytecode-module-strip-source-map",
-            *settings.flags,
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            return compiled.read_bytes()
+        for flags in _attempts(settings.flags):
+            # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
+            # process that holds both dies when it ends.
+            command = [
+                *(sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile"),
+                *(str(source), "-o", str(compiled)),
+                "--iree-input-type=stablehlo",
+                f"--iree-hal-target-backends={settings.backend}",
+                "--iree-vm-bytecode-module-strip-source-map",
+                *flags,
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode == 0:
+                return compiled.read_bytes(), flags
     found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
     raise ValueError(
         f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}. "
         f"Targets known to work are {', '.join(TARGETS)}"
     )
+
+
+def _attempts(flags: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return flags to try in turn: tiles are faster, but some programs do not compile in them."""
+    plain = tuple(flag for flag in flags if flag not in _DATA_TILING)
+    return [flags] if plain == flags else [flags, plain]
 
 
 def _find_target(name: str) -> Target:
@@ -355,8 +367,8 @@ def save_artefact(
     for target in dict.fromkeys(targets):
         file = f"round.{target}.vmfb"
         start = time.perf_counter()
-        files[file] = compile_iree(exported.stablehlo, target)
-        compiled[target] = _describe_target(target, file, time.perf_counter() - start)
+        files[file], flags = _compile(exported.stablehlo, target)
+        compiled[target] = _describe_target(target, file, flags, time.perf_counter() - start)
     if trained is not None:
         features = {
             "normaliser": {
@@ -374,7 +386,7 @@ def save_artefact(
     return folder
 
 
-def _describe_target(target: str, file: str, seconds: float) -> dict:
+def _describe_target(target: str, file: str, flags: tuple[str, ...], seconds: float) -> dict:
     settings = _find_target(target)
     host = {"machine": platform.machine(), "features": list(cpu_features())}
     return {
@@ -382,7 +394,7 @@ def _describe_target(target: str, file: str, seconds: float) -> dict:
         "entry": _ENTRY,
         "driver": settings.driver,
         "iree_version": iree_version(),
-        "flags": list(settings.flags),
+        "flags": list(flags),
         "compile_seconds": round(seconds, 1),
         "cpu": host if settings.backend == "llvm-cpu" else None,
     }
