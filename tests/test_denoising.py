@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import tiny_camdm, tiny_trained, tiny_windows
+from builders import tiny_camdm, tiny_config, tiny_trained, tiny_windows
 
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.evaluation import denoising
@@ -18,6 +18,8 @@ from f3amd_lib.training.loop import network_inputs
 
 class Fake:
     """A network that answers by a rule: `answer(x_noisy)`."""
+
+    config = tiny_config()
 
     def __init__(self, answer):
         self.answer = answer

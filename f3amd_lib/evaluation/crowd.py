@@ -287,6 +287,7 @@ def generate_crowd(
         "model": {
             "name": trained.name,
             "weights": weights_digest(trained.params),
+            "dtype": generator.dtype.name,
             "sampler": generator.sampler,
             "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
             "dataset": trained.record.get("dataset"),

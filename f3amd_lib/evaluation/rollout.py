@@ -95,8 +95,9 @@ class MotionGenerator:
                 f"unknown sampler {self.sampler!r}{nearest_hint(self.sampler, SAMPLERS)}"
             )
         self.sigmas = schedule.grid(num_steps, spacing)
-        self._dtype = dtype
-        self._network = cast_network(trained.network(), dtype)
+        self.dtype = jnp.dtype(dtype)
+        network = trained.network()
+        self._network = network if dtype == jnp.float32 else cast_network(network, dtype)
         self._run = jax.jit(self._rounds)
 
     def sample_window(self, key, condition: Condition, noise=None):
@@ -107,8 +108,8 @@ class MotionGenerator:
           condition: normalised.
           noise: standard normal numbers to start from, [B, T, C].
         """
-        condition = jax.tree.map(lambda leaf: leaf.astype(self._dtype), condition)
-        noise = None if noise is None else noise.astype(self._dtype)
+        condition = jax.tree.map(lambda leaf: leaf.astype(self.dtype), condition)
+        noise = None if noise is None else noise.astype(self.dtype)
         x0_hat = sample_round(
             self._network, condition, self.sigmas, key, noise=noise, sampler=self.sampler
         )
