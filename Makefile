@@ -12,13 +12,14 @@ PYTEST_OPTIONS ?=
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 INSTALLED := .venv/installed
-NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/standalone/*.ipynb))
 
 export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke measure bench bench-tools test lint lab clean
+.PHONY: help install figures smoke measure bench bench-tools test test-web web-tools lint lab clean \
+  site site-tools
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
@@ -59,6 +60,26 @@ test: lint ## Lint, run the tests and check the notebooks' committed outputs
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
+# The browser is the system's own: as root on Debian it is installed, elsewhere named.
+web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if it is missing
+	@bash scripts/browser.sh
+	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
+	  -q --require-hashes --no-deps -r requirements-web.txt
+
+test-web: web-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
+	$(PYTEST) tests/web $(PYTEST_OPTIONS)
+
+site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
+	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
+	  -q --require-hashes --no-deps -r requirements-site.txt
+
+# From nothing each time, so that no page outlives its source. A warning is an error.
+site: site-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html
+	rm -rf docs/_build
+	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -W --keep-going -c docs -d docs/_build/doctrees \
+	  . docs/_build/html
+	$(PYTHON) docs/check_links.py docs/_build/html
+
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff
 	$(PYTHON) -m ruff check .
 
@@ -66,6 +87,6 @@ lab: $(INSTALLED) ## Open the notebooks in JupyterLab
 	$(PYTHON) -m jupyterlab --notebook-dir=notebooks $(LAB_OPTIONS)
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
-	rm -rf build dist .pytest_cache .ruff_cache .coverage ./*.egg-info
+	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage ./*.egg-info
 	find . \( -path ./.venv -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
 	  -prune -o -type d \( -name __pycache__ -o -name .pytest_cache \) -exec rm -rf {} +

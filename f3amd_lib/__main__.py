@@ -3,7 +3,7 @@
 data      open a data set, build its packed cache, say what is in it
 presets   list the models
 train     train a model (goes on where an earlier run stopped)
-rollout   animate one character: BVH, film strip PNG and GIF
+rollout   animate one character: BVH, film strip PNG, GIF and player page
 crowd     animate any number of characters, streamed to a folder
 export    make a round that runs without the model code: StableHLO, jax.export, IREE
 bench     time synthesis and training, write records, compare with what is asked
@@ -56,20 +56,31 @@ def _presets(arguments) -> None:
 
 
 def _train(arguments) -> None:
-    from f3amd_lib.training.pipeline import model_files, prepare, train
+    from f3amd_lib.training import parallel
+    from f3amd_lib.training.family import train_family
+    from f3amd_lib.training.pipeline import model_files, prepare
 
+    if arguments.processes is not None:
+        parallel.join_processes(arguments.coordinator, arguments.processes, arguments.process)
     profile = _profile(
         arguments,
-        preset=arguments.preset,
         train_steps=arguments.steps,
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         window=arguments.window,
     )
-    files = model_files(profile, folder=arguments.out)
-    _, history = train(prepare(profile, path=arguments.source), profile, folder=arguments.out)
-    log.info("model        %s", files.model)
-    log.info("held-out     %.4f", history["held_out_loss"].dropna().iloc[-1])
+    several = arguments.all_devices or arguments.processes is not None
+    runs = train_family(
+        prepare(profile, path=arguments.source),
+        profile,
+        arguments.preset or [profile.preset],
+        folder=arguments.out,
+        budget_s=None if arguments.minutes is None else 60.0 * arguments.minutes,
+        mesh=parallel.all_devices() if several else None,
+    )
+    for preset, state in runs:
+        files = model_files(profile, preset, folder=arguments.out)
+        log.info("%-12s %s", state, files.state if state == "unfinished" else files.model)
 
 
 def _path(text: str, num_frames: int, speed: float, seed: int):
@@ -97,6 +108,7 @@ def _rollout(arguments) -> None:
     from f3amd_lib.motion.bvh import write_bvh
     from f3amd_lib.report.figures import save_figure
     from f3amd_lib.report.pictures import film_strip, write_gif
+    from f3amd_lib.report.player import rollout_scene, write_player
 
     trained = _trained(arguments)
     if not 0.1 <= arguments.seconds <= 3600.0:
@@ -105,17 +117,26 @@ def _rollout(arguments) -> None:
     path = _path(arguments.path, num_frames, arguments.speed, arguments.seed)
     out = Path(arguments.out)
     name = f"{arguments.style}_{Path(arguments.path).stem}_seed{arguments.seed}"
-    targets = [out / f"{name}{ending}" for ending in (".bvh", ".png", ".gif")]
+    targets = [out / f"{name}{ending}" for ending in (".bvh", ".png", ".gif", ".html")]
     taken = [str(target) for target in targets if target.exists()]
     if taken and not arguments.overwrite:
         raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
     generator = MotionGenerator(trained, arguments.steps, sampler=arguments.sampler)
-    motion = generator.rollout(path, arguments.style, seed=arguments.seed).motion()
+    rollout = generator.rollout(
+        path, arguments.style, seed=arguments.seed, blend_frames=arguments.blend
+    )
+    motion = rollout.motion()
     out.mkdir(parents=True, exist_ok=True)
     write_bvh(targets[0], motion, overwrite=arguments.overwrite)
     title = f"{trained.name}, {arguments.style}"
     save_figure(film_strip(motion, paths=path, titles=[title]), targets[1])
     write_gif(targets[2], motion, target_paths=path, titles=[title], max_seconds=12.0)
+    write_player(
+        targets[3],
+        rollout_scene(rollout, title),
+        credit=trained.record.get("dataset_credit") or "",
+        strip=False,  # the film strip is written above
+    )
     for target in targets:
         log.info("wrote        %s", target)
 
@@ -132,6 +153,7 @@ def _crowd(arguments) -> None:
         max(2, round(arguments.seconds * 30)),
         arguments.out,
         styles=arguments.style,
+        min_distance=arguments.plan,
         seed=arguments.seed,
         chunk=arguments.chunk,
         overwrite=arguments.overwrite,
@@ -142,6 +164,29 @@ def _crowd(arguments) -> None:
         "wrote        %s: %d characters of %d frames", arguments.out, len(crowd), crowd.num_frames
     )
     log.info("took         %.0f s", seconds)
+    if arguments.pictures:
+        for path in _crowd_pictures(crowd, Path(arguments.out)):
+            log.info("wrote        %s", path)
+
+
+def _crowd_pictures(crowd, out: Path) -> list[Path]:
+    """Draw a crowd half way through, and a page that plays up to 100 of it, beside its folder."""
+    from f3amd_lib.report import plots_crowd as draw
+    from f3amd_lib.report.figures import save_figure
+    from f3amd_lib.report.player import Character, Scene, write_player
+
+    few, model = min(100, len(crowd)), crowd.settings["model"]
+    motions = [crowd.motion(k) for k in range(few)]
+    colors = draw.crowd_colors([motion.name for motion in motions])
+    picture = draw.CrowdPicture(motions, colors, model["name"])
+    figure = draw.crowd_figure([picture], crowd.num_frames // 2, columns=1)
+    characters = [
+        Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)
+    ]
+    credit = ", ".join(filter(None, (model["dataset_credit"], model["dataset_licence"])))
+    scene = Scene(characters, title=model["name"])
+    page = write_player(out.with_name(f"{out.name}.html"), scene, strip=False, credit=credit)
+    return [save_figure(figure, out.with_name(f"{out.name}.png")), page]
 
 
 def _export(arguments) -> None:
@@ -197,7 +242,20 @@ def _parser() -> argparse.ArgumentParser:
 
     train = add("train", _train, "train a model; a killed run goes on where it stopped")
     with_data(train)
-    train.add_argument("--preset", help="such as F3AMD-FNO-96; by default the profile's")
+    train.add_argument(
+        "--preset",
+        action="append",
+        help="such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order",
+    )
+    train.add_argument(
+        "--minutes", type=float, help="stop then, with a checkpoint that a later call goes on from"
+    )
+    train.add_argument(
+        "--all-devices", action="store_true", help="share each batch among the devices JAX sees"
+    )
+    train.add_argument("--processes", type=int, help="train in so many processes together")
+    train.add_argument("--process", type=int, help="number of this one, from 0")
+    train.add_argument("--coordinator", metavar="HOST:PORT", help="of process 0")
     train.add_argument("--steps", type=int, help="optimiser steps; by default the profile's")
     train.add_argument("--batch-size", type=int, help="windows a step")
     train.add_argument("--window", type=int, help="future frames, 32 or 64")
@@ -213,6 +271,8 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--weights", help="a weights file, instead of the data set's own")
         command.add_argument("--overwrite", action="store_true", help="replace what lies there")
 
+    from f3amd_lib.evaluation.crowd_planning import MIN_DISTANCE
+
     crowd = add("crowd", _crowd, "animate any number of characters; goes on where it was stopped")
     with_model(crowd)
     crowd.add_argument("--characters", type=int, default=1024)
@@ -220,6 +280,17 @@ def _parser() -> argparse.ArgumentParser:
     crowd.add_argument("--style", action="append", help="taken in turn; repeatable; default: all")
     crowd.add_argument("--seed", type=int, default=0)
     crowd.add_argument("--chunk", type=int, help="characters at once")
+    crowd.add_argument(
+        "--plan",
+        type=float,
+        nargs="?",
+        const=MIN_DISTANCE,
+        metavar="METRES",
+        help=f"paths that keep this far apart at every frame ({MIN_DISTANCE} without a number)",
+    )
+    crowd.add_argument(
+        "--pictures", action="store_true", help="draw OUT.png and the player page OUT.html as well"
+    )
     crowd.add_argument("--out", default="out/crowd", help="folder to write to")
 
     export = add("export", _export, "make a round that runs without the model code")
@@ -234,7 +305,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("words", nargs=argparse.REMAINDER, help="options of the benchmarks")
 
     rollout = add(
-        "rollout", _rollout, "animate one character: BVH, film strip and GIF (its first 12 s)"
+        "rollout", _rollout, "animate one character: BVH, film strip, GIF (its first 12 s), player"
     )
     rollout.add_argument("--style", required=True)
     rollout.add_argument("--path", default="figure-eight", help="a named path, or a CSV file")
@@ -246,6 +317,13 @@ def _parser() -> argparse.ArgumentParser:
         "--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own"
     )
     with_model(rollout)
+    rollout.add_argument(
+        "--blend",
+        type=int,
+        default=0,
+        metavar="N",
+        help="blend N frames after each window boundary",
+    )
     rollout.add_argument("--out", default="out", help="folder to write to")
     return parser
 

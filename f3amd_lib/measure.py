@@ -22,7 +22,8 @@ from tqdm import tqdm
 
 from f3amd_lib.evaluation import literal_update, sensitivity
 from f3amd_lib.evaluation.classifier import StyleClassifier, obtain_classifier
-from f3amd_lib.evaluation.denoising import x0_error_by_sigma
+from f3amd_lib.evaluation.denoising import window_row, x0_error_by_sigma
+from f3amd_lib.evaluation.posterior import measure_posterior
 from f3amd_lib.evaluation.precision import measure_precision
 from f3amd_lib.evaluation.protocol import (
     REFERENCE_MODELS,
@@ -37,7 +38,7 @@ from f3amd_lib.evaluation.quality import reference_clips, row_label
 from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.models import zoo
 from f3amd_lib.names import nearest_hint
-from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir
+from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir, runs_dir
 from f3amd_lib.report.records import kept_rows, run_record, write_table
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.family import SHORT_RUN, learning_curves
@@ -47,13 +48,16 @@ from f3amd_lib.training.pipeline import (
     obtain_model,
     prepare,
 )
+from f3amd_lib.training.recipes import RECIPE_STEPS, RECIPES, train_recipe
 
 __all__ = [
     "MEASUREMENTS",
     "STEPS",
     "measure_learning",
     "measure_literal_update",
+    "measure_noise_use",
     "measure_quality",
+    "measure_recipes",
     "measure_sensitivity",
     "main",
 ]
@@ -253,18 +257,17 @@ def measure_literal_update(
 
     Args:
       prepared, profile: as for `measure_quality`.
-      models: presets; by default all that have weights. Of one whose own sampler is not DDIM only
-        the x0 error against the noise level is measured, at the levels that it was told. One that
-        is asked for by name is measured again, and trained if it has none.
+      models: presets; by default all that have weights, but for those whose own sampler is not
+        DDIM. One that is asked for by name is measured again, and trained if it has none.
 
     Returns:
       The table of means and intervals, `records/literal_update.csv`; beside it
-      `literal_update_by_seed.csv`, `literal_update_windows.csv` and `x0_by_sigma.csv`.
+      `literal_update_by_seed.csv` and `literal_update_windows.csv`.
     """
     folder = results_dir(profile.dataset, profile.name) / "records"
     packed = prepared.packed
     classifier, protocol, record = _protocol(prepared, profile, "literal_update")
-    names = ("literal_update_by_seed", "literal_update_windows", "x0_by_sigma")
+    names = ("literal_update_by_seed", "literal_update_windows")
     kept = {name: kept_rows(folder / f"{name}.csv", record) for name in names}
     held_out = prepared.windows(prepared.held_out_split)
     asked = [zoo.find_preset(name).name for name in models or ()]
@@ -285,12 +288,6 @@ def measure_literal_update(
     for model in asked or available_models(profile):
         trained, _, _ = obtain_model(prepared, profile, preset=model)
         weights = weights_digest(trained.params)
-        if not measured("x0_by_sigma", weights, model=model):
-            levels = getattr(trained.config, "noise_levels", ()) or SIGMAS
-            errors = x0_error_by_sigma(trained, held_out, levels).assign(
-                model=model, noise=trained.diffusion.kind, weights=weights
-            )
-            keep("x0_by_sigma", errors)
         if trained.diffusion.sampler != literal_update.UPDATES["rescaled"]:
             continue
         for spacing in SPACINGS:
@@ -327,6 +324,90 @@ def measure_literal_update(
     return folder / "literal_update.csv"
 
 
+def measure_noise_use(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Ask trained models whether they use their noisy input; single windows, seconds a model.
+
+    Args:
+      prepared: the data.
+      profile: where models and results lie.
+      models: presets; by default all that have weights. One that is asked for by name is measured
+        again, and trained if it has none.
+
+    Returns:
+      The table `records/noise_use.csv`, a row per model and number of steps (see
+      `denoising.window_row`); beside it `x0_by_sigma.csv`, the x0 error against the noise level, at
+      the levels that a model was told where it was told some.
+    """
+    folder = results_dir(profile.dataset, profile.name) / "records"
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="noise_use"
+    )
+    paths = {name: folder / f"{name}.csv" for name in ("noise_use", "x0_by_sigma")}
+    kept = {name: kept_rows(path, record) for name, path in paths.items()}
+    held_out = prepared.windows(prepared.held_out_split)
+    asked = [zoo.find_preset(name).name for name in models or ()]
+    for model in tqdm(asked or available_models(profile), unit="model"):
+        trained, _, _ = obtain_model(prepared, profile, preset=model)
+        weights = weights_digest(trained.params)
+        rows = kept["x0_by_sigma"]
+        if not asked and rows is not None and weights in set(rows["weights"]):
+            continue
+        levels = getattr(trained.config, "noise_levels", ()) or SIGMAS
+        steps = [count for count in (8, 1) if count <= len(levels)]
+        made = {
+            "noise_use": window_row(trained, held_out, steps=steps, seed=profile.seed),
+            "x0_by_sigma": x0_error_by_sigma(trained, held_out, levels),
+        }
+        for name, table in made.items():
+            table = table.assign(model=model, noise=trained.diffusion.kind, weights=weights)
+            kept[name] = _with_rows(kept[name], table, ["model"])
+            write_table(paths[name], kept[name], record)
+    return paths["noise_use"]
+
+
+def measure_recipes(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Train `F3AMD-FNO-96` with one change each, for a short while (see `training.recipes`).
+
+    Unfinished runs are gone on with; a row takes some minutes on 2 cores.
+
+    Args:
+      prepared: the data.
+      profile: how many steps, of what batch; where results lie.
+      models: no use here: rows are recipes, and all are measured.
+
+    Returns:
+      The table `records/recipes.csv`.
+
+    Raises:
+      ValueError: if models are named.
+    """
+    if models:
+        raise ValueError("recipes are rows of their own: leave --model out")
+    path = results_dir(profile.dataset, profile.name) / "records" / "recipes.csv"
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="recipes",
+        num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size,
+    )  # fmt: skip
+    held_out = prepared.windows(prepared.held_out_split)
+    kept = kept_rows(path, record)
+    folder = runs_dir(profile.dataset, profile.name) / "recipes"
+    for name in tqdm(RECIPES, unit="recipe"):
+        if kept is not None and name in set(kept["recipe"]):
+            continue
+        trained = train_recipe(prepared, profile, name, folder=folder)
+        rows = window_row(trained, held_out, seed=profile.seed)
+        rows = rows.assign(
+            recipe=name, change=RECIPES[name].change, weights=weights_digest(trained.params)
+        )
+        kept = rows if kept is None else pd.concat([kept, rows])
+        write_table(path, kept, record)
+    return path
+
+
 STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
@@ -342,6 +423,9 @@ MEASUREMENTS: dict[str, Callable] = {
     "learning": measure_learning,
     "precision": measure_precision,
     "literal_update": measure_literal_update,
+    "posterior": measure_posterior,
+    "noise_use": measure_noise_use,
+    "recipes": measure_recipes,
     "quality": measure_quality,
     "sensitivity": measure_sensitivity,
 }

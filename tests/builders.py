@@ -181,12 +181,12 @@ def tiny_normaliser():
     return jax.jit(fit)(tiny_windows(), jax.random.key(5))
 
 
-def tiny_trainer(model=None, *, windows=None, **settings) -> Trainer:
+def tiny_trainer(model=None, *, windows=None, mesh=None, **settings) -> Trainer:
     """A trainer of the tiny network on the tiny data set."""
     windows = tiny_windows() if windows is None else windows
     normaliser = tiny_normaliser()
     config = TrainingConfig.from_dict({"num_steps": 12, "batch_size": 8, **settings})
-    return Trainer(model or tiny_config(), config, SKELETON, normaliser, windows)
+    return Trainer(model or tiny_config(), config, SKELETON, normaliser, windows, mesh=mesh)
 
 
 def random_frames(shape, seed: int = 0) -> np.ndarray:

@@ -242,3 +242,40 @@ def test_networks_of_a_model_share_nothing():
     first.encoder.local_first.bias[...] = jnp.ones(CHANNELS)
     for network in (second, trained.network()):
         assert float(jnp.abs(network.encoder.local_first.bias[...]).max()) == 0.0
+
+
+def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "EIGHT_BITS_FROM", 64)
+    path = tmp_path / "small.safetensors"
+    save_model(path, trained, jnp.int8)
+    again = load_model(path)
+    assert checkpoints.describe(path)["weights"] == "int8"
+    kept = 0
+    for ours, theirs in zip(
+        jax.tree.leaves(trained.params), jax.tree.leaves(again.params), strict=True
+    ):
+        before, after = np.asarray(ours, np.float32), np.asarray(theirs, np.float32)
+        if before.ndim < 2 or before.size < 64:
+            np.testing.assert_array_equal(after, before.astype(jnp.bfloat16).astype(np.float32))
+            continue
+        kept += 1
+        step = np.abs(before).max(axis=-2, keepdims=True) / 127.0
+        assert np.all(np.abs(after - before) <= 0.5 * step * (1 + 1e-4) + 1e-12)
+        assert np.any(after != before) or not before.any()
+    assert kept > 3
+    # Written again, what was in 8 bits already loses no more than rounding.
+    save_model(tmp_path / "again.safetensors", again, jnp.int8)
+    twice = load_model(tmp_path / "again.safetensors").params
+    for ours, theirs in zip(jax.tree.leaves(again.params), jax.tree.leaves(twice), strict=True):
+        np.testing.assert_allclose(np.asarray(theirs), np.asarray(ours), rtol=1e-5)
+
+
+def test_eight_bits_quarter_the_file(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "EIGHT_BITS_FROM", 64)
+    sizes = {}
+    for dtype in (jnp.float32, jnp.int8):
+        path = tmp_path / f"{jnp.dtype(dtype).name}.safetensors"
+        save_model(path, trained, dtype)
+        arrays, _ = checkpoints._read(path)
+        sizes[dtype] = sum(a.nbytes for name, a in arrays.items() if name.startswith("['params']"))
+    assert sizes[jnp.int8] < 0.45 * sizes[jnp.float32]

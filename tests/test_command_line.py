@@ -1,5 +1,8 @@
 """Commands that hand a model's work out: crowds, exports, benchmarks."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 from builders import WINDOW, tiny_trained
@@ -7,13 +10,18 @@ from builders import WINDOW, tiny_trained
 from f3amd_lib.__main__ import main
 from f3amd_lib.benchmarking.__main__ import main as bench
 from f3amd_lib.evaluation.crowd import read_crowd
+from f3amd_lib.evaluation.crowd_planning import closest_approach
+from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "tiny.safetensors"
-    save_model(path, tiny_trained({"dataset": "tiny", "dataset_licence": "none"}))
+    save_model(
+        path,
+        tiny_trained({"dataset": "tiny", "dataset_licence": "none", "dataset_credit": "nobody"}),
+    )
     return str(path)
 
 
@@ -30,6 +38,48 @@ def test_crowd_is_written_as_asked_and_never_over_another(weights, tmp_path, cap
     assert len(read_crowd(out)) == 3
     assert main([*words, *seconds, "--characters", "4", "--overwrite"]) == 0
     assert len(read_crowd(out)) == 4
+
+
+def test_rollout_writes_a_player_page_with_its_path_windows_and_terms(weights, tmp_path, capsys):
+    words = ["rollout", "--weights", weights, "--out", str(tmp_path), "--steps", "1"]
+    words += ["--style", "proud", "--path", "circle", "--seconds", "1"]
+    assert main(words) == 0
+    page = (tmp_path / "proud_circle_seed0.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'id="player-data">(.*?)</script>', page, re.S)[1])
+    (scene,) = data["scenes"]
+    assert (scene["title"], data["frames"]) == ("F3AMD-FNO-8, proud", 30)
+    assert scene["boundaries"] == list(range(WINDOW, 30, WINDOW))
+    assert [character["path"] for character in scene["characters"]] == [True]
+    assert '<p class="credit">nobody</p>' in page
+    (tmp_path / "proud_circle_seed0.bvh").unlink()
+    assert main(words) == 2
+    assert "proud_circle_seed0.html: exists already" in capsys.readouterr().err
+
+
+def test_a_planned_crowd_keeps_apart_and_is_drawn_beside_its_folder(weights, tmp_path):
+    out = tmp_path / "crowd"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "1.6"]
+    assert main([*words, "--characters", "5", "--plan", "1.5", "--pictures"]) == 0
+    crowd = read_crowd(out)
+    assert crowd.settings["min_distance"] == 1.5
+    assert closest_approach(crowd.path[..., :2]).min() >= 1.5
+    page = (tmp_path / "crowd.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'id="player-data">(.*?)</script>', page, re.S)[1])
+    assert len(data["scenes"][0]["characters"]) == 5 and data["frames"] == 48
+    assert (tmp_path / "crowd.png").stat().st_size > 5000
+
+
+def test_rollout_is_blended_only_if_asked(weights, tmp_path):
+    def positions(name, *more):
+        words = ["rollout", "--weights", weights, "--out", str(tmp_path / name), "--steps", "1"]
+        words += ["--style", "calm", "--path", "circle", "--seconds", "1"]
+        assert main([*words, *more]) == 0
+        return read_bvh(tmp_path / name / "calm_circle_seed0.bvh").positions
+
+    plain, blended = positions("plain"), positions("blended", "--blend", "4")
+    keep = np.arange(30) % WINDOW >= 4
+    np.testing.assert_allclose(blended[keep], plain[keep], atol=1e-5)
+    assert np.abs(blended - plain).max() > 1e-3
 
 
 def test_export_is_an_artefact_that_loads(weights, tmp_path):

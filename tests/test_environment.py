@@ -23,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11.2", "3.12.3", "3.13.5", "3.14.0")
 MACHINES = ("x86_64", "aarch64")
 
+HASHED = ("web",)
+"""Extras with a requirements file of their own, hashed and in step with the lock."""
+
 CONDA_NAMES = {"matplotlib": "matplotlib-base"}
 """What conda-forge calls a package that PyPI calls otherwise."""
 
@@ -48,13 +51,25 @@ def read_apart() -> dict[str, set[str]]:
     return pinned
 
 
+def read_hashed(extra: str) -> list[tuple[Requirement, list[str], str]]:
+    """Entries of an extra's requirements file that, like the lock, names every hash."""
+    text = (ROOT / f"requirements-{extra}.txt").read_text(encoding="utf-8")
+    return read_lock("".join(re.findall(r"^[^#].*\n", text, re.M)))
+
+
+def extra_names(pyproject: dict, extra: str) -> set[str]:
+    """Packages of an extra."""
+    lines = pyproject["project"]["optional-dependencies"].get(extra, [])
+    return {canonicalize_name(Requirement(line).name) for line in lines}
+
+
 def read_pyproject() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
 def direct_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
     """Every direct dependency that the lock holds, of whatever part, with its range."""
-    apart = read_apart()
+    apart = set(read_apart()) | set().union(*(extra_names(pyproject, name) for name in HASHED))
     ranges = all_requirements(pyproject)
     return {name: found for name, found in ranges.items() if name not in apart}
 
@@ -75,9 +90,11 @@ def all_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
 
 
 def read_environment(text: str) -> dict[str, SpecifierSet]:
-    """The conda packages of an environment file with their ranges."""
+    """The packages of an environment file with their ranges; conda's, then those left to pip."""
+    listed = yaml.safe_load(text)["dependencies"]
+    from_pip = [line for entry in listed if isinstance(entry, dict) for line in entry["pip"]]
     ranges = {}
-    for entry in yaml.safe_load(text)["dependencies"]:
+    for entry in [item for item in listed if item != "pip" and isinstance(item, str)] + from_pip:
         name, _, specifier = entry.partition(" ")
         ranges[name] = SpecifierSet(specifier)
     return ranges
@@ -262,3 +279,18 @@ def test_what_is_installed_apart_is_pinned_within_its_range():
     for name, versions in apart.items():
         for version in versions:
             assert ranges[name].contains(version.split("+")[0]), f"{name} {version}"
+
+
+@pytest.mark.parametrize("extra", HASHED)
+def test_an_extra_of_its_own_is_hashed_within_its_range_and_agrees_with_the_lock(extra):
+    ranges = all_requirements(PYPROJECT)
+    entries = read_hashed(extra)
+    unhashed = [entry.name for entry, hashes, _ in entries if not hashes]
+    assert len(entries) > 1 and unhashed == []
+    pins = {canonicalize_name(entry.name): next(iter(entry.specifier)) for entry, _, _ in entries}
+    for name in extra_names(PYPROJECT, extra):
+        assert pins[name].operator == "==" and pins[name].version in ranges[name]
+    locked = {canonicalize_name(entry.name): str(entry.specifier) for entry, _, _ in LOCK}
+    assert {name: str(pin) for name, pin in pins.items() if name in locked} == {
+        name: locked[name] for name in pins if name in locked
+    }

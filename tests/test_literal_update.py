@@ -18,9 +18,12 @@ from f3amd_lib.evaluation.literal_update import (
     UPDATES,
     WINDOW_METRICS,
     WindowWalks,
+    opening_condition,
+    walk_openings,
     walk_windows,
     window_figures,
 )
+from f3amd_lib.motion.rotations import rotation_6d_from_yaw
 from f3amd_lib.profiles import load_profile
 from f3amd_lib.report.records import read_table, run_record
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -182,12 +185,6 @@ def test_the_measurement_walks_both_updates_on_both_grids(measurement):
     windows, _ = read_table(path.with_name("literal_update_windows.csv"))
     assert set(windows["model"]) == {"F3AMD-FNO-32"}
     assert set(windows["spacing"]) == {"endpoints", "uniform"}
-    errors, _ = read_table(path.with_name("x0_by_sigma.csv"))
-    levels = errors.groupby("model")["sigma"].apply(list)
-    assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
-    # A network that is told the number of a step is asked at its own levels.
-    assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
-    assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
 
 
 def test_the_measurement_goes_on_and_notices_other_weights(measurement):
@@ -204,4 +201,47 @@ def test_the_measurement_goes_on_and_notices_other_weights(measurement):
     )
     assert run()[1] == first
     assert len(read_table(path)[0]) == 5
-    assert len(read_table(path.with_name("x0_by_sigma.csv"))[0]) == 2 + 4
+
+
+def test_openings_go_straight_on_at_their_own_pace():
+    trained = tiny_trained()
+    condition = opening_condition(trained)
+    normaliser = trained.normaliser
+    assert condition.style.shape == (len(trained.styles),) * 2
+    for row, style in enumerate(trained.styles):
+        opening = trained.seeds[style][0]
+        shown = normaliser.denormalise(condition.history[row])
+        np.testing.assert_allclose(shown, opening, atol=1e-5)
+        assert int(np.argmax(condition.style[row])) == trained.style_index(style)
+        # Displacements along +Z, by the mean step of the opening, and no turn.
+        path = np.asarray(condition.path[row])
+        pace = np.linalg.norm((opening[-1] - opening[0])[[0, 2]]) / (len(opening) - 1)
+        ahead = path[:, 1] * float(normaliser.path_scale)
+        np.testing.assert_allclose(ahead, pace * np.arange(1, WINDOW + 1), rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(path[:, 0], 0.0, atol=1e-7)
+        np.testing.assert_allclose(path[:, 2:], rotation_6d_from_yaw(np.zeros(WINDOW)), atol=1e-7)
+
+
+def test_walks_from_openings_need_no_data_and_have_no_error():
+    trained = tiny_trained()
+    walks = walk_openings(trained, (8, 4), num_seeds=2, seed=1)
+    assert walks.real is None
+    assert walks.made["literal", 8].shape[:3] == (2, len(trained.styles), WINDOW)
+    table = window_figures(walks)
+    assert set(table["metric"]) == set(WINDOW_METRICS) - {"joint_error"}
+    assert set(table["update"]) == set(UPDATES)
+    # The condition is what `opening_condition` says, the noise that of the seed's first key.
+    network, condition = trained.network(), opening_condition(trained)
+    noise = jax.random.normal(jax.random.split(jax.random.key(1), 2)[0], (len(trained.styles),
+                              WINDOW, trained.config.channels))  # fmt: skip
+    x = jax.jit(
+        lambda noise: SAMPLERS["ddim"](
+            lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)),
+            128.0 * noise,
+            trained.diffusion.grid(8),
+        )
+    )(noise)
+    joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
+    np.testing.assert_allclose(walks.made["rescaled", 8][0], joints, atol=1e-4)
+    with pytest.raises(ValueError, match="num_seeds must be at least 2"):
+        walk_openings(trained, num_seeds=1)

@@ -197,3 +197,22 @@ def test_kinematics_of_the_loss_is_that_of_the_features():
     assert terms_of(other, future)["position"] == pytest.approx(
         float(jnp.mean(difference**2)), rel=1e-5
     )
+
+
+def test_weights_count_samples_and_equal_ones_change_nothing():
+    """Twice the weight of a sample is that sample twice, in every term."""
+    future_hat, future = (
+        jnp.asarray(random_frames((2, FRAMES), seed), jnp.float32) for seed in (0, 1)
+    )
+
+    def terms(rows, weights):
+        hat, real = future_hat[rows], future[rows]
+        return loss_terms(SKELETON, hat, real, hat, real, real[:, 0], weights=weights)
+
+    pair, once = jnp.array([0, 1]), terms(jnp.array([0, 1]), None)
+    for name, value in terms(pair, jnp.ones(2)).items():
+        assert value == pytest.approx(once[name], rel=1e-6)
+    weighted = terms(pair, jnp.array([4.0, 2.0]) / 3.0)
+    for name, value in terms(jnp.array([0, 0, 1]), None).items():
+        assert weighted[name] == pytest.approx(value, rel=1e-5)
+        assert weighted[name] != pytest.approx(once[name], rel=1e-5) or value == 0.0

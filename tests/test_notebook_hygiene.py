@@ -14,9 +14,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+STANDALONE = sorted((ROOT / "notebooks/standalone").glob("*.ipynb"))
 LARGEST_NOTEBOOK = 250_000  # bytes
 LARGEST_FILE = 5_000_000  # bytes
-ALL_WEIGHTS = 20_000_000  # bytes of f3amd_lib/weights/ together
+ALL_WEIGHTS = 20_000_000  # bytes of f3amd_lib/pretrained/ together
 
 # Folders that stand for somebody's computer; a slash before, so that web addresses do not match.
 # The names are put together here, so that this file does not hold what it looks for.
@@ -26,13 +27,17 @@ MACHINE_PATH = re.compile(rf"(?<![\w.\-/:<>])/(?:{_FOLDERS})/|\b[A-Z]:\\\\?(?:Us
 BINARY = {".png", ".gif", ".npz", ".safetensors", ".jpg", ".pdf"}
 
 
-def notebook_faults(path: Path) -> list[str]:
-    """Everything about a notebook file that should not be committed, one sentence each."""
+def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
+    """Everything about a notebook file that should not be committed, one sentence each.
+
+    One that is not numbered stands alone: `reproduce` does not run it, so that it needs neither a
+    number nor parameters.
+    """
     faults = []
     text = path.read_text(encoding="utf-8")
     if len(text.encode()) >= LARGEST_NOTEBOOK:
         faults.append(f"{len(text.encode())} bytes, limit {LARGEST_NOTEBOOK}")
-    if not re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name):
+    if numbered and not re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name):
         faults.append("name is not NN_words.ipynb")
     if MACHINE_PATH.search(text):
         faults.append(f"absolute path {MACHINE_PATH.search(text)[0]!r}")
@@ -56,7 +61,7 @@ def notebook_faults(path: Path) -> list[str]:
         faults.append("no cell is tagged nbval-check-output")
     if not all(cell.outputs for cell in code if "nbval-check-output" in tags_of(cell)):
         faults.append("a cell tagged nbval-check-output has no output to check")
-    return faults + parameter_faults(code)
+    return faults + (parameter_faults(code) if numbered else [])
 
 
 def parameter_faults(code_cells) -> list[str]:
@@ -107,15 +112,15 @@ def repository_faults(paths, root: Path) -> list[str]:
         faults.append(f"weights: {size} bytes together, limit {ALL_WEIGHTS}")
     for path in paths:
         name = path.relative_to(root).as_posix()
-        shipped = re.fullmatch(r"f3amd_lib/weights/[^/]+/[^/]+\.safetensors", name)
+        shipped = re.fullmatch(r"f3amd_lib/pretrained/[^/]+/[^/]+\.safetensors", name)
         if path.stat().st_size > LARGEST_FILE and not shipped:
             faults.append(f"{name}: {path.stat().st_size} bytes, limit {LARGEST_FILE}")
         if path.suffix in (".bvh", ".zip") and not re.fullmatch(
             r"paper_figures/[^/]+/[^/]+/media/[^/]+\.bvh", name
         ):
             faults.append(f"{name}: motion data does not belong in the repository")
-        if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/[^/]+", name):
-            faults.append(f"{name}: notebooks lie in notebooks/")
+        if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/(standalone/)?[^/]+", name):
+            faults.append(f"{name}: notebooks lie in notebooks/ or notebooks/standalone/")
         if path.suffix not in BINARY:
             found = MACHINE_PATH.search(path.read_text(encoding="utf-8", errors="replace"))
             if found:
@@ -126,6 +131,11 @@ def repository_faults(paths, root: Path) -> list[str]:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_is_fit_to_be_read(path):
     assert notebook_faults(path) == []
+
+
+@pytest.mark.parametrize("path", STANDALONE, ids=lambda path: path.stem)
+def test_standalone_notebook_is_fit_to_be_read(path):
+    assert notebook_faults(path, numbered=False) == []
 
 
 def test_notebooks_are_numbered_without_gaps():
@@ -221,6 +231,17 @@ def test_a_notebook_without_number_is_found(tmp_path):
     assert notebook_faults(path) == ["name is not NN_words.ipynb"]
 
 
+def test_a_standalone_notebook_needs_no_number_and_no_parameters(tmp_path):
+    notebook = good_notebook()
+    set_parameters("import numpy")(notebook)
+    notebook["cells"][0]["metadata"].update(tags=[])
+    path = save(tmp_path, notebook, "anything.ipynb")
+    assert notebook_faults(path, numbered=False) == []
+    set_verdict(execution_count=3)(notebook)
+    (fault,) = notebook_faults(save(tmp_path, notebook, "anything.ipynb"), numbered=False)
+    assert "execution counts" in fault
+
+
 @pytest.mark.parametrize(
     "name, content, fault",
     [
@@ -228,9 +249,10 @@ def test_a_notebook_without_number_is_found(tmp_path):
         ("paper_figures/bandai/laptop/tables/walk.bvh", "HIERARCHY", "motion data"),
         ("paper_figures/bandai/laptop/media/walk.zip", "", "motion data"),
         ("paper_figures/copy.ipynb", "{}", "notebooks lie in"),
+        ("notebooks/drafts/copy.ipynb", "{}", "notebooks lie in"),
         ("notes.md", f"see {ELSEWHERE}", "path of a machine"),
         ("large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
-        ("f3amd_lib/weights/large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
+        ("f3amd_lib/pretrained/large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
     ],
 )
 def test_each_fault_of_the_repository_is_found(tmp_path, name, content, fault):

@@ -131,14 +131,14 @@ def test_models_that_lie_there_are_listed(trained_once, same_runs, monkeypatch, 
 def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs, monkeypatch):
     folder, prepared, profile, model = trained_once
     laptop = dataclasses.replace(profile, name="laptop")
-    shipped = folder / "weights" / "synthetic"
+    shipped = folder / "pretrained" / "synthetic"
     other = dataclasses.replace(
         model,
         skeleton=dataclasses.replace(model.skeleton, offsets=1.5 * model.skeleton.offsets),
     )
     files = pipeline.model_files(laptop, folder=shipped)
     pipeline.save_model(files.model, other)
-    monkeypatch.setattr(pipeline, "WEIGHTS_DIR", folder / "weights")
+    monkeypatch.setattr(pipeline, "PRETRAINED_DIR", folder / "pretrained")
     monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
     *_, origin = pipeline.obtain_model(prepared, laptop, progress=False)
     assert origin == "trained now"
@@ -146,7 +146,7 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
 
 def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: tmp_path / profile)
-    monkeypatch.setattr(pipeline, "WEIGHTS_DIR", tmp_path / "weights")
+    monkeypatch.setattr(pipeline, "PRETRAINED_DIR", tmp_path / "pretrained")
     with pytest.raises(ValueError, match="f3amd_lib train --data bandai"):
         pipeline.find_model("bandai")
 

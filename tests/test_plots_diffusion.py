@@ -1,11 +1,16 @@
 """Figures of the sampler notebook: lines hold the numbers given, labels lie where they belong."""
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from f3amd_lib.diffusion import schedules
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report import plots_ablations
 from f3amd_lib.report import plots_diffusion as draw
+from f3amd_lib.report.records import run_record, write_table
 
 
 def tick_labels(axis):
@@ -118,10 +123,74 @@ def test_spread_lines_are_the_recursion_and_marks_the_samples():
         assert axis.lines[6].get_ydata() == [1.0, 1.0]
 
 
-def test_collapse_has_a_line_for_each_form_and_one_for_the_data():
+def test_flow_lines_lie_over_the_density_of_noisy_data():
+    fine, coarse, places = np.array([9.0, 3.0, 1.0]), np.array([9.0, 1.0]), np.linspace(-2, 2, 5)
+    exact, steps = np.array([[9.0], [3.0], [1.0]]), np.array([[18.0], [1.0]])
+    density = np.array([[1.0, 2, 4, 2, 1], [0, 1, 2, 1, 0], [0, 0, 1, 0, 0]])
+    title, behind = "flow", {"places": places, "density": density}
+    (axis,) = draw.flow_and_steps(fine, exact, coarse, steps, title, **behind).axes
+    scale = np.sqrt(1.0 + fine**2)
+    np.testing.assert_allclose(points(axis.lines[0]), [fine, exact[:, 0] / scale])
+    np.testing.assert_allclose(points(axis.lines[1]), [coarse, steps[:, 0] / scale[[0, 2]]])
+    (contours,) = axis.collections
+    # Every level is drawn by its own highest density, so that all of them reach the darkest shade.
+    assert contours.get_clim() == (0.0, 1.0)
+    (bare,) = draw.flow_and_steps(fine, exact, coarse, steps, title).axes
+    assert not bare.collections
+
+
+MODES = np.array([[-1.0, 0.0], [1.0, 0.0]])
+WAY = np.array([[[30.0, 0.0], [-30.0, 3.0]], [[-0.9, 0.0], [0.8, 0.1]]])
+
+
+def test_film_shows_samples_in_preserving_units_by_where_they_end():
+    first, last = draw.film_frames([10.0, 0.0], WAY, MODES)
+    for figure, states, sigma in ((first, WAY[0], 10.0), (last, WAY[1], 0.0)):
+        (dots,) = figure.axes[0].collections
+        np.testing.assert_allclose(dots.get_offsets(), states / np.sqrt(1.0 + sigma**2))
+        colors = [matplotlib.colors.to_hex(color) for color in dots.get_facecolors()]
+        assert colors == [matplotlib.colors.to_hex(draw.PALETTE[c]) for c in ("purple", "orange")]
+    assert [f.axes[0].get_title(loc="left") for f in (first, last)] == ["σ = 10", "σ = 0"]
+
+
+def test_film_is_an_animated_image_that_opens_on_its_end(tmp_path):
+    frames = draw.film_frames([10.0, 1.0, 0.0], WAY[[0, 1, 1]], MODES)
+    shown = draw.keep_film(frames, tmp_path, "walk", milliseconds=80)
+    path = tmp_path / "media" / "walk.png"
+    assert path.read_bytes() == shown.data
+    film = Image.open(path)
+    pictures, durations = [], []
+    for frame in range(film.n_frames):
+        film.seek(frame)
+        pictures.append(np.asarray(film.convert("RGB")).astype(int))
+        durations.append(film.info["duration"])
+    assert len(pictures) == 4 and durations[0] > 1000 and set(durations[1:]) == {80.0}
+    np.testing.assert_array_equal(pictures[0], pictures[-1])
+    assert np.abs(pictures[0] - pictures[1]).max() > 100
+    again = draw.keep_film(draw.film_frames([10.0, 1.0, 0.0], WAY[[0, 1, 1]], MODES), tmp_path, "b",
+                           milliseconds=80)  # fmt: skip
+    assert again.data == shown.data
+    with pytest.raises(ValueError, match="at least 2 figures, got 1"):
+        draw.keep_film(frames[:1], tmp_path, "short")
+
+
+def test_what_both_updates_show_is_drawn_in_preserving_units():
+    sigmas = np.array([np.sqrt(99.0), np.sqrt(3.0)])
+    shown = {"rescaled": np.array([[20.0], [3.0]]), "literal": np.array([[20.0], [0.5]])}
+    left = {2: np.array([1.0, 0.9]), 3: np.array([1.0, 0.1, 0.01])}
+    right, literal, noise = draw.two_updates(sigmas, shown, left).axes
+    np.testing.assert_allclose(points(right.lines[0]), [sigmas, [2.0, 1.5]])
+    np.testing.assert_allclose(points(literal.lines[0]), [sigmas, [2.0, 0.25]])
+    np.testing.assert_array_equal(points(noise.lines[0]), [[1, 2], left[2]])
+    np.testing.assert_array_equal(points(noise.lines[1]), [[1, 2, 3], left[3]])
+    assert set(noise.lines[2].get_ydata()) == {1.0} and noise.get_yscale() == "log"
+    assert right.lines[0].get_marker() != literal.lines[0].get_marker()
+
+
+def test_collapse_has_a_line_for_each_update_and_one_for_the_data():
     table = pd.DataFrame(
         {
-            "form": ["rescaled"] * 2 + ["to the letter"] * 2,
+            "update": ["rescaled"] * 2 + ["literal"] * 2,
             "steps": [1, 8] * 2,
             "mean_abs": [0.0, 0.7, 0.01, 0.02],
         }
@@ -129,7 +198,82 @@ def test_collapse_has_a_line_for_each_form_and_one_for_the_data():
     rescaled, literal, truth = draw.collapse_figure(table, 1.02).axes[0].lines
     np.testing.assert_array_equal(points(rescaled), [[1, 8], [0.0, 0.7]])
     np.testing.assert_array_equal(points(literal), [[1, 8], [0.01, 0.02]])
+    assert rescaled.get_linestyle() != literal.get_linestyle()
     assert set(truth.get_ydata()) == {1.02}
+
+
+def test_noticing_is_drawn_against_the_width_of_the_data():
+    table = pd.DataFrame(
+        {"width": [0.1, 1.0] * 2, "steps": [4] * 2 + [8] * 2, "apart": [0.01, 0.2, 0.02, 0.5]}
+    )
+    four, eight, as_wide = draw.noticing_figure(table).axes[0].lines
+    np.testing.assert_array_equal(points(four), [[0.1, 1.0], [0.01, 0.2]])
+    np.testing.assert_array_equal(points(eight), [[0.1, 1.0], [0.02, 0.5]])
+    np.testing.assert_array_equal(*points(as_wide))
+
+
+def test_errors_have_a_line_for_each_denoiser_and_ticks_where_it_was_trained():
+    table = pd.DataFrame(
+        {
+            "denoiser": ["exact"] * 2 + ["VP"] * 2,
+            "sigma": [0.1, 10.0] * 2,
+            "x0_error": [0.05, 1.0, 0.4, 1.1],
+        }
+    )
+    floor, network, ticks = draw.error_by_sigma(table, {"VP": [0.2, 5.0, 160.0]}).axes[0].lines
+    np.testing.assert_array_equal(points(floor), [[0.1, 10.0], [0.05, 1.0]])
+    np.testing.assert_array_equal(points(network), [[0.1, 10.0], [0.4, 1.1]])
+    np.testing.assert_array_equal(ticks.get_xdata(), [0.2, 5.0, 160.0])
+    assert ticks.get_color() == network.get_color() != floor.get_color()
+
+
+def window_table():
+    rows = [
+        (model, update, steps, metric, scale * steps)
+        for model, scale in (("F3AMD-FNO-96", 0.1), ("F3AMD-FNO-96-plus", 0.3))
+        for update in ("rescaled", "literal")
+        for steps in (8, 1)
+        for metric in ("seed_spread", "joint_acceleration", "from_rescaled")
+    ]
+    rows += [
+        (model, "real", 0, "joint_acceleration", 0.7)
+        for model in ("F3AMD-FNO-96", "F3AMD-FNO-96-plus")
+    ]
+    return pd.DataFrame(rows, columns=["model", "update", "steps", "metric", "value"])
+
+
+def test_both_updates_have_a_row_of_panels_for_each_model():
+    figure = draw.updates_on_models(window_table())
+    assert len(figure.axes) == 6
+    spread, acceleration, apart = figure.axes[3:]
+    rescaled, literal = spread.lines
+    np.testing.assert_allclose(points(rescaled), [[8, 1], [2.4, 0.3]])
+    assert rescaled.get_linestyle() != literal.get_linestyle()
+    # Real motion has an acceleration, and the rescaled walk no distance from itself.
+    assert set(acceleration.lines[2].get_ydata()) == {0.7}
+    assert len(spread.lines) == 2 and len(apart.lines) == 1
+    assert figure.axes[3].get_title(loc="left") == "F3AMD-FNO-96-plus"
+    # The highest point does not lie on the edge.
+    assert all(axis.get_ylim()[1] > 1.05 * axis.dataLim.y1 for axis in (spread, apart))
+
+
+def test_halvings_mark_diversity_apart_and_bar_the_largest_of_the_others():
+    table = pd.DataFrame(
+        [
+            (source, steps, metric, change)
+            for source in ("paper, Table 5", "FNO-96,\nliteral")
+            for steps in (8, 4)
+            for metric, change in (("IRD", 0.04), ("FID", 0.0), ("diversity", 0.9))
+        ],
+        columns=["source", "steps", "metric", "change"],
+    )
+    paper, ours = draw.halving_figure(table).axes
+    others, diversity, bar = paper.lines[:3]
+    np.testing.assert_allclose(sorted(others.get_ydata()), [1e-5, 0.04])  # no change: on the edge
+    assert list(diversity.get_ydata()) == [0.9] and diversity.get_marker() == "D"
+    assert set(bar.get_ydata()) == {0.04}
+    assert [text.get_text() for text in paper.get_xticklabels()] == ["8→4", "4→2"]
+    assert paper.lines[0].get_color() != ours.lines[0].get_color()
 
 
 def test_histograms_of_samples_and_data_have_the_same_bins_and_lose_nobody():
@@ -142,3 +286,18 @@ def test_histograms_of_samples_and_data_have_the_same_bins_and_lose_nobody():
     heights = outline.get_xy()
     assert heights[:, 1].max() == pytest.approx(0.5)
     assert heights[:, 0].min() == pytest.approx(-1.6) and heights[:, 0].max() == pytest.approx(1.6)
+
+
+def test_stored_results_are_those_of_the_data_set_then_bandais_and_say_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(plots_ablations, "repository_root", lambda: tmp_path)
+    found, sentence = draw.stored_result("synthetic", "posterior", "posterior")
+    assert found is None
+    assert "Not measured yet: `posterior`" in sentence
+    assert "`make measure MEASURE=posterior DATA=bandai`" in sentence
+    for dataset, value in (("bandai", 1.0), ("synthetic", 2.0)):
+        record = run_record(profile=load_profile("laptop", dataset), dataset=dataset, seed=0)
+        path = tmp_path / "paper_figures" / dataset / "laptop" / "records" / "posterior.csv"
+        write_table(path, pd.DataFrame({"value": [value]}), record)
+        found, sentence = draw.stored_result("synthetic", "posterior", "posterior")
+        assert found["value"].tolist() == [value]
+        assert f"data {dataset}, profile laptop" in sentence

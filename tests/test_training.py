@@ -368,3 +368,59 @@ def test_our_recipe_trains_and_resumes_exactly(tmp_path):
     resumed, _ = trainer.run(checkpoint=checkpoint, **QUIET)
     assert finite(whole) and same_tree(whole, resumed)
     assert largest_change(whole.params, trainer.initial_state().params) > 1e-4
+
+
+def test_log_normal_noise_has_the_mean_and_deviation_it_names():
+    config = TrainingConfig(10, noise="log_normal")
+    log_sigma = np.log(loop.draw_sigma(jax.random.key(3), 20_000, config))
+    mean, deviation = loop.LOG_NORMAL_SIGMA
+    assert log_sigma.mean() == pytest.approx(mean, abs=0.03)
+    assert log_sigma.std() == pytest.approx(deviation, abs=0.03)
+    narrow = TrainingConfig(
+        10, noise="log_normal", diffusion=VarianceExploding(sigma_max=1.0, sigma_min=0.5)
+    )
+    sigma = np.asarray(loop.draw_sigma(jax.random.key(3), 1000, narrow))
+    assert sigma.min() == pytest.approx(0.5) and sigma.max() == pytest.approx(1.0)
+
+
+def test_weights_towards_low_noise_are_those_of_karras_up_to_the_cap():
+    sigma = jnp.array([0.1, 1.0, 128.0])
+    assert loop.noise_weights(sigma, TrainingConfig(10)) is None
+    weights = np.asarray(loop.noise_weights(sigma, TrainingConfig(10, noise_weighting="low_noise")))
+    expected = np.array([6.0, 2.0, 1.0 + 128.0**-2])
+    np.testing.assert_allclose(weights, expected / expected.mean(), rtol=1e-6)
+
+
+def test_condition_dropout_hides_history_path_and_style_together():
+    trainer = tiny_trainer(condition_dropout=0.5)
+    batch = gather_windows(
+        tiny_windows(), jnp.zeros(64, int), jnp.zeros(64), jnp.zeros(64, int),
+        window=WINDOW, num_history=HISTORY,
+    )  # fmt: skip
+    _, condition = network_inputs(batch, trainer.normaliser)
+    hidden = trainer._disturbed(condition, jax.random.key(0))
+    gone = np.array([not np.any(np.asarray(part)) for part in hidden.style])
+    assert 16 < gone.sum() < 48
+    for part, before in zip(hidden, condition, strict=True):
+        assert not np.any(np.asarray(part)[gone])
+        np.testing.assert_array_equal(np.asarray(part)[~gone], np.asarray(before)[~gone])
+
+
+def test_weighted_noise_changes_training_but_not_the_held_out_loss():
+    plain, weighted = tiny_trainer(), tiny_trainer(noise_weighting="low_noise")
+    state = plain.initial_state()
+    assert plain.held_out_terms(state.ema, tiny_windows()) == weighted.held_out_terms(
+        state.ema, tiny_windows()
+    )
+    one, _ = plain.advance(plain.initial_state(), 2)
+    two, _ = weighted.advance(weighted.initial_state(), 2)
+    assert largest_change(one.params, two.params) > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "hint"),
+    [("noise", "mixd", "'mixed'"), ("noise_weighting", "low_nose", "'low_noise'")],
+)
+def test_misspelt_noise_is_refused(field, value, hint):
+    with pytest.raises(ValueError, match=f"unknown {field} '{value}'.*{hint}"):
+        TrainingConfig(10, **{field: value})

@@ -21,7 +21,14 @@ from f3amd_lib.evaluation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import network_inputs
 
-__all__ = ["held_out_batch", "x0_error_by_sigma", "window_quality", "seed_spread", "noise_use"]
+__all__ = [
+    "held_out_batch",
+    "x0_error_by_sigma",
+    "window_quality",
+    "seed_spread",
+    "noise_use",
+    "window_row",
+]
 
 CM = 100.0
 
@@ -160,3 +167,25 @@ def noise_use(
         "x0_error_ratio": float(low / high),
         "seed_spread_cm": seed_spread(generator, windows, seed=seed),
     }
+
+
+def window_row(
+    trained: TrainedModel, windows: WindowSet, *, steps=(8, 1), seed: int = 0
+) -> pd.DataFrame:
+    """Measure what a model does with single held-out windows, and whether it uses its noise.
+
+    Args:
+      trained: the model.
+      windows: held-out.
+      steps: numbers of denoising steps.
+      seed: of the noise.
+
+    Returns:
+      A row per number of steps: steps, then the figures of `noise_use` and `window_quality`.
+    """
+    rows = []
+    for count in steps:
+        generator = MotionGenerator(trained, count)
+        figures = noise_use(generator, windows, seed=seed)
+        rows.append({"steps": count, **figures, **window_quality(generator, windows, seed=seed)})
+    return pd.DataFrame(rows)

@@ -60,6 +60,11 @@ class F3AMDConfig(NetworkConfig):
       block_residual: add each block's input to its output (ours; the paper's Figure 2 has none).
       history_anchor: add the last history frame, with a learned weight that starts as a decay over
         the window, so that the network predicts a change (ours).
+      output_scaling: let the network estimate what is left of the clean features after a skip,
+        x0_hat = c_skip x + c_out F(c_in x), as Karras et al. 2022 do (Table 1, with sigma_data);
+        at low noise the noisy input passes through (ours).
+      decoder_hidden_width: channels between two layers of the decoder; 0: one layer, as in the
+        paper (ours).
       residual_prior: combine the network's estimate with the noisy input as the posterior mean of a
         Gaussian residual whose variance per channel and cosine mode is learned (ours).
 
@@ -75,7 +80,7 @@ class F3AMDConfig(NetworkConfig):
         "encoder_decoder": ("fno", "linear"),
         "conditioning": CONDITIONINGS,
     }
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "decoder_hidden_width")
 
     base_block: str = "fno"
     num_kept_modes: int = 17
@@ -91,6 +96,8 @@ class F3AMDConfig(NetworkConfig):
     dropout: float = 0.0
     block_residual: bool = False
     history_anchor: bool = False
+    output_scaling: bool = False
+    decoder_hidden_width: int = 0
     residual_prior: bool = False
 
     def __post_init__(self):
@@ -144,7 +151,9 @@ class F3AMD(Denoiser):
         self.encoder = self._coder(config.channels, width, rngs)
         self.blocks = nnx.List([self._base_block(rngs) for _ in depth])
         self.conditionings = nnx.List([self._conditioning_layer(rngs) for _ in depth])
-        self.decoder = self._coder(width, config.channels, rngs)
+        if hidden := config.decoder_hidden_width:
+            self.decoder_hidden = self._coder(width, hidden, rngs)
+        self.decoder = self._coder(hidden or width, config.channels, rngs)
         if config.history_anchor:
             decay = np.exp(-np.arange(1, config.window + 1) / 10.0)
             anchor = np.repeat(decay[:, None], config.channels, axis=1)
@@ -246,8 +255,15 @@ class F3AMD(Denoiser):
         last = jax.lax.slice_in_dim(
             z, z.shape[frames] - config.window, z.shape[frames], axis=frames
         )
+        if config.decoder_hidden_width:
+            last = nnx.gelu(_applied(self.decoder_hidden, turned)(last))
         x0_hat = turn(_applied(self.decoder, turned)(last))
         yield "decoder", x0_hat
+        if config.output_scaling:
+            total = sigma.reshape(-1, 1, 1) ** 2 + config.sigma_data**2
+            c_skip = config.sigma_data**2 / total
+            c_out = sigma.reshape(-1, 1, 1) * config.sigma_data / jnp.sqrt(total)
+            x0_hat = c_skip * x_noisy + c_out * x0_hat
         if config.history_anchor:
             x0_hat = x0_hat + self.anchor[...] * last_frame[:, None, :]
         if config.residual_prior:

@@ -1,19 +1,77 @@
-"""Does every preset learn? Short runs of the whole family on one data set, all alike."""
+"""The family on one data set, one preset after the other: trained within a time budget, or only
+asked, in short runs all alike, whether each of them learns.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 
 import pandas as pd
+from jax.sharding import Mesh
 from tqdm import tqdm
 
+from f3amd_lib.profiles import Profile
+from f3amd_lib.training.checkpoints import describe
 from f3amd_lib.training.loop import short_recipe
-from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.pipeline import PreparedData, model_files, profile_recipe, train
 
-__all__ = ["SHORT_RUN", "learning_curve", "learning_curves", "learning_table"]
+__all__ = ["SHORT_RUN", "train_family", "learning_curve", "learning_curves", "learning_table"]
 
 SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
 """What all runs have in common; enough to see a loss fall, far from enough to walk."""
+
+
+def train_family(
+    prepared: PreparedData,
+    profile: Profile,
+    presets: Iterable[str],
+    *,
+    folder=None,
+    budget_s: float | None = None,
+    mesh: Mesh | None = None,
+    progress: bool = True,
+) -> Iterator[tuple[str, str]]:
+    """Train presets one after the other, all with the profile's steps and batch.
+
+    Each leaves its model, state and history in one folder, and a later call goes on from them: a
+    finished model is left as it is, an unfinished one resumed. So a long job can be done in legs.
+
+    Args:
+      prepared: the data.
+      profile: how much.
+      presets: names, in the order to train them.
+      folder: where files go instead of `runs/`.
+      budget_s: seconds for all together; the run under way stops with a checkpoint when they are
+        over. By default as long as it takes.
+      mesh: see `pipeline.train`.
+      progress: show progress bars.
+
+    Yields:
+      (preset, state) as each is done with; the state is "finished before", "finished" or
+      "unfinished", and the budget is over with the first "unfinished".
+
+    Raises:
+      ValueError: for an unknown preset, before anything is trained.
+      TrainingDiverged: if a loss stops being a number.
+    """
+    stop_at = None if budget_s is None else time.monotonic() + budget_s
+    files = {preset: model_files(profile, preset, folder=folder) for preset in presets}
+    for preset, its in files.items():
+        recipe = profile_recipe(profile, preset).to_dict()
+        if its.model.exists() and describe(its.model)["record"].get("training") == recipe:
+            yield preset, "finished before"
+            continue
+        if stop_at is not None and time.monotonic() >= stop_at:
+            yield preset, "unfinished"
+            return
+        trained, _ = train(
+            prepared, profile, preset=preset, folder=folder, mesh=mesh, stop_at=stop_at,
+            progress=progress,
+        )  # fmt: skip
+        yield preset, "unfinished" if trained is None else "finished"
+        if trained is None:
+            return
 
 
 def learning_curve(

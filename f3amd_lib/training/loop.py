@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
@@ -37,7 +39,8 @@ from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.models.zoo import build_from_config, find_preset
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.names import refuse_unknown
+from f3amd_lib.names import nearest_hint, refuse_unknown
+from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
 
@@ -46,7 +49,9 @@ __all__ = [
     "TrainingState",
     "TrainingDiverged",
     "Trainer",
+    "LOG_NORMAL_SIGMA",
     "draw_sigma",
+    "noise_weights",
     "learning_rate_schedule",
     "network_inputs",
     "paper_recipe",
@@ -74,11 +79,17 @@ class TrainingConfig:
       gradient_clip: largest global gradient norm; 0 clips nothing (the paper names none).
       noise: "schedule" draws levels as the schedule says (Eq. 9: t uniform); "mixed" (ours) draws
         every second sigma log-uniform between sigma_min and 1, where the noisy input says something
-        that the condition does not.
+        that the condition does not; "log_normal" (ours) draws the logarithm from
+        `LOG_NORMAL_SIGMA`, cut off at the ends of the schedule.
+      noise_weighting: "uniform" weighs all noise levels alike; "low_noise" (ours) by
+        1 + min(1 / sigma^2, 5), the weight of Karras et al. 2022 for a clean estimate, capped, and
+        divided by its mean over the batch.
       history_noise: deviation, in network units, of noise added to the history in training (ours;
         0 in paper presets): rounds are started from generated frames, which are never quite real.
       history_dropout: share of samples whose history is set to 0 (CAMDM's code: 0.15; F3AMD
         mentions none).
+      condition_dropout: share of samples that see no condition at all, history, path and style 0
+        (ours; 0 in paper presets), so that only the noisy input can tell them what to make.
       captured_path_share: share of samples whose path condition is the captured root, sway and all;
         the rest see a smoothed one, as users draw them (CAMDM: 0.5).
       own_history_share: share of samples that start from the network's own last frames of the
@@ -105,8 +116,10 @@ class TrainingConfig:
     ema_decay: float = 0.993
     gradient_clip: float = 0.0
     noise: str = "schedule"
+    noise_weighting: str = "uniform"
     history_noise: float = 0.0
     history_dropout: float = 0.0
+    condition_dropout: float = 0.0
     captured_path_share: float = 0.5
     own_history_share: float = 0.0
     history_damping: float = 0.0
@@ -120,8 +133,13 @@ class TrainingConfig:
                 f"unknown learning-rate schedule {self.schedule!r}: use 'inverse_square', "
                 "'inverse_sqrt' or 'warmup_cosine'"
             )
-        if self.noise not in ("schedule", "mixed"):
-            raise ValueError(f"unknown training noise {self.noise!r}: use 'schedule' or 'mixed'")
+        for name, known in (
+            ("noise", ("schedule", "mixed", "log_normal")),
+            ("noise_weighting", ("uniform", "low_noise")),
+        ):
+            if getattr(self, name) not in known:
+                value = getattr(self, name)
+                raise ValueError(f"unknown {name} {value!r}{nearest_hint(value, known)}")
         for name in ("num_steps", "batch_size", "warmup_steps"):
             if type(getattr(self, name)) is not int or getattr(self, name) < 1:
                 raise ValueError(f"{name} must be positive and whole: {getattr(self, name)!r}")
@@ -131,14 +149,20 @@ class TrainingConfig:
         for name in ("gradient_clip", "history_noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more, got {getattr(self, name)!r}")
-        if self.noise == "mixed" and not (
+        if self.noise != "schedule" and not (
             isinstance(self.diffusion, VarianceExploding) and self.diffusion.sigma_min < 1.0
         ):
             raise ValueError(
-                "mixed noise needs a variance-exploding schedule with sigma_min below 1, "
+                f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, "
                 f"got {self.diffusion!r}"
             )
-        shares = ("history_dropout", "captured_path_share", "own_history_share", "history_damping")
+        shares = (
+            "history_dropout",
+            "condition_dropout",
+            "captured_path_share",
+            "own_history_share",
+            "history_damping",
+        )
         for name in shares:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
@@ -245,7 +269,24 @@ def draw_sigma(key, batch_size: int, config: TrainingConfig):
         )
         low = jax.random.bernoulli(key_choice, 0.5, (batch_size,))
         sigma = jnp.where(low, jnp.exp(log_low), sigma)
+    if config.noise == "log_normal":
+        mean, deviation = LOG_NORMAL_SIGMA
+        log_sigma = mean + deviation * jax.random.normal(key_low, (batch_size,))
+        sigma = jnp.clip(jnp.exp(log_sigma), config.diffusion.sigma_min, config.diffusion.sigma_max)
     return sigma
+
+
+LOG_NORMAL_SIGMA = (-1.2 + math.log(2.0), 1.2)
+"""Mean and deviation of ln sigma: Karras et al. 2022, Table 1, for features of deviation 1 where
+theirs have 0.5."""
+
+
+def noise_weights(sigma, config: TrainingConfig):
+    """Return what each sample counts in the loss, [B], mean 1, or None where all count alike."""
+    if config.noise_weighting == "uniform":
+        return None
+    weights = 1.0 + jnp.minimum(sigma**-2.0, 5.0)
+    return weights / weights.mean()
 
 
 class Trainer:
@@ -258,6 +299,10 @@ class Trainer:
       normaliser: of the training windows (replaced by the identity if the model wants none).
       windows: training windows on the device.
       dataset_fingerprint: of the data they come from; a state of other data is not resumed.
+      mesh: devices to spread each batch over (`parallel.all_devices`); by default one does it all.
+
+    Raises:
+      ValueError: if the devices cannot share a batch equally.
     """
 
     def __init__(
@@ -269,12 +314,14 @@ class Trainer:
         windows: WindowSet,
         *,
         dataset_fingerprint: str = "",
+        mesh: Mesh | None = None,
     ):
-        self.dataset_fingerprint = dataset_fingerprint
+        parallel.check_batch(config.batch_size, mesh)
+        self.dataset_fingerprint, self.mesh = dataset_fingerprint, mesh
         self.model_config, self.config, self.skeleton = model_config, config, skeleton
         if not model_config.normalise:
             normaliser = Normaliser.identity(model_config.channels)
-        self.normaliser, self.windows = normaliser, windows
+        self.normaliser, self.windows = normaliser, parallel.replicate(windows, mesh)
         self.mean_poses = mean_poses(windows)
         model = nnx.eval_shape(lambda: build_from_config(model_config, jax.random.key(0)))
         self.graph = nnx.graphdef(model)
@@ -282,7 +329,10 @@ class Trainer:
         if config.gradient_clip > 0:
             steps.insert(0, optax.clip_by_global_norm(config.gradient_clip))
         self.optimiser = optax.chain(*steps)
-        self._chunk = jax.jit(self._run_chunk, static_argnames="length", donate_argnums=0)
+        everywhere = None if mesh is None else NamedSharding(mesh, PartitionSpec())
+        self._chunk = jax.jit(
+            self._run_chunk, static_argnames="length", donate_argnums=0, out_shardings=everywhere
+        )
         self._evaluate = jax.jit(self._held_out_terms, static_argnames="num_samples")
 
     def initial_state(self) -> TrainingState:
@@ -296,7 +346,8 @@ class Trainer:
 
         params, optimiser = build(key)
         ema = jax.tree.map(jnp.copy, params)
-        return TrainingState(params, ema, optimiser, jnp.zeros((), jnp.int32))
+        state = TrainingState(params, ema, optimiser, jnp.zeros((), jnp.int32))
+        return parallel.replicate(state, self.mesh)
 
     def model(self, params):
         """Return a network with the given weights (use the state's `ema`)."""
@@ -321,6 +372,7 @@ class Trainer:
             batch.future,
             batch.history[:, -1],
             self.config.loss.ird_form,
+            noise_weights(sigma, self.config) if training else None,
         )
         loss = total_loss(terms, self.config.loss)
         return loss, {"loss": loss, **terms}
@@ -335,7 +387,15 @@ class Trainer:
             size = (history.shape[0], 1, 1)
             kept = jax.random.bernoulli(key_dropout, 1.0 - config.history_dropout, size)
             history = jnp.where(kept, history, 0.0)
-        return condition._replace(history=history)
+        condition = condition._replace(history=history)
+        if config.condition_dropout > 0:
+            share = 1.0 - config.condition_dropout
+            kept = jax.random.bernoulli(jax.random.fold_in(key, 1), share, history.shape[:1])
+            condition = jax.tree.map(
+                lambda part: jnp.where(kept.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0),
+                condition,
+            )
+        return condition
 
     def _training_batch(self, windows: WindowSet, state: TrainingState, key) -> Batch:
         """Draw a batch; where the recipe asks, start it from histories as a rollout meets them."""
@@ -395,6 +455,7 @@ class Trainer:
             )
             batch = self._training_batch(windows, state, key_batch)
             sigma = draw_sigma(key_sigma, config.batch_size, config)
+            batch, sigma = parallel.spread((batch, sigma), self.mesh)
             gradient, terms = jax.grad(self._loss, has_aux=True)(
                 state.params, batch, sigma, key_loss, training=True
             )
@@ -444,12 +505,14 @@ class Trainer:
           windows: of another split than the one trained on.
           num_samples: windows to take, spread evenly.
         """
+        windows = parallel.replicate(windows, self.mesh)
         terms = self._evaluate(params, windows, jax.random.key(7), num_samples=num_samples)
         return {name: float(value) for name, value in terms.items()}
 
     def save(self, path: Path, state: TrainingState) -> None:
         """Write the whole training state; an interrupted write leaves the old file whole."""
-        save_tree(path, state, {"kind": "training state", **self._identity()})
+        if parallel.is_first_process():
+            save_tree(path, state, {"kind": "training state", **self._identity()})
 
     def _identity(self) -> dict:
         """All that decides the weights, so that a state is only resumed where it belongs."""
@@ -482,7 +545,7 @@ class Trainer:
                 raise ValueError(f"{path}: checkpoint was made on other data; choose another file")
             return jax.eval_shape(self.initial_state)
 
-        return load_tree(path, template)[0]
+        return parallel.replicate(load_tree(path, template)[0], self.mesh)
 
     def run(
         self,
@@ -493,6 +556,7 @@ class Trainer:
         held_out: WindowSet | None = None,
         chunk: int = 50,
         stop_after: int | None = None,
+        stop_at: float | None = None,
         on_chunk: Callable[[dict], None] | None = None,
         progress: bool = True,
     ) -> tuple[TrainingState, list[dict]]:
@@ -504,7 +568,9 @@ class Trainer:
           checkpoint_every: steps between checkpoints and held-out evaluations.
           held_out: windows to evaluate on.
           chunk: steps per jitted scan.
-          stop_after: stop once this many steps are done in all (for tests and time budgets).
+          stop_after: stop once this many steps are done in all.
+          stop_at: stop, with a checkpoint, at the end of the first chunk after this time
+            (`time.monotonic`). Processes that train together must be given none.
           on_chunk: called with each history row as it is made.
           progress: show a progress bar.
 
@@ -528,7 +594,8 @@ class Trainer:
             raise ValueError("chunk and checkpoint_every must be at least 1")
         done = int(state.step)
         history = []
-        with tqdm(total=total, initial=done, unit="step", disable=not progress) as bar:
+        hidden = not (progress and parallel.is_first_process())
+        with tqdm(total=total, initial=done, unit="step", disable=hidden) as bar:
             while done < total:
                 # Chunks end on multiples, so that a resumed run makes the same ones.
                 length = min(chunk - done % chunk, total - done)
@@ -538,7 +605,8 @@ class Trainer:
                 passed = (done + length) // checkpoint_every > done // checkpoint_every
                 done += length
                 row = {"step": done, **{name: float(v.mean()) for name, v in terms.items()}}
-                due = passed or done == total
+                late = stop_at is not None and time.monotonic() >= stop_at
+                due = passed or done == total or late
                 if due and held_out is not None:
                     measured = self.held_out_terms(state.ema, held_out)
                     row.update({f"held_out_{name}": value for name, value in measured.items()})
@@ -549,6 +617,8 @@ class Trainer:
                     on_chunk(row)
                 bar.update(length)
                 bar.set_postfix(loss=f"{row['loss']:.4f}")
+                if late:
+                    break
         return state, history
 
     def _check_finite(self, done: int, terms: dict, state: TrainingState, checkpoint) -> None:

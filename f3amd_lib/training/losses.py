@@ -59,8 +59,11 @@ def _check_ird_form(ird_form: str) -> None:
         raise ValueError(f"ird_form must be 'literal' or 'excess', got {ird_form!r}")
 
 
-def _mean_square(difference):
-    return jnp.mean(difference * difference)
+def _mean(values, weights):
+    """Mean over everything, each sample (first axis) counted by its weight."""
+    if weights is not None:
+        values = values * weights.reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.mean(values)
 
 
 def _norm(difference):
@@ -69,7 +72,14 @@ def _norm(difference):
 
 
 def loss_terms(
-    skeleton: Skeleton, x0_hat, x0, future_hat, future, last_history, ird_form: str = "literal"
+    skeleton: Skeleton,
+    x0_hat,
+    x0,
+    future_hat,
+    future,
+    last_history,
+    ird_form: str = "literal",
+    weights=None,
 ) -> dict:
     """Return each term of the loss, unweighted.
 
@@ -79,6 +89,7 @@ def loss_terms(
       future_hat, future: the same in metres and 6D numbers, [B, T, C].
       last_history: the frame before the window, metres and 6D numbers, [B, C].
       ird_form: see `LossWeights`.
+      weights: what each sample counts, [B]; all alike by default.
 
     Returns:
       A dict of scalars, keyed by `LOSS_TERMS`:
@@ -94,6 +105,10 @@ def loss_terms(
       ValueError: for an unknown `ird_form`.
     """
     _check_ird_form(ird_form)
+
+    def mean_square(difference):
+        return _mean(difference * difference, weights)
+
     positions_hat = frame_positions(skeleton, future_hat)
     positions = frame_positions(skeleton, future)
     before = frame_positions(skeleton, last_history)
@@ -105,14 +120,14 @@ def loss_terms(
     if ird_form == "excess":
         seam = seam - (positions[:, 0] - before)
     return {
-        "sample": _mean_square(x0_hat - x0),
-        "position": _mean_square(positions_hat - positions),
-        "feature_velocity": _mean_square(
+        "sample": mean_square(x0_hat - x0),
+        "position": mean_square(positions_hat - positions),
+        "feature_velocity": mean_square(
             (x0_hat[:, 1:] - x0_hat[:, :-1]) - (x0[:, 1:] - x0[:, :-1])
         ),
-        "joint_velocity": _mean_square(step_hat - step),
-        "foot": _mean_square(step_hat[:, :, toes] * contact[..., None]),
-        "ird": jnp.mean(_norm(seam)),
+        "joint_velocity": mean_square(step_hat - step),
+        "foot": mean_square(step_hat[:, :, toes] * contact[..., None]),
+        "ird": _mean(_norm(seam), weights),
     }
 
 

@@ -4,7 +4,7 @@
 
 Everything a run leaves lies in `runs/<data set>/<profile>/models/`: the model, its training state
 (a killed run goes on from there) and its loss history with a record. A model that ships with the
-project lies in `f3amd_lib/weights/<data set>/` in the same form.
+project lies in `f3amd_lib/pretrained/<data set>/` in the same form.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import dataclasses
 import functools
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import numpy as np
 import pandas as pd
+from jax.sharding import Mesh
 
 from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
@@ -30,6 +32,7 @@ from f3amd_lib.models import zoo
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.report.records import read_table, run_record, write_table
+from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import (
     OutdatedFile,
     TrainedModel,
@@ -53,7 +56,7 @@ __all__ = [
 
 log = logging.getLogger("f3amd")
 
-WEIGHTS_DIR = Path(__file__).resolve().parents[1] / "weights"
+PRETRAINED_DIR = Path(__file__).resolve().parents[1] / "pretrained"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +111,24 @@ class PreparedData:
             **settings,
         )
 
-    def trainer(self, preset: str, config: TrainingConfig) -> Trainer:
-        """Return what trains a preset on this data set's training windows."""
+    def trainer(
+        self, preset: str, config: TrainingConfig, *, network=None, mesh: Mesh | None = None
+    ) -> Trainer:
+        """Return what trains a preset on this data set's training windows.
+
+        Args:
+          preset, config: the model and its training.
+          network: fields of the preset's network to change.
+          mesh: see `Trainer`.
+        """
         return Trainer(
-            self.model_config(preset),
+            self.model_config(preset, **(network or {})),
             config,
             self.packed.skeleton,
             self.normaliser,
             self.windows("train"),
             dataset_fingerprint=self.packed.fingerprint,
+            mesh=mesh,
         )
 
 
@@ -196,9 +208,12 @@ def train(
     *,
     preset: str | None = None,
     config: TrainingConfig | None = None,
+    network: Mapping | None = None,
     folder=None,
+    mesh: Mesh | None = None,
+    stop_at: float | None = None,
     progress: bool = True,
-) -> tuple[TrainedModel, pd.DataFrame]:
+) -> tuple[TrainedModel | None, pd.DataFrame]:
     """Train a preset to the end, going on from its training state if there is one.
 
     Args:
@@ -206,12 +221,15 @@ def train(
       profile: says how long, and where files go.
       preset: by default the profile's own.
       config: by default `profile_recipe`.
-      folder: where files go instead of `runs/`.
+      network: fields of the preset's network to change.
+      folder: where files go instead of `runs/`; several processes must see the same one.
+      mesh: devices that share each batch (`parallel.all_devices`); by default one.
+      stop_at: see `Trainer.run`.
       progress: show a progress bar.
 
     Returns:
       (model, history): the history has a row per 50 steps or fewer, with held-out losses
-      where they were measured.
+      where they were measured. The model is None where `stop_at` came first; the state waits.
 
     Raises:
       ValueError: if a training state lies there that was made with other settings.
@@ -221,7 +239,7 @@ def train(
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
     packed = prepared.packed
-    trainer = prepared.trainer(preset, config)
+    trainer = prepared.trainer(preset, config, network=network, mesh=mesh)
     held_out = prepared.windows(prepared.held_out_split)
     record = run_record(
         profile=profile,
@@ -232,9 +250,14 @@ def train(
         held_out_split=prepared.held_out_split,
         num_train_windows=int(prepared.windows("train").num_windows),
     )
+    if mesh is not None:
+        record["training_devices"] = mesh.size
     state, rows = None, []
-    if not files.state.exists():
-        _set_aside(files)  # a finished model without its state cannot be gone on with
+    begun = files.state.exists()
+    parallel.wait_for_all("looked for a training state")
+    if not begun:
+        if parallel.is_first_process():
+            _set_aside(files)  # a finished model without its state cannot be gone on with
     else:
         if not files.history.exists():
             raise ValueError(
@@ -247,7 +270,7 @@ def train(
 
     def keep(row: dict) -> None:
         rows.append(row)
-        if "held_out_loss" in row:
+        if "held_out_loss" in row and parallel.is_first_process():
             write_table(files.history, pd.DataFrame(rows), record)
 
     state, _ = trainer.run(
@@ -256,10 +279,13 @@ def train(
         checkpoint_every=max(1, config.num_steps // 20),
         held_out=held_out,
         chunk=max(1, min(50, config.num_steps // 20)),
+        stop_at=stop_at,
         on_chunk=keep,
         progress=progress,
     )
     history = pd.DataFrame(rows)
+    if int(state.step) < config.num_steps:
+        return None, history
     trained = TrainedModel(
         name=preset,
         config=trainer.model_config,
@@ -271,8 +297,11 @@ def train(
         seeds=seed_histories(packed, num_history=prepared.num_history),
         record=record,
     )
-    save_model(files.model, trained)
-    return load_model(files.model), history
+    if parallel.is_first_process():
+        save_model(files.model, trained)
+        trained = load_model(files.model)
+    parallel.wait_for_all("wrote the model")
+    return trained, history
 
 
 def obtain_model(
@@ -302,7 +331,7 @@ def obtain_model(
     preset = _preset_name(profile, preset)
     wanted = prepared.model_config(preset)
     if allow_shipped and profile.name == "laptop":
-        shipped = model_files(profile, preset, folder=WEIGHTS_DIR / profile.dataset)
+        shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
         if shipped.model.exists():
             trained = load_model(shipped.model)
             if (
@@ -341,7 +370,7 @@ def available_models(profile: Profile) -> list[str]:
     """
     folders = [runs_dir(profile.dataset, profile.name) / "models"]
     if profile.name == "laptop":
-        folders.append(WEIGHTS_DIR / profile.dataset)
+        folders.append(PRETRAINED_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
     names = [name + end for end in ("", "-raw", "-plus") for name in zoo.PRESETS]
     return [
@@ -371,7 +400,7 @@ def find_model(dataset: str) -> Path:
     for profile, folder in (
         ("gpu", runs_dir(dataset, "gpu") / "models"),
         ("laptop", runs_dir(dataset, "laptop") / "models"),
-        ("laptop", WEIGHTS_DIR / dataset),
+        ("laptop", PRETRAINED_DIR / dataset),
     ):
         first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
         found = [

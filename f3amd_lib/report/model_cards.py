@@ -1,0 +1,223 @@
+"""A card for every model that ships: what it is, its data, how well it does, its limits.
+
+    python -m f3amd_lib.report.model_cards        # writes the cards and the list of checksums
+
+Everything on a card is read from the weights file and from committed results; nothing is typed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import sys
+from pathlib import Path
+
+import jax
+import pandas as pd
+
+from f3amd_lib.profiles import repository_root
+from f3amd_lib.report.quality_tables import figure_text
+from f3amd_lib.report.records import read_table
+from f3amd_lib.report.tables import markdown_table
+from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
+
+__all__ = ["CARD_FIGURES", "model_card", "checksums", "write_cards", "main"]
+
+log = logging.getLogger("f3amd")
+
+CARD_FIGURES = {
+    "FID": "FID",
+    "EMD": "EMD",
+    "style_coverage": "Style (%)",
+    "trajectory_error": "Traj. (m)",
+    "direction_error": "Dir. (degrees)",
+    "foot_sliding": "Foot",
+    "contact_share": "contact share",
+    "foot_alternation": "foot alternation (1/s)",
+    "IRD": "IRD (cm)",
+    "IRD_excess": "IRD excess (cm)",
+    "joint_acceleration": "joint acceleration (cm/frame²)",
+    "path_drift": "drift (m per m)",
+    "seed_spread": "seed spread (cm)",
+    "x0_error_ratio": "x0 error, low over high noise",
+}
+"""Figures on a card, with their headings."""
+
+
+def _figures(name: str, weights: str, quality: pd.DataFrame | None) -> pd.DataFrame | None:
+    """Return the table of a model's figures beside real motion's, or None if not measured."""
+    if quality is None or "weights" not in quality:
+        return None
+    mine = quality[(quality["model"] == name) & (quality["weights"] == weights)]
+    if mine.empty:
+        return None
+    real = quality[quality["model"] == "real"]
+    columns = {f"{steps} steps" if steps > 1 else "1 step": mine[mine["steps"] == steps]
+               for steps in sorted(mine["steps"].unique(), reverse=True)}  # fmt: skip
+    rows = []
+    for metric, heading in CARD_FIGURES.items():
+        row = {"figure": heading}
+        for label, part in (columns | {"real motion": real}).items():
+            found = part[part["metric"] == metric]
+            row[label] = (
+                "–" if found.empty else figure_text(*found.iloc[0][["value", "low", "high"]])
+            )
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _limits(name: str, weights: str, quality: pd.DataFrame | None) -> list[str]:
+    """Return sentences on what a model does badly, as far as its figures say so."""
+    if quality is None or "weights" not in quality:
+        return []
+    mine = quality[(quality["model"] == name) & (quality["weights"] == weights)]
+    mine = mine[mine["steps"] == mine["steps"].max()] if len(mine) else mine
+    value = mine.set_index("metric")["value"]
+    real = quality[quality["model"] == "real"].set_index("metric")["value"]
+    found = []
+    if value.get("x0_error_ratio", 0.0) > 0.5:
+        found.append("It hardly uses its noisy input: every seed gives nearly the same motion.")
+    if value.get("foot_alternation", 1e9) < 0.5 * real.get("foot_alternation", 0.0):
+        found.append(
+            "It does not keep walking: its feet alternate less than half as often as real ones."
+        )
+    if value.get("foot_sliding", 0.0) > 1.5 * real.get("foot_sliding", 1e9):
+        ratio = value["foot_sliding"] / real["foot_sliding"]
+        found.append(
+            f"Its feet slide {ratio:.0f} times as far as real ones while they touch the floor."
+        )
+    if value.get("joint_acceleration", 0.0) > 1.5 * real.get("joint_acceleration", 1e9):
+        found.append(
+            "It trembles: joints accelerate more than 1.5 times as much as in real motion."
+        )
+    return found
+
+
+def model_card(path: Path, quality: pd.DataFrame | None) -> str:
+    """Write the card of one weights file.
+
+    Args:
+      path: the weights.
+      quality: `records/quality_by_seed.csv` summed up with a column of weights, or None; rows of
+        other weights are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    path = Path(path)
+    trained, told = load_model(path), describe(path)
+    record, recipe = trained.record, trained.record["training"]
+    windows = recipe["num_steps"] * recipe["batch_size"]
+    passes = windows / record["num_train_windows"]
+    count = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
+    history, _ = read_table(path.with_name(f"{trained.name}.history.csv"))
+    losses = history["held_out_loss"].dropna()
+    state = " from a work tree with uncommitted changes" if record["git_dirty"] else ""
+    free = record["dataset_licence"] in ("Apache-2.0", "MIT")
+    lines = [
+        f"# {trained.name}, trained on `{record['dataset']}`",
+        "",
+        f"- **File**: `{path.name}`, {path.stat().st_size / 1e6:.1f} MB, {count:,} parameters in "
+        f"{told.get('weights', 'bfloat16')}",
+        f"- **Terms**: {record['dataset_licence']}, as of the data"
+        + ("" if free else ": **non-commercial use only**"),
+        f"- **Data**: {record['dataset_credit']} The starting poses are excerpts.",
+        f"- **Styles**: {', '.join(trained.styles)}",
+        f"- **Training**: {recipe['num_steps']:,} steps of {recipe['batch_size']} windows "
+        f"({windows:,} windows, {passes:.2f} passes over {record['num_train_windows']:,}; "
+        f"the paper: 100 passes, batches of 512), learning rate {recipe['learning_rate']:g} "
+        f"(`{recipe['schedule']}`), moving average {recipe['ema_decay']:g}, "
+        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}, "
+        f"commit {record['git_commit'][:10]}{state}",
+        f"- **Held-out loss**: {losses.iloc[-1]:.4f} at the end (its own loss; losses of different "
+        "recipes do not compare)",
+        "",
+    ]
+    figures = _figures(trained.name, weights_digest(trained.params), quality)
+    lines += ["## Measured", ""]
+    if figures is None:
+        lines += ["Not measured by the protocol yet.", ""]
+    else:
+        lines += [markdown_table(figures), ""]
+        lines += [
+            "Means and 95 % intervals over seeds, by notebook 07's protocol with these weights. "
+            "FID and EMD compare within this data set alone.",
+            "",
+        ]
+    lines += ["## Limits", ""]
+    limits = _limits(trained.name, weights_digest(trained.params), quality)
+    limits.append(
+        "It knows the walks, runs and styles of its data, on level ground, and no others."
+    )
+    if passes < 20:
+        limits.append("It was trained far shorter than the paper's models.")
+    lines += [f"- {limit}" for limit in limits]
+    lines += [
+        "",
+        "## Use",
+        "",
+        "```python",
+        "from f3amd_lib.evaluation.rollout import MotionGenerator",
+        "from f3amd_lib.training.checkpoints import load_model",
+        "",
+        f'generator = MotionGenerator(load_model("{path.name}"), num_steps=8)',
+        "```",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def checksums(folder: Path) -> str:
+    """Return lines for `sha256sum --check` of all weights below a folder."""
+    folder = Path(folder)
+    files = sorted(folder.glob("*/*.safetensors"))
+    return "".join(
+        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"
+        for file in files
+    )
+
+
+def committed_quality(dataset: str) -> pd.DataFrame | None:
+    """Return the committed means of the protocol on a data set, with the weights of each row."""
+    folder = repository_root() / "paper_figures" / dataset / "laptop" / "records"
+    if not (folder / "quality.csv").exists():
+        return None
+    table, _ = read_table(folder / "quality.csv")
+    by_seed, _ = read_table(folder / "quality_by_seed.csv")
+    keys = ["model", "window_frames", "steps"]
+    return table.merge(by_seed[[*keys, "weights"]].drop_duplicates(keys), on=keys, how="left")
+
+
+def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
+    """Write the card beside every weights file below a folder, and `checksums.txt`.
+
+    Args:
+      folder: with a folder for each data set.
+
+    Returns:
+      The cards.
+    """
+    folder = Path(folder)
+    cards = []
+    for path in sorted(folder.glob("*/*.safetensors")):
+        card = path.with_suffix(".md")
+        card.write_text(model_card(path, committed_quality(path.parent.name)), encoding="utf-8")
+        cards.append(card)
+    (folder / "checksums.txt").write_text(checksums(folder), encoding="utf-8")
+    return cards
+
+
+def main() -> int:
+    """Write all cards; see the module's first lines."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    for card in write_cards():
+        log.info("%s", card)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,111 @@
+"""Training on several devices, and in several processes: data parallelism by `jax.sharding`.
+
+Weights and windows lie on every device, a batch is spread over them, and XLA adds up the
+gradients. Every random number belongs to a step and a sample, not to a device, so that the weights
+are those of one device up to the order of sums. Processes on several machines work as more devices
+of one mesh, once each has called `join_processes`.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+__all__ = [
+    "AXIS",
+    "join_processes",
+    "all_devices",
+    "check_batch",
+    "replicate",
+    "spread",
+    "is_first_process",
+    "wait_for_all",
+]
+
+AXIS = "batch"
+"""Name of the mesh axis that a batch is spread over."""
+
+
+def join_processes(
+    coordinator: str | None = None, count: int | None = None, number: int | None = None
+) -> None:
+    """Make this process one of several that train together; before anything else touches JAX.
+
+    Args:
+      coordinator: "host:port" of process 0. On clusters that JAX knows (Slurm, Open MPI,
+        Kubernetes, TPU) leave all three out.
+      count: number of processes.
+      number: of this one, from 0.
+
+    Raises:
+      ValueError: if only some of the three are given, or the number is out of range.
+    """
+    given = (coordinator, count, number)
+    if any(value is None for value in given) and any(value is not None for value in given):
+        raise ValueError(
+            "coordinator, count and number of processes come together or not at all, got "
+            f"{coordinator!r}, {count!r}, {number!r}"
+        )
+    if count is not None and not 0 <= number < count:
+        raise ValueError(f"process {number} of {count}: numbers run from 0 to {count - 1}")
+    jax.distributed.initialize(coordinator, count, number)
+
+
+def all_devices() -> Mesh:
+    """Return a mesh of every device of every process, one axis long."""
+    return Mesh(np.array(jax.devices()), (AXIS,))
+
+
+def check_batch(batch_size: int, mesh: Mesh | None) -> None:
+    """Raise ValueError unless the devices can share a batch equally."""
+    if mesh is not None and batch_size % mesh.size:
+        raise ValueError(
+            f"a batch of {batch_size} windows cannot be shared equally by {mesh.size} devices: "
+            f"take {max(1, batch_size // mesh.size) * mesh.size}"
+        )
+
+
+def replicate(tree, mesh: Mesh | None):
+    """Return arrays that lie on every device of a mesh (as they are without one).
+
+    Args:
+      tree: of arrays that every process has with the same values.
+      mesh: from `all_devices`, or None.
+    """
+    if mesh is None:
+        return tree
+    everywhere = NamedSharding(mesh, PartitionSpec())
+
+    def place(leaf):
+        # Shapes alone are asked for under `jax.eval_shape`, and lie nowhere.
+        if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "sharding", None) == everywhere:
+            return leaf
+        values = np.asarray(leaf)
+        return jax.make_array_from_callback(values.shape, everywhere, lambda part: values[part])
+
+    return jax.tree.map(place, tree)
+
+
+def spread(tree, mesh: Mesh | None):
+    """Ask, inside jit, that arrays are spread over the devices along their first axis."""
+    if mesh is None:
+        return tree
+    shares = NamedSharding(mesh, PartitionSpec(AXIS))
+    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, shares), tree)
+
+
+def is_first_process() -> bool:
+    """Say whether this process writes the files; the others only compute."""
+    return jax.process_index() == 0
+
+
+def wait_for_all(what: str) -> None:
+    """Wait until every process has come here; alone, go on.
+
+    Args:
+      what: name of the place, the same in every process.
+    """
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(what)

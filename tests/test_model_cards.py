@@ -1,0 +1,70 @@
+"""Cards of shipped models say what the weights file and the committed results say."""
+
+import hashlib
+import re
+
+import pandas as pd
+import pytest
+
+from f3amd_lib.report import model_cards
+from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
+
+SHIPPED = sorted(PRETRAINED_DIR.glob("*/*.safetensors"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_model_has_its_card(path):
+    card = path.with_suffix(".md").read_text(encoding="utf-8")
+    assert card == model_cards.model_card(path, model_cards.committed_quality(path.parent.name)), (
+        "write the cards anew: python -m f3amd_lib.report.model_cards"
+    )
+    record = describe(path)["record"]
+    assert record["dataset_licence"] in card and record["dataset_credit"] in card
+    assert ("non-commercial" in card) == ("NC" in record["dataset_licence"])
+    assert f"{record['training']['num_steps']:,} steps" in card
+
+
+def test_checksums_are_those_of_the_files():
+    lines = (PRETRAINED_DIR / "checksums.txt").read_text(encoding="utf-8").splitlines()
+    listed = dict(reversed(line.split("  ")) for line in lines)
+    assert listed.keys() == {path.relative_to(PRETRAINED_DIR).as_posix() for path in SHIPPED}
+    for name, digest in listed.items():
+        assert hashlib.sha256((PRETRAINED_DIR / name).read_bytes()).hexdigest() == digest
+
+
+def test_shipped_weights_stay_within_twenty_megabytes():
+    assert sum(path.stat().st_size for path in SHIPPED) <= 20_000_000
+
+
+def quality(weights: str, **figures) -> pd.DataFrame:
+    real = {"foot_alternation": 2.0, "foot_sliding": 0.1, "joint_acceleration": 0.6, "FID": 10.0}
+    rows = [("real", 0, "real", name, value) for name, value in real.items()]
+    rows += [("F3AMD-FNO-96-plus", 8, weights, name, value) for name, value in figures.items()]
+    columns = ["model", "steps", "weights", "metric", "value"]
+    return pd.DataFrame(rows, columns=columns).assign(low=float("nan"), high=float("nan"))
+
+
+def test_limits_follow_from_the_figures():
+    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-plus.safetensors"
+    weights = weights_digest(load_model(path).params)
+
+    def limits(**figures):
+        card = model_cards.model_card(path, quality(weights, **figures))
+        return card.split("## Limits")[1].split("## Use")[0]
+
+    good = {"x0_error_ratio": 0.2, "foot_alternation": 2.0, "foot_sliding": 0.1}
+    assert "noisy input" not in limits(**good) and "slide" not in limits(**good)
+    assert "hardly uses its noisy input" in limits(**good | {"x0_error_ratio": 0.95})
+    assert "does not keep walking" in limits(**good | {"foot_alternation": 0.9})
+    assert "slide 6 times" in limits(**good | {"foot_sliding": 0.6})
+    assert "trembles" in limits(**good, joint_acceleration=1.0)
+
+
+def test_figures_of_other_weights_are_not_shown():
+    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-plus.safetensors"
+    assert "Not measured by the protocol" in model_cards.model_card(path, quality("other", FID=5.0))
+    assert "Not measured by the protocol" in model_cards.model_card(path, None)
+    weights = weights_digest(load_model(path).params)
+    card = model_cards.model_card(path, quality(weights, FID=12.345))
+    assert re.search(r"\| FID +\| +12\.35 +\| +10\.00? +\|", card) or "12.35" in card

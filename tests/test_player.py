@@ -1,0 +1,413 @@
+"""The motion player's page: its numbers, its text, what it refuses. tests/web opens it."""
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import SKELETON, straight_motion, wandering_motion
+from PIL import Image
+
+from f3amd_lib.evaluation.paths import RootPath, named_path, path_from_motion
+from f3amd_lib.evaluation.rollout import Rollout
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.report import player
+from f3amd_lib.report.pictures import LIMB_COLORS, limb_side
+from f3amd_lib.report.player import (
+    Character,
+    Scene,
+    player_page,
+    rollout_scene,
+    scenes_strip,
+    show_player,
+    write_player,
+)
+
+FRAMES = 40
+
+
+def page_data(page: str) -> dict:
+    """The JSON block of a page."""
+    return json.loads(re.search(r'id="player-data">(.*?)</script>', page, re.S)[1])
+
+
+def read_tracks(data: dict) -> list[list[dict]]:
+    """Every character's tracks, read as the module's text says, one number at a time.
+
+    Plain Python integers, so that nothing is shared with the encoder's arithmetic.
+    """
+    stream = zlib.decompress(base64.b64decode(data["tracks"]))
+    frames, offset = data["frames"], 0
+
+    def take(channels: int, size: int, signed: bool):
+        nonlocal offset
+        count = channels * frames
+        values = np.zeros((frames, channels), int)
+        for channel in range(channels):
+            total = 0
+            for frame in range(frames):
+                place = channel * frames + frame
+                raw = bytes(stream[offset + plane * count + place] for plane in range(size))
+                total = (total + int.from_bytes(raw, "little")) % 256**size
+                wrapped = total - 256**size if signed and total >= 256**size // 2 else total
+                values[frame, channel] = wrapped
+        offset += size * count
+        return values
+
+    scenes = []
+    for scene in data["scenes"]:
+        characters = []
+        for character in scene["characters"]:
+            skeleton = data["skeletons"][character["skeleton"]]
+            tracks = {"root": take(3, 4, True)}
+            points = take(3 * skeleton["points"], 2, True).reshape(frames, -1, 3)
+            tracks["global"] = points + tracks["root"][:, None]
+            tracks["contacts"] = take(1, 1, False)[:, 0] if character["contacts"] else None
+            tracks["path"] = take(2, 4, True) if character["path"] else None
+            characters.append(tracks)
+        scenes.append(characters)
+    assert offset == len(stream)
+    return scenes
+
+
+class Elements(HTMLParser):
+    """All start tags of a page with their attributes, and its text."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.tags: list[tuple[str, dict]] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.text += data
+
+
+# ----------------------------------------------------------------------------------------- numbers
+
+
+def test_positions_come_back_to_half_a_millimetre():
+    motions = [wandering_motion(FRAMES, seed) for seed in range(3)]
+    # Far away and back again: beyond what int16 millimetres from the origin would hold.
+    away = np.array([4000.0, 0.0, -90000.0])
+    motions[1] = motions[1].replace(root_position=motions[1].root_position + away)
+    data = page_data(player_page([Scene(motions[:2]), Scene(motions[2])]))
+    assert [len(scene["characters"]) for scene in data["scenes"]] == [2, 1]
+    assert (data["fps"], data["frames"], len(data["skeletons"])) == (30.0, FRAMES, 1)
+    read = [tracks for scene in read_tracks(data) for tracks in scene]
+    for motion, tracks in zip(motions, read, strict=True):
+        joints = motion.skeleton.num_joints
+        error = tracks["global"][:, :joints] - 1000 * motion.positions
+        assert np.abs(error).max() <= 0.5 + 1e-6
+        np.testing.assert_array_equal(tracks["root"], tracks["global"][:, 0])
+
+
+def test_tips_of_limbs_are_points_too():
+    motion = straight_motion(3)
+    data = page_data(player_page(motion))
+    # Upright with unturned joints: the spine's tip is its offset away.
+    tip = read_tracks(data)[0][0]["global"][:, SKELETON.num_joints]
+    expected = motion.positions[:, 1] + np.array([0.0, 0.2, 0.0])
+    np.testing.assert_allclose(tip, 1000 * expected, atol=0.5001)
+
+
+def test_contacts_and_path_come_back():
+    motion = wandering_motion(FRAMES)
+    path = path_from_motion(motion)
+    contacts = np.zeros((FRAMES, 2), bool)
+    contacts[5:9, 0] = contacts[8:12, 1] = True
+    character = Character(motion, path=path, contacts=contacts)
+    tracks = read_tracks(page_data(player_page(character)))[0][0]
+    np.testing.assert_array_equal(tracks["contacts"] & 1, contacts[:, 0])
+    np.testing.assert_array_equal(tracks["contacts"] >> 1, contacts[:, 1])
+    np.testing.assert_allclose(tracks["path"], 1000 * path.position, atol=0.5001)
+    # A plain array of x and z does as well, and by default contacts are the motion's own.
+    other = read_tracks(page_data(player_page(Character(motion, path=path.position))))[0][0]
+    np.testing.assert_array_equal(other["path"], tracks["path"])
+    own = motion.contacts.astype(int) @ np.array([1, 2])
+    np.testing.assert_array_equal(other["contacts"], own)
+
+
+def test_every_bone_is_drawn_once_in_a_limb_of_its_side():
+    drawn = player._what_is_drawn(SYNTHETIC_SKELETON)
+    joints = [point for point in drawn.points if point < SYNTHETIC_SKELETON.num_joints]
+    assert joints == list(range(SYNTHETIC_SKELETON.num_joints))
+    lines = {}
+    for side, bones in drawn.limbs:
+        for parent, child in bones:
+            assert drawn.points[child] not in lines
+            lines[drawn.points[child]] = (drawn.points[parent], side)
+    for joint, parent in enumerate(SYNTHETIC_SKELETON.parents):
+        if parent >= 0:
+            assert lines[joint] == (parent, limb_side(SYNTHETIC_SKELETON.names[joint]))
+    # Trunk, two arms, two legs.
+    assert sorted(side for side, _ in drawn.limbs) == ["left"] * 2 + ["middle"] + ["right"] * 2
+    toes = tuple(drawn.points[toe] for toe in drawn.toes)
+    assert toes == SYNTHETIC_SKELETON.toes
+    head = SYNTHETIC_SKELETON.index("Head")
+    neck = SYNTHETIC_SKELETON.parents[head]
+    assert tuple(drawn.points[k] for k in drawn.head) == (head, neck)
+
+
+def test_unlike_skeletons_share_a_page():
+    parents = (-1, 0, 1)
+    chain = Skeleton(("Root", "Mid", "Tip"), parents, [[0, 0, 0], [0, 1, 0], [0, 1, 0]])
+    rotations = np.broadcast_to(np.eye(3), (FRAMES, 3, 3, 3))
+    pole = Motion(chain, np.full((FRAMES, 3), 0.25), rotations, name="pole")
+    data = page_data(player_page([wandering_motion(FRAMES), pole, pole]))
+    assert [scene["characters"][0]["skeleton"] for scene in data["scenes"]] == [0, 1, 1]
+    tracks = read_tracks(data)[1][0]
+    np.testing.assert_array_equal(
+        tracks["global"][7], [[250] * 3, [250, 1250, 250], [250, 2250, 250]]
+    )
+    # Nobody knows where this rig's toes or hips are: no contacts, and a camera along +Z.
+    assert tracks["contacts"] is None and data["skeletons"][1]["toes"] is None
+
+
+def test_one_frame_is_enough():
+    data = page_data(player_page(wandering_motion(1)))
+    assert data["frames"] == 1 and read_tracks(data)[0][0]["global"].shape[0] == 1
+
+
+def test_a_smooth_motion_takes_less_than_its_raw_numbers():
+    data = page_data(player_page(wandering_motion(300), autoplay=False))
+    points = data["skeletons"][0]["points"]
+    raw = 300 * (12 + 6 * points + 1)
+    assert len(data["tracks"]) < 0.75 * raw  # base64 alone would add a third
+
+
+# -------------------------------------------------------------------------------------------- text
+
+
+def test_the_page_holds_everything_and_asks_for_nothing():
+    page = player_page(wandering_motion(FRAMES), title="Walk")
+    for tag, attributes in Elements(page).tags:
+        assert "src" not in attributes and "srcset" not in attributes
+        assert tag != "link" or attributes["href"] == "data:,"
+    assert "://" not in page and "@import" not in page and "url(" not in page
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
+    assert "default-src 'none'" in policy
+    assert not re.search(r"\$[a-z]+\b", page.split("<script>")[0].split('id="player-data"')[0])
+
+
+def test_titles_are_text_and_never_markup():
+    evil = '</script><script>alert("1")</script> & <b>'
+    motion = wandering_motion(3)
+    scene = Scene(Character(motion, color="#00aa33"), title=evil, note=evil)
+    page = player_page(scene, title=evil, credit=evil)
+    elements = Elements(page)
+    assert [tag for tag, _ in elements.tags].count("script") == 2
+    assert "b" not in [tag for tag, _ in elements.tags]
+    assert page_data(page)["scenes"][0]["title"] == evil
+    assert elements.text.count(evil) == 5  # title, heading, panel, note, credit
+    label = next(attributes["aria-label"] for tag, attributes in elements.tags if tag == "canvas")
+    assert label.startswith(evil)
+
+
+def test_each_scene_has_a_panel_that_says_what_it_shows():
+    one, two, three = (wandering_motion(FRAMES, seed) for seed in range(3))
+    page = player_page([Scene([one, two], title="Pair", note="8 ms"), three])
+    elements = Elements(page)
+    labels = [attributes for tag, attributes in elements.tags if tag == "canvas"]
+    assert [(item["role"], item["aria-label"]) for item in labels] == [
+        ("img", "Pair: 2 characters of 6 joints, 1.3 seconds"),
+        ("img", "wandering 2: 1 character of 6 joints, 1.3 seconds"),
+    ]
+    assert "Pair8 ms" in elements.text
+    assert "<title>Pair, wandering 2</title>" in page
+
+
+def test_the_legend_names_what_is_there_and_no_more():
+    motion = wandering_motion(FRAMES)
+    plain = Elements(player_page(motion)).text
+    assert "toe in contact" in plain and "walked" in plain
+    assert "target path" not in plain and "a window begins" not in plain
+    character = Character(motion, path=path_from_motion(motion))
+    full = Elements(player_page(Scene(character, boundaries=[32]))).text
+    assert "target path" in full and "a window begins" in full
+
+
+def test_colours_are_those_of_the_pictures():
+    page = player_page(wandering_motion(3))
+    for side, color in LIMB_COLORS.items():
+        assert f"--{side}: {color};" in page
+
+
+def test_boundaries_and_settings_are_handed_on():
+    motion = wandering_motion(FRAMES)
+    scene = Scene(motion, boundaries=range(8, FRAMES, 8))
+    data = page_data(player_page(scene, autoplay=False))
+    assert data["scenes"][0]["boundaries"] == [8, 16, 24, 32]
+    assert data["autoplay"] is False and data["follow"] is True
+    assert page_data(player_page(Scene([motion, motion])))["follow"] is False
+    assert page_data(player_page(Scene([motion, motion]), follow=True))["follow"] is True
+    assert data["around"] == pytest.approx(motion.yaw[0] - np.deg2rad(50), abs=1e-4)
+
+
+def test_equal_motions_make_equal_pages():
+    pages = [player_page(wandering_motion(FRAMES, 3), title="a") for _ in range(2)]
+    assert pages[0] == pages[1]
+    assert pages[0] != player_page(wandering_motion(FRAMES, 4), title="a")
+
+
+def test_a_rollout_becomes_a_scene():
+    from f3amd_lib.data.features import world_frames
+
+    motions = [wandering_motion(20, seed) for seed in range(2)]
+    frames = np.stack([world_frames(motion) for motion in motions]).astype(np.float32)
+    paths = tuple(named_path(name, 20) for name in ("circle", "straight"))
+    rollout = Rollout(SKELETON, frames, frames[:, :4], paths, ("calm", "proud"), window=8)
+    scene = rollout_scene(rollout, "Two", colors=["#112233", None])
+    assert list(scene.boundaries) == [8, 16]
+    assert [one.name or one.motion.name for one in scene.characters] == ["calm", "proud"]
+    assert [one.color for one in scene.characters] == ["#112233", None]
+    tracks = read_tracks(page_data(player_page(scene)))[0]
+    for motion, path, read in zip(motions, paths, tracks, strict=True):
+        error = np.abs(read["global"][:, :6] - 1000 * motion.positions).max()
+        assert error < 0.6  # features are float32
+        np.testing.assert_allclose(read["path"], 1000 * path.position, atol=0.5001)
+    with pytest.raises(ValueError, match="1 colours for 2 characters"):
+        rollout_scene(rollout, colors=["#112233"])
+
+
+# ----------------------------------------------------------------------------------------- refusal
+
+
+def long_armed(length: float) -> Motion:
+    motion = straight_motion(4)
+    offsets = np.array(SKELETON.offsets)
+    offsets[1] = [0.0, length, 0.0]
+    return motion.replace(skeleton=dataclasses.replace(SKELETON, offsets=offsets, end_sites=()))
+
+
+def test_what_cannot_be_shown_is_refused_by_name():
+    motion, short = wandering_motion(FRAMES), wandering_motion(FRAMES - 1, 1)
+    with pytest.raises(ValueError, match="at least one scene"):
+        player_page([])
+    with pytest.raises(ValueError, match=r"scene 0 \(Empty\) has no character"):
+        player_page(Scene([], title="Empty"))
+    with pytest.raises(ValueError, match="scene 1 is a str"):
+        player_page([motion, "walk"])
+    with pytest.raises(ValueError, match="scene 0, character 1 is a int"):
+        player_page(Scene([motion, 3]))
+    with pytest.raises(ValueError, match="wandering 1: 39 frames, .* has 40"):
+        player_page([motion, short])
+    with pytest.raises(ValueError, match="60 frames a second, .* has 30"):
+        player_page([motion, motion.replace(fps=60.0)])
+    with pytest.raises(ValueError, match=r"color must be like '#1b4f8f', got 'red'"):
+        player_page(Character(motion, color="red"))
+
+
+def test_numbers_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="a joint lies 40.0 m from its root at frame 0"):
+        player_page(long_armed(40.0))
+    assert player_page(long_armed(32.0))
+    motion = straight_motion(4)
+    root = np.array(motion.root_position)
+    root[2, 0] = 3e6
+    with pytest.raises(ValueError, match="root at frame 2 .* 2000 km"):
+        player_page(motion.replace(root_position=root))
+    broken = straight_motion(4)
+    positions = np.array(broken.positions)
+    positions[3, 1] = np.nan
+    broken.__dict__["positions"] = positions  # as if kinematics had gone wrong
+    with pytest.raises(ValueError, match="points at frame 3 is not finite"):
+        player_page(broken)
+
+
+def test_paths_and_contacts_that_do_not_fit_are_refused():
+    motion = wandering_motion(FRAMES)
+    path = path_from_motion(motion)
+    with pytest.raises(ValueError, match="wandering 0: the target path has 39 frames at 30"):
+        player_page(Character(motion, path=path.slice(0, FRAMES - 1)))
+    with pytest.raises(ValueError, match="at 60 a second, the motion 40 at 30"):
+        player_page(Character(motion, path=RootPath(path.position, path.yaw, fps=60.0)))
+    bad = np.array(path.position)
+    bad[3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"wandering 0: a target path must be \[T, 2\]"):
+        player_page(Character(motion, path=bad))
+    with pytest.raises(ValueError, match=r"contacts must be \[40, 2\] .* got \(39, 2\)"):
+        player_page(Character(motion, contacts=np.zeros((FRAMES - 1, 2), bool)))
+    with pytest.raises(ValueError, match="true or false"):
+        player_page(Character(motion, contacts=np.full((FRAMES, 2), 0.5)))
+    with pytest.raises(ValueError, match="true or false"):
+        player_page(Character(motion, contacts=np.full((FRAMES, 2), np.nan)))
+
+
+@pytest.mark.parametrize("boundaries", [[0], [FRAMES], [-3], [3.5]])
+def test_boundaries_that_are_no_frames_are_refused(boundaries):
+    with pytest.raises(ValueError, match=re.escape(f"boundary {boundaries[0]} of scene 'Walk'")):
+        player_page(Scene(wandering_motion(FRAMES), title="Walk", boundaries=boundaries))
+
+
+# --------------------------------------------------------------------------------- files, notebooks
+
+
+def test_a_film_strip_stands_beside_the_page(tmp_path):
+    scene = Scene(wandering_motion(FRAMES), title="Walk")
+    path = write_player(tmp_path / "new" / "walk.html", scene, title="Walk")
+    assert path.read_text(encoding="utf-8") == player_page(scene, title="Walk")
+    assert Image.open(path.with_suffix(".png")).width > 500
+    with pytest.raises(ValueError, match=r"walk.html, .*walk.png: exists already"):
+        write_player(path, scene, overwrite=False)
+    write_player(path, scene, title="Other")
+    assert "<h1>Other</h1>" in path.read_text(encoding="utf-8")
+    write_player(tmp_path / "alone.html", scene, strip=False)
+    assert not (tmp_path / "alone.png").exists()
+    with pytest.raises(ValueError, match=r"players are written as \.html"):
+        write_player(tmp_path / "walk.htm", scene)
+
+
+def test_the_strip_has_a_row_a_scene(tmp_path):
+    motions = [wandering_motion(FRAMES, seed) for seed in range(3)]
+    assert len(scenes_strip(motions).axes) == 6  # poses and plan each
+    assert len(scenes_strip(motions, max_rows=2).axes) == 4
+
+
+def test_a_notebook_gets_an_iframe_and_an_image(monkeypatch):
+    motion = wandering_motion(FRAMES)
+    shown = show_player(motion, title='A "quoted" <title>', height=300)
+    (attributes,) = [found for tag, found in Elements(shown.iframe).tags if tag == "iframe"]
+    assert attributes["sandbox"] == "allow-scripts"
+    assert attributes["srcdoc"] == player_page(motion, title='A "quoted" <title>', autoplay=False)
+    assert attributes["title"] == 'Motion player: A "quoted" <title>'
+    assert "height:300px" in attributes["style"]
+    displayed = []
+    monkeypatch.setattr("IPython.display.display", lambda one, **raw: displayed.append(one))
+    shown._ipython_display_()
+    html, image = displayed
+    assert html["text/html"] == shown.iframe
+    assert image._repr_mimebundle_()[0]["image/png"]
+    displayed.clear()
+    show_player(motion, strip=False)._ipython_display_()
+    assert len(displayed) == 1
+    with pytest.raises(ValueError, match="height must be 200 or more"):
+        show_player(motion, height=20)
+
+
+def test_the_page_is_made_of_files_that_are_installed():
+    import tomllib
+
+    root = Path(__file__).resolve().parents[1]
+    listed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
+    patterns = listed["package-data"]["f3amd_lib"]
+    package = root / "f3amd_lib"
+    found = {path for pattern in patterns for path in package.glob(pattern)}
+    assert {package / "report" / f"player.{kind}" for kind in ("html", "css", "js")} <= found
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node on this machine")
+def test_the_script_is_sound():
+    script = Path(player.__file__).with_name("player.js")
+    subprocess.run(["node", "--check", str(script)], check=True)

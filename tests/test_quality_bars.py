@@ -1,0 +1,91 @@
+"""Bars of our own: figures that meet them, figures that miss them, figures that are not there."""
+
+import pandas as pd
+import pytest
+
+from f3amd_lib.report.quality_bars import BAR_MODELS, quality_bars
+
+REAL = {
+    "style_coverage": 99.0, "FID": 10.0, "EMD": 5.0, "IRD": 4.0, "IRD_excess": 0.7,
+    "trajectory_error": 0.03, "direction_error": 4.0, "foot_sliding": 0.1, "contact_share": 0.4,
+    "joint_acceleration": 0.6,
+}  # fmt: skip
+MADE = REAL | {
+    "path_drift": 0.01, "x0_error_ratio": 0.2, "seed_spread": 2.0, "FID": 12.0, "EMD": 5.5,
+    "foot_sliding": 0.14, "contact_share": 0.45,
+}  # fmt: skip
+
+
+def table(**figures) -> pd.DataFrame:
+    rows = {("real", 0): REAL, ("frozen pose", 0): REAL | {"FID": 100.0, "EMD": 11.0}}
+    rows |= {(model, 1): MADE | figures for model in BAR_MODELS}
+    rows[BAR_MODELS[1], 8] = dict.fromkeys(MADE, 1e6)  # eight steps are not asked
+    return pd.DataFrame(
+        [
+            {"model": model, "steps": steps, "metric": metric, "value": value}
+            for (model, steps), values in rows.items()
+            for metric, value in values.items()
+        ]
+    )
+
+
+def met_by(frame: pd.DataFrame) -> dict:
+    return frame.set_index("bar")["met_by"].to_dict()
+
+
+def test_good_figures_meet_every_bar():
+    bars = quality_bars(table(), 0.9, 4.0)
+    assert set(bars["met_by"]) == {"both"} and len(bars) == 14
+    plus = bars.set_index("bar")["F3AMD-FNO-96-plus"]
+    assert plus["Classifier, held-out accuracy"] == pytest.approx(90.0)
+    assert plus["FID: distance to real over that to a bad one"] == pytest.approx(2.0 / 88.0)
+    assert plus["Foot over real"] == pytest.approx(1.4)
+    assert plus["Drift over the rollout"] == pytest.approx(1.0)
+    assert plus["Seed spread over that of real continuations"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("metric", "value", "bar"),
+    [
+        ("style_coverage", 80.0, "Style coverage"),
+        ("FID", 70.0, "FID: distance to real over that to a bad one"),
+        ("IRD", 6.0, "IRD: distance to real"),
+        ("IRD_excess", 2.0, "IRD excess"),
+        ("trajectory_error", 0.1, "Traj. per window"),
+        ("direction_error", 6.5, "Dir. per window"),
+        ("path_drift", 0.06, "Drift over the rollout"),
+        ("foot_sliding", 0.16, "Foot over real"),
+        ("contact_share", 0.5, "Contact share: distance to real over real"),
+        ("joint_acceleration", 1.0, "Joint acceleration over real"),
+        ("x0_error_ratio", 0.6, "x0 error at sigma 0.1 over that at 128"),
+        ("seed_spread", 0.9, "Seed spread over that of real continuations"),
+    ],
+)
+def test_a_bad_figure_misses_its_bar_and_no_other(metric, value, bar):
+    found = met_by(quality_bars(table(**{metric: value}), 0.9, 4.0))
+    assert [name for name, answer in found.items() if answer != "both"] == [bar]
+    assert found[bar] == "neither"
+
+
+def test_bars_name_the_model_that_meets_them():
+    frame = table()
+    first = (frame["model"] == BAR_MODELS[0]) & frame["metric"].isin(["IRD_excess", "seed_spread"])
+    frame.loc[first, "value"] = [9.0, 0.5]
+    second = (frame["model"] == BAR_MODELS[1]) & (frame["metric"] == "style_coverage")
+    frame.loc[second & (frame["steps"] == 1), "value"] = 80.0
+    found = met_by(quality_bars(frame, 0.9, 4.0))
+    assert found["IRD excess"] == BAR_MODELS[1]
+    assert found["Seed spread over that of real continuations"] == BAR_MODELS[1]
+    assert found["Style coverage"] == BAR_MODELS[0]
+
+
+def test_what_was_not_measured_is_said():
+    bars = met_by(quality_bars(table(), 0.5, None))
+    assert bars["Seed spread over that of real continuations"] == "not measured"
+    assert bars["Classifier, held-out accuracy"] == "neither"
+    frame = table()
+    alone = met_by(quality_bars(frame[~frame["model"].isin(BAR_MODELS)], 0.9))
+    assert alone.pop("Classifier, held-out accuracy") == "both"
+    assert set(alone.values()) == {"not measured"}
+    with pytest.raises(ValueError, match="no rows of real motion"):
+        quality_bars(frame[frame["model"] != "real"], 0.9)

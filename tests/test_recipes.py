@@ -1,0 +1,134 @@
+"""Recipes of our own: one change each, and the measurements that ask networks about their noise."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
+
+from f3amd_lib import measure
+from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.models import zoo
+from f3amd_lib.profiles import load_profile
+from f3amd_lib.report.records import read_table
+from f3amd_lib.training import recipes
+from f3amd_lib.training.loop import paper_recipe
+from f3amd_lib.training.pipeline import PreparedData
+
+PROFILE = load_profile("smoke", "synthetic", batch_size=2, window=WINDOW)
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    clips = [(wandering_motion(60, seed), seed % 2, split) for seed, split in ((0, 0), (1, 1))]
+    return PreparedData(packed_from(clips), WINDOW, HISTORY)
+
+
+def changed(first: dict, second: dict) -> set[str]:
+    return {name for name in first if first[name] != second[name]}
+
+
+def test_every_recipe_changes_one_thing(prepared):
+    paper = recipes.RECIPES["paper"].config(100, 8, 0)
+    assert paper == paper_recipe("F3AMD-FNO-96", 100, batch_size=8, seed=0)
+    base = prepared.model_config("F3AMD-FNO-96", num_kept_modes=5).to_dict()
+    for name, recipe in recipes.RECIPES.items():
+        if name in ("paper", "plus"):
+            continue
+        network = prepared.model_config(recipe.preset, num_kept_modes=5, **recipe.network)
+        training = recipe.config(100, 8, 0).to_dict()
+        ours = changed(base, network.to_dict()) | changed(paper.to_dict(), training)
+        assert len(ours) == 1 or name == "warm-up-and-cosine", (name, ours)
+    warm = recipes.RECIPES["warm-up-and-cosine"].config(100, 8, 0)
+    assert (warm.schedule, warm.warmup_steps, warm.learning_rate) == ("warmup_cosine", 10, 2e-3)
+    plus = recipes.RECIPES["plus"].config(100, 8, 0)
+    assert plus.own_history_share == zoo.find_preset("F3AMD-FNO-96-plus").training[
+        "own_history_share"
+    ]  # fmt: skip
+
+
+def test_unknown_recipe_names_the_nearest():
+    with pytest.raises(ValueError, match="'wide-decodr'; did you mean 'wide-decoder'"):
+        recipes.find_recipe("wide-decodr")
+
+
+@pytest.fixture
+def two_recipes(monkeypatch):
+    """Two rows only, on networks of one narrow block."""
+    build = zoo.build_config
+    monkeypatch.setattr(
+        zoo,
+        "build_config",
+        lambda *a, **k: build(
+            *a, **{**k, "depth": 1, "latent_width": 8, "num_kept_modes": WINDOW // 2 + 1}
+        ),
+    )
+    rows = {name: recipes.RECIPES[name] for name in ("paper", "residual-prior")}
+    monkeypatch.setattr(measure, "RECIPES", rows)
+    monkeypatch.setattr(recipes, "RECIPE_STEPS", {"smoke": 2})
+    monkeypatch.setattr(measure, "RECIPE_STEPS", {"smoke": 2})
+    return rows
+
+
+def test_recipes_are_trained_measured_and_gone_on_with(
+    prepared, two_recipes, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(measure, "runs_dir", lambda *names: tmp_path.joinpath("runs", *names))
+    path = measure.measure_recipes(prepared, PROFILE)
+    table, record = read_table(path)
+    assert record["num_steps"] == 2 and record["batch_size"] == 2
+    assert list(table["recipe"]) == ["paper", "paper", "residual-prior", "residual-prior"]
+    assert list(table["steps"]) == [8, 1, 8, 1]
+    assert np.isfinite(table.select_dtypes("number")).all().all()
+    assert set(table["change"]) == {recipe.change for recipe in two_recipes.values()}
+    assert table["weights"].nunique() == 2
+    folder = tmp_path / "runs" / "synthetic" / "smoke" / "recipes" / "paper"
+    assert list(folder.glob("F3AMD-FNO-96*.history.csv"))
+
+    def refuse(*arguments, **settings):
+        raise AssertionError("a row that is there was trained again")
+
+    monkeypatch.setattr(measure, "train_recipe", refuse)
+    assert measure.measure_recipes(prepared, PROFILE) == path
+    with pytest.raises(ValueError, match="leave --model out"):
+        measure.measure_recipes(prepared, PROFILE, ["F3AMD-FNO-96"])
+
+
+def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkeypatch):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    models = {
+        "F3AMD-FNO-32": tiny_trained(),
+        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=VariancePreservingCosine(4)),
+    }
+    asked = []
+
+    def obtain(prepared, profile, *, preset):
+        asked.append(preset)
+        return models[preset], None, "earlier run"
+
+    monkeypatch.setattr(measure, "obtain_model", obtain)
+    monkeypatch.setattr(measure, "available_models", lambda profile: list(models))
+    monkeypatch.setattr(measure, "SIGMAS", (0.1, 128.0))
+    path = measure.measure_noise_use(prepared, PROFILE)
+    table, _ = read_table(path)
+    errors, _ = read_table(path.with_name("x0_by_sigma.csv"))
+    levels = errors.groupby("model")["sigma"].apply(list)
+    assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
+    # A network that is told the number of a step is asked at its own levels.
+    assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
+    assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
+    assert set(table["model"]) == set(models) and "x0_error_ratio" in table
+    before = len(errors)
+    # Nothing changed: nothing new. Other weights: that model alone anew.
+    measure.measure_noise_use(prepared, PROFILE)
+    assert len(read_table(path.with_name("x0_by_sigma.csv"))[0]) == before
+    first = table[table["model"] == "CAMDM"]["x0_error_ratio"].tolist()
+    tiny = models["CAMDM"]
+    doubled = jax.tree.map(lambda leaf: 2 * leaf, tiny.params)
+    models["CAMDM"] = dataclasses.replace(tiny, params=doubled)
+    measure.measure_noise_use(prepared, PROFILE)
+    again, _ = read_table(path)
+    assert len(again) == len(table)
+    assert again[again["model"] == "CAMDM"]["x0_error_ratio"].tolist() != first

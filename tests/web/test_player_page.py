@@ -1,0 +1,487 @@
+"""The motion player in a real browser: what a reader sees, presses and touches."""
+
+import base64
+import io
+
+import numpy as np
+import pytest
+from builders import wandering_motion
+from conftest import DESKTOP, PHONE
+from PIL import Image
+
+from f3amd_lib.evaluation.paths import path_from_motion
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.report.player import Character, Scene, player_page, show_player, write_player
+
+FRAMES = 90
+TITLES = ["Real", "CAMDM, 8 steps", "F3AMD, 8 steps", "F3AMD, 1 step"]
+
+
+@pytest.fixture(scope="module")
+def walks():
+    return [synthesize("Neutral", FRAMES / 30, seed=seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def side_by_side(walks, tmp_path_factory):
+    """Four motions in step, with target paths and windows of 32 frames."""
+    scenes = [
+        Scene(
+            Character(walk, path=path_from_motion(walk)),
+            title=title,
+            note="a note <b>below</b>" if title == "Real" else "",
+            boundaries=(32, 64),
+        )
+        for walk, title in zip(walks, TITLES, strict=True)
+    ]
+    path = tmp_path_factory.mktemp("pages") / "four.html"
+    return write_player(path, scenes, title="One path & four ways", credit="Nobody's", strip=False)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """One small figure that does not start by itself."""
+    path = tmp_path_factory.mktemp("pages") / "one.html"
+    scene = Scene(wandering_motion(FRAMES), title="Wanderer")
+    return write_player(path, scene, autoplay=False, strip=False)
+
+
+def opened(browser, page):
+    browser.open(page)
+    browser.wait("return document.documentElement.dataset.ready === 'yes'")
+    return browser
+
+
+def state(browser) -> dict:
+    return browser.script("return player.state()")
+
+
+def settled(browser) -> dict:
+    """The state after the next picture has been drawn."""
+    browser.driver.execute_async_script(
+        "const done = arguments[0];"
+        "requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done)));"
+    )
+    return state(browser)
+
+
+def pixels(browser, panel: int = 0) -> np.ndarray:
+    """What a panel's canvas shows, [H, W, 3]."""
+    picture = browser.script(
+        "return document.querySelectorAll('canvas')[arguments[0]].toDataURL()", panel
+    )
+    image = Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1])))
+    return np.asarray(image.convert("RGB"))
+
+
+def share_of(picture: np.ndarray, color: str, within: int = 30) -> int:
+    """Number of pixels near a colour."""
+    wanted = np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)])
+    return int((np.abs(picture.astype(int) - wanted).max(axis=-1) < within).sum())
+
+
+# ------------------------------------------------------------------------------ the fixture itself
+
+
+def test_the_fixture_hears_of_requests_and_errors(browser, tmp_path):
+    page = tmp_path / "bad.html"
+    page.write_text(
+        "<img src='http://outside.invalid/x.png'><script>undefinedThing();</script>"
+        "<iframe sandbox='allow-scripts' srcdoc=\"<script src='http://inner.invalid/y.js'></script>"
+        '<script>otherThing();</script>"></iframe>'
+    )
+    browser.open(page)
+    browser.wait("return document.readyState === 'complete'")
+    asked = browser.outside()
+    assert "http://outside.invalid/x.png" in asked
+    assert "http://inner.invalid/y.js" in asked
+    errors = " ".join(browser.errors())
+    assert "undefinedThing" in errors and "otherThing" in errors
+
+
+# ----------------------------------------------------------------------------------------- loading
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_the_page_opens_without_errors_or_requests(browser, side_by_side, screenshots, size):
+    browser.resize(*size, phone=size == PHONE)
+    opened(browser, side_by_side)
+    browser.wait("return player.state().frame > 20")
+    name = "phone" if size == PHONE else "desktop"
+    picture = browser.screenshot(screenshots / f"player_{name}.png")
+    assert picture.shape[1] == size[0] * (2 if size == PHONE else 1)
+    assert browser.errors() == []
+    assert browser.requests() == []
+    # Nothing sticks out: what is wider than the window would have to be scrolled to.
+    assert browser.script("return document.documentElement.scrollWidth") <= size[0]
+    assert browser.script("return document.documentElement.scrollHeight") <= size[1]
+
+
+def test_titles_stand_over_their_panels_and_text_is_text(browser, side_by_side):
+    opened(browser, side_by_side)
+    captions = browser.script(
+        "return [...document.querySelectorAll('.panel')].map((one) =>"
+        " [one.querySelector('strong').textContent, one.getBoundingClientRect().left,"
+        "  one.querySelector('canvas').getAttribute('aria-label')])"
+    )
+    assert [title for title, _, _ in captions] == TITLES
+    lefts = [left for _, left, _ in captions]
+    assert lefts == sorted(lefts) and len(set(lefts)) == 4  # side by side on a desktop
+    assert all(
+        label == f"{title}: 1 character of 23 joints, 3.0 seconds" for title, _, label in captions
+    )
+    assert browser.find("h1").text == "One path & four ways"
+    assert browser.find("figcaption span").text == "a note <b>below</b>"
+    assert browser.find(".credit").text == "Nobody's"
+
+
+def test_the_browser_reads_the_positions_that_python_wrote(browser, side_by_side, walks):
+    opened(browser, side_by_side)
+    for scene, frame in ((0, 0), (3, FRAMES - 1), (2, 47)):
+        read = [
+            browser.script("return player.position(...arguments)", scene, 0, frame, place)
+            for place in (0, 5)
+        ]
+        # The first points are joints in their order; heads' tips come last.
+        expected = walks[scene].positions[frame, [0, 5]] * 1000
+        np.testing.assert_allclose(read, expected, atol=0.5001)
+
+
+def test_every_panel_shows_a_figure_in_the_colours_of_the_pictures(browser, side_by_side):
+    from f3amd_lib.report.pictures import LIMB_COLORS
+
+    opened(browser, side_by_side)
+    for panel in range(4):
+        picture = pixels(browser, panel)
+        for side in ("left", "right", "middle"):
+            assert share_of(picture, LIMB_COLORS[side]) > 300, (panel, side)
+
+
+# -------------------------------------------------------------------------------------------- time
+
+
+def test_play_advances_frames_and_pause_holds_them(browser, alone):
+    opened(browser, alone)
+    assert state(browser)["playing"] is False and state(browser)["frame"] == 0
+    button = browser.find("#play")
+    assert button.accessible_name == "Play"
+    before = pixels(browser)
+    button.click()
+    browser.wait("return player.state().frame >= 5")
+    assert button.accessible_name == "Pause"
+    assert settled(browser)["draws"] > 3
+    button.click()
+    held = settled(browser)
+    assert (pixels(browser) != before).any()
+    assert held["playing"] is False and held["time"] == held["frame"]
+    later = settled(browser)
+    assert later["frame"] == held["frame"] and later["draws"] == held["draws"]  # no idle work
+
+
+def test_playing_keeps_time_and_starts_again_at_the_end(browser, alone):
+    opened(browser, alone)
+    browser.script("player.seek(60); player.setPlaying(true)")
+    seen = browser.driver.execute_async_script(
+        "const done = arguments[0]; const seen = []; const began = performance.now();"
+        "(function look() { seen.push([performance.now() - began, player.state().time]);"
+        " if (performance.now() - began < 2400) requestAnimationFrame(look); else done(seen); })();"
+    )
+    milliseconds, time = np.array(seen).T
+    assert time.max() == FRAMES - 1
+    again = int(np.argmax(np.diff(time) < -50))  # from the last frame back to the first
+    assert again > 0 and time[again + 1] < 20
+    # 30 frames a second by the page's own clock, until the last frame is reached.
+    first = slice(1, int(np.argmax(time == FRAMES - 1)))
+    if np.diff(milliseconds[first]).max(initial=0) < 200:  # longer gaps are cut, and do not tell
+        slope = np.polyfit(milliseconds[first], time[first], 1)[0]
+        assert slope == pytest.approx(0.03, rel=0.15)
+
+
+def test_scrubbing_seeks(browser, side_by_side):
+    opened(browser, side_by_side)
+    browser.script("player.setPlaying(false)")
+    slider = browser.find("#scrub")
+    assert slider.accessible_name == "Time" and slider.aria_role == "slider"
+    box = slider.rect
+    # The middle of the thumb's road is the middle frame.
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.command(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=middle[0],
+            y=middle[1],
+            button="left",
+            clickCount=1,
+        )
+    now = settled(browser)
+    assert abs(now["frame"] - (FRAMES - 1) / 2) <= 1.5
+    assert now["window"] == 2
+    spoken = slider.get_attribute("aria-valuetext")
+    assert spoken.startswith(f"{now['frame'] / 30:.1f} of 3.0 seconds, window 2 of 3")
+    assert f"frame {now['frame'] + 1} of {FRAMES}" in spoken
+
+
+def test_ticks_stand_where_the_thumb_is_when_a_window_begins(browser, side_by_side):
+    opened(browser, side_by_side)
+    ticks = browser.script(
+        "return [...document.querySelectorAll('#ticks i')].map((one) => {"
+        " const box = one.getBoundingClientRect(); return (box.left + box.right) / 2; })"
+    )
+    box = browser.find("#scrub").rect
+    road = box["width"] - 16  # the thumb is 16 px wide
+    expected = [box["x"] + 8 + road * frame / (FRAMES - 1) for frame in (32, 64)]
+    np.testing.assert_allclose(ticks, expected, atol=1.0)
+
+
+def test_motions_play_in_step(browser, side_by_side, walks):
+    """All panels show one frame: at the first contact change of a walk its dot comes and goes."""
+    opened(browser, side_by_side)
+    browser.script("player.setPlaying(false)")
+    for panel in (0, 3):
+        touching = walks[panel].contacts.any(axis=1)
+        green = []
+        for frame in (int(np.argmax(touching)), int(np.argmin(touching))):
+            browser.script("player.seek(arguments[0])", frame)
+            settled(browser)
+            green.append(share_of(pixels(browser, panel), "#0B9E64"))
+        if not touching.all():
+            assert green[0] > 20 and green[1] == 0, (panel, green)
+        else:
+            assert green[0] > 20
+
+
+# -------------------------------------------------------------------------------- keys and fingers
+
+
+def test_keyboard(browser, alone):
+    opened(browser, alone)
+    for key, expected in (
+        ("ArrowRight", 1),
+        ("ArrowRight", 2),
+        ("ArrowLeft", 1),
+        ("End", FRAMES - 1),
+        ("ArrowRight", FRAMES - 1),
+        ("Home", 0),
+        ("ArrowLeft", 0),
+    ):
+        browser.keys(key)
+        assert settled(browser)["frame"] == expected, key
+    zoom = browser.script("return player.view.zoom")
+    browser.keys("+")
+    assert browser.script("return player.view.zoom") == pytest.approx(1.2 * zoom)
+    browser.keys("-")
+    assert browser.script("return player.view.zoom") == pytest.approx(zoom)
+    browser.keys("ArrowUp")
+    assert state(browser)["speed"] == 2 and browser.find("#speed").get_attribute("value") == "2"
+    browser.keys("ArrowDown", "ArrowDown")
+    assert state(browser)["speed"] == 0.5
+    browser.keys(" ")
+    browser.wait("return player.state().playing && player.state().frame > 0")
+    browser.keys(" ")
+    assert state(browser)["playing"] is False
+    assert browser.errors() == []
+
+
+def test_a_focused_button_or_slider_obeys_once(browser, alone):
+    opened(browser, alone)
+    browser.keys("Tab")
+    assert browser.script("return document.activeElement.id") == "play"
+    browser.keys(" ")
+    assert state(browser)["playing"] is True  # and not paused again by the page's own space key
+    browser.keys(" ")
+    assert state(browser)["playing"] is False
+    browser.script("player.seek(10); document.getElementById('scrub').focus()")
+    browser.keys("ArrowRight")
+    assert settled(browser)["frame"] == 11
+
+
+def test_every_control_has_a_name(browser, alone):
+    opened(browser, alone)
+    controls = browser.driver.find_elements(
+        "css selector", "button, input, select, canvas, summary"
+    )
+    names = [control.accessible_name for control in controls]
+    assert len(names) >= 11 and all(names)
+    assert len(set(names)) == len(names)
+
+
+def test_dragging_orbits_and_the_wheel_zooms(browser, alone):
+    opened(browser, alone)
+    before = browser.script("return {...player.view}")
+    picture = pixels(browser)
+    for kind, x, y in (
+        ("mousePressed", 600, 300),
+        ("mouseMoved", 700, 250),
+        ("mouseReleased", 700, 250),
+    ):
+        browser.command(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
+        )
+    settled(browser)
+    after = browser.script("return {...player.view}")
+    assert after["around"] == pytest.approx(before["around"] - 0.8)
+    assert after["elevation"] < before["elevation"]
+    assert (pixels(browser) != picture).any()
+    browser.command(
+        "Input.dispatchMouseEvent", type="mouseWheel", x=600, y=300, deltaX=0, deltaY=-200
+    )
+    browser.wait("return player.view.zoom > 1.2")
+    browser.find("#reset").click()
+    again = browser.script("return {...player.view}")
+    assert again == before
+
+
+def test_touch_orbits_and_pinches(browser, alone):
+    browser.resize(*PHONE, phone=True)
+    opened(browser, alone)
+    before = browser.script("return {...player.view}")
+    browser.touch("touchStart", (200, 300))
+    browser.touch("touchMove", (250, 300))
+    browser.touch("touchEnd")
+    after = browser.script("return {...player.view}")
+    assert after["around"] == pytest.approx(before["around"] - 0.4, abs=0.2)
+    assert after["zoom"] == before["zoom"]
+    browser.touch("touchStart", (150, 300), (250, 300))
+    browser.touch("touchMove", (100, 300), (300, 300))
+    browser.touch("touchEnd")
+    assert browser.script("return player.view.zoom") == pytest.approx(2.0, rel=0.05)
+    browser.find("#play").click()
+    browser.wait("return player.state().frame > 2")
+
+
+def test_follow_and_from_above(browser, alone):
+    opened(browser, alone)
+    follow, above = browser.find("#follow"), browser.find("#top")
+    assert follow.get_attribute("aria-pressed") == "true"
+    follow.click()
+    assert follow.get_attribute("aria-pressed") == "false"
+    # Without following, the whole walk is in the picture: the figure is at both ends of it.
+    for frame in (0, FRAMES - 1):
+        browser.script("player.seek(arguments[0])", frame)
+        settled(browser)
+        assert share_of(pixels(browser), "#EF9A26") > 50
+    standing = pixels(browser)
+    above.click()
+    settled(browser)
+    assert above.get_attribute("aria-pressed") == "true"
+    assert (pixels(browser) != standing).any()
+    assert browser.script("return player.view.around") == pytest.approx(np.pi)  # +Z up the page
+    above.click()
+    settled(browser)
+    difference = pixels(browser).astype(int) - standing
+    assert np.abs(difference).max() < 16  # the edges' shades depend on who draws, CPU or GPU
+
+
+def test_the_list_of_keys_opens_inside_the_page_and_closes(browser, alone):
+    for size in (DESKTOP, PHONE):
+        browser.resize(*size, phone=size == PHONE)
+        opened(browser, alone)
+        browser.find("summary").click()
+        box = browser.find(".sheet").rect
+        assert box["x"] >= 0 and box["x"] + box["width"] <= size[0]
+        assert box["y"] >= 0 and box["y"] + box["height"] <= browser.find("#controls").rect["y"]
+        browser.keys("Escape")
+        assert not browser.find(".sheet").is_displayed()
+
+
+# ------------------------------------------------------------------------------------ surroundings
+
+
+def test_it_starts_by_itself_unless_motion_is_unwanted(browser, side_by_side):
+    opened(browser, side_by_side)
+    browser.wait("return player.state().frame > 2")
+    browser.reduced_motion()
+    opened(browser, side_by_side)
+    assert settled(browser)["playing"] is False
+    assert state(browser)["frame"] == 0
+    browser.find("#play").click()  # but it plays when asked
+    browser.wait("return player.state().frame > 2")
+
+
+def test_dark_readers_get_a_dark_page(browser, side_by_side, screenshots):
+    opened(browser, side_by_side)
+    light = browser.screenshot().mean()
+    browser.dark()
+    settled(browser)  # the page changes while it is open
+    dark = browser.screenshot(screenshots / "player_dark.png").mean()
+    assert light > 200 and dark < 60
+    assert share_of(pixels(browser), "#6fa6e6") > 300  # the right limbs, light on dark
+
+
+def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
+    shown = show_player(walks[0], strip=False, autoplay=True)
+    page = tmp_path / "notebook.html"
+    page.write_text(f"<!doctype html><title>Notebook</title><body>{shown.iframe}</body>")
+    browser.open(page)
+    frame = browser.find("iframe")
+    assert frame.accessible_name == "Motion player: Neutral_0"
+    browser.driver.switch_to.frame(frame)
+    browser.wait("return document.documentElement.dataset.ready === 'yes'")
+    browser.wait("return player.state().frame > 2")
+    picture = pixels(browser)
+    assert share_of(picture, "#EF9A26") > 300
+    # On its own: neither the notebook around it nor its storage is within reach.
+    assert browser.script(
+        "try { return String(window.parent.document); } catch (error) { return error.name; }"
+    ) in ("SecurityError", "null")
+    browser.driver.switch_to.default_content()
+    assert browser.errors() == [] and browser.requests() == []
+
+
+def test_the_page_forbids_itself_any_request(browser, alone):
+    opened(browser, alone)
+    refused = browser.driver.execute_async_script(
+        "const done = arguments[0];"
+        "fetch('http://outside.invalid/').then(() => done('sent'), (error) => done(error.name));"
+    )
+    assert refused == "TypeError"
+    assert any("Content Security Policy" in message for message in browser.errors())
+    assert browser.outside() == []
+
+
+def test_damaged_data_are_told_of(browser, tmp_path):
+    page = player_page(wandering_motion(20), autoplay=False)
+    broken = page.replace('"frames":20', '"frames":19')
+    assert broken != page
+    path = tmp_path / "broken.html"
+    path.write_text(broken, encoding="utf-8")
+    browser.open(path)
+    browser.wait("return !document.getElementById('message').hidden")
+    assert "cannot be shown" in browser.find("#message").text
+
+
+def test_a_crowd_is_all_there(browser, tmp_path, screenshots, capsys):
+    """Frame rates are printed for whoever wants them; a machine's speed is no test."""
+    base = [synthesize("Neutral", 2.0, seed=seed) for seed in range(4)]
+    lines = []
+    for count in (1, 16, 100):
+        side = int(np.ceil(np.sqrt(count)))
+        crowd = [
+            base[k % 4].replace(
+                root_position=base[k % 4].root_position
+                + np.array([1.5 * (k % side), 0.0, 1.5 * (k // side)])
+            )
+            for k in range(count)
+        ]
+        path = write_player(tmp_path / f"{count}.html", Scene(crowd, title="Crowd"), strip=False)
+        opened(browser, path)
+        one, other, seconds = browser.driver.execute_async_script(
+            "const [done] = arguments; const one = player.state(); const began = performance.now();"
+            "const since = () => (performance.now() - began) / 1000;"
+            "setTimeout(() => done([one, player.state(), since()]), 1500);"
+        )
+        draws = other["draws"] - one["draws"]
+        assert draws > 0
+        lines.append(
+            f"{count:3d} characters: {draws / seconds:.0f} pictures a second, "
+            f"{(other['drawMs'] - one['drawMs']) / draws:.2f} ms of script each, "
+            f"page {path.stat().st_size / 1000:.0f} kB"
+        )
+    browser.script("player.setPlaying(false)")
+    browser.screenshot(screenshots / "player_crowd.png")
+    left = share_of(pixels(browser), "#EF9A26")
+    assert left > 3000  # one figure alone, so far away, covers some 50 pixels
+    assert browser.errors() == []
+    with capsys.disabled():
+        print("", *lines, sep="\n")
