@@ -438,6 +438,15 @@ def test_film_strip_has_a_row_a_motion(tmp_path):
             assert count_near(image, pictures.LIMB_COLORS[side]) > 200
 
 
+def test_film_strip_is_written_in_one_call(tmp_path):
+    motion = make_motion(30)
+    path = pictures.write_film_strip(tmp_path / "new" / "strip.png", motion, num_poses=3)
+    other = figures.save_figure(pictures.film_strip(motion, num_poses=3), tmp_path / "other.png")
+    assert path.read_bytes() == other.read_bytes()
+    with pytest.raises(ValueError, match="strip.jpg: figures are written as .png"):
+        pictures.write_film_strip(tmp_path / "strip.jpg", motion)
+
+
 def test_film_strip_errors():
     with pytest.raises(ValueError, match="frames 0 to 119; asked for 0 to 500"):
         pictures.film_strip(make_motion(), frames=[0, 500])

@@ -607,8 +607,7 @@ def updates_on_models(table: pd.DataFrame):
                 axis.axhline(real.iloc[0], color=PALETTE["black"], linestyle=":", linewidth=1.4,
                              label="real motion")  # fmt: skip
             _step_axis(axis, mine.loc[mine["steps"] > 0, "steps"])
-            axis.margins(y=0.12)
-            axis.set_ylim(0.0, axis.get_ylim()[1])
+            axis.set_ylim(0.0, 1.12 * axis.dataLim.y1)
             axis.set_ylabel(title, fontsize=9)
         row[0].set_title(model, fontsize=10)
     for axis in axes[:-1].flat:

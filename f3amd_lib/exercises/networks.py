@@ -1,0 +1,143 @@
+"""Exercises of notebook 12: what spectral layers and FiLM can express."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from f3amd_lib.evaluation import expressivity
+from f3amd_lib.exercises.judging import agree
+from f3amd_lib.models.spectral import spectral_convolution
+
+__all__ = ["CHECKS"]
+
+
+def _layer_matrix(weights, num_frames: int):
+    """Return the matrix of a spectral layer of one channel by sending it pulses, [T, T]."""
+    weights = jnp.asarray(weights)[:, None, None]
+    pulses = jnp.eye(num_frames)[:, :, None]
+    return spectral_convolution(pulses, weights.real, weights.imag)[:, :, 0].T
+
+
+def _random_weights(num_modes: int, seed: int = 0) -> np.ndarray:
+    real, imag = np.random.default_rng(seed).standard_normal((2, num_modes))
+    return real + 1j * imag
+
+
+def _matrix(answer) -> str | None:
+    for num_frames, num_modes in ((8, 5), (8, 2), (9, 5), (32, 4)):
+        weights = _random_weights(num_modes, seed=num_frames + num_modes)
+        expected = _layer_matrix(weights, num_frames)
+        if not agree(answer(weights, num_frames), expected, atol=1e-4):
+            return (
+                f"with T = {num_frames} and m = {num_modes} it is another matrix; what does the "
+                "layer make of a pulse at frame 0, and of one at frame 1?"
+            )
+    return None
+
+
+def _num_unheard(num_frames: int, num_modes: int) -> int:
+    """Count the real numbers of a one-channel layer that its output does not depend on."""
+    matrix = lambda parts: _layer_matrix(parts[0] + 1j * parts[1], num_frames)
+    slopes = jax.jacobian(matrix)(jnp.ones((2, num_modes)))
+    return int(np.sum(np.abs(slopes).max(axis=(0, 1)) < 1e-5))
+
+
+def _ranks(answer) -> str | None:
+    rank = lambda num_frames, num_modes: np.linalg.matrix_rank(
+        np.asarray(_layer_matrix(_random_weights(num_modes), num_frames)), tol=1e-4
+    )
+    expected = (rank(32, 4), rank(32, 17), _num_unheard(32, 17), _num_unheard(31, 16))
+    if np.shape(answer) != (4,):
+        return "four whole numbers are asked for: two ranks, then two counts"
+    hints = (
+        "how many real numbers describe a sum of a mean and three sine waves?",
+        "how many frames can a layer tell apart that cuts nothing?",
+        "which modes of a real signal are real, and what does IRFFT do with their imaginary part?",
+        "is there a wave that changes its sign in every frame of a window of odd length?",
+    )
+    for place, (given, known, hint) in enumerate(zip(answer, expected, hints, strict=True)):
+        if not agree(given, known):
+            return f"number {place + 1} is not right; {hint}"
+    return None
+
+
+def _beside_a_line(answer) -> str | None:
+    rng = np.random.default_rng(0)
+    walk = np.linspace(0.0, 1.3, 32)
+    cases = (("a straight walk", walk, 1), ("a walk that sways", walk + 0.1 * np.sin(9 * walk), 3))
+    cases += (("noise", rng.standard_normal(31), 5),)
+    for what, x, modes in cases:
+        expected = expressivity.keep_modes(x[:, None], modes, "fourier beside a line")[:, 0]
+        if not agree(answer(x, modes), expected, atol=1e-6):
+            return (
+                f"for {what} with m = {modes} something else comes out; take the line away, keep "
+                "the modes of the rest, and give the line back"
+            )
+    return None
+
+
+def _shared_kernels(answer) -> str | None:
+    rng = np.random.default_rng(0)
+    mixtures = rng.standard_normal((12, 3)) @ rng.standard_normal((3, 16))
+    families = (
+        ("8 delays", np.eye(8, 32), 0.1),
+        ("8 delays", np.eye(8, 32), 0.3),
+        ("12 mixtures of 3 kernels", mixtures, 1e-6),
+        ("random filters", rng.standard_normal((10, 16)), 0.2),
+    )
+    for what, filters, allowed in families:
+        expected = next(
+            count
+            for count in range(len(filters) + 1)
+            if expressivity.film_share(filters, count) <= allowed + 1e-12
+        )
+        if not agree(answer(filters, allowed), expected):
+            return (
+                f"{what}, {allowed:g} allowed: it is another number; how much of a matrix is left "
+                "beside the best one of rank D?"
+            )
+    return None
+
+
+def _delay_line(signal, num_blocks: int):
+    """Return what a delay line makes of a signal [2^N], as a function of its condition [N]."""
+    blocks = expressivity.film_delay_line(num_blocks, len(signal))
+
+    def run(bits):
+        c = jnp.tile(bits, (1, len(signal), 1))
+        z = nnx.silu(jnp.asarray(np.stack([signal, -signal], axis=-1)[None], jnp.float32))
+        for base, film in blocks:
+            z = film(base, z, c)
+        return z[0, :, 0] - z[0, :, 1]
+
+    return run
+
+
+def _advance(answer) -> str | None:
+    for num_blocks, leads in ((2, (1, 2, 3)), (3, (0, 3))):
+        num_frames = 2**num_blocks
+        signal = np.random.default_rng(num_blocks).standard_normal(num_frames)
+        run = jax.jit(_delay_line(signal, num_blocks))
+        for lead in leads:
+            bits = np.asarray(answer(lead, num_blocks), dtype=np.float64)
+            if bits.shape != (num_blocks,) or not np.all(np.abs(bits) == 1.0):
+                return f"give {num_blocks} numbers, each -1 or 1, for {num_blocks} blocks"
+            if not agree(run(jnp.asarray(bits, jnp.float32)), np.roll(signal, -lead), atol=1e-4):
+                return (
+                    f"{num_blocks} blocks, {lead} frames ahead: the signal ends elsewhere; on a "
+                    "circle, which delay is the same as going ahead?"
+                )
+    return None
+
+
+CHECKS = {
+    "12.a": _matrix,
+    "12.b": _ranks,
+    "12.c": _beside_a_line,
+    "12.d": _shared_kernels,
+    "12.e": _advance,
+}
+"""By number, a function of the answer that returns None if it is right, else a hint."""

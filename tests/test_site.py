@@ -1,0 +1,380 @@
+"""The site's sources: notebooks, modules and data sets have their place, nothing is from outside.
+
+Nothing is built here; `make site` does that, and checks its own links with what is tested below.
+"""
+
+import fnmatch
+import importlib.util
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from test_environment import LOCK, read_hashed
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
+
+
+def load(path: Path):
+    """A Python file of the site as a module; docs/ is no package."""
+    spec = importlib.util.spec_from_file_location(f"site_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+pages = load(DOCS / "_ext" / "pages.py")
+links = load(DOCS / "check_links.py")
+
+
+@pytest.fixture
+def settings(monkeypatch) -> dict:
+    """The settings of conf.py."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    return runpy.run_path(str(DOCS / "conf.py"))
+
+
+def toctree_entries(path: Path) -> list[str]:
+    """What the tables of contents of a page name, as paths from the root of the repository."""
+    entries = []
+    for block in re.findall(r"```\{toctree\}\n(.*?)```", path.read_text(encoding="utf-8"), re.S):
+        for line in filter(None, map(str.strip, block.splitlines())):
+            if not line.startswith(":"):
+                base = "" if line.startswith("/") else f"{path.parent.relative_to(ROOT)}/"
+                entries.append(base + line.lstrip("/"))
+    return entries
+
+
+def documents(*patterns: str) -> set[str]:
+    """Pages of the repository without their suffix, as Sphinx names them."""
+    found = {path for pattern in patterns for path in ROOT.glob(pattern)}
+    hidden = (".ipynb_checkpoints", "_build")
+    return {
+        path.relative_to(ROOT).with_suffix("").as_posix()
+        for path in found
+        if not set(hidden) & set(path.parts)
+    }
+
+
+def listed(entries: list[str], names: set[str]) -> set[str]:
+    """Names that an entry means; as in Sphinx, a star stops at a slash."""
+    return {
+        name
+        for name in names
+        for entry in entries
+        if name.count("/") == entry.count("/") and fnmatch.fnmatchcase(name, entry)
+    }
+
+
+# Everything has its place
+
+
+def test_every_notebook_is_in_the_table_of_contents():
+    notebooks = documents("notebooks/**/*.ipynb")
+    assert len(notebooks) > 10
+    assert listed(toctree_entries(DOCS / "index.md"), notebooks) == notebooks
+
+
+def test_every_page_is_in_a_table_of_contents():
+    names = documents("docs/**/*.md", "paper_figures/*.md") - {"docs/index"}
+    entries = [entry for path in DOCS.rglob("*.md") for entry in toctree_entries(path)]
+    assert listed(entries, names) == names
+
+
+def test_settings_make_pages_of_all_of_them_and_of_nothing_else(settings):
+    names = documents("docs/**/*.md", "notebooks/**/*.ipynb", "paper_figures/*.md")
+    included, excluded = settings["include_patterns"], settings["exclude_patterns"]
+    for name in names:
+        suffix = ".ipynb" if name.startswith("notebooks/") else ".md"
+        assert any(fnmatch.fnmatchcase(name + suffix, pattern) for pattern in included), name
+        assert not any(fnmatch.fnmatchcase(name, pattern) for pattern in excluded), name
+    assert not any(fnmatch.fnmatchcase("README.md", pattern) for pattern in included)
+
+
+def test_notebooks_are_shown_as_committed(settings):
+    assert settings["nb_execution_mode"] == "off"
+
+
+def test_every_public_module_is_on_one_page_of_the_library():
+    rooms = [
+        match[2]
+        for path in sorted((DOCS / "api").glob("*.md"))
+        for match in pages.INSERT.finditer(path.read_text(encoding="utf-8"))
+        if match[1] == "room"
+    ]
+    shown = [name for room in rooms for name in pages.modules_of(room)]
+    files = [path.relative_to(ROOT).with_suffix("") for path in (ROOT / "f3amd_lib").rglob("*.py")]
+    public = {".".join(path.parts) for path in files if not path.name.startswith("_")}
+    assert len(shown) == len(set(shown))
+    assert public <= set(shown)
+
+
+def test_every_data_set_has_a_gallery_page_that_inserts_it():
+    for folder in pages.result_folders():
+        page = DOCS / "gallery" / f"{folder.parent.name}.md"
+        assert page.is_file(), f"{folder.parent.name}: add docs/gallery/{page.name}"
+        assert ("gallery", folder.parent.name) in pages.INSERT.findall(
+            page.read_text(encoding="utf-8")
+        )
+
+
+@pytest.mark.parametrize("dataset", ["bandai", "synthetic"])
+def test_a_gallery_shows_every_figure_with_words_licence_and_notebook(dataset):
+    text = pages.gallery_markdown(dataset)
+    folder = ROOT / "paper_figures" / dataset / "laptop"
+    figures = sorted(folder.glob("figures/*.png"))
+    assert len(figures) > 50
+    licence, credit = pages.credit_of(folder)
+    for path in figures:
+        place = text.index(f"/paper_figures/{dataset}/laptop/figures/{path.name}")
+        alt, caption = re.match(r".*?:alt: (.+?)\n.*?\n\n(.+?)\n", text[place:], re.S).groups()
+        assert pages.words(path.stem).lower() in alt.lower()
+        assert path.stem in caption and licence in caption
+    assert credit in text
+    assert "/notebooks/05_rollout.ipynb" in text
+    assert f"/paper_figures/{dataset}/laptop/media/05_rollout.gif" in text
+
+
+def test_pictures_of_non_commercial_data_say_so():
+    text = pages.moving_markdown("bandai")
+    assert "© 2022 Bandai Namco Research Inc." in text
+    assert "for non-commercial use" in text
+    first_page = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert "CC BY-NC 4.0" in first_page and "non-commercial use" in " ".join(first_page.split())
+
+
+def test_results_without_a_licence_are_not_shown(tmp_path, monkeypatch):
+    folder = tmp_path / "paper_figures" / "new" / "laptop"
+    (folder / "tables").mkdir(parents=True)
+    (folder / "tables" / "00_x.json").write_text(json.dumps({"dataset_licence": None}))
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    with pytest.raises(ValueError, match="paper_figures/new/laptop: no record names"):
+        pages.credit_of(folder)
+    record = {"dataset_licence": "CC BY 4.0", "dataset_credit": "Somebody."}
+    (folder / "tables" / "01_x.json").write_text(json.dumps(record))
+    assert pages.credit_line(folder).endswith("Somebody. CC BY 4.0, with credit.")
+
+
+def test_a_player_is_linked_where_it_is_copied_to(tmp_path, monkeypatch):
+    media = tmp_path / "paper_figures" / "bandai" / "laptop" / "media"
+    media.mkdir(parents=True)
+    (media / "05_rollout.html").write_text("<p>player</p>")
+    (media / "05_rollout.png").write_bytes(b"")
+    record = {"dataset_licence": "CC BY-NC 4.0", "dataset_credit": "Somebody."}
+    (media / "05_rollout.json").write_text(json.dumps(record))
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    (player,) = pages.players()
+    assert pages.player_address(player).as_posix() == "players/bandai/laptop/media/05_rollout.html"
+    text = pages.moving_markdown("bandai")
+    assert 'href="../../players/bandai/laptop/media/05_rollout.html"' in text
+    assert "/paper_figures/bandai/laptop/media/05_rollout.png" in text
+
+
+def test_a_figure_has_the_heading_under_which_its_notebook_draws_it():
+    title, headings = pages.notebook_sections(ROOT / "notebooks" / "00_reading_guide.ipynb")
+    assert title == "00 · Reading guide"
+    assert headings["00_paper_claim"].startswith("0.1 ")
+    assert headings["00_road_map"].startswith("0.2 ")
+
+
+def test_every_numbered_notebook_is_listed_with_its_question():
+    text = pages.notebooks_markdown()
+    for path in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
+        line = text[text.index(f"(/notebooks/{path.name})") :].splitlines()[1]
+        assert line.strip().startswith("<br>") and "?" in line, path.name
+
+
+def test_the_readme_is_taken_from_its_quick_start_on_with_links_from_the_root():
+    text = pages.readme_markdown()
+    assert text.startswith("## Quick start")
+    relative = [link for link in re.findall(r"\]\(([^)]+)\)", text) if ":" not in link]
+    assert all(link.startswith(("/", "#")) for link in relative)
+
+
+def test_an_unknown_insert_is_refused():
+    assert pages.insert("a\nb") == "a\nb"
+    with pytest.raises(ValueError, match="insert: galery: unknown; there are room, gallery"):
+        pages.insert("<!-- insert: galery bandai -->")
+    with pytest.raises(ValueError, match="room f3amd_lib.motoin: there is no such"):
+        pages.insert("<!-- insert: room f3amd_lib.motoin -->")
+
+
+# Docstrings
+
+
+@pytest.mark.parametrize(
+    "line, expected",
+    [
+        ("x0 * sigma and |x|^2", r"x0 \* sigma and \|x\|^2"),
+        ("see `a * b` and trailing_ name", r"see `a * b` and trailing\_ name"),
+        ("snake_case stays", "snake_case stays"),
+        ("trees of `Array`s", r"trees of `Array`\ s"),
+        ("  * an item", "  * an item"),
+        ("  *arguments: more * than", r"  *arguments: more \* than"),
+    ],
+)
+def test_marks_in_a_docstring_mean_themselves(line, expected):
+    assert pages.plain_line(line) == expected
+
+
+def test_a_list_by_indentation_becomes_a_list():
+    named = ["ratio: near 1 it is", "  ignored", "spread: in cm"]
+    assert pages.bulleted(named) == ["", "- ratio: near 1 it is", "  ignored", "- spread: in cm"]
+    below = ["A dict of", "  length: metres;", "  share: of", "    all"]
+    assert pages.bulleted(below) == ["A dict of", "", "- length: metres;", "- share: of", "  all"]
+    assert pages.bulleted(["one", "two"]) == ["one", "two"]
+
+
+def test_a_colon_in_what_is_returned_names_no_type():
+    lines = ["Say.", "", "Returns:", "  A dict: of numbers.", "", "Raises:", "  ValueError: if."]
+    assert pages.plain_lines(lines) == [*lines[:3], "  : A dict: of numbers.", *lines[4:]]
+
+
+def test_an_alternative_text_is_the_first_sentence():
+    assert pages.first_sentence("The line is\nflat. It stays.") == "The line is flat."
+    assert pages.first_sentence("At 0.1 s it stops") == "At 0.1 s it stops"
+    assert len(pages.first_sentence("word " * 100)) < 210
+
+
+# Nothing from outside
+
+
+def test_neither_settings_nor_styles_nor_scripts_name_an_address(settings):
+    for path in [DOCS / "conf.py", *(DOCS / "_static").iterdir(), *(DOCS / "_extra").iterdir()]:
+        text = path.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+        assert not re.search(r"https?://|//cdn|@import|url\(['\"]?//", text), path.name
+    assert settings["mathjax_path"] == "mathjax/tex-svg-full.js"
+    assert "sphinx.ext.intersphinx" not in settings["extensions"]  # it would fetch
+    assert settings["html_theme_options"].get("analytics") is None
+
+
+def test_an_altered_mathjax_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("sphinx", reason="Sphinx is added by `make site-tools`")
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    companion = load(DOCS / "_ext" / "companion.py")
+
+    class App:
+        outdir = tmp_path / "html"
+
+    companion.copy_mathjax(App)
+    copied = tmp_path / "html" / "_static" / "mathjax"
+    assert "Apache License" in (copied / "LICENSE").read_text(encoding="utf-8")
+    assert (copied / "tex-svg-full.js").stat().st_size > 2_000_000
+    monkeypatch.setattr(companion, "MATHJAX_SHA256", "0" * 64)
+    with pytest.raises(companion.ExtensionError, match="not MathJax 3.2.2 as published"):
+        companion.copy_mathjax(App)
+
+
+# The link checker, on a site that is right and on ones that are wrong in one way
+
+
+def write_site(folder: Path, body: str) -> Path:
+    (folder / "sub").mkdir()
+    (folder / "index.html").write_text(body, encoding="utf-8")
+    (folder / "sub" / "other.html").write_text("<h1 id='here'>o</h1>", encoding="utf-8")
+    (folder / "style.css").write_text("")
+    return folder
+
+
+def test_a_whole_site_has_no_faults(tmp_path):
+    body = (
+        "<link rel='stylesheet' href='style.css?v=1'><a href='sub/other.html#here'>a</a>"
+        "<p id='p'><a href='#p'>b</a> <a href='https://example.org/x'>c</a>"
+        "<img src='data:image/png;base64,' alt='a dot'> <a href='mailto:a@example.org'>d</a>"
+    )
+    assert links.check_site(write_site(tmp_path, body)) == ([], 1)
+
+
+@pytest.mark.parametrize(
+    "body, fault",
+    [
+        ("<a href='gone.html'>a</a>", "gone.html leads nowhere"),
+        ("<img src='gone.png' alt='x'>", "gone.png leads nowhere"),
+        ("<a href='sub/other.html#there'>a</a>", "sub/other.html#there: no such place"),
+        ("<a href='#there'>a</a>", "#there: no such place"),
+        ("<a href='/sub/other.html'>a</a>", "/sub/other.html leads out of"),
+        ("<a href='../x.html'>a</a>", "../x.html leads out of"),
+        ("<script src='https://example.org/a.js'></script>", "asks https://example.org/a.js"),
+        ("<link rel='stylesheet' href='//example.org/a.css'>", "asks //example.org/a.css"),
+        ("<img src='style.css'>", "image style.css has no alternative text"),
+        ("<img src='style.css' alt='a_1.png'>", "image style.css has no alternative text"),
+    ],
+)
+def test_each_fault_of_a_site_is_found(tmp_path, body, fault):
+    (found,) = links.check_site(write_site(tmp_path, body))[0]
+    assert found.startswith("index.html: ") and fault in found
+
+
+def test_the_checker_ends_with_its_verdict(tmp_path, capsys):
+    assert links.main([str(tmp_path)]) == 1
+    assert "build the site first" in capsys.readouterr().err
+    write_site(tmp_path, "<a href='gone.html'>a</a>")
+    assert links.main([str(tmp_path)]) == 1
+    (tmp_path / "gone.html").write_text("")
+    assert links.main([str(tmp_path)]) == 0
+    assert "3 pages" in capsys.readouterr().out
+
+
+# Building and publishing
+
+
+def test_the_workflow_builds_with_make_and_publishes_what_it_built():
+    workflow = yaml.safe_load(WORKFLOW.read_text(encoding="utf-8"))
+    build, deploy = workflow["jobs"]["build"], workflow["jobs"]["deploy"]
+    assert {"run": "make site"} in build["steps"]
+    steps = [*build["steps"], *deploy["steps"]]
+    uses = {step["uses"].split("@")[0]: step for step in steps if "uses" in step}
+    built = uses["actions/upload-pages-artifact"]["with"]["path"]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    recipe = re.search(r"^site:.*\n((?:\t.*\n)+)", makefile, re.M)[1]
+    assert f". {built}\n" in recipe and f"check_links.py {built}\n" in recipe
+    assert deploy["needs"] == "build" and "actions/deploy-pages" in uses
+    assert deploy["permissions"] == {"pages": "write", "id-token": "write"}
+    assert workflow["permissions"] == {"contents": "read"}
+
+
+def test_actions_are_pinned_to_commits():
+    lines = re.findall(r"uses: (.+)", WORKFLOW.read_text(encoding="utf-8"))
+    assert len(lines) == 4
+    for line in lines:
+        assert re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40} # v\d+(\.\d+)*", line), line
+
+
+def test_continuous_integration_builds_the_site_before_a_browser_looks_at_it():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    order = [
+        script.index(f"make {name}") for name in ("test\n", "site-tools", "site\n", "test-web")
+    ]
+    assert order == sorted(order)
+
+
+def test_the_built_site_is_ignored_by_git():
+    assert "/docs/_build/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+
+
+def test_the_sites_packages_are_hashed_within_their_ranges_and_agree_with_the_lock():
+    entries = read_hashed("site")
+    assert all(hashes for _, hashes, _ in entries)
+    pins = {}
+    for entry, _, _ in entries:
+        (pin,) = entry.specifier
+        assert pin.operator == "=="
+        pins.setdefault(canonicalize_name(entry.name), set()).add(pin.version)
+    wanted = re.findall(r"^[^#\s][^#\n]*", (DOCS / "requirements.in").read_text(), re.M)
+    for requirement in map(Requirement, wanted):
+        versions = pins[canonicalize_name(requirement.name)]
+        assert all(version in requirement.specifier for version in versions), requirement
+    locked = {}
+    for entry, _, _ in LOCK:
+        (pin,) = entry.specifier
+        locked.setdefault(canonicalize_name(entry.name), set()).add(pin.version)
+    for name in pins.keys() & locked.keys():
+        assert pins[name] == locked[name], name

@@ -1,0 +1,164 @@
+"""The built site in a real browser, opened from the disk: `make site`, then `make test-web`."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SITE = ROOT / "docs" / "_build" / "html"
+
+pytestmark = pytest.mark.skipif(
+    not (SITE / "docs" / "index.html").is_file(), reason="the site is not built: `make site`"
+)
+
+PHONE = (390, 844)
+
+PAGES = [
+    *sorted(path.relative_to(SITE).as_posix() for path in (SITE / "docs").rglob("*.html")),
+    "paper_figures/claims.html",
+    "search.html",
+]
+
+# How far the page can be pushed sideways, and the widest thing that is to blame.
+SIDEWAYS = """
+const extra = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+if (extra <= 0) return "";
+const inside = (e) => {  // what scrolls in itself pushes nobody
+  for (let up = e.parentElement; up; up = up.parentElement)
+    if (["auto", "scroll", "hidden"].includes(getComputedStyle(up).overflowX)) return true;
+};
+const wide = [...document.querySelectorAll(".bd-article *")].find(
+  (e) => e.getBoundingClientRect().right > document.documentElement.clientWidth + 1 && !inside(e));
+return `${extra} px: ${wide ? wide.outerHTML.slice(0, 120) : "?"}`;
+"""
+
+# What MathJax leaves where it does not understand: a message, or the unknown command in red.
+NOT_UNDERSTOOD = '[data-mml-node="merror"], mjx-merror, [fill="red"]'
+
+PAGE_BACKGROUND = (
+    "return getComputedStyle(document.body).backgroundColor.match(/[0-9.]+/g).map(Number)"
+)
+
+
+def notebooks() -> list[str]:
+    """Addresses of the notebooks that the built site has."""
+    return sorted(
+        path.relative_to(SITE).as_posix() for path in (SITE / "notebooks").rglob("*.html")
+    )
+
+
+def open_with_equations(browser, name: str):
+    """Open a page of the site and wait until its equations, if any, are drawn."""
+    page = browser.open(SITE / name)
+    if page.script("return !!document.querySelector('.math')"):
+        page.wait("return window.MathJax && MathJax.startup && !!MathJax.startup.promise")
+        page.driver.execute_async_script("MathJax.startup.promise.then(arguments[0])")
+    return page
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_opens_from_the_disk_fits_a_phone_and_asks_nothing_of_the_outside(browser, name):
+    browser.resize(*PHONE, phone=True)
+    page = browser.open(SITE / name)
+    assert page.errors() == []
+    assert page.outside() == []
+    assert page.script(SIDEWAYS) == ""
+    assert any("companion.css" in address for address in page.requests())  # it was heard at all
+
+
+def test_the_root_leads_to_the_first_page(browser):
+    page = browser.open(SITE / "index.html")
+    page.wait("return location.pathname.endsWith('/docs/index.html')")
+    assert page.errors() == []
+
+
+def test_the_first_screen_says_what_this_is_shows_a_walk_and_leads_on(browser, screenshots):
+    page = browser.open(SITE / "docs/index.html")
+    page.wait("return [...document.images].every((image) => image.complete)")
+    page.screenshot(screenshots / "site_first_page.png")
+    seen = "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
+    seen += "return box.top >= 0 && box.bottom <= innerHeight && box.width > 100;"
+    assert page.script(seen, ".bd-article h1")
+    assert page.script(seen, ".hero img.moving")
+    cards = page.script(
+        "return [...document.querySelectorAll('.leads a.sd-stretched-link')].filter("
+        "(a) => a.closest('.sd-card').getBoundingClientRect().bottom <= innerHeight)"
+        ".map((a) => a.getAttribute('href'))"
+    )
+    for goal in ("00_reading_guide", "notebooks.html", "claims", "gallery", "api"):
+        assert any(goal in card for card in cards), (goal, cards)
+    page.resize(*PHONE, phone=True)
+    page.screenshot(screenshots / "site_first_page_phone.png")
+
+
+def test_every_notebook_is_whole_on_a_phone(browser):
+    """Equations drawn, nothing wider than the screen, no errors, nothing asked of the outside."""
+    browser.resize(*PHONE, phone=True)
+    equations = 0
+    for name in notebooks():
+        page = open_with_equations(browser, name)
+        asked = page.script("return document.querySelectorAll('.math').length")
+        drawn = page.script("return document.querySelectorAll('.math mjx-container svg').length")
+        equations += asked
+        assert drawn >= asked, name
+        assert page.script(f"return document.querySelectorAll('{NOT_UNDERSTOOD}').length") == 0, (
+            name
+        )
+        assert page.script(SIDEWAYS) == "", name
+        assert page.errors() == [] and page.outside() == [], name
+    assert equations > 100
+
+
+def test_what_equations_are_written_with_is_understood(browser):
+    page = open_with_equations(browser, "notebooks/02_sampler_theory.html")
+    faults = (
+        "return MathJax.tex2svg(arguments[0], {display: true})"
+        f".querySelectorAll('{NOT_UNDERSTOOD}').length"
+    )
+    for text in (
+        r"\bar\alpha = \frac{1}{1 + \sigma^2} \tag{9}",
+        r"\begin{aligned} z &= \sqrt{\bar\alpha}\,x \\ x &= z / \sqrt{\bar\alpha} \end{aligned}",
+        r"\begin{cases} 0 & t < \tau \\ 1 & \text{else} \end{cases}",
+        r"\bigl(\operatorname{FFT}(\hat{x}_0)\bigr)_k \in \mathbb{C}^{D \times m}",
+    ):
+        assert page.script(faults, text) == 0, text
+    assert page.script(faults, r"\nonsense") > 0 and page.script(faults, r"\frac{1}") > 0
+
+
+def test_a_word_is_found_and_leads_to_its_notebook(browser):
+    page = browser.open(f"{(SITE / 'search.html').as_uri()}?q=alpha_bar")
+    page.wait("return /found \\d+ pages?/.test(document.querySelector('main').textContent)", 60)
+    found = page.script(
+        "return [...document.querySelectorAll('#search-results li a')].map((a) => a.pathname)"
+    )
+    assert any("02_sampler_theory" in address for address in found)
+    assert any("docs/api/diffusion" in address for address in found)
+    assert page.errors() == [] and page.outside() == []
+
+
+def test_a_word_that_nobody_wrote_is_not_found(browser):
+    page = browser.open(f"{(SITE / 'search.html').as_uri()}?q=zyzzyvas")
+    page.wait("return document.querySelector('#search-results p.search-summary, #search-results')")
+    page.wait("return /did not match/.test(document.querySelector('#search-results').textContent)")
+
+
+def test_the_walk_stands_still_for_who_asked_for_less_motion(browser):
+    browser.reduced_motion()
+    page = browser.open(SITE / "docs/index.html")
+    page.wait("return document.querySelector('.hero canvas.moving')")
+    assert page.script("return document.querySelector('.hero img.moving')") is None
+    assert "walks" in page.find(".hero canvas.moving").get_attribute("aria-label")
+    drawn = "const c = document.querySelector('.hero canvas.moving'); return c.width * c.height"
+    assert page.script(drawn) > 10_000
+
+
+def test_figures_stay_on_white_in_the_dark(browser, screenshots):
+    browser.dark()
+    page = browser.open(SITE / "notebooks/02_sampler_theory.html")
+    assert max(page.script(PAGE_BACKGROUND)[:3]) < 60
+    backgrounds = page.script(
+        "return [...document.querySelectorAll('.cell_output img')]"
+        ".map((image) => getComputedStyle(image)).map((s) => s.backgroundColor + ' ' + s.filter)"
+    )
+    assert set(backgrounds) == {"rgb(255, 255, 255) none"}
+    page.screenshot(screenshots / "site_dark.png")
