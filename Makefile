@@ -41,6 +41,8 @@ smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under r
 # Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
 PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durations=5
+# Files side by side on the cores there are; the tests of one file, or the cells of one notebook, in order.
+SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
@@ -56,8 +58,8 @@ bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 
 	  -q -r requirements-bench.txt
 
 test: lint ## Lint, run the tests and check the notebooks' committed outputs
-	$(PYTEST) tests $(PYTEST_OPTIONS)
-	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) \
+	$(PYTEST) tests $(SIDE_BY_SIDE) $(PYTEST_OPTIONS)
+	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.

@@ -14,7 +14,8 @@ Rotations bear half precision, root positions do not: float16 steps 0.25 m at 30
 
 A character is made from the seed and its own number alone: neither the chunk it comes in, nor the
 size of the crowd, nor a run that stopped and went on makes a difference beyond rounding. Characters
-do not see each other; they may walk through one another.
+do not see each other; they may walk through one another, unless their paths are planned to keep
+apart (`min_distance`). Then everybody's path depends on who else is there.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ import numpy as np
 from tqdm import tqdm
 
 from f3amd_lib.data.features import center_window, motion_from_frames, turn_frames
+from f3amd_lib.evaluation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.evaluation.paths import NAMES, RootPath, named_path
 from f3amd_lib.evaluation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
 from f3amd_lib.files import whole_file
@@ -53,6 +55,7 @@ __all__ = [
     "crowd_paths",
     "default_chunk",
     "generate_crowd",
+    "plan_crowd",
     "read_crowd",
 ]
 
@@ -157,6 +160,52 @@ def _sunflower(characters: range) -> np.ndarray:
     return radius[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
 
 
+def plan_crowd(
+    num_characters: int,
+    num_frames: int,
+    *,
+    pace=_TEMPLATE_SPEED,
+    seed: int = 0,
+    min_distance: float = MIN_DISTANCE,
+    radius: float | None = None,
+    names: Sequence[str] = PATHS,
+) -> tuple[RootPath, ...]:
+    """Plan paths for a crowd that keeps apart, ready for `MotionGenerator.rollout`.
+
+    Args:
+      num_characters: B.
+      num_frames: F, at 30 fps.
+      pace: of all, or of each, [B], m/s.
+      seed: of all choices.
+      min_distance: metres between any two characters at every frame.
+      radius: of the disc that holds the starting places, metres; by default as large as it has to
+        be.
+      names: of `paths.NAMES` to draw from.
+
+    Returns:
+      A path each; the same for the same arguments.
+
+    Raises:
+      ValueError: for counts or paces out of range, an unknown path, or what `keep_apart` refuses.
+    """
+    num_characters = _whole("num_characters", num_characters, 1)
+    num_frames, seed = _whole("num_frames", num_frames, 2), _whole("seed", seed, 0)
+    pace = np.asarray(pace, np.float64)
+    if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
+        raise ValueError(
+            f"pace must be one number above 0 m/s, or one for each of {num_characters} characters"
+        )
+    make_paths, _ = _path_maker(names)
+    pace = np.broadcast_to(pace, (num_characters,))
+    position, yaw = keep_apart(
+        *make_paths(range(num_characters), pace, num_frames, seed),
+        min_distance=min_distance,
+        radius=radius,
+        fps=_FPS,
+    )
+    return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
+
+
 def default_chunk(num_frames: int, channels: int) -> int:
     """Return how many characters to generate at once.
 
@@ -224,6 +273,7 @@ def generate_crowd(
     *,
     styles: str | Sequence[str] | None = None,
     paths: str | Sequence[str] | PathMaker = PATHS,
+    min_distance: float | None = None,
     seed: int = 0,
     chunk: int | None = None,
     overwrite: bool = False,
@@ -242,6 +292,8 @@ def generate_crowd(
       styles: names, taken in turn; by default all that the model knows and has starting poses for.
       paths: name or names of paths to draw from (see `crowd_paths`), or a function of its first
         four arguments and with its result.
+      min_distance: metres that paths keep from each other at every frame, all planned before the
+        first chunk is made (see `crowd_planning`); None lets characters walk through one another.
       seed: of paths, starting poses and noise, 0 or more.
       chunk: characters generated at once; by default `default_chunk`.
       overwrite: write over a crowd that lies there, finished or not.
@@ -280,6 +332,7 @@ def generate_crowd(
         "seed": seed,
         "chunk": chunk,
         "paths": path_names,
+        "min_distance": min_distance,
         "styles": list(trained.styles),
         "styles_in_turn": hashlib.sha256(in_turn.tobytes()).hexdigest()[:12],
         **describe_skeleton(skeleton),
@@ -299,6 +352,16 @@ def generate_crowd(
     out = Path(out)
     finished = _look_into(out, settings, overwrite)
     _check_room(out, settings)
+    if min_distance is not None:
+        everybody = range(num_characters)
+        pace, _ = _paces(
+            generator, everybody, in_turn[np.arange(num_characters) % len(in_turn)], seed
+        )
+        wanted = _checked(
+            make_paths(everybody, pace, num_frames, seed), (num_characters, num_frames)
+        )
+        planned = keep_apart(*wanted, min_distance=min_distance, fps=_FPS)
+        make_paths = lambda part, *_: tuple(array[part.start : part.stop] for array in planned)
     if finished == 0:
         _write_settings(out, settings, 0)
     noise = jax.random.key(seed)

@@ -25,6 +25,7 @@ from f3amd_lib.data.features import (
 from f3amd_lib.diffusion.rounds import sample_round
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.evaluation.blending import blend_rollout
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.config import cast_network
@@ -46,6 +47,7 @@ class Rollout:
       paths: what each character was asked to follow.
       styles: what each character was asked to look like.
       window: T; window k starts at frame k * T.
+      blend_frames: frames after each window boundary that were blended; 0 is as it was made.
     """
 
     skeleton: Skeleton
@@ -54,6 +56,7 @@ class Rollout:
     paths: tuple[RootPath, ...]
     styles: tuple[str, ...]
     window: int
+    blend_frames: int = 0
 
     def motion(self, character: int = 0, *, with_history: bool = False) -> Motion:
         """Return one character's motion, from the first generated frame unless told."""
@@ -207,6 +210,7 @@ class MotionGenerator:
         *,
         seed: int = 0,
         history: np.ndarray | None = None,
+        blend_frames: int = 0,
     ) -> Rollout:
         """Animate one or many characters along their paths.
 
@@ -217,12 +221,15 @@ class MotionGenerator:
           seed: of the noise and of the choice among the starting poses.
           history: world frames to start from, [B, H, C]; by default a stored starting pose of the
             style, moved to the start of the path.
+          blend_frames: blend so many frames after each window boundary (see `blending`); 0, as in
+            all figures that do not say otherwise, leaves the frames as the network made them.
 
         Returns:
           The rollout, [B, frames of the path, C].
 
         Raises:
-          ValueError: for an unknown style, unlike lengths or counts, or a wrong history.
+          ValueError: for an unknown style, unlike lengths or counts, a wrong history, or more
+            blend_frames than a window has.
         """
         trained, config = self.trained, self.trained.config
         paths = [paths] if isinstance(paths, RootPath) else list(paths)
@@ -257,7 +264,7 @@ class MotionGenerator:
             raise ValueError(f"history must have shape {expected}, got {history.shape}")
         if not np.isfinite(history).all():
             raise ValueError("history holds a number that is not finite")
-        return Rollout(
+        rollout = Rollout(
             skeleton=trained.skeleton,
             frames=self.generate(position, yaw, indices, history, jax.random.key(seed)),
             history=np.asarray(history),
@@ -265,6 +272,7 @@ class MotionGenerator:
             styles=tuple(styles),
             window=config.window,
         )
+        return blend_rollout(rollout, blend_frames)
 
     def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
         """Pick a stored pose for each character; those of one style take others in turn."""

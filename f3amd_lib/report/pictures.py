@@ -15,9 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
-from f3amd_lib.report.figures import new_figure, plot_style
+from f3amd_lib.report.figures import new_figure, plot_style, save_figure
 
-__all__ = ["LIMB_COLORS", "film_strip", "write_gif"]
+__all__ = ["LIMB_COLORS", "film_strip", "write_film_strip", "write_gif"]
 
 LIMB_COLORS = {"left": "#EF9A26", "right": "#1B4F8F", "middle": "#3A3A3A"}
 """Colours of limbs, the character's own left and right."""
@@ -187,6 +187,22 @@ def film_strip(
             axes[row, 0].set_title(title or " ")
             _draw_plan(axes[row, 1], motion, chosen, paths[row], row == 0)
     return figure
+
+
+def write_film_strip(path, motions, **options) -> Path:
+    """Write a film strip as a PNG file, in one call.
+
+    Args:
+      path: ends in .png; folders are made, a picture drawn before is replaced.
+      motions, options: as for `film_strip`.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: for a wrong suffix, or as `film_strip` does.
+    """
+    return save_figure(film_strip(motions, **options), path)
 
 
 def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend: bool) -> None:

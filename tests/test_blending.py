@@ -1,0 +1,195 @@
+"""Blending at window boundaries: closed forms of the quintic, seams that are known, rotations."""
+
+import numpy as np
+import pytest
+from builders import CHANNELS, SKELETON, WINDOW, random_frames, straight_motion, tiny_trained
+from scipy.interpolate import BPoly
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.data.features import motion_from_frames, split_frames, world_frames
+from f3amd_lib.evaluation.blending import (
+    blend_motion,
+    blend_rollout,
+    blend_seams,
+    blending_table,
+    dying_offset,
+)
+from f3amd_lib.evaluation.metrics import ird, ird_excess
+from f3amd_lib.evaluation.paths import named_path
+from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+
+T = 16
+
+
+def frames_of(root, turns=None):
+    """World frames of root positions [F, 3] and one turn for all joints, [F, 3, 3]."""
+    if turns is None:
+        turns = np.broadcast_to(np.eye(3), (len(root), 3, 3))
+    sixes = np.tile(rotation_6d_from_matrix(np.asarray(turns)), SKELETON.num_joints)
+    return np.concatenate([root, sixes], axis=-1)
+
+
+def about(axis, angles):
+    """Rotations about one axis, [F, 3, 3]."""
+    return Rotation.from_rotvec(np.asarray(angles)[:, None] * np.asarray(axis)).as_matrix()
+
+
+def test_the_offset_is_the_quintic_that_ends_at_rest():
+    offset, velocity, count = np.array([2.0, -1.0, 0.5]), np.array([0.3, 0.1, -0.2]), 7
+    still = np.zeros(3)
+    ends = [[offset, velocity, still], [still, still, still]]
+    exact = BPoly.from_derivatives([0.0, count], ends)  # another library's Hermite polynomial
+    got = dying_offset(offset, velocity, count)
+    np.testing.assert_allclose(got, exact(np.arange(count) + 0.5), atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_without_a_seam_nothing_changes(order):
+    # Motion of constant acceleration has no seam; both sides extend to the same point.
+    time = np.arange(4 * T)[:, None]
+    root = np.array([0.2, 0.9, -0.1]) + np.array([0.03, 0.001, 0.04]) * time**order / T**order
+    turns = about([0.0, 1.0, 0.0], 0.4 * time[:, 0] ** order / T**order)
+    frames = frames_of(root, turns)
+    blended = blend_seams(frames, T, 10, history=frames[:3] - (frames[3] - frames[0]) * (order < 2))
+    np.testing.assert_allclose(blended[10:], frames[10:], atol=1e-12)
+    np.testing.assert_allclose(blend_seams(frames, T, 10), frames, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 5, T])
+def test_a_step_dies_away_within_the_given_frames(count):
+    step = np.array([0.3, -0.1, 0.2])
+    root = np.where(np.arange(2 * T)[:, None] < T, 0.0, step)
+    blended = blend_seams(frames_of(root), T, count)[:, :3]
+    np.testing.assert_array_equal(blended[:T], 0.0)
+    np.testing.assert_allclose(blended[T + count :], step + np.zeros((T - count, 3)), atol=1e-15)
+    u = (np.arange(count) + 0.5) / count
+    left = 1 - 10 * u**3 + 15 * u**4 - 6 * u**5
+    np.testing.assert_allclose(blended[T : T + count], (1 - left)[:, None] * step, atol=1e-12)
+
+
+def test_value_and_velocity_are_continuous_at_the_seam():
+    # A finer clock: the same two lines sampled so often that a step must be small.
+    gaps = []
+    for fine in (1, 10, 100):
+        time = (np.arange(64 * fine) - 32 * fine + 0.5) / fine
+        later = time > 0
+        root = np.stack([np.where(later, 0.2 - 0.05 * time, 0.03 * time)] * 3, axis=-1)
+        blended = blend_seams(frames_of(root), 32 * fine, 16 * fine)[:, 0]
+        slope = np.diff(blended) * fine
+        jump = np.abs(np.diff(blended))[32 * fine - 1]
+        gaps.append((jump, np.abs(slope[32 * fine - 2] - slope[32 * fine])))
+    # Untreated, the step stays 0.2 and the slope 0.08 however fine the clock.
+    values, slopes = np.array(gaps).T
+    assert values[2] < 1e-3 and slopes[2] < 1e-4
+    assert values[2] < values[1] / 8 < values[0] / 64 and slopes[2] < slopes[1] / 8
+
+
+def test_turns_about_one_axis_blend_like_numbers():
+    rng = np.random.default_rng(0)
+    angles = 0.1 * np.cumsum(rng.normal(size=3 * T))
+    axis = np.array([0.6, 0.0, 0.8])
+    root = np.stack([angles] * 3, axis=-1)
+    blended = blend_seams(frames_of(root, about(axis, angles)), T, 9)
+    expected = frames_of(blended[:, :3], about(axis, blended[:, 0]))
+    np.testing.assert_allclose(blended, expected, atol=1e-9)
+    assert np.abs(blended[:, 0] - angles).max() > 0.05
+
+
+def test_what_comes_out_are_rotations_whatever_goes_in():
+    frames = random_frames((2, 5 * T), seed=3)
+    blended = blend_seams(frames, T, T, history=random_frames((2, 4), seed=4))
+    matrices = matrix_from_rotation_6d(split_frames(blended)[1])
+    np.testing.assert_allclose(
+        rotation_6d_from_matrix(matrices), split_frames(blended)[1], atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.det(matrices), 1.0, atol=1e-9)
+    # Half a turn at most: the frames far from a seam are the given ones.
+    one = blend_seams(frames[0], T, 4)
+    keep = [k for k in range(5 * T) if k < T or k % T >= 4]
+    np.testing.assert_allclose(one[keep], frames[0, keep], atol=1e-12)
+
+
+def test_each_character_is_blended_alone():
+    frames = random_frames((3, 3 * T), seed=5)
+    together = blend_seams(frames, T, 6)
+    np.testing.assert_allclose(together[1], blend_seams(frames[1], T, 6), atol=1e-12)
+
+
+@pytest.mark.parametrize("tail", [1, 2, 3])
+def test_a_short_last_window_is_blended_with_what_there_is(tail):
+    step = np.array([0.0, 0.4, 0.0])
+    root = np.where(np.arange(T + tail)[:, None] < T, 0.0, step)
+    blended = blend_seams(frames_of(root), T, 8)[T:, 1]
+    assert np.all(np.diff(np.concatenate([[0.0], blended])) > 0) and blended[0] < 0.01
+
+
+def test_history_makes_the_first_frame_a_seam():
+    frames = frames_of(np.tile([1.0, 0.0, 0.0], (T, 1)))
+    history = frames_of(np.zeros((4, 3)))
+    np.testing.assert_array_equal(blend_seams(frames, T, 8), frames)
+    first = blend_seams(frames, T, 8, history=history)
+    assert first[0, 0] < 0.01 and first[7, 0] > 0.99
+    np.testing.assert_array_equal(first[8:], frames[8:])
+
+
+def test_ird_of_a_broken_walk_falls_to_the_step_of_the_walk():
+    walk = straight_motion(6 * T)
+    frames = world_frames(walk)
+    jumps = np.random.default_rng(1).normal(scale=0.05, size=(6, 3))
+    frames[:, :3] += np.repeat(jumps, T, axis=0)
+    broken = motion_from_frames(SKELETON, frames)
+    mended = blend_motion(broken, T, 8)
+    speed = np.linalg.norm([0.03, 0.0, 0.04])
+    assert ird(broken.positions, T) > 100 * 1.3 * speed
+    assert ird_excess(mended.positions, T) < 0.1 * ird_excess(broken.positions, T)
+    np.testing.assert_allclose(ird(mended.positions, T), 100 * speed, rtol=0.1)
+
+
+@pytest.fixture(scope="module")
+def generator():
+    return MotionGenerator(tiny_trained(), num_steps=1)
+
+
+@pytest.fixture(scope="module")
+def plain(generator):
+    return generator.rollout(named_path("circle", 3 * WINDOW), ["calm", "proud"])
+
+
+def test_a_rollout_is_blended_only_if_asked(generator, plain):
+    path = plain.paths[0]
+    assert plain.blend_frames == 0
+    blended = generator.rollout(path, ["calm", "proud"], blend_frames=4)
+    assert blended.blend_frames == 4 and blended.frames.dtype == plain.frames.dtype
+    expected = blend_seams(plain.frames, WINDOW, 4, history=plain.history)
+    np.testing.assert_allclose(blended.frames, expected, atol=1e-6)
+    keep = np.arange(3 * WINDOW) % WINDOW >= 4
+    np.testing.assert_allclose(blended.frames[:, keep], plain.frames[:, keep], atol=1e-6)
+    assert np.abs(blended.frames - plain.frames).max() > 1e-3
+    with pytest.raises(ValueError, match="blended already"):
+        blend_rollout(blended, 4)
+
+
+def test_the_table_has_the_unblended_rollout_beside_the_blended(plain):
+    table = blending_table(plain, 0.0, (0, 2, 6)).set_index("blend_frames")
+    positions = np.stack([plain.motion(k).positions for k in range(2)])
+    np.testing.assert_allclose(table.loc[0, "ird_cm"], ird(positions, WINDOW).mean(), rtol=1e-6)
+    assert table.loc[6, "ird_excess_cm"] < table.loc[0, "ird_excess_cm"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"blend_frames": T + 1}, f"from 0 to the window's {T} frames, got {T + 1}"),
+        ({"blend_frames": -1}, "got -1"),
+        ({"blend_frames": 2.5}, "got 2.5"),
+        ({"window": 0}, "window must be a whole number .* got 0"),
+        ({"frames": np.zeros((4, 10))}, r"frames must be .* got \(4, 10\)"),
+        ({"frames": np.full((4, CHANNELS), np.nan)}, "not finite at frame 0"),
+        ({"history": np.zeros((3, CHANNELS - 6))}, "does not fit"),
+    ],
+)
+def test_bad_input_is_refused(changed, message):
+    call = {"frames": random_frames((2 * T,)), "window": T, "blend_frames": 4}
+    with pytest.raises(ValueError, match=message):
+        blend_seams(**call | changed)

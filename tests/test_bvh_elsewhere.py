@@ -1,0 +1,110 @@
+"""What `write_bvh` writes, read by another library: pybvh, which shares no code with ours."""
+
+import numpy as np
+import pybvh
+import pytest
+from builders import SKELETON, wandering_motion
+
+from f3amd_lib.motion.bvh import write_bvh
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion, forward_kinematics, turn
+from f3amd_lib.motion.synthetic import synthesize
+
+
+def opened(tmp_path, motion, **how):
+    """The motion as pybvh sees it."""
+    return pybvh.read_bvh_file(write_bvh(tmp_path / "written.bvh", motion, **how))
+
+
+def metres_by_name(bvh) -> dict[str, np.ndarray]:
+    """Joint name -> positions [T, 3] by pybvh's own kinematics; centimetres in the file."""
+    positions = bvh.joint_positions()
+    return {name: 0.01 * positions[:, joint] for joint, name in enumerate(bvh.joint_names)}
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return synthesize("LimpLeft", 1.5)
+
+
+@pytest.mark.parametrize("order", ["ZXY", "XYZ", "YZX"])
+def test_joints_are_where_we_put_them_in_every_frame(tmp_path, walk, order):
+    seen = metres_by_name(opened(tmp_path, walk, order=order))
+    assert sorted(seen) == sorted(walk.skeleton.names)
+    for joint, name in enumerate(walk.skeleton.names):
+        np.testing.assert_allclose(seen[name], walk.positions[:, joint], atol=1e-6, err_msg=name)
+
+
+def test_a_motion_that_turns_every_joint_is_read_alike(tmp_path):
+    motion = wandering_motion(25, seed=3)
+    seen = metres_by_name(opened(tmp_path, motion))
+    for joint, name in enumerate(SKELETON.names):
+        np.testing.assert_allclose(seen[name], motion.positions[:, joint], atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0])
+def test_frames_and_frame_rate(tmp_path, walk, fps):
+    bvh = opened(tmp_path, walk.replace(fps=fps))
+    assert bvh.frame_count == walk.num_frames
+    assert bvh.fps == pytest.approx(fps, rel=1e-6)
+
+
+def test_lengths_are_centimetres_unless_asked_otherwise(tmp_path, walk):
+    height = walk.root_position[:, 1]
+    np.testing.assert_allclose(opened(tmp_path, walk).root_pos[:, 1], 100 * height, atol=1e-4)
+    metric = opened(tmp_path / "metric", walk, scale=1.0)
+    np.testing.assert_allclose(metric.root_pos, walk.root_position, atol=1e-6)
+
+
+def test_the_rest_pose_is_the_skeleton(tmp_path, walk):
+    skeleton = walk.skeleton
+    bvh = opened(tmp_path, walk)
+    eye = np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3))
+    ours = forward_kinematics(skeleton, np.zeros(3), np.array(eye))
+    rest = 0.01 * bvh.rest_pose_positions()
+    place = bvh.node_index
+    for joint, name in enumerate(skeleton.names):
+        np.testing.assert_allclose(rest[place[name]], ours[joint], atol=1e-6, err_msg=name)
+    parents = {
+        node.name: node.parent.name if node.parent else None
+        for node in bvh.nodes
+        if not node.is_end_site()
+    }
+    names = skeleton.names
+    assert parents == {
+        name: names[parent] if parent >= 0 else None
+        for name, parent in zip(names, skeleton.parents, strict=True)
+    }
+
+
+def test_up_and_forward_are_the_axes_that_other_programs_find(tmp_path, walk):
+    bvh = opened(tmp_path, walk)
+    assert str(bvh.world_up) == "+y"
+    assert bvh.rest_up == "+y"
+    # Which way it faces, by geometry and names of the other library.
+    for degrees, axis in ((0, "+z"), (90, "+x"), (180, "-z"), (-90, "-x")):
+        facing = np.deg2rad(degrees) - walk.yaw[0]
+        bvh = opened(tmp_path / axis, turn(walk, facing))
+        assert str(bvh.forward_at(0)) == axis
+
+
+def test_a_turned_character_is_turned_for_others_as_well(tmp_path):
+    root = np.zeros((4, 3)) + [0.0, 0.9, 0.0]
+    yaw = np.deg2rad([0.0, 90.0, 180.0, -90.0])
+    turns = np.broadcast_to(np.eye(3), (4, SKELETON.num_joints, 3, 3)).copy()
+    turns[:, 0] = matrix_from_yaw(yaw)
+    seen = metres_by_name(opened(tmp_path, Motion(SKELETON, root, turns)))
+    # Facing +Z the left hip lies at +X; a quarter turn to the left takes it to -Z.
+    left = seen["LeftUpLeg"] - root - [0.0, -0.05, 0.0]
+    expected = 0.1 * np.array([[1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(left, expected, atol=1e-6)
+
+
+def test_tips_come_along(tmp_path):
+    motion = wandering_motion(5)
+    bvh = opened(tmp_path, motion)
+    ends = [node for node in bvh.nodes if node.is_end_site()]
+    by_parent = {node.parent.name: 0.01 * np.asarray(node.offset) for node in ends}
+    np.testing.assert_allclose(by_parent["Spine"], [0.0, 0.2, 0.0], atol=1e-8)
+    # A limb without a tip of its own ends where its joint is.
+    np.testing.assert_array_equal(by_parent["LeftToeBase"], 0.0)
