@@ -2,13 +2,21 @@
 
 import json
 
+import pandas as pd
 import pytest
 
 from f3amd_lib.models.camdm import CAMDMConfig
 from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.zoo import find_preset
-from f3amd_lib.report.equation_map import EQUATIONS, equation_map, mentioned_equations
+from f3amd_lib.report.equation_map import (
+    EQUATIONS,
+    equation_map,
+    mentioned_equations,
+    notebook_sections,
+    running_times,
+)
 from f3amd_lib.report.readings import READINGS, Reading, readings_table
+from f3amd_lib.report.records import run_record, write_table
 
 
 @pytest.mark.parametrize(
@@ -22,6 +30,9 @@ from f3amd_lib.report.readings import READINGS, Reading, readings_table
         ("Source: section 3.2; Zhou et al. 2019, Eq. 15.", set()),
         ("paper Appendix F and Appendix B", {"Appendix F"}),
         ("Eq. 81 and a sequence of 3", set()),
+        ("alpha_t of Appendix F", {"Appendix F", "alpha_t"}),
+        (r"with $\alpha_t = \sqrt{\alpha}$", {"alpha_t"}),
+        (r"$\bar\alpha_t$, alpha_bar_t and my_alpha_t", set()),
     ],
 )
 def test_mentions_are_read(text, expected):
@@ -49,16 +60,128 @@ def test_a_small_checkout_is_mapped(tmp_path):
     assert rows.loc["Eq. 3", "tests"] == "test_block: test_eq03_to_eq04_sum"
     assert rows.loc["Appendix F", "tests"] == "test_block: test_appendix_f_step"
     assert rows.loc["Eq. 4", "notebooks"] == "03_blocks"
-    assert (rows.loc["Eq. 9", ["functions", "tests", "notebooks"]] == "").all()
+    assert (rows.loc["Eq. 9", ["functions", "tests", "notebooks", "cells"]] == "").all()
 
 
-def test_every_equation_of_the_paper_has_code():
-    rows = equation_map()
-    assert len(rows) == len(EQUATIONS) == 15
+def write_notebook(path, *cells):
+    """A notebook of (kind, source) cells, "text" or "code"."""
+    kinds = {"text": "markdown", "code": "code"}
+    cells = [{"cell_type": kinds[kind], "source": [source]} for kind, source in cells]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"cells": cells}), encoding="utf-8")
+    return path
+
+
+LOSSES = (
+    ("text", "# 04 · Losses (Eqs 2-4)\n\nA title page about Eq. 1."),
+    ("code", 'keep_figure(before, results, "04_title_page")'),
+    ("text", "## 4.1 Batches\n\nText.\n\n## 4.2 Losses\n\n$$a \\qquad (11)$$"),
+    ("text", "$$b \\qquad (14, 4.1)$$"),
+    ("text", "### Closer\n\nAs $f(10)$ says, $$x = g(9)$$"),
+    ("code", 'keep_film(frames, results, "04_film")'),
+    ("code", "assert ok  # Eqs 12 and 13"),
+    ("code", 'plots.keep_figure(\n    figure("04_other"),\n    results,\n    "04_terms",\n)'),
+    ("text", "and Eq. 10.\n\n## What we learned\n\nEq. 8."),
+    ("code", 'open("04_not_kept")'),
+)  # fmt: skip
+
+
+def test_sections_know_their_equations_and_figures(tmp_path):
+    sections = notebook_sections(write_notebook(tmp_path / "04_losses.ipynb", *LOSSES))
+    assert [section.heading for section in sections] == ["4.1 Batches", "4.2 Losses",
+                                                         "What we learned"]  # fmt: skip
+    assert [section.number for section in sections] == ["4.1", "4.2", ""]
+    assert sections[0].equations == set() and sections[0].figures == ()
+    assert sections[1].equations == {f"Eq. {number}" for number in (10, 11, 12, 13, 14)}
+    assert sections[1].figures == ("04_film", "04_terms")
+    assert sections[2].equations == {"Eq. 8"} and sections[2].figures == ()
+
+
+def test_the_map_points_to_sections_and_their_figures(tmp_path):
+    write_notebook(tmp_path / "notebooks/04_losses.ipynb", *LOSSES)
+    write_notebook(
+        tmp_path / "notebooks/13_exercise_solutions.ipynb", ("text", "## 13.1\n\nEq. 11")
+    )
+    write_notebook(tmp_path / "notebooks/00_guide.ipynb", ("text", "## 0.1 Map\n\nEq. 11"))
+    rows = equation_map(root=tmp_path).set_index("equation")
+    assert rows.loc["Eq. 11", ["notebooks", "cells", "figures"]].tolist() == [
+        "04_losses", "4.2", "04_film, 04_terms",
+    ]  # fmt: skip
+    assert rows.loc["Eq. 1", ["notebooks", "cells", "figures"]].tolist() == ["04_losses", "", ""]
+    assert rows.loc["Eq. 8", "cells"] == ""  # a summary explains nothing
+    assert rows.loc["alpha_t", "notebooks"] == ""
+
+
+@pytest.fixture(scope="module")
+def whole_map():
+    """The map of this checkout."""
+    return equation_map()
+
+
+def test_every_equation_of_the_paper_has_code(whole_map):
+    rows = whole_map
+    assert len(rows) == len(EQUATIONS) == 16
     assert rows.loc[rows["functions"] == "", "equation"].tolist() == []
     by_label = rows.set_index("equation")["functions"]
     assert "diffusion/schedules: VarianceExploding.sigma" in by_label["Eq. 9"].split(", ")
     assert "training/losses: total_loss" in by_label["Eq. 14"].split(", ")
+
+
+@pytest.mark.parametrize("column", ["functions", "tests", "notebooks", "cells"])
+def test_every_equation_of_the_paper_has_an_entry_in_every_column(whole_map, column):
+    assert whole_map.loc[whole_map[column] == "", "equation"].tolist() == []
+
+
+def test_every_equation_that_is_used_has_a_figure_that_a_notebook_draws(whole_map):
+    rows = whole_map.set_index("equation")
+    assert rows.index[rows["figures"] == ""].tolist() == []
+    assert "02_schedule" in rows.loc["Eq. 9", "figures"].split(", ")
+    assert "2.3" in rows.loc["Eq. 9", "cells"].split(", ")
+    assert "02_paths" in rows.loc["Appendix F", "figures"].split(", ")
+
+
+def record_of_a_run(root, dataset, *, seconds, finished=(True, True), **changes):
+    record = run_record(profile="laptop", dataset=dataset, seed=0) | changes
+    summary = pd.DataFrame(
+        {
+            "notebook": ["00_guide.ipynb", "04_losses.ipynb"],
+            "seconds": seconds,
+            "cells": 1,
+            "finished": finished,
+        }
+    )
+    write_table(root / f"paper_figures/{dataset}/laptop/tables/run_summary.csv", summary, record)
+
+
+def test_running_times_are_those_of_the_records(tmp_path):
+    for name in ("00_guide", "04_losses", "05_new"):
+        write_notebook(tmp_path / f"notebooks/{name}.ipynb", ("text", "# Title"))
+    cpu = {"device_platform": "cpu", "device_kind": "cpu", "cores": 2}
+    gpu = {"device_platform": "gpu", "device_kind": "Some GPU", "cores": 16}
+    record_of_a_run(tmp_path, "synthetic", seconds=[3.4, 1045.5], **cpu)
+    record_of_a_run(tmp_path, "bandai", seconds=[1.0, 2.0], finished=(True, False), **gpu)
+    table = running_times(root=tmp_path).set_index("notebook")
+    assert table.columns.tolist() == ["bandai, laptop, Some GPU", "synthetic, laptop, 2 CPU cores"]
+    assert table.index.tolist() == ["00_guide", "04_losses", "05_new"]
+    cpu_times, gpu_times = (table[name] for name in table.columns[::-1])
+    assert cpu_times.iloc[:2].tolist() == [3, 1046] and gpu_times.iloc[0] == 1
+    assert cpu_times.isna().tolist() == [False, False, True]
+    assert gpu_times.isna().tolist() == [False, True, True]  # one stopped: that is no time
+
+
+def test_running_times_that_were_changed_by_hand_are_refused(tmp_path):
+    record_of_a_run(tmp_path, "synthetic", seconds=[3.4, 12.0])
+    path = tmp_path / "paper_figures/synthetic/laptop/tables/run_summary.csv"
+    path.write_text(path.read_text().replace("12.0", "1.0"))
+    with pytest.raises(ValueError, match="not the table"):
+        running_times(root=tmp_path)
+
+
+def test_the_committed_running_times_name_the_notebooks_that_are_there():
+    table = running_times()
+    assert table["notebook"].str.fullmatch(r"\d\d_\w+").all()
+    assert [name for name in table if name.startswith("synthetic, laptop")]
+    assert table.set_index("notebook").loc["02_sampler_theory"].min() > 0
 
 
 def test_open_points_show_the_codes_own_defaults():

@@ -1,8 +1,10 @@
 """From equation to code: a table that is read off the code itself, so that it cannot go stale.
 
 Docstrings of the library say which equation of the paper a function implements ("Eq. 9",
-"Eqs 2-4", "Appendix F"). This module collects them, together with the tests and the notebooks that
-mention the same equation. Nothing is imported for it: source files are parsed.
+"Eqs 2-4", "Appendix F"). This module collects them, together with the tests and the sections of
+notebooks that mention the same equation, and the figures that these sections draw. Nothing is
+imported for it: source files are parsed. How long a notebook runs is read off the records of
+complete runs.
 """
 
 from __future__ import annotations
@@ -16,8 +18,17 @@ from pathlib import Path
 import pandas as pd
 
 from f3amd_lib.profiles import repository_root
+from f3amd_lib.report.records import read_table
 
-__all__ = ["EQUATIONS", "Equation", "equation_map", "mentioned_equations"]
+__all__ = [
+    "EQUATIONS",
+    "Equation",
+    "Section",
+    "equation_map",
+    "mentioned_equations",
+    "notebook_sections",
+    "running_times",
+]
 
 
 @dataclass(frozen=True)
@@ -25,7 +36,8 @@ class Equation:
     """An equation of the paper.
 
     Attributes:
-      label: "Eq. 9", or "Appendix F" for the unnumbered update.
+      label: "Eq. 9", "Appendix F" for the unnumbered update, "alpha_t" for what that appendix
+        defines beside it.
       section: where the paper has it.
       what: what it says, in our words.
     """
@@ -51,10 +63,16 @@ EQUATIONS = (
     Equation("Eq. 13", "App. B", "velocity loss"),
     Equation("Eq. 14", "App. B", "weighted sum of the losses"),
     Equation("Appendix F", "App. F", "DDIM update through alpha_bar"),
+    Equation("alpha_t", "App. F", "root of the signal kept by one step; the update never uses it"),
 )
-"""All equations of the paper that carry a number, and the update of Appendix F."""
+"""All equations of the paper that carry a number, and the two of Appendix F, which carry none."""
 
-_MENTION = re.compile(r"\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|\b(Appendix F)\b")
+# In LaTeX the last one is \alpha_t, which \bar\alpha_t holds too and does not mean.
+_MENTION = re.compile(
+    r"\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|\b(Appendix F)\b"
+    r"|(?<!\\bar\\)(?<!\w)(alpha_t)(?!\w)"
+)
+_DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
 _TEST_NAME = re.compile(r"^test_(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|(appendix_f))(?=_)")
 
 
@@ -69,8 +87,8 @@ def mentioned_equations(text: str) -> set[str]:
         for match in _MENTION.finditer(clause):
             if "et al." in clause[: match.start()]:
                 continue
-            if match.group(2):
-                found.add("Appendix F")
+            if match.group(2) or match.group(3):
+                found.add(match.group(2) or match.group(3))
             else:
                 found |= {f"Eq. {number}" for number in _numbers(match.group(1))}
     return found & {equation.label for equation in EQUATIONS}
@@ -94,12 +112,14 @@ def equation_map(*, root=None) -> pd.DataFrame:
         folder that is absent (an installed package has no tests) gives empty cells.
 
     Returns:
-      One row per entry of `EQUATIONS`: equation, section, what, functions, tests, notebooks; the
-      last three hold names joined by ", ", "" where there are none.
+      One row per entry of `EQUATIONS`: equation, section (of the paper), what, functions, tests,
+      notebooks, cells (numbers of the notebooks' sections that speak of it: "2.3" is in notebook
+      02), figures (files that these sections draw). The last five hold names joined by ", ", ""
+      where there are none.
     """
     root = Path(root) if root is not None else repository_root()
-    places = {equation.label: {"functions": [], "tests": [], "notebooks": []}
-              for equation in EQUATIONS}  # fmt: skip
+    kinds = ("functions", "tests", "notebooks", "cells", "figures")
+    places = {equation.label: {kind: [] for kind in kinds} for equation in EQUATIONS}
     for path in sorted((root / "f3amd_lib").rglob("*.py")):
         module = path.relative_to(root / "f3amd_lib").with_suffix("").as_posix()
         if module.startswith("report/"):  # what draws and lists implements nothing
@@ -112,10 +132,16 @@ def equation_map(*, root=None) -> pd.DataFrame:
             for label in labels:
                 places[label]["tests"].append(f"{path.stem}: {name}")
     for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb")):
-        # The reading guide shows this very map and explains none of it.
-        if not path.stem.startswith("00"):
-            for label in mentioned_equations(_notebook_text(path)):
-                places[label]["notebooks"].append(path.stem)
+        # The reading guide shows this very map and explains none of it; solutions only repeat.
+        if path.stem.startswith("00") or path.stem.endswith("_solutions"):
+            continue
+        text = _notebook_text(path)
+        for label in mentioned_equations(text) | _displayed([text]):
+            places[label]["notebooks"].append(path.stem)
+        for section in notebook_sections(path):
+            for label in section.equations if section.number else ():
+                places[label]["cells"].append(section.number)
+                places[label]["figures"] += section.figures
     return pd.DataFrame(
         [
             {"equation": item.label, "section": item.section, "what": item.what}
@@ -153,7 +179,108 @@ def _tests(path: Path):
             yield node.name, labels & {equation.label for equation in EQUATIONS}
 
 
+@dataclass(frozen=True)
+class Section:
+    """What stands under one heading of a notebook.
+
+    Attributes:
+      heading: its line, without the marks: "2.3 One line, three labels (Eq. 9)".
+      equations: labels of the paper's equations that its text, or its code, mentions.
+      figures: names of the figures that its code draws and keeps, "02_schedule".
+    """
+
+    heading: str
+    equations: frozenset[str]
+    figures: tuple[str, ...]
+
+    @property
+    def number(self) -> str:
+        """The heading's own number, "2.3"; "" if it has none, as "What we learned" has."""
+        found = re.match(r"\d+\.\d+(?= )", self.heading)
+        return found[0] if found else ""
+
+
+def notebook_sections(path) -> list[Section]:
+    """Read the sections of a notebook in their order.
+
+    Args:
+      path: of the notebook. What stands before its first heading of the second level is its title
+        page and in no section; deeper headings stay in the section they stand in.
+
+    Returns:
+      One entry per heading of the second level ("## ...").
+    """
+    texts: list[tuple[str, list[str], list[str]]] = []
+    for cell in json.loads(Path(path).read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            if texts:
+                texts[-1][1].append(source)
+                texts[-1][2].extend(_kept_figures(source))
+            continue
+        before, *parts = re.split(r"^## (.*)$", source, flags=re.M)
+        if texts:
+            texts[-1][1].append(before)
+        for heading, text in zip(parts[::2], parts[1::2], strict=True):
+            texts.append((heading.strip(), [heading, text], []))
+    return [
+        Section(heading, frozenset(mentioned_equations("\n\n".join(text)) | _displayed(text)),
+                tuple(figures))
+        for heading, text, figures in texts
+    ]  # fmt: skip
+
+
+def _displayed(texts: list[str]) -> set[str]:
+    """Return the labels of displayed equations that carry the number, "\\qquad (11)$$"."""
+    numbers = {match for text in texts for match in _DISPLAYED.findall(text)}
+    found = {f"Eq. {part.strip()}" for number in numbers for part in number.split(",")}
+    return found & {equation.label for equation in EQUATIONS}
+
+
+def _kept_figures(source: str) -> list[str]:
+    """Return the names under which a code cell keeps figures: `keep_figure(..., "02_paths")`."""
+    names = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and node.args and isinstance(node.args[-1], ast.Constant):
+            called = ast.unparse(node.func).split(".")[-1]
+            if called.startswith("keep_") and re.match(r"\d\d_", str(node.args[-1].value)):
+                names.append((node.lineno, node.args[-1].value))
+    return [name for _, name in sorted(names)]
+
+
 def _notebook_text(path: Path) -> str:
     """Return the Markdown of a notebook, one cell a paragraph."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
+def running_times(*, root=None) -> pd.DataFrame:
+    """Collect how long each notebook ran, from the records of complete runs.
+
+    Args:
+      root: a checkout, by default the one in use. Read are `run_summary.csv` and its record in
+        `paper_figures/<data set>/<profile>/tables/`, which a run of all notebooks leaves there.
+
+    Returns:
+      notebook, and a column for each record, "synthetic, laptop, 2 CPU cores": seconds of wall
+      time, to a whole second. A notebook that did not exist when a record was made is a missing
+      value. Profiles and machines without a record have no column.
+
+    Raises:
+      ValueError: if a summary is not the one its record describes.
+    """
+    root = Path(root) if root is not None else repository_root()
+    columns = {}
+    for path in sorted((root / "paper_figures").glob("*/*/tables/run_summary.csv")):
+        summary, record = read_table(path)
+        where = record["device_kind"]
+        if record["device_platform"] == "cpu":
+            where = f"{record['cores']} CPU cores"
+        finished = summary[summary["finished"]]
+        seconds = finished["seconds"].round().astype("Int64")
+        columns[f"{record['dataset']}, {record['profile']}, {where}"] = pd.Series(
+            seconds.to_numpy(), index=finished["notebook"].str.removesuffix(".ipynb")
+        ).astype("Int64")
+    names = [path.stem for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb"))]
+    table = pd.DataFrame(columns, index=pd.Index(names, name="notebook"))
+    return table.reset_index()

@@ -1,0 +1,326 @@
+"""What layers can express: closed forms against brute force, set weights against plain numpy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import SKELETON
+from flax import nnx
+
+from f3amd_lib.evaluation import expressivity as ex
+from f3amd_lib.models.conditioning import CONDITIONINGS, conditioning_layer
+from f3amd_lib.models.spectral import SpectralConvolution
+from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
+
+# -------------------------------------------------------------------------------------- modes
+
+
+@pytest.mark.parametrize("num_frames", [7, 8])
+def test_keeping_fourier_modes_is_cutting_an_fft(num_frames):
+    x = np.random.default_rng(0).standard_normal((2, num_frames, 3))
+    for modes in range(1, num_frames // 2 + 2):
+        spectrum = np.fft.rfft(x, axis=1)
+        spectrum[:, modes:] = 0
+        expected = np.fft.irfft(spectrum, n=num_frames, axis=1)
+        np.testing.assert_allclose(ex.keep_modes(x, modes), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("num_frames", [7, 8])
+def test_every_band_keeps_as_many_numbers_and_all_modes_keep_everything(num_frames):
+    for modes in (1, 2, 3):
+        for band in ("fourier", "cosine"):
+            kept = ex.kept_projection(num_frames, modes, band)
+            assert np.linalg.matrix_rank(kept) == 2 * modes - 1
+            np.testing.assert_allclose(kept @ kept, kept, atol=1e-12)
+    for band in ex.BANDS:
+        everything = ex.kept_projection(num_frames, num_frames // 2 + 1, band)
+        np.testing.assert_allclose(everything, np.eye(num_frames), atol=1e-12)
+
+
+def test_beside_a_line_a_straight_walk_loses_nothing_and_others_cut_the_rest():
+    walk = np.linspace(0.2, 1.5, 16)[:, None]
+    np.testing.assert_allclose(ex.keep_modes(walk, 1, "fourier beside a line"), walk, atol=1e-12)
+    x = np.random.default_rng(1).standard_normal((16, 1))
+    line = np.linspace(x[0, 0], x[-1, 0], 16)[:, None]
+    expected = line + ex.keep_modes(x - line, 3)
+    np.testing.assert_allclose(ex.keep_modes(x, 3, "fourier beside a line"), expected, atol=1e-12)
+
+
+def test_unknown_bands_and_modes_are_refused_by_name():
+    with pytest.raises(ValueError, match="unknown band 'cosin'.*cosine"):
+        ex.keep_modes(np.zeros((8, 1)), 2, "cosin")
+    with pytest.raises(ValueError, match="between 1 and 5"):
+        ex.keep_modes(np.zeros((8, 1)), 6)
+    with pytest.raises(ValueError, match="beside a line"):
+        ex.ramp_energy(8, "fourier beside a line")
+
+
+# ------------------------------------------------------------------------------------- motion
+
+
+def walking_frames(num_frames=16, windows=2):
+    """Windows that walk along z, turn a little, and swing the left leg twice a window."""
+    time = np.arange(num_frames) / num_frames
+    rotations = np.tile(np.eye(3), (windows, num_frames, SKELETON.num_joints, 1, 1))
+    swing = 0.4 * np.sin(4 * np.pi * time)
+    rotations[:, :, 2] = np.swapaxes(matrix_from_yaw(swing), -1, -2)[:, [1, 0, 2]][:, :, [1, 0, 2]]
+    root = np.stack([0 * time, 0 * time + 1.0, 1.2 * time], axis=-1)
+    flat = np.asarray(rotation_6d_from_matrix(rotations)).reshape(windows, num_frames, -1)
+    return np.concatenate([np.tile(root, (windows, 1, 1)), flat], axis=-1)
+
+
+def test_every_joint_has_one_body_part():
+    groups = ex.joint_groups(SKELETON)
+    assert groups == {"root": (0,), "trunk and head": (1,), "legs": (2, 4), "toes": (3, 5)}
+
+
+def test_the_squares_of_a_spectrum_add_up_to_the_variance():
+    frames = walking_frames()
+    table = ex.motion_spectrum(SKELETON, frames, fps=16.0)
+    positions = ex.group_positions(SKELETON, frames)
+    for group, values in positions.items():
+        spread = np.mean(np.sum((values - values.mean(axis=1, keepdims=True)) ** 2, axis=-1))
+        for band in ("fourier", "cosine"):
+            rows = table[(table["band"] == band) & (table["group"] == group)]
+            np.testing.assert_allclose(rows["frequency_hz"], np.arange(9.0))
+            np.testing.assert_allclose(
+                np.sum(rows["amplitude_cm"].to_numpy()[1:] ** 2), spread, rtol=1e-9, atol=1e-12
+            )
+
+
+def test_a_spectrum_has_its_peak_at_the_frequency_of_a_swing():
+    table = ex.motion_spectrum(SKELETON, walking_frames(), fps=16.0)
+    toes = table[(table["group"] == "toes") & (table["frequency_hz"] > 0)]
+    for _, rows in toes.groupby("band"):
+        assert rows.loc[rows["amplitude_cm"].idxmax(), "frequency_hz"] in (2.0, 4.0)
+
+
+def test_a_walk_costs_its_root_at_the_ends_and_a_line_mends_it():
+    table = ex.band_limit_errors(SKELETON, walking_frames(), (1, 3, 9))
+    error = table.groupby(["band", "group", "num_kept_modes"])["error_cm"].mean()
+    # With one mode the root stands in the middle of 16 frames of 7.5 cm.
+    np.testing.assert_allclose(error["fourier", "root", 1], 7.5 * 4.0)
+    assert error["fourier", "root", 3] > 20 * error["fourier beside a line", "root", 3]
+    assert error["fourier", "root", 3] > 4 * error["cosine", "root", 3]
+    assert all(error[band, "root", 9] < 1e-9 for band in ex.BANDS)
+    # The pose swings twice a window: three modes hold its features, one does not.
+    assert error["fourier", "toes", 3] < 0.1 * error["fourier", "toes", 1]
+    by_frame = table[(table["band"] == "fourier") & (table["group"] == "root")]
+    by_frame = by_frame[by_frame["num_kept_modes"] == 3]["error_cm"].to_numpy()
+    assert by_frame[0] > 3 * by_frame[4:12].mean()
+    np.testing.assert_allclose(by_frame[0], by_frame[-1])
+
+
+# -------------------------------------------------------------------------------------- seams
+
+
+@pytest.mark.parametrize("num_frames", [15, 16])
+def test_energy_of_a_line_is_that_of_its_transform(num_frames):
+    line = np.arange(num_frames, dtype=float)
+    spectrum = np.abs(np.fft.rfft(line)) ** 2 / num_frames
+    spectrum[1 : (num_frames + 1) // 2] *= 2
+    np.testing.assert_allclose(ex.ramp_energy(num_frames), spectrum, rtol=1e-10)
+    from scipy.fft import dct
+
+    expected = dct(line, norm="ortho") ** 2
+    np.testing.assert_allclose(ex.ramp_energy(num_frames, "cosine"), expected, atol=1e-9)
+
+
+def test_what_is_left_of_a_line_falls_as_one_half_and_three_halves():
+    kept = np.array([16, 32, 64])
+    for band, step, exponent in (("fourier", 1, -0.5), ("cosine", 2, -1.5)):
+        energy = ex.ramp_energy(1024, band)
+        left = [np.sqrt(energy[step * (m - 1) + 1 :].sum()) for m in kept]
+        assert abs(np.polyfit(np.log(kept), np.log(left), 1)[0] - exponent) < 0.1
+
+
+def least_squares_share(target, parts):
+    columns = np.stack([part.ravel() for part in parts], axis=1)
+    fit = columns @ np.linalg.lstsq(columns, target.ravel(), rcond=None)[0]
+    return np.sum((target.ravel() - fit) ** 2) / np.sum(target**2)
+
+
+@pytest.mark.parametrize("reach", [None, 0, 2])
+def test_the_share_that_wraps_is_what_least_squares_leave(reach):
+    num_frames = 12
+    parts = [np.roll(np.eye(num_frames), lag, axis=0) for lag in range(num_frames)]
+    if reach is not None:
+        parts += [np.eye(num_frames, k=lag) for lag in range(-reach, reach + 1)]
+    rng = np.random.default_rng(0)
+    for taps in (np.ones(1), np.array([1.0, -1.0]), np.ones(5), rng.standard_normal(12)):
+        expected = least_squares_share(ex.toeplitz(taps, num_frames), parts)
+        np.testing.assert_allclose(ex.wrapped_share(taps, num_frames, reach), expected, atol=1e-12)
+
+
+def test_a_filter_matrix_sees_zeros_before_the_window():
+    x = np.random.default_rng(0).standard_normal(9)
+    taps = np.array([0.5, -1.0, 2.0])
+    np.testing.assert_allclose(ex.toeplitz(taps, 9) @ x, np.convolve(x, taps)[:9])
+    with pytest.raises(ValueError, match="4 taps is longer than the window, 3"):
+        ex.toeplitz(np.ones(4), 3)
+
+
+# ----------------------------------------------------------------------- filters by condition
+
+
+def circular(signal, kernel):
+    return np.fft.irfft(np.fft.rfft(signal) * np.fft.rfft(kernel), n=len(signal))
+
+
+def through(base, film, signal, conditions):
+    """A signal [T] under each condition [S, C], after the pair of SiLUs."""
+    shape = (len(conditions), len(signal), 1)
+    z = jnp.broadcast_to(jnp.asarray(signal, jnp.float32)[None, :, None], shape)
+    c = jnp.repeat(jnp.asarray(conditions, jnp.float32)[:, None], len(signal), axis=1)
+    out = np.asarray(jax.jit(lambda z, c: film(base, z, c))(z, c))
+    return out[..., 0] - out[..., 1]
+
+
+def test_film_has_every_family_of_low_rank_exactly():
+    rng = np.random.default_rng(0)
+    filters = rng.standard_normal((5, 2)) @ rng.standard_normal((2, 12))
+    base, film = ex.film_for_filters(filters)
+    assert film.output.kernel[...].shape == (3, 3)  # two kernels and one more
+    signal = rng.standard_normal(12)
+    expected = [circular(signal, kernel) for kernel in filters]
+    np.testing.assert_allclose(through(base, film, signal, np.eye(5)), expected, atol=1e-4)
+
+
+def test_film_with_fewer_kernels_leaves_the_share_that_is_foretold():
+    filters = np.random.default_rng(1).standard_normal((6, 10))
+    base, film = ex.film_for_filters(filters, 3)
+    kernels = through(base, film, np.eye(10)[0], np.eye(6))
+    left = np.sum((kernels - filters) ** 2) / np.sum(filters**2)
+    np.testing.assert_allclose(left, ex.film_share(filters, 3), rtol=1e-4)
+    assert 0.1 < left < 0.9
+    with pytest.raises(ValueError, match="between 1 and 6, got 7"):
+        ex.film_for_filters(filters, 7)
+
+
+def test_each_channel_buys_one_delay():
+    for channels in (0, 3, 8):
+        np.testing.assert_allclose(ex.film_share(np.eye(8, 32), channels), 1 - channels / 8)
+
+
+def test_no_shared_kernels_do_better_than_the_share_foretold():
+    # Alternating least squares from random starts finds the bound and never goes below it.
+    rng = np.random.default_rng(2)
+    filters = rng.standard_normal((6, 9))
+    kernels = rng.standard_normal((2, 9))
+    for _ in range(500):
+        gains = filters @ np.linalg.pinv(kernels)
+        kernels = np.linalg.pinv(gains) @ filters
+    left = np.sum((filters - gains @ kernels) ** 2) / np.sum(filters**2)
+    np.testing.assert_allclose(left, ex.film_share(filters, 2), rtol=1e-6)
+
+
+def test_a_condition_that_is_added_leaves_one_filter_for_all():
+    filters = np.random.default_rng(3).standard_normal((4, 7))
+    expected = np.sum((filters - filters.mean(axis=0)) ** 2) / np.sum(filters**2)
+    np.testing.assert_allclose(ex.additive_share(filters), expected)
+    np.testing.assert_allclose(ex.additive_share(np.eye(8)), 7 / 8)
+
+
+def test_three_blocks_of_two_channels_have_all_eight_delays():
+    signal = np.random.default_rng(4).standard_normal(8)
+    blocks = ex.film_delay_line(3, 8)
+    delays = np.arange(8)
+    bits = 2.0 * ((delays[:, None] >> np.arange(3)) & 1) - 1.0
+
+    @jax.jit
+    def delayed(c):
+        z = nnx.silu(jnp.asarray(np.stack([signal, -signal], -1)[None], jnp.float32))
+        z = jnp.broadcast_to(z, (8, 8, 2))
+        for base, film in blocks:
+            z = film(base, z, c)
+        return z[..., 0] - z[..., 1]
+
+    out = delayed(jnp.repeat(jnp.asarray(bits, jnp.float32)[:, None], 8, axis=1))
+    np.testing.assert_allclose(out, [np.roll(signal, delay) for delay in delays], atol=1e-5)
+
+
+# ------------------------------------------------------------------------------- ways of c in
+
+WIDTH, WINDOW = 3, 6
+BASES = {
+    frames: SpectralConvolution(WIDTH, WIDTH, frames // 2 + 1, rngs=nnx.Rngs(2))
+    for frames in (WINDOW, 2 * WINDOW)
+}
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """Name of a way in -> (z, c) [1, T, D] to one block before its SiLU."""
+    rng = np.random.default_rng(0)
+    ways = {
+        name: conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(1)) for name in CONDITIONINGS
+    }
+    modulation = ways["adaln_zero"].modulation.kernel
+    modulation[...] = jnp.asarray(0.5 * rng.standard_normal(modulation.shape), jnp.float32)
+
+    def block(name):
+        def run(z, c):
+            both = jnp.concatenate([c, z], axis=1) if name == "concatenation" else z
+            base = BASES[both.shape[1]]
+            return ex.without_activation(ways[name], base, both, c)[:, -WINDOW:]
+
+        return jax.jit(run)
+
+    return {name: block(name) for name in CONDITIONINGS}
+
+
+def draw(*shape, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).standard_normal(shape), jnp.float32)
+
+
+def test_without_its_activation_film_is_equation_six_and_a_linear_layer():
+    film = conditioning_layer("film", WIDTH, WIDTH, rngs=nnx.Rngs(1))
+    base = BASES[WINDOW]
+    film.output.bias[...] = draw(WIDTH, seed=9)
+    z, c = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
+    gamma, beta = np.split(np.asarray(film.modulation(c)), 2, axis=-1)
+    z_tilde = np.asarray(base(z)) * (1 + np.tanh(gamma)) + beta
+    expected = z_tilde @ np.asarray(film.output.kernel[...]) + np.asarray(film.output.bias[...])
+    found = jax.jit(lambda z, c: ex.without_activation(film, base, z, c))(z, c)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_only_gains_filter_by_a_condition_that_is_constant(blocks):
+    first, second = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
+    styles = [jnp.tile(draw(WIDTH, seed=seed), (1, WINDOW, 1)) for seed in (2, 3)]
+    filters_by_it = {}
+    for name, block in blocks.items():
+        effect = [block(first, c) - block(second, c) for c in styles]
+        filters_by_it[name] = bool(jnp.abs(effect[0] - effect[1]).max() > 1e-4)
+    assert filters_by_it == {
+        "film": True, "concatenation": False, "adaln_zero": True, "cross_attention": False
+    }  # fmt: skip
+
+
+def test_a_condition_meets_the_signal_where_each_way_lets_it(blocks):
+    z, c, frame = draw(WINDOW, WIDTH), draw(WINDOW, WIDTH, seed=1), 4
+    maps = {name: ex.interaction_map(block, z, c, frame) for name, block in blocks.items()}
+    others = np.arange(WINDOW) != frame
+    assert (maps["film"][others] < 1e-6).all() and (maps["film"][frame] > 1e-4).all()
+    assert maps["concatenation"].max() < 1e-6
+    before, gate = maps["adaln_zero"][others], maps["adaln_zero"][frame]
+    diagonal = np.eye(WINDOW, dtype=bool)[others]
+    assert (gate > 1e-4).all() and (before[diagonal] > 1e-4).all()
+    assert (before[~diagonal] < 1e-6).all()
+    assert np.mean(maps["cross_attention"] > 1e-6) > 0.9
+
+
+def test_an_interaction_map_is_the_size_of_the_mixed_derivative():
+    # y_t = c_t z_t + 3 c_0 z_1: derivative 1 at (t, t) and 3 at (0, 1).
+    way = lambda z, c: c * z + 3.0 * c[:, :1] * z[:, 1:2]
+    found = ex.interaction_map(way, draw(4, 1), draw(4, 1, seed=1), 2)
+    expected = np.zeros((4, 4))
+    expected[2, 2], expected[0, 1] = 1.0, 3.0
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_adaln_zero_adds_the_same_to_a_motion_and_to_twice_it(blocks):
+    z, c = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
+    added = lambda z: blocks["adaln_zero"](z, c) - z
+    assert float(jnp.abs(added(z)).max()) > 0.05
+    np.testing.assert_allclose(added(2 * z), added(z), atol=1e-4)

@@ -1,0 +1,204 @@
+"""The standalone notebook: it needs numpy and matplotlib alone, and says what the library says.
+
+It holds copies of the library's formulas, so that a teacher can drop one file into any course.
+Here the copies are held against the originals, by value.
+"""
+
+import ast
+import builtins
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import nbformat
+import numpy as np
+import pytest
+
+from f3amd_lib.diffusion import oracles, samplers, schedules
+
+PATH = Path(__file__).resolve().parents[1] / "notebooks/standalone/sampler_theory_standalone.ipynb"
+ALLOWED = {"numpy", "matplotlib"}
+LEVELS = [(128.0, 82.3), (2.0, 0.5), (2.0, 1.9), (0.3, 0.01), (0.01, 0.0)]
+
+
+def code_cells(tag=None) -> list[str]:
+    """Sources of the notebook's code cells, all or those with a tag."""
+    notebook = nbformat.read(PATH, as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    return [cell.source for cell in cells if tag is None or tag in cell.metadata.get("tags", [])]
+
+
+def imported_packages(source: str) -> set[str]:
+    """Top names of what a piece of code imports, by import statement or by calling for it."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add("." * node.level + (node.module or "").split(".")[0])
+        elif isinstance(node, ast.Name) and node.id in ("__import__", "exec", "eval", "open"):
+            names.add(node.id)
+    return names
+
+
+@pytest.fixture(scope="module")
+def standalone() -> dict:
+    """Names that the cells tagged `functions` define, run where nothing but numpy can be had."""
+
+    def only_allowed(name, *args, **kwargs):
+        if name.split(".")[0] not in ALLOWED:
+            raise ImportError(f"{name} is not to be had here")
+        return builtins.__import__(name, *args, **kwargs)
+
+    namespace = {"np": np, "__builtins__": vars(builtins) | {"__import__": only_allowed}}
+    for source in code_cells("functions"):
+        exec(compile(source, PATH.name, "exec"), namespace)
+    return namespace
+
+
+@pytest.fixture
+def states() -> dict:
+    """A state, a guess and fresh noise, [50, 2] each."""
+    draws = np.random.default_rng(0).standard_normal((3, 50, 2))
+    return dict(zip(("x", "x0_hat", "noise"), draws, strict=True))
+
+
+MIXTURES = [([-1.0, 1.0], 0.3), ([[-1.2, -0.8], [1.3, -0.6], [0.0, 1.3]], 0.15)]
+
+
+def test_the_notebook_imports_numpy_and_matplotlib_and_nothing_else():
+    assert set().union(*map(imported_packages, code_cells())) == ALLOWED
+
+
+@pytest.mark.parametrize(
+    "source, found",
+    [
+        ("import os.path as p, numpy as np", {"os", "numpy"}),
+        ("from f3amd_lib.diffusion import samplers", {"f3amd_lib"}),
+        ("def f():\n    from . import samplers", {"."}),
+        ("__import__('scipy')", {"__import__"}),
+    ],
+)
+def test_every_way_to_import_is_seen(source, found):
+    assert imported_packages(source) == found
+
+
+def test_every_function_of_the_notebook_is_compared_here(standalone):
+    """A new function in a cell tagged `functions` needs a comparison; this list names them."""
+    defined = {
+        node.name
+        for source in code_cells("functions")
+        for node in ast.parse(source).body
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+    }
+    assert defined == {
+        "GaussianMixture", "add_noise", "alpha_bar_from_sigma", "sigma_from_alpha_bar",
+        "log_snr_from_sigma", "sigma_at", "rho_grid", "probability_flow_slope", "euler_step",
+        "heun_step", "walk", "ddim_step", "ddim_step_vp", "ve_step", "vp_step", "fitted_order",
+        "ddpm_posterior", "ddpm_step",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("means", "width"), MIXTURES)
+@pytest.mark.parametrize("sigma", [0.0, 0.2, 1.0, 128.0])
+def test_eq01_mixture_is_the_librarys(standalone, means, width, sigma):
+    here = standalone["GaussianMixture"](means, width)
+    library = oracles.GaussianMixture(means, width)
+    x = 3.0 * np.random.default_rng(1).standard_normal((40, library.means.shape[1]))
+    for name in ("log_density", "score", "denoise"):
+        ours, theirs = getattr(here, name)(x, sigma), getattr(library, name)(x, sigma)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11, err_msg=name)
+    draws = [m.sample(np.random.default_rng(2), 100) for m in (here, library)]
+    np.testing.assert_array_equal(*draws)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.01, 1.0, 128.0])
+def test_eq08_noise_and_labels_are_the_librarys(standalone, states, sigma):
+    x0, noise = states["x"], states["noise"]
+    np.testing.assert_array_equal(
+        standalone["add_noise"](x0, sigma, noise), samplers.add_noise(x0, sigma, noise)
+    )
+    level = np.array([sigma + 1e-3])
+    for name in ("alpha_bar_from_sigma", "log_snr_from_sigma"):
+        np.testing.assert_allclose(
+            standalone[name](level), getattr(schedules, name)(level), rtol=1e-14
+        )
+    share = np.array([0.999, 0.5, 1e-4])
+    np.testing.assert_allclose(
+        standalone["sigma_from_alpha_bar"](share), schedules.sigma_from_alpha_bar(share), rtol=1e-14
+    )
+
+
+@pytest.mark.parametrize("rho", [3.0, 7.0])
+def test_eq09_levels_are_the_librarys(standalone, rho):
+    library = schedules.VarianceExploding(rho=rho)
+    t = np.linspace(0.0, 1.0, 33)
+    np.testing.assert_allclose(standalone["sigma_at"](t, rho=rho), library.sigma(t), rtol=1e-14)
+    for num_steps in (1, 2, 4, 8, 64):
+        ours = standalone["rho_grid"](num_steps, rho=rho)
+        np.testing.assert_allclose(ours, library.grid(num_steps), rtol=1e-14)
+        assert ours[-1] == 0.0
+    assert standalone["rho_grid"](2)[0] == pytest.approx(schedules.VarianceExploding().sigma_max)
+
+
+@pytest.mark.parametrize(("sigma", "sigma_next"), LEVELS)
+def test_appendix_f_steps_are_the_librarys(standalone, states, sigma, sigma_next):
+    x, x0_hat, noise = states["x"], states["x0_hat"], states["noise"]
+    exact = dict(rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(
+        standalone["ddim_step"](x, x0_hat, sigma, sigma_next),
+        samplers.ddim_step(x, x0_hat, sigma, sigma_next),
+        **exact,
+    )
+    np.testing.assert_allclose(
+        standalone["ddpm_step"](x, x0_hat, sigma, sigma_next, noise),
+        samplers.ddpm_step(x, x0_hat, sigma, sigma_next, noise),
+        **exact,
+    )
+    np.testing.assert_allclose(
+        standalone["probability_flow_slope"](x, x0_hat, sigma),
+        samplers.probability_flow_slope(x, x0_hat, sigma),
+        **exact,
+    )
+    powers = [1.0 / (1.0 + level**2) for level in (sigma, sigma_next)]
+    np.testing.assert_allclose(
+        standalone["ddim_step_vp"](x, x0_hat, *powers),
+        samplers.ddim_step_vp(x, x0_hat, *powers),
+        **exact,
+    )
+    np.testing.assert_allclose(
+        standalone["ddpm_posterior"](*powers), samplers.ddpm_posterior(*powers), **exact
+    )
+
+
+@pytest.mark.parametrize(
+    ("step", "sampler"),
+    [("euler_step", "euler"), ("ve_step", "ddim"), ("vp_step", "ddim_vp"), ("heun_step", "heun")],
+)
+@pytest.mark.parametrize("num_steps", [1, 8])
+def test_walks_end_where_the_librarys_samplers_end(standalone, step, sampler, num_steps):
+    library = oracles.GaussianMixture([-1.0, 1.0], 0.3)
+    grid = schedules.VarianceExploding().grid(num_steps)
+    start = grid[0] * np.random.default_rng(3).standard_normal((60, 1))
+    # The VP state starts and ends as z; at sigma = 0 both states are one.
+    first = start / np.sqrt(1.0 + grid[0] ** 2) if step == "vp_step" else start
+    states = standalone["walk"](standalone[step], library.denoise, first, grid)
+    assert states.shape == (num_steps + 1, 60, 1)
+    with jax.enable_x64(True):
+        expected = samplers.sample(sampler, library.denoise, jnp.asarray(start), grid)
+    np.testing.assert_allclose(states[-1], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_notebooks_truth_is_the_exact_flow(standalone):
+    """Section 6 measures errors against Heun with many steps; the library knows the exact flow."""
+    library = oracles.GaussianMixture([-1.0, 1.0], 0.3)
+    grid = standalone["rho_grid"](4096)
+    start = 128.0 * np.random.default_rng(4).standard_normal((50, 1))
+    truth = standalone["walk"](standalone["heun_step"], library.denoise, start, grid)[-1]
+    exact = library.denoise(library.flow(start, 128.0, 0.01), 0.01)
+    assert np.abs(truth - exact).mean() < 2e-6  # Heun's own error at 512 steps is 5e-5
+
+
+def test_fitted_order_is_the_power_of_the_fall(standalone):
+    counts = np.array([8, 16, 64])
+    assert standalone["fitted_order"](counts, 5.0 / counts**2.5) == pytest.approx(2.5)
