@@ -298,14 +298,14 @@ def test_output_scaling_is_the_skip_of_karras(monkeypatch):
     settings = {"sigma_data": 0.5}
     scaled = make_network(output_scaling=True, **settings)
     plain = make_network(**settings)
-    x_noisy, sigma = draw((2, WINDOW, CHANNELS)), np.array([0.3, 20.0])[:, None, None]
+    x_noisy, sigma = draw(2, WINDOW, CHANNELS), np.array([0.3, 20.0])[:, None, None]
     total = sigma**2 + 0.25
     expected = 0.25 / total * x_noisy + sigma * 0.5 / np.sqrt(total) * run(plain, x_noisy)
     np.testing.assert_allclose(run(scaled, x_noisy), expected, atol=1e-5)
 
 
 def test_output_scaling_passes_a_nearly_clean_input_through():
-    x_noisy = draw((2, WINDOW, CHANNELS))
+    x_noisy = draw(2, WINDOW, CHANNELS)
     answer = run(make_network(output_scaling=True), x_noisy, jnp.array([1e-4, 1e-4]))
     np.testing.assert_allclose(answer, x_noisy, atol=1e-2)
 
@@ -313,13 +313,15 @@ def test_output_scaling_passes_a_nearly_clean_input_through():
 @pytest.mark.parametrize("coder", ["fno", "linear"])
 def test_a_wider_decoder_has_a_second_layer(coder):
     wide = make_network(decoder_hidden_width=24, encoder_decoder=coder)
-    x_noisy = draw((2, WINDOW, CHANNELS))
+    x_noisy = draw(2, WINDOW, CHANNELS)
     assert run(wide, x_noisy).shape == x_noisy.shape
     state = nnx.state(wide).flat_state()
     names = {str(path) for path, _ in state}
     assert any("decoder_hidden" in name for name in names)
     plain = nnx.state(make_network(encoder_decoder=coder)).flat_state()
     assert not any("decoder_hidden" in str(path) for path, _ in plain)
-    # Only what comes after the hidden layer sees 24 channels.
+    # The hidden layer makes 24 channels, the last one takes them.
     shapes = {str(path): np.shape(leaf[...]) for path, leaf in state}
-    assert all(24 in shape for name, shape in shapes.items() if "decoder_hidden" in name)
+    for layer in ("'decoder_hidden'", "'decoder'"):
+        assert any(24 in shape for name, shape in shapes.items() if layer in name), layer
+    assert not any(24 in np.shape(leaf[...]) for _, leaf in plain)
