@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import pandas as pd
+from matplotlib.ticker import NullFormatter
 
 from f3amd_lib.report.figures import PALETTE, model_style, new_figure, plot_style
 
@@ -44,6 +46,7 @@ def held_out_curves(histories: Mapping[str, pd.DataFrame]):
                 )
             axis.set(xscale="log", yscale="log", xlabel="windows seen", ylabel="held-out error")
             axis.set_title(title)
+            axis.xaxis.set_minor_formatter(NullFormatter())
         axes[0].legend(fontsize=8)
     return figure
 
@@ -63,9 +66,8 @@ def error_by_noise(table: pd.DataFrame):
             )
         low, high = table["sigma"].min(), table["sigma"].max()
         top = 1.15 * table["x0_error"].max()
-        axis.plot(
-            [low, high], [low, high], color=PALETTE["grey"], linestyle=":", label="the input's own"
-        )
+        own = np.geomspace(low, high, 200)
+        axis.plot(own, own, color=PALETTE["grey"], linestyle=":", label="the input's own")
         axis.set(
             xscale="log", xlabel="noise level sigma", ylabel="x0 error (deviations)", ylim=(0, top)
         )
