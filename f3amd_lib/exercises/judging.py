@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["NotAnswered", "agree", "is_choice", "is_missing"]
+__all__ = ["NotAnswered", "agree", "is_choice", "is_missing", "numbers"]
 
 
 class NotAnswered(ValueError):
@@ -16,6 +16,18 @@ def is_missing(answer) -> bool:
     if isinstance(answer, (tuple, list)):
         return any(map(is_missing, answer))
     return answer is None or answer is ...
+
+
+def numbers(answer) -> np.ndarray:
+    """Return what a reader's function gave as an array of float64.
+
+    Raises:
+      NotAnswered: for None or `...`, which a stub's function returns.
+      TypeError, ValueError: if the answer is made of something else than numbers.
+    """
+    if is_missing(answer):
+        raise NotAnswered("your function returns nothing yet")
+    return np.asarray(answer, dtype=np.float64)
 
 
 def agree(answer, expected, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
@@ -30,9 +42,7 @@ def agree(answer, expected, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
       NotAnswered: for None or `...`, which a stub's function returns.
       TypeError, ValueError: if the answer is made of something else than numbers.
     """
-    if is_missing(answer):
-        raise NotAnswered("your function returns nothing yet")
-    answer, expected = np.asarray(answer, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    answer, expected = numbers(answer), np.asarray(expected, dtype=np.float64)
     if answer.shape != expected.shape:
         return False
     return bool(np.all(np.abs(answer - expected) <= atol + rtol * np.abs(expected)))

@@ -8,7 +8,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.evaluation import expressivity
-from f3amd_lib.exercises.judging import agree
+from f3amd_lib.exercises.judging import agree, numbers
 from f3amd_lib.models.spectral import spectral_convolution
 
 __all__ = ["CHECKS"]
@@ -122,7 +122,7 @@ def _advance(answer) -> str | None:
         signal = np.random.default_rng(num_blocks).standard_normal(num_frames)
         run = jax.jit(_delay_line(signal, num_blocks))
         for lead in leads:
-            bits = np.asarray(answer(lead, num_blocks), dtype=np.float64)
+            bits = numbers(answer(lead, num_blocks))
             if bits.shape != (num_blocks,) or not np.all(np.abs(bits) == 1.0):
                 return f"give {num_blocks} numbers, each -1 or 1, for {num_blocks} blocks"
             if not agree(run(jnp.asarray(bits, jnp.float32)), np.roll(signal, -lead), atol=1e-4):
