@@ -20,7 +20,6 @@ from f3amd_lib.evaluation.rollout import Rollout
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.report import player
-from f3amd_lib.report.pictures import LIMB_COLORS, limb_side
 from f3amd_lib.report.player import (
     Character,
     Scene,
@@ -30,6 +29,7 @@ from f3amd_lib.report.player import (
     show_player,
     write_player,
 )
+from f3amd_lib.report.stick_figures import LIMB_COLORS, limb_side
 
 FRAMES = 40
 

@@ -51,6 +51,14 @@ def test_poses_stand_in_a_row_with_a_head_only_where_there_is_one():
     assert hips == {0.0, 0.95, 1.9}
 
 
+def test_a_pose_panel_may_stay_empty():
+    motions = {"real": wandering_motion(20), "": None, "frozen pose": straight_motion(20)}
+    figure = draw.poses_beside(motions, [0, 5])
+    assert titles(figure) == ["real", "", "frozen pose", ""]
+    assert [bool(axis.lines) for axis in figure.axes] == [True, False, True, False]
+    assert not any(axis.axison for axis in figure.axes)
+
+
 def test_verdict_grid_colours_a_cell_by_its_verdict():
     table = pd.DataFrame(
         [

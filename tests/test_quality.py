@@ -190,6 +190,17 @@ def test_own_path_keeps_a_line_and_loses_the_sway():
     np.testing.assert_array_equal(quality.own_path(tiny).position, line[:3])
 
 
+def test_a_clip_is_followed_from_its_own_first_frames(packed):
+    whole = packed.motion(4)
+    history, path, real = quality.follow_clip(packed, 4, num_history=5, num_frames=20)
+    np.testing.assert_allclose(history[0], world_frames(whole)[:5], atol=1e-6)
+    assert path.num_frames == real.num_frames == 20
+    np.testing.assert_array_equal(real.root_position, whole.root_position[5:25])
+    np.testing.assert_array_equal(path.position, quality.own_path(whole).position[5:25])
+    with pytest.raises(ValueError, match=f"{whole.num_frames} frames, 1005 are needed"):
+        quality.follow_clip(packed, 4, num_history=5, num_frames=1000)
+
+
 # --------------------------------------------------------------------------------- whole rollouts
 
 

@@ -17,7 +17,7 @@ from PIL import Image
 from f3amd_lib.evaluation.paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_euler, matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.report import figures, papers, pictures, records, tables
+from f3amd_lib.report import figures, papers, pictures, records, stick_figures, tables
 
 
 def make_motion(num_frames=120, fps=30.0, name="test walk"):
@@ -345,7 +345,7 @@ def test_colours_stay_apart_in_grey():
     families = ["real", "F3AMD-FNO-96", "CAMDM", "F3AMD-Transformer-64"]
     grey = [luminance(figures.model_style(name).color) for name in families]
     assert np.min(np.diff(grey)) > 0.03 and grey == sorted(grey)
-    limbs = [luminance(pictures.LIMB_COLORS[side]) for side in ("middle", "right", "left")]
+    limbs = [luminance(stick_figures.LIMB_COLORS[side]) for side in ("middle", "right", "left")]
     assert np.min(np.diff(limbs)) > 0.03
 
 
@@ -412,7 +412,7 @@ def test_camera_stands_at_the_right_side():
     ],
 )
 def test_sides_by_name(name, side):
-    assert pictures.limb_side(name) == side
+    assert stick_figures.limb_side(name) == side
 
 
 def count_near(image, color, tolerance=12):
@@ -435,7 +435,7 @@ def test_film_strip_has_a_row_a_motion(tmp_path):
     path = figures.save_figure(figure, tmp_path / "strip.png")
     with Image.open(path) as image:
         for side in ("left", "right", "middle"):
-            assert count_near(image, pictures.LIMB_COLORS[side]) > 200
+            assert count_near(image, stick_figures.LIMB_COLORS[side]) > 200
 
 
 def test_film_strip_is_written_in_one_call(tmp_path):
@@ -473,7 +473,7 @@ def test_gif_plays_in_real_time_and_stays_small(tmp_path):
         assert total == 8000 + 600  # 8 s and a pause
         image.seek(40)
         for side in ("left", "right"):
-            assert count_near(image, pictures.LIMB_COLORS[side], tolerance=25) > 100
+            assert count_near(image, stick_figures.LIMB_COLORS[side], tolerance=25) > 100
 
 
 def test_gif_follows_the_character(tmp_path):

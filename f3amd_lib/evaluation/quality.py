@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from scipy.signal import savgol_filter
 
+from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.evaluation.metrics import (
@@ -42,6 +43,7 @@ __all__ = [
     "style_pace",
     "style_floor",
     "own_path",
+    "follow_clip",
     "reference_clips",
     "measure_clips",
     "measure_rollout",
@@ -177,6 +179,40 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
         return path
     return RootPath(
         savgol_filter(path.position, span, 2, axis=0), savgol_filter(path.yaw, span, 2), path.fps
+    )
+
+
+def follow_clip(
+    packed: PackedMotion, clip: int, *, num_history: int, num_frames: int
+) -> tuple[np.ndarray, RootPath, Motion]:
+    """Return what a model needs to walk where a real clip walked, and what that clip did.
+
+    Args:
+      packed: the data set.
+      clip: its number.
+      num_history: frames that the model is given, the clip's first.
+      num_frames: frames that it is to make after them.
+
+    Returns:
+      (history, path, motion): world frames [1, num_history, C]; the clip's own line (`own_path`)
+      and its motion over the frames that follow, num_frames each.
+
+    Raises:
+      ValueError: if there is no such clip, or it is too short.
+    """
+    whole = packed.motion(clip)
+    end = num_history + num_frames
+    if whole.num_frames < end:
+        raise ValueError(
+            f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for at most "
+            f"{max(0, whole.num_frames - num_history)} frames after the history"
+        )
+    line = own_path(whole)
+    part = slice(num_history, end)
+    return (
+        world_frames(whole)[None, :num_history].astype(np.float32),
+        RootPath(line.position[part], line.yaw[part], line.fps),
+        whole.slice(num_history, end),
     )
 
 

@@ -1,8 +1,7 @@
 """Motion as pictures: film strips for the page, small GIFs for the eye.
 
-Both draw stick figures in the same colours: left limbs light orange, right limbs dark blue, trunk
-dark grey (they differ in lightness, so they survive grey print), and a green dot under a toe that
-is in contact.
+Both draw stick figures in the same colours (`stick_figures`), with a green dot under a toe that is
+in contact.
 """
 
 from __future__ import annotations
@@ -14,70 +13,22 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
-from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
+from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.report.figures import new_figure, plot_style, save_figure
+from f3amd_lib.report.stick_figures import (
+    CONTACT_COLOR,
+    LIMB_COLORS,
+    TARGET_COLOR,
+    TRAIL_COLOR,
+    bones_of,
+    drawn_points,
+    head_center,
+    path_on_ground,
+)
 
-__all__ = ["LIMB_COLORS", "film_strip", "write_film_strip", "write_gif"]
+__all__ = ["film_strip", "write_film_strip", "write_gif"]
 
-LIMB_COLORS = {"left": "#EF9A26", "right": "#1B4F8F", "middle": "#3A3A3A"}
-"""Colours of limbs, the character's own left and right."""
-
-_CONTACT = "#0B9E64"
-_TARGET = "#C2649A"
-_TRAIL = "#6F6F6F"
 _GROUND = "#B8B8B8"
-
-
-def limb_side(name: str) -> str:
-    """Return "left", "right" or "middle" for a joint name of the usual conventions."""
-    lowered = name.lower()
-    if "left" in lowered or lowered.endswith("_l"):
-        return "left"
-    if "right" in lowered or lowered.endswith("_r"):
-        return "right"
-    return "middle"
-
-
-def _bones(skeleton: Skeleton) -> list[tuple[int, int, str]]:
-    """List (parent, child, side); end sites are numbered on from the joints."""
-    bones = [
-        (parent, joint, limb_side(skeleton.names[joint]))
-        for joint, parent in enumerate(skeleton.parents)
-        if parent >= 0
-    ]
-    for tip, (joint, offset) in enumerate(skeleton.end_sites):
-        # A tip on the head would stick out of the disc that is drawn for it.
-        if np.linalg.norm(offset) > 1e-3 and not _is_head(skeleton.names[joint]):
-            bones.append((joint, skeleton.num_joints + tip, limb_side(skeleton.names[joint])))
-    return bones
-
-
-def _is_head(name: str) -> bool:
-    return name.lower().split(":")[-1] == "head"
-
-
-def _points(motion: Motion, frames: np.ndarray) -> np.ndarray:
-    """Positions of joints and end sites at some frames, [len(frames), J + tips, 3]."""
-    positions = np.asarray(motion.positions, dtype=np.float64)[frames]
-    if not motion.skeleton.end_sites:
-        return positions
-    turned = global_rotations(motion.skeleton, np.asarray(motion.rotations)[frames])
-    tips = [
-        positions[:, joint] + turned[:, joint] @ np.asarray(offset, dtype=np.float64)
-        for joint, offset in motion.skeleton.end_sites
-    ]
-    return np.concatenate([positions, np.stack(tips, axis=1)], axis=1)
-
-
-def _head_center(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
-    """Where to draw a head: a little beyond the head joint, away from its parent, [F, 3]."""
-    heads = [joint for joint, name in enumerate(skeleton.names) if _is_head(name)]
-    if not heads or skeleton.parents[heads[0]] < 0:
-        return None
-    head, neck = points[:, heads[0]], points[:, skeleton.parents[heads[0]]]
-    along = head - neck
-    length = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
-    return head + 0.07 * along / length
 
 
 def _view(facing: float, around: float, elevation: float) -> np.ndarray:
@@ -114,14 +65,6 @@ def _per_motion(value, count: int, what: str) -> list:
     if len(value) != count:
         raise ValueError(f"{len(value)} {what} for {count} motions")
     return list(value)
-
-
-def _path_xz(path) -> np.ndarray:
-    """Accept a RootPath or an array [T, 2] of x and z."""
-    points = np.asarray(getattr(path, "position", path), dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 2 or not np.all(np.isfinite(points)):
-        raise ValueError(f"a target path must be [T, 2] (x, z) and finite, got {points.shape}")
-    return points
 
 
 def film_strip(
@@ -206,11 +149,11 @@ def write_film_strip(path, motions, **options) -> Path:
 
 
 def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend: bool) -> None:
-    points = _points(motion, chosen)
-    heads = _head_center(motion.skeleton, points)
+    points = drawn_points(motion, chosen)
+    heads = head_center(motion.skeleton, points)
     facing = gaussian_filter1d(np.unwrap(motion.yaw), 0.3 * motion.fps, mode="nearest")[chosen]
     contacts = motion.contacts[chosen]
-    bones = _bones(motion.skeleton)
+    bones = bones_of(motion.skeleton)
     toes = motion.skeleton.toes
     axis.axhline(0.0, color=_GROUND, linewidth=1.0, zorder=0)
     top = 1.7
@@ -250,7 +193,7 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend
                     left + seen[toe, 0],
                     seen[toe, 1],
                     "o",
-                    color=_CONTACT,
+                    color=CONTACT_COLOR,
                     markersize=5,
                     markeredgecolor="white",
                     markeredgewidth=0.6,
@@ -269,7 +212,7 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend
         keys = [
             axis.plot([], [], color=LIMB_COLORS["left"], linewidth=3, label="left")[0],
             axis.plot([], [], color=LIMB_COLORS["right"], linewidth=3, label="right")[0],
-            axis.plot([], [], "o", color=_CONTACT, markersize=5, label="toe in contact")[0],
+            axis.plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")[0],
         ]
         axis.legend(
             handles=keys,
@@ -287,10 +230,12 @@ def _draw_plan(axis, motion: Motion, chosen, path, legend: bool) -> None:
     root = np.asarray(motion.root_position, dtype=np.float64)[:, [0, 2]]
     everything = [root]
     if path is not None:
-        target = _path_xz(path)
+        target = path_on_ground(path)
         everything.append(target)
-        axis.plot(*target.T, color=_TARGET, linestyle="--", linewidth=1.6, label="target", zorder=3)
-    axis.plot(*root.T, color=_TRAIL, linewidth=1.6, label="walked")
+        axis.plot(
+            *target.T, color=TARGET_COLOR, linestyle="--", linewidth=1.6, label="target", zorder=3
+        )
+    axis.plot(*root.T, color=TRAIL_COLOR, linewidth=1.6, label="walked")
     extent = np.ptp(np.concatenate(everything), axis=0).max()
     reach = 0.09 * max(extent, 1.0)
     arrow = np.stack([np.sin(motion.yaw[chosen]), np.cos(motion.yaw[chosen])], axis=-1)
@@ -434,15 +379,15 @@ def _draw_panel(motion: Motion, frames, target, title: str, size, around: float)
     """Draw one character at the given frames (held at its last), one image a frame."""
     scale = 2  # draw twice as large, then shrink: smooth edges
     frames = np.minimum(frames, motion.num_frames - 1)
-    points = _points(motion, frames)
-    heads = _head_center(motion.skeleton, points)
+    points = drawn_points(motion, frames)
+    heads = head_center(motion.skeleton, points)
     contacts = motion.contacts[frames]
-    bones = _bones(motion.skeleton)
+    bones = bones_of(motion.skeleton)
     toes = motion.skeleton.toes
     root = np.asarray(motion.root_position, dtype=np.float64)
     follow = gaussian_filter1d(root, 0.25 * motion.fps, axis=0, mode="nearest")[frames]
     camera = _Camera(motion.yaw[0], around, np.deg2rad(14.0), (size[0] * scale, size[1] * scale))
-    ground_target = None if target is None else _on_ground(_path_xz(target))
+    ground_target = None if target is None else _on_ground(path_on_ground(target))
     trail = _on_ground(root[:, [0, 2]])
     font = ImageFont.load_default(size=12 * scale)
     images = []
@@ -452,8 +397,8 @@ def _draw_panel(motion: Motion, frames, target, title: str, size, around: float)
         camera.target = np.array([follow[place, 0], 0.88, follow[place, 2]])
         _draw_grid(draw, camera, scale)
         if ground_target is not None:
-            _draw_line(draw, camera, ground_target, _TARGET, 3 * scale)
-        _draw_line(draw, camera, trail[: frame + 1], _TRAIL, 2 * scale)
+            _draw_line(draw, camera, ground_target, TARGET_COLOR, 3 * scale)
+        _draw_line(draw, camera, trail[: frame + 1], TRAIL_COLOR, 2 * scale)
         _draw_figure(
             draw,
             camera,
@@ -528,7 +473,7 @@ def _draw_figure(draw, camera: _Camera, points, head, bones, touching, scale: in
                 _disc(draw, *seen[joint, :2], (width - 1) / 2, color)
     for toe in touching:
         _disc(draw, *seen[toe, :2], 0.055 * pixel, "white")
-        _disc(draw, *seen[toe, :2], 0.04 * pixel, _CONTACT)
+        _disc(draw, *seen[toe, :2], 0.04 * pixel, CONTACT_COLOR)
 
 
 def _disc(draw, column: float, row: float, radius: float, color: str) -> None:

@@ -48,16 +48,16 @@ from PIL import Image
 
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.report.figures import save_figure, show_figure
-from f3amd_lib.report.pictures import (
-    _CONTACT,
-    _TARGET,
-    _TRAIL,
+from f3amd_lib.report.pictures import film_strip
+from f3amd_lib.report.stick_figures import (
+    CONTACT_COLOR,
     LIMB_COLORS,
-    _bones,
-    _is_head,
-    _path_xz,
-    _points,
-    film_strip,
+    TARGET_COLOR,
+    TRAIL_COLOR,
+    bones_of,
+    drawn_points,
+    is_head,
+    path_on_ground,
 )
 
 __all__ = [
@@ -446,7 +446,7 @@ def _draws_alike(one: Skeleton, other: Skeleton) -> bool:
     return (
         one.names == other.names
         and one.parents == other.parents
-        and _bones(one) == _bones(other)
+        and bones_of(one) == bones_of(other)
         and len(one.end_sites) == len(other.end_sites)
     )
 
@@ -458,7 +458,7 @@ def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
     bone above it. Sorting a handful of limbs does for the eye what sorting all bones would, in a
     fraction of the strokes.
     """
-    bones = _bones(skeleton)
+    bones = bones_of(skeleton)
     limb_of: dict[int, int] = {}  # the limb whose bone ends in this point
     limbs: list[tuple[str, list[tuple[int, int]]]] = []
     middle = None  # the trunk is one limb, though hips and shoulders part it
@@ -474,7 +474,7 @@ def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
             middle = number if side == "middle" else middle
         limbs[number][1].append((parent, child))
         limb_of[child] = number
-    heads = [k for k, name in enumerate(skeleton.names) if _is_head(name)]
+    heads = [k for k, name in enumerate(skeleton.names) if is_head(name)]
     head = (heads[0], skeleton.parents[heads[0]]) if heads and heads[0] > 0 else None
     try:
         toes = skeleton.toes
@@ -511,7 +511,7 @@ def _encode_character(character: Character, drawn: _Drawn) -> tuple[dict, list[b
     """Describe a character and turn its tracks into bytes."""
     motion, label = character.motion, character.name
     num_frames = motion.num_frames
-    points = _points(motion, np.arange(num_frames))[:, drawn.points]
+    points = drawn_points(motion, np.arange(num_frames))[:, drawn.points]
     root = _whole_millimetres(points[:, 0], label, "root")
     joints = _whole_millimetres(points, label, "points") - root[:, None]
     reach = np.abs(joints).max(axis=(1, 2))
@@ -540,7 +540,7 @@ def _encode_character(character: Character, drawn: _Drawn) -> tuple[dict, list[b
 
     if character.path is not None:
         try:
-            path = _path_xz(character.path)
+            path = path_on_ground(character.path)
         except ValueError as error:
             raise ValueError(f"{label}: {error}") from None
         fps = getattr(character.path, "fps", motion.fps)
@@ -589,7 +589,7 @@ def _read(name: str) -> str:
 
 def _color_rules() -> str:
     """The pictures' colours, so that strips, GIFs and the player look alike; CSS has dark ones."""
-    colors = {**LIMB_COLORS, "contact": _CONTACT, "target": _TARGET, "trail": _TRAIL}
+    colors = {**LIMB_COLORS, "contact": CONTACT_COLOR, "target": TARGET_COLOR, "trail": TRAIL_COLOR}
     return ":root { " + " ".join(f"--{name}: {color};" for name, color in colors.items()) + " }"
 
 

@@ -25,7 +25,7 @@ from f3amd_lib.report.figures import (
     save_figure,
     show_figure,
 )
-from f3amd_lib.report.pictures import LIMB_COLORS, limb_side
+from f3amd_lib.report.stick_figures import LIMB_COLORS, limb_side
 
 __all__ = [
     "ORDER",

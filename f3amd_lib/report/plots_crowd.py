@@ -17,8 +17,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.report.figures import PALETTE, model_style, new_figure
-from f3amd_lib.report.pictures import _bones, _head_center, _path_xz, _points
 from f3amd_lib.report.plots import styled
+from f3amd_lib.report.stick_figures import bones_of, drawn_points, head_center, path_on_ground
 
 __all__ = [
     "CrowdPicture",
@@ -290,9 +290,9 @@ def _draw_ground(axis, roots: np.ndarray, eye: Eye) -> None:
 
 def _body(motion: Motion, frame: int, color, eye: Eye) -> dict:
     """Everything of one character as the eye sees it."""
-    points = _points(motion, np.array([frame]))
-    head = _head_center(motion.skeleton, points)
-    bones = _bones(motion.skeleton)
+    points = drawn_points(motion, np.array([frame]))
+    head = head_center(motion.skeleton, points)
+    bones = bones_of(motion.skeleton)
     seen, depth = eye.project(points[0])
     root = points[0, 0]
     rgb = np.array(matplotlib.colors.to_rgb(color))
@@ -341,7 +341,7 @@ def crowd_from_above(
         raise ValueError(f"{len(paths)} paths for {len(picture.motions)} motions")
     roots = _roots(picture, frame)
     figure, axis = new_figure(5.4, 5.6)
-    lines = [_path_xz(path) for path in paths]
+    lines = [path_on_ground(path) for path in paths]
     axis.add_collection(
         LineCollection(lines, colors="#9A9A9A", linewidths=0.8, linestyles=(0, (3, 2)), zorder=2)
     )

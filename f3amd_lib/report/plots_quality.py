@@ -15,8 +15,8 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.report.figures import PALETTE, model_style, new_figure
-from f3amd_lib.report.pictures import LIMB_COLORS, limb_side
 from f3amd_lib.report.plots import styled
+from f3amd_lib.report.stick_figures import LIMB_COLORS, TARGET_COLOR, limb_side
 
 __all__ = [
     "BAD_COLORS",
@@ -45,7 +45,6 @@ BAD_COLORS = {
 """Colour of each bad generator (see `evaluation.corruptions`); no network is drawn in these."""
 
 _REAL = model_style("real").line | {"linewidth": 1.4}
-_TARGET = "#C2649A"
 
 
 def _color(name: str) -> str:
@@ -66,11 +65,16 @@ def poses_beside(motions: Mapping[str, Motion], frames: Sequence[int]):
     Every pose is seen from the character's own front right, wherever it goes.
 
     Args:
-      motions: title -> motion, an even number of them.
+      motions: title -> motion, or None where a panel is to stay empty.
       frames: which, in this order.
     """
-    figure, axes = new_figure(7.2, 1.6 * len(motions) / 2, len(motions) // 2, 2)
-    for axis, (title, motion) in zip(axes.flat, motions.items(), strict=True):
+    rows = -(-len(motions) // 2)
+    figure, axes = new_figure(7.2, 1.6 * rows, rows, 2, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
+        if motion is None:
+            continue
         skeleton = motion.skeleton
         for place, frame in enumerate(frames):
             view = motion.yaw[frame] - np.pi / 3
@@ -89,7 +93,6 @@ def poses_beside(motions: Mapping[str, Motion], frames: Sequence[int]):
         axis.set_xlim(-0.5, 0.95 * len(frames) - 0.4)
         axis.set_ylim(-0.08, 1.85)
         axis.set_aspect("equal")
-        axis.axis("off")
         axis.set_title(title, color=_color(title))
     return figure
 
@@ -158,7 +161,7 @@ def drift_picture(target, walks: Mapping[str, np.ndarray], table: pd.DataFrame):
     colors = dict(zip(walks, ("blue", "vermilion"), strict=False))
     for label, walked in walks.items():
         plan.plot(*walked.T, color=PALETTE[colors[label]], linewidth=1.5)
-    plan.plot(*np.asarray(target).T, "--", color=_TARGET, linewidth=1.4, label="target")
+    plan.plot(*np.asarray(target).T, "--", color=TARGET_COLOR, linewidth=1.4, label="target")
     plan.plot(*target[0], "o", color=PALETTE["black"], markersize=4, label="start")
     plan.set_aspect("equal", adjustable="datalim")
     plan.margins(0.08)

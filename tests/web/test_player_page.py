@@ -148,7 +148,7 @@ def test_the_browser_reads_the_positions_that_python_wrote(browser, side_by_side
 
 
 def test_every_panel_shows_a_figure_in_the_colours_of_the_pictures(browser, side_by_side):
-    from f3amd_lib.report.pictures import LIMB_COLORS
+    from f3amd_lib.report.stick_figures import LIMB_COLORS
 
     opened(browser, side_by_side)
     for panel in range(4):
