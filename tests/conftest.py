@@ -2,14 +2,18 @@
 
 import csv
 import os
+from pathlib import Path
 
 # Before anything imports JAX or matplotlib.
 os.environ["JAX_PLATFORMS"] = "cpu"
 # Tests compile much and run little.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ["MPLBACKEND"] = "Agg"
-
-from pathlib import Path
+# Many tests compile the same small networks, in processes that run side by side.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax")
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import pytest
 
