@@ -1,4 +1,4 @@
-# Everything runs in .venv, which the first target that needs it builds from requirements.lock.
+# Everything runs in .venv (or F3AMD_VENV), which the first target that needs it builds from requirements.lock.
 #   make figures DATA=bandai PROFILE=laptop
 #   make test F3AMD_PYTHON=python3.12
 
@@ -10,8 +10,9 @@ BENCH ?=
 PYTEST_OPTIONS ?=
 
 SHELL := /bin/bash
-PYTHON := .venv/bin/python
-INSTALLED := .venv/installed
+VENV := $(or $(F3AMD_VENV),.venv)
+PYTHON := $(VENV)/bin/python
+INSTALLED := $(VENV)/installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/standalone/*.ipynb))
 
 export F3AMD_PYTHON
@@ -90,5 +91,5 @@ lab: $(INSTALLED) ## Open the notebooks in JupyterLab
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
 	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage ./*.egg-info
-	find . \( -path ./.venv -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
+	find . \( -path ./.venv -o -path ./$(VENV) -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
 	  -prune -o -type d \( -name __pycache__ -o -name .pytest_cache \) -exec rm -rf {} +

@@ -55,13 +55,21 @@ def _presets(arguments) -> None:
     log.info("%s", markdown_table(table))
 
 
-def _train(arguments) -> None:
+UNFINISHED = 3
+"""Exit status of `train` where the minutes were over first; a later call goes on."""
+
+
+def _train(arguments) -> int:
     from f3amd_lib.training import parallel
     from f3amd_lib.training.family import train_family
     from f3amd_lib.training.pipeline import model_files, prepare
 
-    if arguments.processes is not None:
-        parallel.join_processes(arguments.coordinator, arguments.processes, arguments.process)
+    together = (arguments.coordinator, arguments.processes, arguments.process)
+    several = arguments.cluster or any(value is not None for value in together)
+    if arguments.cluster and any(value is not None for value in together):
+        raise ValueError("--cluster finds the processes itself: leave the three others out")
+    if several:
+        parallel.join_processes(*together)
     profile = _profile(
         arguments,
         train_steps=arguments.steps,
@@ -69,18 +77,20 @@ def _train(arguments) -> None:
         seed=arguments.seed,
         window=arguments.window,
     )
-    several = arguments.all_devices or arguments.processes is not None
     runs = train_family(
         prepare(profile, path=arguments.source),
         profile,
         arguments.preset or [profile.preset],
         folder=arguments.out,
         budget_s=None if arguments.minutes is None else 60.0 * arguments.minutes,
-        mesh=parallel.all_devices() if several else None,
+        mesh=parallel.all_devices() if several or arguments.all_devices else None,
     )
+    status = 0
     for preset, state in runs:
         files = model_files(profile, preset, folder=arguments.out)
         log.info("%-12s %s", state, files.state if state == "unfinished" else files.model)
+        status = UNFINISHED if state == "unfinished" else status
+    return status
 
 
 def _path(text: str, num_frames: int, speed: float, seed: int):
@@ -141,17 +151,31 @@ def _rollout(arguments) -> None:
         log.info("wrote        %s", target)
 
 
+def _num_frames(seconds: float) -> int:
+    """Return the frames of a length that was asked for; ValueError if it is out of range."""
+    if not 0.1 <= seconds <= 3600.0:  # also catches NaN
+        raise ValueError(f"--seconds must be between 0.1 and 3600, got {seconds}")
+    return max(2, round(seconds * 30))
+
+
 def _crowd(arguments) -> None:
     from f3amd_lib.evaluation.crowd import generate_crowd
     from f3amd_lib.evaluation.rollout import MotionGenerator
 
+    num_frames, out = _num_frames(arguments.seconds), Path(arguments.out)
+    pictures = []
+    if arguments.pictures:
+        pictures = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")]
+    taken = [str(picture) for picture in pictures if picture.exists()]
+    if taken and not arguments.overwrite:
+        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
     generator = MotionGenerator(_trained(arguments), arguments.steps, sampler=arguments.sampler)
     started = time.perf_counter()
     crowd = generate_crowd(
         generator,
         arguments.characters,
-        max(2, round(arguments.seconds * 30)),
-        arguments.out,
+        num_frames,
+        out,
         styles=arguments.style,
         min_distance=arguments.plan,
         seed=arguments.seed,
@@ -160,17 +184,16 @@ def _crowd(arguments) -> None:
         progress=True,
     )
     seconds = time.perf_counter() - started
-    log.info(
-        "wrote        %s: %d characters of %d frames", arguments.out, len(crowd), crowd.num_frames
-    )
+    log.info("wrote        %s: %d characters of %d frames", out, len(crowd), crowd.num_frames)
     log.info("took         %.0f s", seconds)
-    if arguments.pictures:
-        for path in _crowd_pictures(crowd, Path(arguments.out)):
+    if pictures:
+        _crowd_pictures(crowd, *pictures)
+        for path in pictures:
             log.info("wrote        %s", path)
 
 
-def _crowd_pictures(crowd, out: Path) -> list[Path]:
-    """Draw a crowd half way through, and a page that plays up to 100 of it, beside its folder."""
+def _crowd_pictures(crowd, still: Path, page: Path) -> None:
+    """Draw a crowd half way through, and write a page that plays up to 100 of it."""
     from f3amd_lib.report import plots_crowd as draw
     from f3amd_lib.report.figures import save_figure
     from f3amd_lib.report.player import Character, Scene, write_player
@@ -185,8 +208,8 @@ def _crowd_pictures(crowd, out: Path) -> list[Path]:
     ]
     credit = ", ".join(filter(None, (model["dataset_credit"], model["dataset_licence"])))
     scene = Scene(characters, title=model["name"])
-    page = write_player(out.with_name(f"{out.name}.html"), scene, strip=False, credit=credit)
-    return [save_figure(figure, out.with_name(f"{out.name}.png")), page]
+    write_player(page, scene, strip=False, credit=credit)
+    save_figure(figure, still)
 
 
 def _export(arguments) -> None:
@@ -248,7 +271,9 @@ def _parser() -> argparse.ArgumentParser:
         help="such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order",
     )
     train.add_argument(
-        "--minutes", type=float, help="stop then, with a checkpoint that a later call goes on from"
+        "--minutes",
+        type=float,
+        help="stop then, with a checkpoint that a later call goes on from, and exit status 3",
     )
     train.add_argument(
         "--all-devices", action="store_true", help="share each batch among the devices JAX sees"
@@ -256,6 +281,11 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--processes", type=int, help="train in so many processes together")
     train.add_argument("--process", type=int, help="number of this one, from 0")
     train.add_argument("--coordinator", metavar="HOST:PORT", help="of process 0")
+    train.add_argument(
+        "--cluster",
+        action="store_true",
+        help="train in all processes of a job of Slurm, Open MPI or Kubernetes together",
+    )
     train.add_argument("--steps", type=int, help="optimiser steps; by default the profile's")
     train.add_argument("--batch-size", type=int, help="windows a step")
     train.add_argument("--window", type=int, help="future frames, 32 or 64")

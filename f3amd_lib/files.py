@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     if path.exists() and not overwrite:
         raise ValueError(f"{path}: exists already; choose another name or pass overwrite=True")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Unique among threads, and among machines that share the folder.
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
         yield temporary
         os.replace(temporary, path)

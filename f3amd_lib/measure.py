@@ -74,6 +74,18 @@ def _with_rows(earlier: pd.DataFrame | None, rows: pd.DataFrame, keys: list[str]
     return pd.concat([earlier[old], rows])
 
 
+def _models_with_weights(profile: Profile) -> list[str]:
+    """List the presets that have weights; ValueError, with what to do, if there are none."""
+    names = available_models(profile)
+    if not names:
+        raise ValueError(
+            f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one "
+            f"(`python -m f3amd_lib train --data {profile.dataset} --profile {profile.name}`) or "
+            "name one with --model"
+        )
+    return names
+
+
 def measure_learning(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
 ) -> Path:
@@ -95,7 +107,8 @@ def measure_learning(
     )  # fmt: skip
     kept = kept_rows(path, record)
     measured = set() if kept is None else set(kept["model"])
-    todo = list(models) if models else [name for name in zoo.PRESETS if name not in measured]
+    todo = [zoo.find_preset(name).name for name in models or ()]
+    todo = todo or [name for name in zoo.PRESETS if name not in measured]
     for curve in learning_curves(prepared, todo, seed=profile.seed):
         if kept is not None:
             curve = pd.concat([kept[kept["model"] != curve["model"].iloc[0]], curve])
@@ -285,10 +298,15 @@ def measure_literal_update(
             mine = mine[mine[column] == value]
         return len(mine) > 0 and set(mine["weights"]) == {weights}
 
-    for model in asked or available_models(profile):
+    for model in asked or _models_with_weights(profile):
         trained, _, _ = obtain_model(prepared, profile, preset=model)
         weights = weights_digest(trained.params)
         if trained.diffusion.sampler != literal_update.UPDATES["rescaled"]:
+            if asked:
+                raise ValueError(
+                    f"{model} samples by {trained.diffusion.sampler!r}, which has no printed "
+                    "update: name models that sample by DDIM in the VE state"
+                )
             continue
         for spacing in SPACINGS:
             if not measured("literal_update_windows", weights, model=model, spacing=spacing):
@@ -348,7 +366,7 @@ def measure_noise_use(
     kept = {name: kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
     asked = [zoo.find_preset(name).name for name in models or ()]
-    for model in tqdm(asked or available_models(profile), unit="model"):
+    for model in tqdm(asked or _models_with_weights(profile), unit="model"):
         trained, _, _ = obtain_model(prepared, profile, preset=model)
         weights = weights_digest(trained.params)
         rows = kept["x0_by_sigma"]
@@ -466,7 +484,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name in options.names or MEASUREMENTS:
             path = MEASUREMENTS[name](prepared, profile, models)
             log.info("%-12s %s", name, path)
-    except (ValueError, ArithmeticError, RuntimeError) as error:
+    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         log.error("Stopped: %s", error)
         return 2
     return 0

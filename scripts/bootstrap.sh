@@ -76,6 +76,9 @@ if [ -e "$venv" ] && [ "$(version_of "$venv/bin/python")" != "$version" ]; then
   if [ ! -f "$venv/pyvenv.cfg" ]; then
     stop "$venv exists and is no virtual environment." "Move it away and start again."
   fi
+  if [ ! -f "$venv/installed" ] && [ ! -f "$venv/install.log" ]; then
+    stop "$venv is of another Python and was not made by this script." "Move it away and start again."
+  fi
   echo "Replacing $venv, which was made for another Python."
   rm -rf "$venv"
 fi

@@ -9,11 +9,12 @@ import pytest
 from builders import HISTORY, WINDOW, packed_from, wandering_motion
 
 from f3amd_lib import measure
+from f3amd_lib.__main__ import main
 from f3amd_lib.models import zoo
 from f3amd_lib.profiles import load_profile
 from f3amd_lib.report.records import read_table
-from f3amd_lib.training import checkpoints, family
-from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training import checkpoints, family, pipeline
+from f3amd_lib.training.pipeline import PreparedData, profile_recipe
 
 SHORT = {"num_steps": 4, "batch_size": 2, "learning_rate": 1e-3}
 
@@ -134,12 +135,19 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path):
     assert len(read_table(files.history)[0]) == 4
     before = files.model.read_bytes()
     assert leg(prepared, profile, tmp_path) == [("F3AMD-FNO-32", "finished before")]
+    # Other data or other settings must not pass for the same model, nor cost the one that is there.
+    others = PreparedData(packed_from([(wandering_motion(60, 7), 0, 0)]), WINDOW, HISTORY)
+    with pytest.raises(ValueError, match=r"F3AMD-FNO-32.*\.safetensors: .* another .*fingerprint"):
+        leg(others, profile, tmp_path)
+    longer = load_profile("smoke", "synthetic", train_steps=5, batch_size=2, window=WINDOW)
+    with pytest.raises(ValueError, match="another training lies there; move it away"):
+        leg(prepared, longer, tmp_path)
     assert files.model.read_bytes() == before
 
 
 def state_of(prepared, profile):
     """What `load_tree` asks for: the shapes of a training state."""
-    trainer = prepared.trainer("F3AMD-FNO-32", family.profile_recipe(profile, "F3AMD-FNO-32"))
+    trainer = prepared.trainer("F3AMD-FNO-32", profile_recipe(profile, "F3AMD-FNO-32"))
     return lambda metadata: jax.eval_shape(trainer.initial_state)
 
 
@@ -148,3 +156,34 @@ def test_an_unknown_preset_stops_before_anything_is_trained(prepared, tmp_path):
     with pytest.raises(ValueError, match="unknown model 'F3AMD-FNO-84'; did you mean"):
         leg(prepared, profile, tmp_path, ["F3AMD-FNO-32", "F3AMD-FNO-84"])
     assert not list(tmp_path.iterdir())
+
+
+def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch, caplog):
+    def legs(*states):
+        monkeypatch.setattr(family, "train_family", lambda *a, **k: iter(states))
+        return main(["train", "--preset", "F3AMD-FNO-32"])
+
+    caplog.set_level("INFO")
+    monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
+    assert legs(("F3AMD-FNO-32", "finished")) == 0
+    assert legs(("F3AMD-FNO-32", "finished"), ("CAMDM", "unfinished")) == 3
+    assert "CAMDM.state.safetensors" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--process", "0", "--coordinator", "host:1"], "come together or not at all"),
+        (["--processes", "2"], "come together or not at all"),
+        (["--cluster", "--processes", "2"], "leave the three others out"),
+    ],
+)
+def test_processes_that_do_not_say_enough_train_nothing(words, message, capsys):
+    assert main(["train", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(measure, "available_models", lambda profile: [])
+    with pytest.raises(ValueError, match="no trained model for 'synthetic' at profile 'smoke'"):
+        measure._models_with_weights(load_profile("smoke", "synthetic"))

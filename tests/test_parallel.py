@@ -42,6 +42,10 @@ state, history = trainer.run(
 parallel.wait_for_all("trained")
 again = trainer.restore(here.Path({out!r}) / "state.safetensors")
 assert int(again.step) == here.STEPS
+# The first process decides, and a difference is seen by both.
+if number >= 0:
+    assert parallel.first_says(number == 0) and not parallel.first_says(number == 1)
+    assert parallel.same_everywhere(5) and not parallel.same_everywhere(number)
 if parallel.is_first_process():
     np.savez({out!r} + "/weights.npz", *here.weights_of(state.ema))
     print("held out", history[-1]["held_out_loss"])
@@ -145,3 +149,17 @@ def test_a_batch_that_devices_cannot_share_is_refused():
 def test_half_told_processes_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         parallel.join_processes(*given)
+
+
+def test_alone_there_is_nobody_to_agree_with():
+    assert parallel.first_says(True) and not parallel.first_says(False)
+    assert parallel.same_everywhere(3)
+
+
+def test_processes_that_cannot_join_are_a_clear_error(monkeypatch):
+    def late(*arguments):
+        raise RuntimeError("deadline exceeded")
+
+    monkeypatch.setattr(jax.distributed, "initialize", late)
+    with pytest.raises(ValueError, match="could not join the others at host:1 .deadline exceeded"):
+        parallel.join_processes("host:1", 2, 1)

@@ -94,6 +94,13 @@ def test_recipes_are_trained_measured_and_gone_on_with(
     assert measure.measure_recipes(prepared, PROFILE) == path
     with pytest.raises(ValueError, match="leave --model out"):
         measure.measure_recipes(prepared, PROFILE, ["F3AMD-FNO-96"])
+    # A run on other data makes way, under another name.
+    others = PreparedData(packed_from([(wandering_motion(60, 7), 0, 0)]), WINDOW, HISTORY)
+    monkeypatch.setattr(recipes, "train", lambda *a, **k: (None, None))
+    recipes.train_recipe(prepared, PROFILE, "paper", folder=folder.parent, progress=False)
+    assert not list(folder.glob("*.old*"))
+    recipes.train_recipe(others, PROFILE, "paper", folder=str(folder.parent), progress=False)
+    assert len(list(folder.glob("F3AMD-FNO-96*.old1*"))) == 4
 
 
 def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkeypatch):

@@ -12,9 +12,9 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from f3amd_lib.profiles import Profile
-from f3amd_lib.training.checkpoints import describe
+from f3amd_lib.training import parallel
 from f3amd_lib.training.loop import short_recipe
-from f3amd_lib.training.pipeline import PreparedData, model_files, profile_recipe, train
+from f3amd_lib.training.pipeline import PreparedData, finished_model, model_files, train
 
 __all__ = ["SHORT_RUN", "train_family", "learning_curve", "learning_curves", "learning_table"]
 
@@ -58,11 +58,10 @@ def train_family(
     stop_at = None if budget_s is None else time.monotonic() + budget_s
     files = {preset: model_files(profile, preset, folder=folder) for preset in presets}
     for preset, its in files.items():
-        recipe = profile_recipe(profile, preset).to_dict()
-        if its.model.exists() and describe(its.model)["record"].get("training") == recipe:
+        if finished_model(prepared, profile, preset, its) is not None:
             yield preset, "finished before"
             continue
-        if stop_at is not None and time.monotonic() >= stop_at:
+        if stop_at is not None and parallel.first_says(time.monotonic() >= stop_at):
             yield preset, "unfinished"
             return
         trained, _ = train(

@@ -343,7 +343,7 @@ def train_fork(
     network, losses = _train(start, common, batches)
     losses = np.asarray(losses)
     if not np.isfinite(losses).all():
-        step = int(np.argmin(np.isfinite(losses)))
+        step = int(np.argmin(np.isfinite(losses))) + 1
         raise ArithmeticError(
             f"the loss stopped being a number at step {step}: lower the learning rate "
             f"{recipe.learning_rate}"

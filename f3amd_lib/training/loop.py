@@ -570,7 +570,7 @@ class Trainer:
           chunk: steps per jitted scan.
           stop_after: stop once this many steps are done in all.
           stop_at: stop, with a checkpoint, at the end of the first chunk after this time
-            (`time.monotonic`). Processes that train together must be given none.
+            (`time.monotonic`). Of processes that train together, the first one's clock counts.
           on_chunk: called with each history row as it is made.
           progress: show a progress bar.
 
@@ -605,16 +605,17 @@ class Trainer:
                 passed = (done + length) // checkpoint_every > done // checkpoint_every
                 done += length
                 row = {"step": done, **{name: float(v.mean()) for name, v in terms.items()}}
-                late = stop_at is not None and time.monotonic() >= stop_at
+                late = stop_at is not None and parallel.first_says(time.monotonic() >= stop_at)
                 due = passed or done == total or late
                 if due and held_out is not None:
                     measured = self.held_out_terms(state.ema, held_out)
                     row.update({f"held_out_{name}": value for name, value in measured.items()})
-                if due and checkpoint is not None:
-                    self.save(Path(checkpoint), state)
                 history.append(row)
                 if on_chunk is not None:
                     on_chunk(row)
+                # After the row: one that the state has not reached yet is dropped on resuming.
+                if due and checkpoint is not None:
+                    self.save(Path(checkpoint), state)
                 bar.update(length)
                 bar.set_postfix(loss=f"{row['loss']:.4f}")
                 if late:

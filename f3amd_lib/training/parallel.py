@@ -21,6 +21,8 @@ __all__ = [
     "replicate",
     "spread",
     "is_first_process",
+    "first_says",
+    "same_everywhere",
     "wait_for_all",
 ]
 
@@ -40,7 +42,8 @@ def join_processes(
       number: of this one, from 0.
 
     Raises:
-      ValueError: if only some of the three are given, or the number is out of range.
+      ValueError: if only some of the three are given, the number is out of range, or the processes
+        do not find each other.
     """
     given = (coordinator, count, number)
     if any(value is None for value in given) and any(value is not None for value in given):
@@ -50,7 +53,14 @@ def join_processes(
         )
     if count is not None and not 0 <= number < count:
         raise ValueError(f"process {number} of {count}: numbers run from 0 to {count - 1}")
-    jax.distributed.initialize(coordinator, count, number)
+    try:
+        jax.distributed.initialize(coordinator, count, number)
+    except RuntimeError as error:
+        where = coordinator or "the coordinator that JAX found"
+        raise ValueError(
+            f"this process could not join the others at {where} ({error}): start all of them, and "
+            "before anything else uses JAX"
+        ) from error
 
 
 def all_devices() -> Mesh:
@@ -99,6 +109,20 @@ def spread(tree, mesh: Mesh | None):
 def is_first_process() -> bool:
     """Say whether this process writes the files; the others only compute."""
     return jax.process_index() == 0
+
+
+def first_says(answer: bool) -> bool:
+    """Return process 0's answer in every process, so that none goes on where another stops."""
+    if jax.process_count() == 1:
+        return answer
+    return bool(multihost_utils.broadcast_one_to_all(np.array(answer)))
+
+
+def same_everywhere(number: int) -> bool:
+    """Say whether a whole number is the same in every process."""
+    if jax.process_count() == 1:
+        return True
+    return len(set(np.ravel(multihost_utils.process_allgather(np.array(number))).tolist())) == 1
 
 
 def wait_for_all(what: str) -> None:

@@ -49,9 +49,11 @@ __all__ = [
     "model_files",
     "profile_recipe",
     "train",
+    "finished_model",
     "obtain_model",
     "available_models",
     "find_model",
+    "set_aside_unlike",
 ]
 
 log = logging.getLogger("f3amd")
@@ -255,6 +257,11 @@ def train(
     state, rows = None, []
     begun = files.state.exists()
     parallel.wait_for_all("looked for a training state")
+    if not parallel.same_everywhere(int(begun)):
+        raise ValueError(
+            f"{files.state}: one process sees it and another does not; processes that train "
+            "together need one folder that all of them see (--out)"
+        )
     if not begun:
         if parallel.is_first_process():
             _set_aside(files)  # a finished model without its state cannot be gone on with
@@ -265,6 +272,11 @@ def train(
                 "beside it, or move the state away to start anew"
             )
         state = trainer.restore(files.state)
+        if not parallel.same_everywhere(int(state.step)):
+            raise ValueError(
+                f"{files.state}: processes found different steps in it; processes that train "
+                "together need one folder that all of them see (--out)"
+            )
         earlier, _ = read_table(files.history)
         rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
 
@@ -342,24 +354,66 @@ def obtain_model(
                 return trained, read_table(shipped.history)[0], "shipped"
     files = model_files(profile, preset)
     mine = _identity(prepared, wanted, profile_recipe(profile, preset))
-    trained = None
     if files.model.exists() and files.history.exists():
         with contextlib.suppress(OutdatedFile):  # set aside below
             trained = load_model(files.model)
-    if trained is not None:
-        record = trained.record
-        theirs = {"model": trained.config.to_dict()} | {
-            "training": record.get("training"),
-            "dataset_fingerprint": record.get("dataset_fingerprint"),
-        }
-        if theirs == mine:
-            return trained, read_table(files.history)[0], "earlier run"
+            if not _unlike(trained, mine):
+                return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
-    state = describe(files.state) if files.state.exists() else {}
-    unfinished = files.history.exists() and not files.model.exists()
-    if not unfinished or any(state.get(name) != value for name, value in mine.items()):
+    if files.model.exists() or not files.history.exists():
         _set_aside(files)
+    set_aside_unlike(prepared, files, wanted, profile_recipe(profile, preset))
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
+
+
+def finished_model(
+    prepared: PreparedData, profile: Profile, preset: str, files: ModelFiles
+) -> TrainedModel | None:
+    """Return the model that a run by the profile's recipe left, None if it left none yet.
+
+    Args:
+      prepared, profile, preset: as for `obtain_model`.
+      files: where it would lie.
+
+    Raises:
+      ValueError: if a model lies there that is of other data, another network or another training.
+    """
+    if not files.model.exists():
+        return None
+    trained = load_model(files.model)
+    mine = _identity(prepared, prepared.model_config(preset), profile_recipe(profile, preset))
+    if unlike := _unlike(trained, mine):
+        raise ValueError(
+            f"{files.model}: a model with another {' and '.join(unlike)} lies there; move it away "
+            "or name another folder (--out)"
+        )
+    return trained
+
+
+def _unlike(trained: TrainedModel, mine: dict) -> list[str]:
+    """List what a finished model has otherwise than `_identity` says."""
+    theirs = {
+        "model": trained.config.to_dict(),
+        "training": trained.record.get("training"),
+        "dataset_fingerprint": trained.record.get("dataset_fingerprint"),
+    }
+    return [name for name, value in mine.items() if theirs[name] != value]
+
+
+def set_aside_unlike(
+    prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig
+) -> None:
+    """Keep a training state under another name if it is of other data or settings.
+
+    Args:
+      prepared: the data.
+      files: of the run.
+      model, config: of the run that is to come.
+    """
+    mine = _identity(prepared, model, config)
+    state = describe(files.state) if files.state.exists() else mine
+    if any(state.get(name) != value for name, value in mine.items()):
+        _set_aside(files)
 
 
 def available_models(profile: Profile) -> list[str]:

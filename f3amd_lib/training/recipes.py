@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import TrainingConfig, paper_recipe
-from f3amd_lib.training.pipeline import PreparedData, train
+from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_unlike, train
 
 __all__ = ["Recipe", "RECIPES", "RECIPE_STEPS", "find_recipe", "train_recipe"]
 
@@ -154,17 +155,22 @@ def train_recipe(
       prepared: the data.
       profile: says how long (`RECIPE_STEPS`), the batch and the seed.
       name: key of `RECIPES`.
-      folder: where rows keep their files, one folder each.
+      folder: where rows keep their files, one folder each; those of a run on other data are kept
+        under other names.
       progress: show a progress bar.
     """
-    recipe = find_recipe(name)
+    recipe, folder = find_recipe(name), Path(folder) / name
+    config = recipe.config(RECIPE_STEPS[profile.name], profile.batch_size, profile.seed)
+    network = prepared.model_config(recipe.preset, **recipe.network)
+    files = model_files(profile, recipe.preset, folder=folder)
+    set_aside_unlike(prepared, files, network, config)
     trained, _ = train(
         prepared,
         profile,
         preset=recipe.preset,
-        config=recipe.config(RECIPE_STEPS[profile.name], profile.batch_size, profile.seed),
+        config=config,
         network=recipe.network,
-        folder=folder / name,
+        folder=folder,
         progress=progress,
     )
     return trained
