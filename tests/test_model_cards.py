@@ -6,6 +6,7 @@ import re
 import pandas as pd
 import pytest
 
+from f3amd_lib.profiles import repository_root
 from f3amd_lib.report import model_cards
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -23,6 +24,19 @@ def test_every_shipped_model_has_its_card(path):
     assert record["dataset_licence"] in card and record["dataset_credit"] in card
     assert ("non-commercial" in card) == ("NC" in record["dataset_licence"])
     assert f"{record['training']['num_steps']:,} steps" in card
+
+
+def test_readme_shows_what_is_on_record(tmp_path):
+    readme = repository_root() / "README.md"
+    copy = tmp_path / "README.md"
+    copy.write_text(readme.read_text(encoding="utf-8"), encoding="utf-8")
+    model_cards.write_readme_table(copy, model_cards.committed_quality("bandai"))
+    assert copy.read_text(encoding="utf-8") == readme.read_text(encoding="utf-8"), (
+        "write the table anew: python -m f3amd_lib.report.model_cards"
+    )
+    copy.write_text("no marks", encoding="utf-8")
+    with pytest.raises(ValueError, match="no `<!-- measured: begin -->`"):
+        model_cards.write_readme_table(copy, model_cards.committed_quality("bandai"))
 
 
 def test_checksums_are_those_of_the_files():

@@ -1,6 +1,6 @@
 """A card for every model that ships: what it is, its data, how well it does, its limits.
 
-    python -m f3amd_lib.report.model_cards        # writes the cards and the list of checksums
+    python -m f3amd_lib.report.model_cards        # writes cards, checksums and README's table
 
 Everything on a card is read from the weights file and from committed results; nothing is typed in.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 import sys
 from pathlib import Path
 
@@ -16,13 +17,13 @@ import jax
 import pandas as pd
 
 from f3amd_lib.profiles import repository_root
-from f3amd_lib.report.quality_tables import figure_text
+from f3amd_lib.report.quality_tables import figure_text, readme_table
 from f3amd_lib.report.records import read_table
 from f3amd_lib.report.tables import markdown_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
-__all__ = ["CARD_FIGURES", "model_card", "checksums", "write_cards", "main"]
+__all__ = ["CARD_FIGURES", "model_card", "checksums", "write_cards", "write_readme_table", "main"]
 
 log = logging.getLogger("f3amd")
 
@@ -114,10 +115,11 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     windows = recipe["num_steps"] * recipe["batch_size"]
     passes = windows / record["num_train_windows"]
     count = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
-    history, _ = read_table(path.with_name(f"{trained.name}.history.csv"))
+    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
     losses = history["held_out_loss"].dropna()
     state = " from a work tree with uncommitted changes" if record["git_dirty"] else ""
-    free = record["dataset_licence"] in ("Apache-2.0", "MIT")
+    free = "NC" not in re.split(r"[\s-]+", record["dataset_licence"])
+    commit = (record["git_commit"] or "unknown")[:10]
     lines = [
         f"# {trained.name}, trained on `{record['dataset']}`",
         "",
@@ -132,7 +134,7 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
         f"the paper: 100 passes, batches of 512), learning rate {recipe['learning_rate']:g} "
         f"(`{recipe['schedule']}`), moving average {recipe['ema_decay']:g}, "
         f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}, "
-        f"commit {record['git_commit'][:10]}{state}",
+        f"commit {commit}{state}",
         f"- **Held-out loss**: {losses.iloc[-1]:.4f} at the end (its own loss; losses of different "
         "recipes do not compare)",
         "",
@@ -211,11 +213,30 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     return cards
 
 
+def write_readme_table(path: Path, quality: pd.DataFrame) -> None:
+    """Put the table of measured figures between its two marks in README.
+
+    Args:
+      path: of README; all other text stays.
+      quality: from `committed_quality`.
+
+    Raises:
+      ValueError: if the marks are not there.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    parts = re.split(r"(<!-- measured: (?:begin|end) -->\n)", text)
+    if len(parts) != 5:
+        raise ValueError(f"{path}: no `<!-- measured: begin -->` and `end` line around the table")
+    parts[2] = "\n" + readme_table(quality) + "\n"
+    Path(path).write_text("".join(parts), encoding="utf-8")
+
+
 def main() -> int:
-    """Write all cards; see the module's first lines."""
+    """Write all cards and README's table; see the module's first lines."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     for card in write_cards():
         log.info("%s", card)
+    write_readme_table(repository_root() / "README.md", committed_quality("bandai"))
     return 0
 
 

@@ -18,6 +18,9 @@ from f3amd_lib.report.papers import PAPER_TABLES, load_paper_table
 from f3amd_lib.report.tables import markdown_table
 
 __all__ = [
+    "README_ROWS",
+    "README_COLUMNS",
+    "readme_table",
     "QUALITY_TABLES",
     "PAPER_SOURCE",
     "NOT_MEASURED",
@@ -235,3 +238,57 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     title += f", windows of {frames[0]} frames." if len(frames) == 1 else "."
     note = " ".join([NOTE, *([_EXTRA_NOTES[table]] if table in _EXTRA_NOTES else [])])
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
+
+
+README_ROWS = {
+    "FID": ("FID", 1),
+    "EMD": ("EMD", 1),
+    "style_coverage": ("style coverage (%)", 0),
+    "trajectory_error": ("Traj. (m)", 3),
+    "direction_error": ("Dir. (°)", 1),
+    "smoothness": ("Smooth", 2),
+    "foot_sliding": ("Foot", 2),
+    "contact_share": ("contact share", 2),
+    "diversity": ("Diversity (cm)", 2),
+    "IRD": ("IRD (cm)", 1),
+    "IRD_excess": ("IRD excess (cm)", 1),
+    "joint_acceleration": ("joint acceleration (cm/frame²)", 2),
+    "foot_alternation": ("foot alternation (1/s)", 2),
+    "x0_error_ratio": ("x0 error, low over high noise", 2),
+}
+"""Metrics of README's table, with their headings and decimals."""
+
+README_COLUMNS = {
+    ("real", 0): "real",
+    ("frozen pose", 0): "frozen pose",
+    ("CAMDM", 8): "`CAMDM`, 8 steps",
+    ("F3AMD-FNO-96", 8): "`F3AMD-FNO-96`, 8 steps",
+    ("F3AMD-FNO-96", 1): "1 step",
+    ("F3AMD-FNO-96-plus", 8): "`-plus`, 8 steps",
+    ("F3AMD-FNO-96-plus", 1): "1 step ",
+}
+"""Model and steps of README's columns, with their headings."""
+
+
+def readme_table(quality: pd.DataFrame, window: int = 32) -> str:
+    """Render README's table of what was measured on real motion, our own figures alone.
+
+    Args:
+      quality: from `protocol.summarise`.
+      window: of the models, frames.
+
+    Returns:
+      Markdown: means with 95 % intervals; a figure that a column does not have is a dash.
+    """
+    own = quality[quality["window_frames"] == window].set_index(["model", "steps", "metric"])
+    rows = []
+    for metric, (heading, decimals) in README_ROWS.items():
+        row = {"": heading}
+        for (model, steps), title in README_COLUMNS.items():
+            row[title] = "–"
+            if (model, steps, metric) in own.index:
+                value, low, high = own.loc[(model, steps, metric), ["value", "low", "high"]]
+                half = 0.5 * (high - low)
+                row[title] = f"{value:.{decimals}f} ± {half:.{decimals}f}"
+        rows.append(row)
+    return markdown_table(pd.DataFrame(rows))
