@@ -6,8 +6,8 @@ no concern of this module.
 
 The paper prints the DDIM update in variance-preserving form (Appendix F). Its state is
 `z = sqrt(alpha_bar) x`, and a network trained on `x` must be shown `z / sqrt(alpha_bar)`. Both
-forms are here and walk the same path; feeding `z` to the network unrescaled does not. That third
-walk is here as well, to be studied (`ddim_step_literal`).
+forms are here and walk the same path; taking `z` for `x`, in the network and in the estimate of the
+noise, does not. That third walk is here as well, to be studied (`ddim_step_literal`).
 
 The same rescaling lets one denoiser serve both kinds of schedule: DDPM, too, is written for the
 variance-exploding state, in which its update has no alpha_bar at all. Every sampler takes any

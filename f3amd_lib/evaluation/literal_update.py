@@ -192,7 +192,7 @@ def window_figures(walks: WindowWalks) -> pd.DataFrame:
     Returns:
       Columns update, steps, metric, unit, value, means over windows and seeds; update "real" with
       0 steps is what was captured, where something was. Metrics:
-        joint_error: distance of joints from what was captured, likewise;
+        joint_error: distance of joints from what was captured;
         joint_acceleration: see `metrics.joint_acceleration`;
         seed_spread: `diversity` over the seeds of one condition;
         from_rescaled: distance of joints from the rescaled walk of as many steps;

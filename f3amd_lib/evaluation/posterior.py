@@ -172,8 +172,9 @@ def continuation_spread(
     Raises:
       ValueError: for an unknown name in `given`, fewer than 2 neighbours, or a pool without any.
 
-    Source: ours. Neighbours differ a little in their conditions, so that the value is an upper
-    bound of the spread under one condition, the closer the smaller the distances are.
+    Source: ours. Neighbours differ a little in their conditions, which makes the value larger than
+    the spread under one condition, the less so the smaller the distances are; neighbours from one
+    clip share a walker's habits, which makes it smaller.
     """
     for name in given:
         if name not in GIVEN:

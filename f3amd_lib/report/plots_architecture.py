@@ -87,6 +87,7 @@ def influence_maps(
     across: str = "input frame",
     down: str = "output frame",
     highest: float | None = None,
+    label: str = "size of the derivative",
 ):
     """Draw how strongly each input frame reaches each output frame, a panel for each layer.
 
@@ -94,9 +95,10 @@ def influence_maps(
       maps: title -> [T out, T in], not negative.
       across, down: what the columns and the rows are.
       highest: where the colour scale ends; by default at the largest value.
+      label: of the colour scale.
     """
     height = 3.2 if len(maps) < 4 else 2.6
-    figure, axes = _map_row(maps, height, "size of the derivative", highest)
+    figure, axes = _map_row(maps, height, label, highest)
     for axis in axes:
         axis.set_xlabel(across)
     axes[0].set_ylabel(down)

@@ -250,7 +250,7 @@ def channel_shares(shares: Mapping[str, np.ndarray], additive: Mapping[str, floa
     longest = max(len(values) for values in shares.values())
     ticks = np.arange(0, longest, 8)
     axis.set_xticks([-2.0, *ticks], ["only\nadded", *(f"{tick}" for tick in ticks)])
-    axis.set_xlabel("channels D under FiLM")
+    axis.set_xlabel("shared kernels under FiLM")
     axis.set_ylabel("energy of the filters left (%)")
     axis.set_ylim(-3, 103)
     axis.legend()

@@ -103,7 +103,7 @@ def noise_levels(draws: Mapping[str, np.ndarray], sigmas):
                 label=f"visited by {len(visited)} steps",
                 zorder=5,
             )
-            axis.set(xscale="log", title=label, xlabel="noise level sigma")
+            axis.set(xscale="log", title=label, xlabel="noise level σ")
         axes[0, 0].set_ylabel("share of draws (%)")
         axes[0, 0].legend(loc="upper left")
     return figure
@@ -255,9 +255,9 @@ def error_against_sigma(table: pd.DataFrame):
             axes[1].plot(rows["sigma"], rows["joint_error_cm"], **_line(model), label=model)
         low = min(0.7 * first["sigma"].min(), 0.5 * table["x0_error"].min())
         axes[0].set(xscale="log", yscale="log", ylim=(low, top))
-        axes[0].set(xlabel="noise level sigma", ylabel="x0 error (network units)")
+        axes[0].set(xlabel="noise level σ", ylabel="x0 error (network units)")
         axes[1].set(xscale="log", ylim=(0, None))
-        axes[1].set(xlabel="noise level sigma", ylabel="joint error (cm)")
+        axes[1].set(xlabel="noise level σ", ylabel="joint error (cm)")
         axes[0].legend(loc="lower right")
     return figure
 

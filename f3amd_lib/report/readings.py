@@ -416,7 +416,7 @@ READINGS = (
     Reading(
         "training",
         "norms of Eqs 10 to 14",
-        "squared norms, all weights 1",
+        "squared norms, but for Eq. 10; all weights 1",
         "means over batch, frames and entries",
         "CAMDM's code",
     ),
