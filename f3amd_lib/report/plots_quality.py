@@ -68,8 +68,9 @@ def poses_beside(motions: Mapping[str, Motion], frames: Sequence[int]):
       motions: title -> motion, or None where a panel is to stay empty.
       frames: which, in this order.
     """
-    rows = -(-len(motions) // 2)
-    figure, axes = new_figure(7.2, 1.6 * rows, rows, 2, squeeze=False)
+    rows, across = -(-len(motions) // 2), 0.95 * len(frames)
+    # As high as its panels are at equal scale, and a line for the title.
+    figure, axes = new_figure(7.2, (0.4 + 3.45 * 1.93 / across) * rows, rows, 2, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
     for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
@@ -90,7 +91,7 @@ def poses_beside(motions: Mapping[str, Motion], frames: Sequence[int]):
                 if name.lower().endswith("head"):
                     axis.plot(*seen[:, joint], "o", color=color, markersize=7)
         axis.axhline(0.0, color=PALETTE["grey"], linewidth=0.8, zorder=0)
-        axis.set_xlim(-0.5, 0.95 * len(frames) - 0.4)
+        axis.set_xlim(-0.5, across - 0.4)
         axis.set_ylim(-0.08, 1.85)
         axis.set_aspect("equal")
         axis.set_title(title, color=_color(title))
