@@ -121,9 +121,7 @@ def _rollout(arguments) -> None:
     from f3amd_lib.report.player import rollout_scene, write_player
 
     trained = _trained(arguments)
-    if not 0.1 <= arguments.seconds <= 3600.0:
-        raise ValueError(f"--seconds must be between 0.1 and 3600, got {arguments.seconds}")
-    num_frames = max(2, round(arguments.seconds * 30))
+    num_frames = _num_frames(arguments.seconds)
     path = _path(arguments.path, num_frames, arguments.speed, arguments.seed)
     out = Path(arguments.out)
     name = f"{arguments.style}_{Path(arguments.path).stem}_seed{arguments.seed}"

@@ -69,6 +69,31 @@ def test_a_planned_crowd_keeps_apart_and_is_drawn_beside_its_folder(weights, tmp
     assert (tmp_path / "crowd.png").stat().st_size > 5000
 
 
+def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsys):
+    out = tmp_path / "crowd"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--characters", "2"]
+    words += ["--seconds", "0.2", "--pictures"]
+    for name in ("crowd.html", "crowd.png"):
+        (tmp_path / name).write_text("of another crowd")
+        assert main(words) == 2
+        assert f"{tmp_path / name}: exists already; pass --overwrite" in capsys.readouterr().err
+        assert (tmp_path / name).read_text() == "of another crowd"
+        assert not out.exists()  # nothing was generated for nothing
+        (tmp_path / name).unlink()
+    (tmp_path / "crowd.html").write_text("of another crowd")
+    assert main([*words, "--overwrite"]) == 0
+    assert "player-data" in (tmp_path / "crowd.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("seconds", ["0", "-5", "nan", "3601"])
+def test_lengths_that_make_no_crowd_are_refused(weights, tmp_path, capsys, seconds):
+    out = tmp_path / "crowd"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--seconds", seconds]
+    assert main([*words, "--steps", "1", "--characters", "2"]) == 2
+    assert "--seconds must be between 0.1 and 3600, got" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_rollout_is_blended_only_if_asked(weights, tmp_path):
     def positions(name, *more):
         words = ["rollout", "--weights", weights, "--out", str(tmp_path / name), "--steps", "1"]

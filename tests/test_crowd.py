@@ -384,7 +384,8 @@ def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(
         crowds, "crowd_paths", lambda *given, **how: made.append(given[0]) or make(*given, **how)
     )
     resumed = call()
-    assert made[0].start == writes // 4 * 4  # what was finished is not made again
+    # What was finished is not made again; the first paths are looked at, to be the same ones.
+    assert [part.start for part in made] == sorted({0, *range(writes // 4 * 4, 11, 4)})
     close(resumed, eleven)
     folder = tmp_path.with_name(tmp_path.name + "-whole")
     generate_crowd(generator, 11, FRAMES, folder, chunk=4)
@@ -428,6 +429,49 @@ def test_a_stopped_run_does_not_go_on_with_other_settings(
     with pytest.raises(ValueError, match=f"{tmp_path}: holds a crowd made with {named}"):
         generate_crowd(still, **settings | changed)
     assert content(tmp_path) == before
+
+
+def along(direction):
+    """Paths straight on in a direction; all such functions have one name."""
+
+    def paths(characters, pace, num_frames, seed):
+        line = np.arange(num_frames)[:, None] / 30.0 * direction
+        start = np.array(characters)[:, None, None] * [1.0, 1.0]
+        return start + line, np.zeros((len(characters), num_frames))
+
+    return paths
+
+
+@pytest.mark.parametrize("stopped_after", [0, 1])
+@pytest.mark.parametrize("min_distance", [None, 0.5])
+def test_a_stopped_run_does_not_go_on_with_other_paths_of_one_name(
+    still, tmp_path, stopped_after, min_distance
+):
+    settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
+    settings["min_distance"] = min_distance
+    with pytest.raises(KeyboardInterrupt):
+        generate_crowd(stop_after(still, stopped_after), paths=along([0.0, 1.0]), **settings)
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match=f"{tmp_path}: .* first character walks another path"):
+        generate_crowd(still, paths=along([1.0, 0.0]), **settings)
+    assert content(tmp_path) == before
+    crowd = generate_crowd(still, paths=along([0.0, 1.0 + 1e-9]), **settings)  # rounding is no path
+    np.testing.assert_array_equal(crowd.path[:, 0, 0], np.arange(6))
+    with pytest.raises(ValueError, match="holds this crowd already"):
+        generate_crowd(still, paths=along([1.0, 0.0]), **settings)
+    crowd = generate_crowd(still, paths=along([1.0, 0.0]), overwrite=True, **settings)
+    assert crowd.path[5, -1, 0] > 5.0
+
+
+def test_a_crowd_from_before_paths_were_told_apart_opens_and_goes_on(still, tmp_path):
+    call = functools.partial(generate_crowd, num_characters=4, num_frames=5, out=tmp_path, chunk=2)
+    with pytest.raises(KeyboardInterrupt):
+        call(stop_after(still, 1))
+    edit(tmp_path, drop="first_path")
+    assert len(call(still)) == 4
+    assert len(json.loads((tmp_path / "crowd.json").read_text())["first_path"]) == 12
+    edit(tmp_path, drop="first_path")
+    assert len(read_crowd(tmp_path)) == 4
 
 
 def stop_after(still, chunks):

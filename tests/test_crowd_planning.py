@@ -98,6 +98,25 @@ def test_paths_that_keep_apart_come_back_unchanged():
     np.testing.assert_array_equal(facing, yaw)
     kept, _ = keep_apart(position[:1], yaw[:1])
     np.testing.assert_array_equal(kept, position[:1])
+    for radius in (3.2, 50.0):  # they start 3.1 m from their middle
+        kept, facing = keep_apart(position, yaw, radius=radius)
+        np.testing.assert_array_equal(kept, position)
+        np.testing.assert_array_equal(facing, yaw)
+        assert not np.shares_memory(kept, position) and not np.shares_memory(facing, yaw)
+    kept, _ = keep_apart(position, yaw, radius=3.0)
+    assert (kept != position).any() and np.linalg.norm(kept[:, 0] - [0.75, 3.0], axis=-1).max() <= 3
+
+
+def test_a_crowd_is_spread_no_wider_than_it_has_to_be():
+    position, yaw = two_who_meet()
+    kept, _ = keep_apart(position, yaw, radius=30.0)
+    assert np.abs(kept - position).max() < 1.0  # they step aside where they are
+    # Six who start in a bunch cannot: they are spread, and not to the ends of the room.
+    together = 0.02 * np.stack([np.cos(np.arange(6.0)), np.sin(np.arange(6.0))], axis=-1)
+    bunch = np.broadcast_to(together[:, None], (6, 30, 2))
+    kept, _ = keep_apart(bunch, np.zeros((6, 30)), radius=20.0)
+    assert smallest_distances(kept).min() >= MIN_DISTANCE
+    assert np.linalg.norm(kept[:, 0], axis=-1).max() < 5.0
 
 
 def test_plans_are_the_same_by_seed_and_differ_between_seeds():

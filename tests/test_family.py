@@ -1,5 +1,6 @@
 """Short runs of the family, and the measurement that keeps them."""
 
+import dataclasses
 import itertools
 import math
 
@@ -136,7 +137,8 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path):
     before = files.model.read_bytes()
     assert leg(prepared, profile, tmp_path) == [("F3AMD-FNO-32", "finished before")]
     # Other data or other settings must not pass for the same model, nor cost the one that is there.
-    others = PreparedData(packed_from([(wandering_motion(60, 7), 0, 0)]), WINDOW, HISTORY)
+    packed = dataclasses.replace(prepared.packed, fingerprint="others")
+    others = PreparedData(packed, WINDOW, HISTORY)
     with pytest.raises(ValueError, match=r"F3AMD-FNO-32.*\.safetensors: .* another .*fingerprint"):
         leg(others, profile, tmp_path)
     longer = load_profile("smoke", "synthetic", train_steps=5, batch_size=2, window=WINDOW)

@@ -20,6 +20,7 @@ from f3amd_lib.evaluation.rollout import Rollout
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.report import player
+from f3amd_lib.report.pictures import film_strip, write_film_strip, write_gif
 from f3amd_lib.report.player import (
     Character,
     Scene,
@@ -160,18 +161,23 @@ def test_every_bone_is_drawn_once_in_a_limb_of_its_side():
     assert tuple(drawn.points[k] for k in drawn.head) == (head, neck)
 
 
-def test_unlike_skeletons_share_a_page():
+def pole_of_three() -> Motion:
+    """A rig of which nobody knows where its toes or hips are."""
     parents = (-1, 0, 1)
     chain = Skeleton(("Root", "Mid", "Tip"), parents, [[0, 0, 0], [0, 1, 0], [0, 1, 0]])
     rotations = np.broadcast_to(np.eye(3), (FRAMES, 3, 3, 3))
-    pole = Motion(chain, np.full((FRAMES, 3), 0.25), rotations, name="pole")
+    return Motion(chain, np.full((FRAMES, 3), 0.25), rotations, name="pole")
+
+
+def test_unlike_skeletons_share_a_page():
+    pole = pole_of_three()
     data = page_data(player_page([wandering_motion(FRAMES), pole, pole]))
     assert [scene["characters"][0]["skeleton"] for scene in data["scenes"]] == [0, 1, 1]
     tracks = read_tracks(data)[1][0]
     np.testing.assert_array_equal(
         tracks["global"][7], [[250] * 3, [250, 1250, 250], [250, 2250, 250]]
     )
-    # Nobody knows where this rig's toes or hips are: no contacts, and a camera along +Z.
+    # No contacts, and a camera along +Z.
     assert tracks["contacts"] is None and data["skeletons"][1]["toes"] is None
 
 
@@ -281,6 +287,25 @@ def test_a_rollout_becomes_a_scene():
         rollout_scene(rollout, colors=["#112233"])
 
 
+def test_what_needs_a_drag_has_keys_and_buttons_and_the_list_of_keys_says_so():
+    elements = Elements(player_page(wandering_motion(3)))
+    buttons = {
+        attributes["id"]: attributes["aria-label"]
+        for tag, attributes in elements.tags
+        if tag == "button" and "aria-label" in attributes
+    }
+    for way in ("left", "right", "up", "down"):
+        assert buttons[f"orbit-{way}"] == f"Orbit {way}"
+    for way in ("left", "right", "forward", "back"):
+        assert buttons[f"move-{way}"] == f"Move the view {way}"
+    (turn,) = [found for _, found in elements.tags if found.get("id") == "turn"]
+    assert (turn["aria-expanded"], turn["aria-controls"]) == ("false", "pad")
+    assert "orbit; with shift move the view" in elements.text
+    assert "without dragging" in elements.text
+    (sheet,) = [found for _, found in elements.tags if found.get("class") == "sheet"]
+    assert sheet["tabindex"] == "0" and sheet["aria-label"] == "List of keys"
+
+
 # ----------------------------------------------------------------------------------------- refusal
 
 
@@ -367,6 +392,38 @@ def test_a_film_strip_stands_beside_the_page(tmp_path):
     assert not (tmp_path / "alone.png").exists()
     with pytest.raises(ValueError, match=r"players are written as \.html"):
         write_player(tmp_path / "walk.htm", scene)
+
+
+def test_pictures_leave_out_contacts_and_facing_of_an_unknown_rig(tmp_path):
+    pole, known = pole_of_three(), wandering_motion(FRAMES)
+
+    def legend_and_strokes(motions):
+        poses, plan = film_strip(motions, num_poses=3).axes[-2:]
+        texts = [text.get_text() for text in poses.get_legend().get_texts()]
+        return texts, sum(len(line.get_xdata()) == 2 for line in plan.lines)
+
+    texts, strokes = legend_and_strokes(pole)
+    assert texts == ["left", "right"] and strokes == 0
+    texts, strokes = legend_and_strokes(known)
+    assert texts == ["left", "right", "toe in contact"] and strokes == 3
+    legend = film_strip([pole, known]).axes[0].get_legend()  # it speaks for all rows
+    assert "toe in contact" in [text.get_text() for text in legend.get_texts()]
+    path = write_player(tmp_path / "pole.html", [pole, known])
+    assert Image.open(path.with_suffix(".png")).width > 500
+    assert show_player(pole).strip is not None
+    with Image.open(write_gif(tmp_path / "pole.gif", [pole, known])) as moving:
+        assert moving.n_frames > 3
+    assert write_film_strip(tmp_path / "strip.png", pole).exists()
+
+
+def test_a_strip_that_cannot_be_drawn_leaves_no_page_behind(tmp_path, monkeypatch):
+    def refuse(scenes):
+        raise ValueError("no strip of this")
+
+    monkeypatch.setattr(player, "scenes_strip", refuse)
+    with pytest.raises(ValueError, match="no strip of this"):
+        write_player(tmp_path / "new" / "walk.html", wandering_motion(FRAMES))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_strip_has_a_row_a_scene(tmp_path):

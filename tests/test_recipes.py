@@ -95,7 +95,8 @@ def test_recipes_are_trained_measured_and_gone_on_with(
     with pytest.raises(ValueError, match="leave --model out"):
         measure.measure_recipes(prepared, PROFILE, ["F3AMD-FNO-96"])
     # A run on other data makes way, under another name.
-    others = PreparedData(packed_from([(wandering_motion(60, 7), 0, 0)]), WINDOW, HISTORY)
+    packed = dataclasses.replace(prepared.packed, fingerprint="others")
+    others = PreparedData(packed, WINDOW, HISTORY)
     monkeypatch.setattr(recipes, "train", lambda *a, **k: (None, None))
     recipes.train_recipe(prepared, PROFILE, "paper", folder=folder.parent, progress=False)
     assert not list(folder.glob("*.old*"))

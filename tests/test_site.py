@@ -304,6 +304,23 @@ def test_a_whole_site_has_no_faults(tmp_path):
         ("<a href='../x.html'>a</a>", "../x.html leads out of"),
         ("<script src='https://example.org/a.js'></script>", "asks https://example.org/a.js"),
         ("<link rel='stylesheet' href='//example.org/a.css'>", "asks //example.org/a.css"),
+        ("<img srcset='sub/other.html 1x, gone.png 2x' alt='x'>", "gone.png leads nowhere"),
+        ("<picture><source srcset='//example.org/a.png'></picture>", "asks //example.org/a.png"),
+        ("<link rel='preload' imagesrcset='gone.png 2x'>", "gone.png leads nowhere"),
+        ("<video poster='https://example.org/a.png'></video>", "asks https://example.org/a.png"),
+        ("<object data='https://example.org/a.svg'></object>", "asks https://example.org/a.svg"),
+        ("<video><track src='//example.org/a.vtt'></video>", "asks //example.org/a.vtt"),
+        ("<svg><use href='//example.org/a.svg#b'/></svg>", "asks //example.org/a.svg#b"),
+        ("<style>@import 'https://example.org/a.css';</style>", "asks https://example.org/a.css"),
+        ("<style>p { background: url(gone.png) }</style>", "gone.png leads nowhere"),
+        ("<p style='background: url(\"//example.org/a.png\")'>", "asks //example.org/a.png"),
+        ("<iframe srcdoc='<img src=gone.png alt=x>'></iframe>", "gone.png leads nowhere"),
+        ("<iframe srcdoc='<script src=//a.org/a.js></script>'></iframe>", "asks //a.org/a.js"),
+        ("<p id='p'><iframe srcdoc='<a href=#p>b</a>'></iframe>", "#p: no such place"),
+        (
+            "<iframe srcdoc='<iframe srcdoc=&quot;<style>p{src:url(//a.org/f)}</style>&quot;>'>",
+            "asks //a.org/f",
+        ),
         ("<img src='style.css'>", "image style.css has no alternative text"),
         ("<img src='style.css' alt='a_1.png'>", "image style.css has no alternative text"),
     ],
@@ -311,6 +328,35 @@ def test_a_whole_site_has_no_faults(tmp_path):
 def test_each_fault_of_a_site_is_found(tmp_path, body, fault):
     (found,) = links.check_site(write_site(tmp_path, body))[0]
     assert found.startswith("index.html: ") and fault in found
+
+
+def test_what_only_looks_like_a_load_is_none(tmp_path):
+    body = (
+        "<style>/* url(https://example.org/a) */ @namespace url(http://www.w3.org/2000/svg);"
+        "p { background: url('data:image/svg+xml,<svg/>'), url( sub/other.html ) }</style>"
+        "<img alt='a dot' srcset='data:image/png;base64,AA== 1x,\n sub/other.html 2x'>"
+        "<script>let a = 'url(//example.org/b)';</script><code>@import 'gone.css'</code>"
+        "<iframe srcdoc=\"<p id='q'><a href='#q'>a</a> <a href='sub/other.html#here'>b</a>\">"
+        "</iframe><iframe srcdoc=''></iframe>"
+    )
+    assert links.check_site(write_site(tmp_path, body)) == ([], 0)
+
+
+def test_style_sheets_are_followed_from_where_they_stand(tmp_path):
+    write_site(tmp_path, "<p>")
+    sheet = tmp_path / "sub" / "own.css"
+    sheet.write_text("@import url(../style.css); @font-face { src: url(../f.woff2?v=1#x) }")
+    assert links.check_site(tmp_path)[0] == ["sub/own.css: ../f.woff2?v=1#x leads nowhere"]
+    (tmp_path / "f.woff2").write_bytes(b"")
+    assert links.check_site(tmp_path)[0] == []
+    sheet.write_text("@import '//example.org/a.css'; p { background: URL('../../x.png') }")
+    assert links.check_site(tmp_path) == (
+        [
+            "sub/own.css: ../../x.png leads out of the site's folder",
+            "sub/own.css: asks //example.org/a.css from outside",
+        ],
+        1,
+    )
 
 
 def test_the_checker_ends_with_its_verdict(tmp_path, capsys):

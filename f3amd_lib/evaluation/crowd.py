@@ -178,8 +178,8 @@ def plan_crowd(
       pace: of all, or of each, [B], m/s.
       seed: of all choices.
       min_distance: metres between any two characters at every frame.
-      radius: of the disc that holds the starting places, metres; by default as large as it has to
-        be.
+      radius: of the disc that holds the starting places, metres; they fill it only if they have
+        to. By default it is as large as it has to be.
       names: of `paths.NAMES` to draw from.
 
     Returns:
@@ -291,7 +291,8 @@ def generate_crowd(
       out: folder to write to (see the module's table); new, empty, or of this call when stopped.
       styles: names, taken in turn; by default all that the model knows and has starting poses for.
       paths: name or names of paths to draw from (see `crowd_paths`), or a function of its first
-        four arguments and with its result.
+        four arguments and with its result. A call that goes on must give the first character the
+        path that it had.
       min_distance: metres that paths keep from each other at every frame, all planned before the
         first chunk is made (see `crowd_planning`); None lets characters walk through one another.
       seed: of paths, starting poses and noise, 0 or more.
@@ -304,7 +305,8 @@ def generate_crowd(
 
     Raises:
       ValueError: for counts below 1 (2 frames), an unknown style or path, paths of a wrong shape, a
-        folder with anything else in it, or too little room on the disk.
+        folder with anything else in it (a crowd of another call, for one), or too little room on
+        the disk.
       ArithmeticError: if the model generates a number that is not finite.
     """
     trained, skeleton = generator.trained, generator.trained.skeleton
@@ -350,18 +352,26 @@ def generate_crowd(
     }
     settings = json.loads(json.dumps(settings))
     out = Path(out)
-    finished = _look_into(out, settings, overwrite)
+    finished, first_path = _look_into(out, settings, overwrite)
     _check_room(out, settings)
+
+    def asked_of(part: range):
+        style_index = in_turn[np.arange(part.start, part.stop) % len(in_turn)]
+        pace, pose = _paces(generator, part, style_index, seed)
+        made = make_paths(part, pace, num_frames, seed)
+        return style_index, pose, *_checked(made, (len(part), num_frames))
+
     if min_distance is not None:
-        everybody = range(num_characters)
-        pace, _ = _paces(
-            generator, everybody, in_turn[np.arange(num_characters) % len(in_turn)], seed
-        )
-        wanted = _checked(
-            make_paths(everybody, pace, num_frames, seed), (num_characters, num_frames)
-        )
+        _, _, *wanted = asked_of(range(num_characters))
         planned = keep_apart(*wanted, min_distance=min_distance, fps=_FPS)
         make_paths = lambda part, *_: tuple(array[part.start : part.stop] for array in planned)
+    beginning = asked_of(range(chunk))
+    settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
+    if first_path not in (None, settings[_FIRST_PATH]):
+        raise ValueError(
+            f"{out}: holds a crowd whose first character walks another path than this call's; "
+            "give the paths that it was begun with, pass overwrite=True, or choose another folder"
+        )
     if finished == 0:
         _write_settings(out, settings, 0)
     noise = jax.random.key(seed)
@@ -374,11 +384,8 @@ def generate_crowd(
         )
         for first in range(finished, num_characters, chunk):
             characters = range(first, min(first + chunk, num_characters))
-            style_index = in_turn[np.arange(first, characters.stop) % len(in_turn)]
-            pace, pose = _paces(generator, characters, style_index, seed)
-            position, yaw = _checked(
-                make_paths(characters, pace, num_frames, seed), (len(characters), num_frames)
-            )
+            asked = asked_of(characters) if first else beginning
+            style_index, pose, position, yaw = asked
             history = _starting_poses(generator, style_index, position, yaw, pose)
             # The last chunk is filled up with its last character, so that nothing compiles twice.
             number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
@@ -477,6 +484,15 @@ def _checked(made, expected: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return position, yaw
 
 
+def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
+    """Return a digest of one path, [F, 2] and [F], in tenths of a millimetre and milliradian.
+
+    The same path worked out on another machine may differ in its last bits.
+    """
+    tenths = np.rint(1e4 * np.column_stack([position, yaw])).astype("<i8")
+    return hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
+
+
 def _paces(generator: MotionGenerator, characters: range, style_index, seed: int):
     """Draw each character's pace from the starting poses of its style.
 
@@ -510,6 +526,7 @@ def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw
 
 
 _SETTINGS = "crowd.json"
+_FIRST_PATH = "first_path"  # digest; crowds of earlier versions lack it
 _NEEDED = ("num_characters", "num_frames", "num_finished", "fps", "styles", "joints", "offsets")
 
 
@@ -537,20 +554,24 @@ def _write_settings(folder: Path, settings: dict, finished: int) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _look_into(out: Path, settings: dict, overwrite: bool) -> int:
-    """Return how many characters of this very crowd are finished; ValueError for anything else."""
+def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | None]:
+    """Return how far this very crowd has come; ValueError for anything else.
+
+    Returns:
+      (number of finished characters, digest of the first one's path if it is known).
+    """
     if not out.exists():
-        return 0
+        return 0, None
     if not out.is_dir():
         raise ValueError(f"{out}: not a folder; a crowd needs one to itself")
     if not (out / _SETTINGS).exists():
         other = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
         if other:
             raise ValueError(f"{out}: holds other files ({other[0]}); choose a folder of its own")
-        return 0
+        return 0, None
     there = _read_settings(out)  # also before overwriting: what is not ours stays
     if overwrite:
-        return 0
+        return 0, None
     finished = there.pop("num_finished")
     for name in settings:
         if there.get(name) != settings[name]:
@@ -564,7 +585,7 @@ def _look_into(out: Path, settings: dict, overwrite: bool) -> int:
             f"{out}: holds this crowd already, finished; read it with read_crowd, pass "
             "overwrite=True, or choose another folder"
         )
-    return finished
+    return finished, there.get(_FIRST_PATH)
 
 
 def _row(name: str, settings: dict) -> tuple[np.dtype, tuple[int, ...]]:

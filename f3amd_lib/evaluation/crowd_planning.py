@@ -5,9 +5,10 @@ who would come too close at time t* step aside: each path is bent away from the 
 bump around t*, along the line that joins them at their closest, which is square to their relative
 motion. That is repeated until no two are too close at any frame. Bumps change how fast somebody
 walks. Who would have to hurry or dawdle out of bounds gets the old path back, and from then on is
-moved aside as a whole. If the crowd is too dense to be untangled even so, starting places are moved
-apart a little and all begins anew. So it ends: places that lie farther apart than two paths are
-long need no bump at all.
+moved aside as a whole. Starting places of a crowd that has to be untangled are moved apart before
+that, by 1.44, and again as long as it is too dense even so. So it ends: places that lie farther
+apart than two paths are long need no bump at all. Within a given radius they are moved apart only
+if they cannot stay where they are, and no farther than it allows.
 
 Nothing is left to chance or to a proof: `keep_apart` measures every frame of what it returns.
 Networks follow paths to a few centimetres, so that generated characters keep a little less distance
@@ -80,14 +81,14 @@ def keep_apart(
       position: paths that know nothing of each other, [B, F, 2], metres.
       yaw: their facing, [B, F], radians; turned with the line.
       min_distance: metres between any two roots at any frame.
-      radius: all starting places stay within this distance of their middle; by default they take
-        the room they need.
+      radius: all starting places stay within this distance of their middle, metres; they are
+        spread no wider than they have to be. By default they take the room they need.
       fps: frames per second.
 
     Returns:
       (position [B, F, 2], yaw [B, F]), float64; the same for the same input. Every character's
-      speed lies within `SPEED_BOUNDS` of its own, and paths that keep apart already come back
-      unchanged.
+      speed lies within `SPEED_BOUNDS` of its own. Paths that keep apart already come back
+      unchanged, unless they start outside the radius.
 
     Raises:
       ValueError: for arrays that do not fit, a distance that is not above 0, or a radius within
@@ -102,16 +103,18 @@ def keep_apart(
         raise ValueError(f"fps must be above 0, got {fps}")
     if radius is not None:
         _check_room(len(position), min_distance, radius)
-    elif closest_approach(position).min() >= min_distance:
-        return position.copy(), yaw.copy()
     start = position[:, 0]
     middle = 0.5 * (start.min(axis=0) + start.max(axis=0))
     places, walked = start - middle, position - position[:, :1]
     reach = float(np.linalg.norm(places, axis=-1).max())
+    if (radius is None or reach <= radius) and closest_approach(position).min() >= min_distance:
+        return position.copy(), yaw.copy()
     spreads = _SPREADS[2 if len(position) > _LARGE else 0 :]
     if radius is not None:
-        # Nearly as wide as it may be, for stepping aside moves starting places, too.
-        spreads = np.array(_TIGHTER) * (radius / reach if reach > 0 else 1.0)
+        widest = radius / reach if reach > 0 else 1.0
+        wider = np.concatenate([[1.0], spreads])
+        # In the end nearly as wide as it may be, for stepping aside moves starting places, too.
+        spreads = np.concatenate([wider[wider < widest], widest * np.array(_TIGHTER)])
     for spread in spreads:
         wanted = middle + spread * places[:, None] + walked
         bent = _untangle(wanted, min_distance, fps)

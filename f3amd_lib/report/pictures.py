@@ -1,7 +1,8 @@
 """Motion as pictures: film strips for the page, small GIFs for the eye.
 
 Both draw stick figures in the same colours (`stick_figures`), with a green dot under a toe that is
-in contact.
+in contact. Of a skeleton whose toes are not known no contacts are shown; one whose hips are not
+known is taken to face +Z, and no facing is drawn.
 """
 
 from __future__ import annotations
@@ -67,6 +68,31 @@ def _per_motion(value, count: int, what: str) -> list:
     return list(value)
 
 
+def _facing(motion: Motion) -> np.ndarray | None:
+    """Yaw per frame, [T], or None where the skeleton's hips are not known."""
+    try:
+        motion.skeleton.role("left_hip"), motion.skeleton.role("right_hip")
+    except ValueError:
+        return None
+    return motion.yaw
+
+
+def _toes(motion: Motion) -> tuple[int, ...]:
+    """The left and the right toe joint, or none where they are not known."""
+    try:
+        return motion.skeleton.toes
+    except ValueError:
+        return ()
+
+
+def _touching(motion: Motion, frames) -> list[list[int]]:
+    """Toes in contact at each frame that is asked for."""
+    toes = _toes(motion)
+    if not toes:
+        return [[] for _ in frames]
+    return [[toes[foot] for foot in np.flatnonzero(row)] for row in motion.contacts[frames]]
+
+
 def film_strip(
     motions,
     *,
@@ -115,6 +141,7 @@ def film_strip(
         width_ratios=[0.96 * count, 2.9],
     )
     with plot_style():
+        contacts = any(_toes(motion) for motion in motions)
         for row, motion in enumerate(motions):
             if frames is None:
                 chosen = np.linspace(0, motion.num_frames - 1, count).round().astype(int)
@@ -126,7 +153,9 @@ def film_strip(
                         f"for {chosen.min()} to {chosen.max()}"
                     )
             title = titles[row] if titles[row] is not None else motion.name
-            _draw_poses(axes[row, 0], motion, chosen, np.deg2rad(around_deg), slot, row == 0)
+            _draw_poses(axes[row, 0], motion, chosen, np.deg2rad(around_deg), slot)
+            if row == 0:
+                _name_colors(axes[row, 0], contacts)
             axes[row, 0].set_title(title or " ")
             _draw_plan(axes[row, 1], motion, chosen, paths[row], row == 0)
     return figure
@@ -148,13 +177,15 @@ def write_film_strip(path, motions, **options) -> Path:
     return save_figure(film_strip(motions, **options), path)
 
 
-def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend: bool) -> None:
+def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float) -> None:
     points = drawn_points(motion, chosen)
     heads = head_center(motion.skeleton, points)
-    facing = gaussian_filter1d(np.unwrap(motion.yaw), 0.3 * motion.fps, mode="nearest")[chosen]
-    contacts = motion.contacts[chosen]
+    yaw = _facing(motion)
+    facing = np.zeros(len(chosen))
+    if yaw is not None:
+        facing = gaussian_filter1d(np.unwrap(yaw), 0.3 * motion.fps, mode="nearest")[chosen]
+    touching = _touching(motion, chosen)
     bones = bones_of(motion.skeleton)
-    toes = motion.skeleton.toes
     axis.axhline(0.0, color=_GROUND, linewidth=1.0, zorder=0)
     top = 1.7
     for place in range(len(chosen)):
@@ -187,18 +218,17 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend
                 zorder=5 + center[2],
             )
             top = max(top, center[1] + 0.15)
-        for foot, toe in enumerate(toes):
-            if contacts[place, foot]:
-                axis.plot(
-                    left + seen[toe, 0],
-                    seen[toe, 1],
-                    "o",
-                    color=CONTACT_COLOR,
-                    markersize=5,
-                    markeredgecolor="white",
-                    markeredgewidth=0.6,
-                    zorder=9,
-                )
+        for toe in touching[place]:
+            axis.plot(
+                left + seen[toe, 0],
+                seen[toe, 1],
+                "o",
+                color=CONTACT_COLOR,
+                markersize=5,
+                markeredgecolor="white",
+                markeredgewidth=0.6,
+                zorder=9,
+            )
         seconds = chosen[place] / motion.fps
         axis.text(left, -0.14, f"{place + 1}", ha="center", va="top", fontsize=8, fontweight="bold")
         axis.text(
@@ -208,22 +238,26 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float, legend
     axis.set_ylim(-0.5, top)
     axis.set_aspect("equal", adjustable="box", anchor="W")
     axis.axis("off")
-    if legend:
-        keys = [
-            axis.plot([], [], color=LIMB_COLORS["left"], linewidth=3, label="left")[0],
-            axis.plot([], [], color=LIMB_COLORS["right"], linewidth=3, label="right")[0],
-            axis.plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")[0],
-        ]
-        axis.legend(
-            handles=keys,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=3,
-            borderaxespad=0.2,
-            handlelength=1.2,
-            columnspacing=1.2,
-            fontsize=8,
-        )
+
+
+def _name_colors(axis, contacts: bool) -> None:
+    """Put a legend over the poses, with the dot of a contact if any skeleton has some."""
+    keys = [
+        axis.plot([], [], color=LIMB_COLORS["left"], linewidth=3, label="left")[0],
+        axis.plot([], [], color=LIMB_COLORS["right"], linewidth=3, label="right")[0],
+    ]
+    if contacts:
+        keys += axis.plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
+    axis.legend(
+        handles=keys,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=3,
+        borderaxespad=0.2,
+        handlelength=1.2,
+        columnspacing=1.2,
+        fontsize=8,
+    )
 
 
 def _draw_plan(axis, motion: Motion, chosen, path, legend: bool) -> None:
@@ -238,10 +272,13 @@ def _draw_plan(axis, motion: Motion, chosen, path, legend: bool) -> None:
     axis.plot(*root.T, color=TRAIL_COLOR, linewidth=1.6, label="walked")
     extent = np.ptp(np.concatenate(everything), axis=0).max()
     reach = 0.09 * max(extent, 1.0)
-    arrow = np.stack([np.sin(motion.yaw[chosen]), np.cos(motion.yaw[chosen])], axis=-1)
+    yaw = _facing(motion)
+    facing = np.zeros(len(chosen)) if yaw is None else yaw[chosen]
+    arrow = np.stack([np.sin(facing), np.cos(facing)], axis=-1)
     for place, frame in enumerate(chosen):
         start, end = root[frame], root[frame] + reach * arrow[place]
-        axis.plot(*np.stack([start, end]).T, color="#1A1A1A", linewidth=1.4)
+        if yaw is not None:
+            axis.plot(*np.stack([start, end]).T, color="#1A1A1A", linewidth=1.4)
         axis.plot(*start, "o", color="#1A1A1A", markersize=3.5)
         beside = start - 0.8 * reach * np.array([arrow[place, 1], -arrow[place, 0]])
         axis.text(*beside, f"{place + 1}", fontsize=7, ha="center", va="center")
@@ -381,12 +418,13 @@ def _draw_panel(motion: Motion, frames, target, title: str, size, around: float)
     frames = np.minimum(frames, motion.num_frames - 1)
     points = drawn_points(motion, frames)
     heads = head_center(motion.skeleton, points)
-    contacts = motion.contacts[frames]
+    touching = _touching(motion, frames)
     bones = bones_of(motion.skeleton)
-    toes = motion.skeleton.toes
     root = np.asarray(motion.root_position, dtype=np.float64)
     follow = gaussian_filter1d(root, 0.25 * motion.fps, axis=0, mode="nearest")[frames]
-    camera = _Camera(motion.yaw[0], around, np.deg2rad(14.0), (size[0] * scale, size[1] * scale))
+    yaw = _facing(motion)
+    first = 0.0 if yaw is None else yaw[0]
+    camera = _Camera(first, around, np.deg2rad(14.0), (size[0] * scale, size[1] * scale))
     ground_target = None if target is None else _on_ground(path_on_ground(target))
     trail = _on_ground(root[:, [0, 2]])
     font = ImageFont.load_default(size=12 * scale)
@@ -405,7 +443,7 @@ def _draw_panel(motion: Motion, frames, target, title: str, size, around: float)
             points[place],
             None if heads is None else heads[place],
             bones,
-            [toe for foot, toe in enumerate(toes) if contacts[place, foot]],
+            touching[place],
             scale,
         )
         draw.text((8 * scale, 6 * scale), title, fill="#1A1A1A", font=font)

@@ -614,6 +614,13 @@
     request();
   }
 
+  // For those who do not drag: a tenth of the panel to a side (of the reader) or over the ground.
+  function moveView(right, forward) {
+    const [panel] = panels;
+    const step = 0.1 * Math.min(panel.width, panel.height);
+    panBy(panel, -right * step, forward * step);
+  }
+
   // From above, +Z is up the page and +X to the left, as in the film strips' plans.
   function setTop(top) {
     if (top && !view.top) {
@@ -734,6 +741,7 @@
     }, { passive: false });
   }
 
+  const sheet = byId("sheet");
   const keys = {
     " ": () => setPlaying(!clock.playing),
     ArrowLeft: (event) => stepBy(event.shiftKey ? -Math.round(data.fps) : -1),
@@ -746,14 +754,36 @@
     "=": () => zoomBy(1.2),
     "-": () => zoomBy(1 / 1.2),
     0: () => resetView(),
-    a: () => orbit(-0.12, 0),
-    d: () => orbit(0.12, 0),
-    w: () => orbit(0, 0.08),
-    s: () => orbit(0, -0.08),
+    a: (event) => (event.shiftKey ? moveView(-1, 0) : orbit(-0.12, 0)),
+    d: (event) => (event.shiftKey ? moveView(1, 0) : orbit(0.12, 0)),
+    w: (event) => (event.shiftKey ? moveView(0, 1) : orbit(0, 0.08)),
+    s: (event) => (event.shiftKey ? moveView(0, -1) : orbit(0, -0.08)),
     f: () => setFollow(!view.follow),
     t: () => setTop(!view.top),
-    Escape: () => document.querySelector(".keys").removeAttribute("open"),
+    Escape: () => {
+      if (sheet.contains(document.activeElement)) byId("keys").querySelector("summary").focus();
+      byId("keys").removeAttribute("open");
+    },
   };
+
+  const TURN = Math.PI / 12; // of one press of a button
+  const presses = {
+    "orbit-left": () => orbit(-TURN, 0),
+    "orbit-right": () => orbit(TURN, 0),
+    "orbit-up": () => orbit(0, TURN),
+    "orbit-down": () => orbit(0, -TURN),
+    "move-left": () => moveView(-1, 0),
+    "move-right": () => moveView(1, 0),
+    "move-forward": () => moveView(0, 1),
+    "move-back": () => moveView(0, -1),
+  };
+
+  function showPad() {
+    const button = byId("turn");
+    const open = button.getAttribute("aria-expanded") !== "true";
+    button.setAttribute("aria-expanded", String(open));
+    byId("pad").hidden = !open;
+  }
 
   function listen() {
     panels.forEach(listenTo);
@@ -761,6 +791,7 @@
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       const where = event.target.tagName;
       if (where === "SELECT") return; // has keys of its own
+      if (event.key !== "Escape" && sheet.contains(event.target)) return; // they scroll it
       if (event.key === " " && (where === "BUTTON" || where === "SUMMARY")) return;
       const act = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
       if (!act) return;
@@ -775,6 +806,8 @@
     byId("follow").addEventListener("click", () => setFollow(!view.follow));
     byId("top").addEventListener("click", () => setTop(!view.top));
     byId("reset").addEventListener("click", resetView);
+    byId("turn").addEventListener("click", showPad);
+    for (const [name, act] of Object.entries(presses)) byId(name).addEventListener("click", act);
     byId("speed").addEventListener("change", (event) => setSpeed(Number(event.target.value)));
     scrub.addEventListener("pointerdown", () => { clock.scrubbing = true; });
     for (const name of ["pointerup", "pointercancel", "change"]) {

@@ -8,7 +8,7 @@ Limbs are drawn as lines on a 2D canvas by code of our own. The alternative was 
 well kept and would bring depth, lights and meshes, none of which a stick figure needs. Its parts
 for lines wider than a pixel and a camera to orbit (renderer, `LineSegments2`, `OrbitControls`)
 bundle to 583 kB minified (0.187.0), in every page, where a notebook is held under 250 kB; ours
-takes 28 kB. And each player would take a WebGL context, of which browsers allow about
+takes 29 kB. And each player would take a WebGL context, of which browsers allow about
 16 at a time: fewer than the players of a long notebook, and none where there is no GPU.
 
 How motion is stored (`"version": 1`). The page holds a JSON object with titles, skeletons, frame
@@ -247,10 +247,11 @@ def write_player(path, scenes, *, strip: bool = True, overwrite: bool = True, **
     if taken and not overwrite:
         raise ValueError(f"{', '.join(taken)}: exists already; pass overwrite=True or another path")
     page = player_page(scenes, **options)
+    figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
     if strip:
-        save_figure(scenes_strip(scenes), targets[1])
+        save_figure(figure, targets[1])
     return path
 
 

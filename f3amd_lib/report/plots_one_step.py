@@ -125,9 +125,15 @@ def answers_against_sigma(table: pd.DataFrame):
       table: from `posterior.posterior_table`, with at least one model; a panel for each.
     """
     models = [name for name in table["model"].unique() if name != "real"]
-    figure, axes = new_figure(9.0, 3.5, 1, len(models), sharey=True, squeeze=False)
+    across = min(3, len(models))
+    down = -(-len(models) // across)
+    figure, axes = new_figure(
+        9.0, 0.6 + 2.8 * down, down, across, sharex=True, sharey=True, squeeze=False
+    )
     real = table[table["model"] == "real"].iloc[-1]
-    for axis, model in zip(axes[0], models, strict=True):
+    for axis in axes.flat[len(models) :]:
+        axis.axis("off")
+    for axis, model in zip(axes.flat, models, strict=False):
         color = model_style(model).color
         looks = {"error": ("o", "-", color), "answer spread": ("s", "--", PALETTE["vermilion"])}
         for quantity, (marker, line, tone) in looks.items():
@@ -142,8 +148,11 @@ def answers_against_sigma(table: pd.DataFrame):
         axis.set_xscale("log")
         axis.set_ylim(bottom=0)
         axis.set_title(model)
+    for axis in axes.flat[max(0, len(models) - across) : len(models)]:
         axis.set_xlabel("noise level σ")
-    axes[0, 0].set_ylabel("joints relative to the root (cm)")
+        axis.tick_params(labelbottom=True)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("joints relative\nto the root (cm)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 

@@ -298,11 +298,12 @@ def test_a_focused_button_or_slider_obeys_once(browser, alone):
 
 def test_every_control_has_a_name(browser, alone):
     opened(browser, alone)
+    browser.find("#turn").click()
     controls = browser.driver.find_elements(
         "css selector", "button, input, select, canvas, summary"
     )
     names = [control.accessible_name for control in controls]
-    assert len(names) >= 11 and all(names)
+    assert len(names) >= 20 and all(names)
     assert len(set(names)) == len(names)
 
 
@@ -330,6 +331,87 @@ def test_dragging_orbits_and_the_wheel_zooms(browser, alone):
     browser.find("#reset").click()
     again = browser.script("return {...player.view}")
     assert again == before
+
+
+def press(browser, letter: str, shift: bool = False) -> dict:
+    """The view after a letter key, with or without shift."""
+    key = letter.upper() if shift else letter
+    for kind in ("keyDown", "keyUp"):
+        browser.command(
+            "Input.dispatchKeyEvent",
+            type=kind,
+            key=key,
+            code=f"Key{letter.upper()}",
+            modifiers=8 if shift else 0,
+        )
+    return browser.script("return {...player.view}")
+
+
+def test_keys_orbit_and_with_shift_move_the_view(browser, alone):
+    opened(browser, alone)
+    before = browser.script("return {...player.view}")
+    assert press(browser, "d")["around"] == pytest.approx(before["around"] + 0.12)
+    assert press(browser, "a")["around"] == pytest.approx(before["around"])
+    picture = pixels(browser)
+    moved = press(browser, "d", shift=True)
+    assert moved["around"] == pytest.approx(before["around"])
+    # To the reader's right, and ahead, away from the eye: each is square to the other.
+    around = moved["around"]
+    right, ahead = (
+        np.array(way)
+        for way in ((np.cos(around), -np.sin(around)), (-np.sin(around), -np.cos(around)))
+    )
+    step = np.array([moved["panX"], moved["panZ"]])
+    assert step @ right > 0.1 and step @ ahead == pytest.approx(0, abs=1e-9)
+    settled(browser)
+    assert (pixels(browser) != picture).any()
+    further = press(browser, "w", shift=True)
+    step = np.array([further["panX"], further["panZ"]]) - step
+    assert step @ ahead > 0.1 and step @ right == pytest.approx(0, abs=1e-9)
+    press(browser, "a", shift=True)
+    again = press(browser, "s", shift=True)
+    assert (again["panX"], again["panZ"]) == pytest.approx((0, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_buttons_orbit_and_move_the_view_without_a_drag(browser, alone, screenshots, size):
+    browser.resize(*size, phone=size == PHONE)
+    opened(browser, alone)
+    turn = browser.find("#turn")
+    assert turn.get_attribute("aria-expanded") == "false"
+    assert not browser.find("#orbit-left").is_displayed()
+    turn.click()
+    assert turn.get_attribute("aria-expanded") == "true"
+    before = browser.script("return {...player.view}")
+
+    def view_after(name):
+        browser.find(f"#{name}").click()
+        return browser.script("return {...player.view}")
+
+    assert view_after("orbit-right")["around"] == pytest.approx(before["around"] + np.pi / 12)
+    assert view_after("orbit-left")["around"] == pytest.approx(before["around"])
+    assert view_after("orbit-up")["elevation"] == pytest.approx(before["elevation"] + np.pi / 12)
+    assert view_after("orbit-down")["elevation"] == pytest.approx(before["elevation"])
+    steps = []
+    for name in ("move-right", "move-left", "move-forward", "move-back"):
+        start = browser.script("return {...player.view}")
+        end = view_after(name)
+        steps.append([end["panX"] - start["panX"], end["panZ"] - start["panZ"]])
+    right, left, forward, back = np.array(steps)
+    assert np.linalg.norm(right) > 0.1 and np.linalg.norm(forward) > 0.1
+    np.testing.assert_allclose([left, back], [-right, -forward], atol=1e-9)
+    name = "phone" if size == PHONE else "desktop"
+    browser.screenshot(screenshots / f"player_turn_{name}.png")
+    for button in browser.driver.find_elements("css selector", "#pad button"):
+        box = button.rect  # large enough for a finger, and inside the window
+        assert min(box["width"], box["height"]) >= 24
+        assert box["x"] >= 0 and box["x"] + box["width"] <= size[0]
+        assert box["y"] + box["height"] <= size[1]
+    assert browser.script("return document.documentElement.scrollWidth") <= size[0]
+    assert browser.script("return document.documentElement.scrollHeight") <= size[1]
+    turn.click()
+    assert not browser.find("#pad").is_displayed()
+    assert browser.errors() == []
 
 
 def test_touch_orbits_and_pinches(browser, alone):
@@ -383,6 +465,31 @@ def test_the_list_of_keys_opens_inside_the_page_and_closes(browser, alone):
         assert box["y"] >= 0 and box["y"] + box["height"] <= browser.find("#controls").rect["y"]
         browser.keys("Escape")
         assert not browser.find(".sheet").is_displayed()
+
+
+def test_the_list_of_keys_is_scrolled_by_its_own_keys(browser, alone):
+    browser.resize(640, 320)  # as in a notebook
+    opened(browser, alone)
+    browser.find("summary").click()
+    scrolled = "return document.querySelector('.sheet').scrollTop"
+    assert browser.script(
+        "const sheet = document.querySelector('.sheet');"
+        "return sheet.scrollHeight > sheet.clientHeight + 20"
+    )
+    browser.keys("Tab")
+    assert browser.script("return document.activeElement.className") == "sheet"
+    before = state(browser)
+    browser.keys("ArrowDown")
+    browser.wait(f"{scrolled} > 0")
+    browser.keys("End", " ")
+    after = state(browser)
+    for name in ("speed", "frame", "playing"):
+        assert after[name] == before[name], name
+    browser.keys("Escape")  # but this one still closes it, and the focus is not lost
+    assert not browser.find(".sheet").is_displayed()
+    assert browser.script("return document.activeElement.tagName") == "SUMMARY"
+    browser.keys("ArrowDown")
+    assert state(browser)["speed"] == 0.5
 
 
 # ------------------------------------------------------------------------------------ surroundings
