@@ -254,5 +254,5 @@ def test_a_training_that_diverges_says_so(trained, monkeypatch):
         toy, "_train", lambda *a: (trained[0], np.array([1.0, 2.0, np.inf, np.nan]))
     )
     recipe = toy.fork_recipe(PRESERVING, 400, batch_size=16, learning_rate=8e-3)
-    with pytest.raises(ArithmeticError, match="at step 2: lower the learning rate 0.008"):
+    with pytest.raises(ArithmeticError, match="at step 3: lower the learning rate 0.008"):
         toy.train_fork(SMALL, recipe, latent_width=8, depth=1)

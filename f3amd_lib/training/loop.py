@@ -610,12 +610,11 @@ class Trainer:
                 if due and held_out is not None:
                     measured = self.held_out_terms(state.ema, held_out)
                     row.update({f"held_out_{name}": value for name, value in measured.items()})
+                if due and checkpoint is not None:
+                    self.save(Path(checkpoint), state)
                 history.append(row)
                 if on_chunk is not None:
                     on_chunk(row)
-                # After the row: one that the state has not reached yet is dropped on resuming.
-                if due and checkpoint is not None:
-                    self.save(Path(checkpoint), state)
                 bar.update(length)
                 bar.set_postfix(loss=f"{row['loss']:.4f}")
                 if late:

@@ -266,19 +266,19 @@ def train(
         if parallel.is_first_process():
             _set_aside(files)  # a finished model without its state cannot be gone on with
     else:
-        if not files.history.exists():
-            raise ValueError(
-                f"{files.state}: its loss history {files.history.name} is missing; put it back "
-                "beside it, or move the state away to start anew"
-            )
         state = trainer.restore(files.state)
         if not parallel.same_everywhere(int(state.step)):
             raise ValueError(
                 f"{files.state}: processes found different steps in it; processes that train "
                 "together need one folder that all of them see (--out)"
             )
-        earlier, _ = read_table(files.history)
-        rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
+        if files.history.exists():
+            earlier, _ = read_table(files.history)
+            rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
+        else:  # it is written after the state: a run may be killed between the two
+            log.warning(
+                "%s is missing: losses of the first %d steps are lost", files.history, state.step
+            )
 
     def keep(row: dict) -> None:
         rows.append(row)
