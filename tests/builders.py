@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import num_channels
@@ -221,3 +222,14 @@ def tiny_trained(record=None, config=None, diffusion=None, **changes) -> Trained
         seeds=seed_histories(packed, num_history=HISTORY),
         record={"note": "made by hand"} if record is None else record,
     )
+
+
+def cut_off(png) -> bool:
+    """Whether something dark touches the edge of a picture: a title or a label without its rest.
+
+    Args:
+      png: path or file object of a PNG.
+    """
+    with Image.open(png) as image:
+        grey = np.asarray(image.convert("L"))
+    return bool((np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]]) < 160).any())

@@ -4,13 +4,18 @@ nbval checks that the notebooks still compute what they show; here is what it ca
 """
 
 import ast
+import base64
+import io
 import json
 import re
 import subprocess
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
+from builders import cut_off
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -141,6 +146,34 @@ def test_standalone_notebook_is_fit_to_be_read(path):
 def test_notebooks_are_numbered_without_gaps():
     assert NOTEBOOKS, "there are no notebooks"
     assert [path.name[:2] for path in NOTEBOOKS] == [f"{i:02d}" for i in range(len(NOTEBOOKS))]
+
+
+def test_no_committed_figure_is_cut_off():
+    figures = [
+        path for path in tracked_files() if path.suffix == ".png" and "figures" in path.parts
+    ]
+    assert figures
+    assert [path.relative_to(ROOT).as_posix() for path in figures if cut_off(path)] == []
+
+
+def test_no_picture_of_a_notebook_is_cut_off():
+    pictures = [
+        (f"{path.name}, cell {cell.id}", base64.b64decode("".join(output.data["image/png"])))
+        for path in NOTEBOOKS + STANDALONE
+        for cell in nbformat.read(path, as_version=4).cells
+        for output in cell.get("outputs", [])
+        if "image/png" in output.get("data", {})
+    ]
+    assert pictures
+    assert [where for where, png in pictures if cut_off(io.BytesIO(png))] == []
+
+
+@pytest.mark.parametrize("margin, expected", [(3, False), (-3, True)])
+def test_a_cut_off_picture_is_found(tmp_path, margin, expected):
+    grey = np.full((40, 60), 255, np.uint8)
+    grey[max(margin, 0) : 12 + margin, 10:30] = 0
+    Image.fromarray(grey).save(tmp_path / "picture.png")
+    assert cut_off(tmp_path / "picture.png") is expected
 
 
 def test_repository_holds_nothing_it_should_not():

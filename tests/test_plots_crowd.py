@@ -70,6 +70,11 @@ def test_shades_begin_with_the_model_and_neighbours_differ():
     assert all(shade[1] > shade[0] for shade in shades)  # still the green of CAMDM
 
 
+def test_a_crowd_of_a_narrow_network_is_not_pale():
+    assert group_shades("F3AMD-FNO-32-plus", 5) == group_shades("F3AMD-FNO-96-plus", 5)
+    assert group_shades("F3AMD-FNO-128", 1) != group_shades("F3AMD-FNO-96", 1)
+
+
 # --- perspective -------------------------------------------------------------------------------
 
 

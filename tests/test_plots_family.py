@@ -26,6 +26,8 @@ def test_held_out_curves_leave_out_what_was_not_measured():
     np.testing.assert_array_equal(line.get_ydata(), [4.0, 1.0])
     assert line.get_color() == model_style("CAMDM").color
     assert figure.axes[1].get_yscale() == "log"
+    figure.draw_without_rendering()
+    assert {"100", "200"} <= {label.get_text() for label in figure.axes[0].get_xticklabels()}
     with pytest.raises(ValueError, match="CAMDM has no column 'windows'"):
         plots_family.held_out_curves({"CAMDM": history.drop(columns="windows")})
 

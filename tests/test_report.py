@@ -11,13 +11,14 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from builders import cut_off
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 from f3amd_lib.evaluation.paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_euler, matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.report import figures, papers, pictures, records, stick_figures, tables
+from f3amd_lib.report import figures, papers, pictures, plots, records, stick_figures, tables
 
 
 def make_motion(num_frames=120, fps=30.0, name="test walk"):
@@ -383,6 +384,33 @@ def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
         assert not {"Software", "Creation Time", "date"} & set(image.info)
     with pytest.raises(ValueError, match=r"written as \.png"):
         draw(tmp_path / "figure.pdf")
+
+
+def test_titles_and_labels_of_fixed_aspect_are_not_cut_off(tmp_path):
+    """One layout is not enough: it does not know yet how much room a fixed aspect leaves."""
+    with figures.plot_style():
+        figure, axes = figures.new_figure(8.8, 3.2, 1, 3, sharey=True)
+        for axis in axes:
+            axis.set(title="title", xlabel="label", aspect="equal", xlim=(-3, 3), ylim=(-3, 3))
+    assert not cut_off(figures.save_figure(figure, tmp_path / "fixed.png"))
+
+
+def test_many_styles_stand_below_the_histograms():
+    def draw(count):
+        rows = [
+            {"style": f"s{k}", "mean_speed_m_s": k / 50, "turn_deg_s": 9.0 + k % 7}
+            | {"toe_contact_fraction": 0.3 + 0.01 * (k % 30)}
+            for k in range(count)
+        ]
+        return plots.clip_statistics_figure(pd.DataFrame(rows))
+
+    few, many = draw(5), draw(61)
+    assert [len(figure.axes) for figure in (few, many)] == [3, 4]
+    assert many.get_figheight() < 10
+    # The fastest stands on top of the left column; no style is left out.
+    left, right = ([label.get_text() for label in a.get_yticklabels()] for a in many.axes[2:])
+    assert left[0] == "s60" and right[-1] == "s0" and len(left + right) == 61
+    assert many.axes[2].yaxis_inverted()
 
 
 # ------------------------------------------------------------------------------------- pictures

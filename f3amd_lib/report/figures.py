@@ -190,5 +190,9 @@ def show_figure(figure: Figure, *, dpi: int = 100):
 def _png(figure: Figure, dpi: int) -> bytes:
     buffer = io.BytesIO()
     with plot_style():
+        # Axes of a fixed aspect have their final size only after a first layout, and titles and
+        # labels are kept inside the picture only by a second one.
+        if any(axis.get_aspect() != "auto" for axis in figure.axes):
+            figure.draw_without_rendering()
         figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()

@@ -387,6 +387,9 @@ def turned_windows(history, future):
     return figure
 
 
+_STYLES_BESIDE = 30  # As many boxes stand beside the histograms; more stand below them.
+
+
 @styled
 def clip_statistics_figure(clips: pd.DataFrame):
     """Draw speed, turning and contact share of a table of clips.
@@ -395,8 +398,15 @@ def clip_statistics_figure(clips: pd.DataFrame):
       clips: one row a clip: style, mean_speed_m_s, turn_deg_s, toe_contact_fraction.
     """
     styles = clips.groupby("style")["mean_speed_m_s"].median().sort_values().index
-    height = max(3.4, 0.24 * len(styles) + 1.3)
-    figure, axes = new_figure(8.6, height, 1, 3, width_ratios=[1.0, 1.0, 1.35])
+    if len(styles) <= _STYLES_BESIDE:
+        height = max(3.4, 0.24 * len(styles) + 1.3)
+        figure, axes = new_figure(8.6, height, 1, 3, width_ratios=[1.0, 1.0, 1.35])
+        boxes = axes[2:]
+    else:  # The boxes below, in two columns: beside them the histograms would be towers.
+        rows = -(-len(styles) // 2)
+        heights = [2.4, 0.19 * rows + 0.8]
+        figure, grid = new_figure(8.6, sum(heights), 2, 2, height_ratios=heights)
+        axes, boxes = grid[0], grid[1]
     bins = int(np.clip(len(clips) // 3, 8, 30))
     axes[0].hist(clips["mean_speed_m_s"], bins=bins, color=PALETTE["purple"])
     axes[0].set_xlabel("mean speed (m/s)")
@@ -407,14 +417,17 @@ def clip_statistics_figure(clips: pd.DataFrame):
     axes[1].set_title("how curved")
     for axis in axes[:2]:
         axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-    groups = [clips.loc[clips["style"] == style, "toe_contact_fraction"] for style in styles]
-    axes[2].boxplot(
-        groups, orientation="horizontal", tick_labels=list(styles), widths=0.6,
-        medianprops={"color": PALETTE["vermilion"]}, flierprops={"markersize": 3},
-    )  # fmt: skip
-    axes[2].set_xlim(0, 1)
-    axes[2].set_xlabel("share of toe steps in contact")
-    axes[2].set_title("how grounded")
+    # The fastest stand on top, and in the left column.
+    for axis, shown in zip(boxes, np.array_split(styles[::-1], len(boxes)), strict=True):
+        groups = [clips.loc[clips["style"] == style, "toe_contact_fraction"] for style in shown]
+        axis.boxplot(
+            groups, orientation="horizontal", tick_labels=list(shown), widths=0.6,
+            medianprops={"color": PALETTE["vermilion"]}, flierprops={"markersize": 3},
+        )  # fmt: skip
+        axis.invert_yaxis()
+        axis.set_xlim(0, 1)
+        axis.set_xlabel("share of toe steps in contact")
+    boxes[0].set_title("how grounded")
     return figure
 
 

@@ -7,6 +7,7 @@ limbs cover those behind them by an outline in white, which keeps bodies apart i
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -127,7 +128,9 @@ def group_shades(name: str, count: int) -> list[tuple]:
       name: of the model, see `figures.model_style`.
       count: of characters.
     """
-    base = np.array(matplotlib.colors.to_rgb(model_style(name).color))
+    # A family's full colour: the pale one of its narrow networks is lost among many characters.
+    full = re.sub(r"-(32|48|64)(?!\d)", "-96", name)
+    base = np.array(matplotlib.colors.to_rgb(model_style(full).color))
     light = np.linspace(0.0, 0.5, 5)[(2 * np.arange(count)) % 5]
     return [tuple(base + amount * (1.0 - base)) for amount in light]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from f3amd_lib.report.figures import PALETTE, model_style, new_figure, plot_style
 
@@ -46,8 +46,11 @@ def held_out_curves(histories: Mapping[str, pd.DataFrame]):
                 )
             axis.set(xscale="log", yscale="log", xlabel="windows seen", ylabel="held-out error")
             axis.set_title(title)
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda windows, _: f"{windows:,.0f}"))
             axis.xaxis.set_minor_formatter(NullFormatter())
-        axes[0].legend(fontsize=8)
+            axis.tick_params(axis="x", labelrotation=30)
+        axes[0].legend(fontsize=8, handlelength=3.2)
     return figure
 
 

@@ -109,7 +109,7 @@ def continuation_bars(tables: Mapping[str, pd.DataFrame]):
             axis.annotate(f"{value:.1f}  (histories {apart:.0f} apart)", (end, row), (5, 0),
                           textcoords="offset points", va="center", fontsize=8.5)  # fmt: skip
         axis.set_yticks(place, table["given"])
-        axis.set_xlim(0, 1.75 * table["high"].fillna(table["value"]).max())
+        axis.set_xlim(0, 1.45 * table["high"].fillna(table["value"]).max())
         axis.set_xlabel("spread of continuations (cm)")
         axis.set_title(title)
         axis.grid(axis="y", visible=False)
