@@ -1,7 +1,9 @@
 """Shared fixtures. Tests run on the CPU and never touch the network or the user's own cache."""
 
 import csv
+import importlib.util
 import os
+import shutil
 from pathlib import Path
 
 # Before anything imports JAX or matplotlib.
@@ -19,6 +21,29 @@ import pytest
 
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+
+
+REMEDY = {
+    "sphinx": "make site-tools",
+    "selenium": "make web-tools",
+    "node": "your system's package manager",
+}
+"""What brings an optional part of the tests, where it is not `make bench-tools`."""
+
+
+def pytest_runtest_setup(item):
+    """Skip a test that asks for an optional package, or program, which is not there: by its name."""
+    for marker in item.iter_markers("needs"):
+        for name in marker.args:
+            if shutil.which(name) is None and not _importable(name):
+                pytest.skip(f"{name} is not installed: {REMEDY.get(name, 'make bench-tools')}")
+
+
+def _importable(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # of the package above it
+        return False
 
 
 @pytest.fixture

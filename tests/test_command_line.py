@@ -107,8 +107,8 @@ def test_rollout_is_blended_only_if_asked(weights, tmp_path):
     assert np.abs(blended - plain).max() > 1e-3
 
 
+@pytest.mark.needs("iree.compiler", "iree.runtime")
 def test_export_is_an_artefact_that_loads(weights, tmp_path):
-    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
     from f3amd_lib.benchmarking.artefact import load_artefact
 
     out = tmp_path / "round"

@@ -32,6 +32,10 @@ BATCH = 2
 SIGMAS = VarianceExploding().grid(2)
 
 
+needs_iree = pytest.mark.needs("iree.compiler", "iree.runtime")
+RUNTIMES = (pytest.param("iree", marks=needs_iree), "jax")
+
+
 @pytest.fixture(scope="module")
 def trained():
     record = {"dataset": "tiny", "dataset_licence": "CC BY 4.0", "dataset_credit": "nobody"}
@@ -65,13 +69,7 @@ def jax_folder(trained, exported, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def iree_folder(exported, tmp_path_factory) -> Path:
     """An artefact for IREE on this CPU, made from a bare network."""
-    skip_without_iree()
     return save_artefact(tmp_path_factory.mktemp("artefact") / "round", exported, name="tiny")
-
-
-def skip_without_iree() -> None:
-    reason = 'IREE is not installed: pip install "f3amd_lib[bench]"'
-    pytest.importorskip("iree.runtime", reason=reason)
 
 
 def inputs_of(shapes, seed: int) -> list[np.ndarray]:
@@ -114,6 +112,7 @@ def test_a_ddpm_round_takes_the_noise_that_the_sampler_would_draw(tmp_path):
         artefact(*condition, noise)
 
 
+@needs_iree
 def test_iree_equals_jit_over_a_hundred_runs(iree_folder, jit_round):
     artefact = load_artefact(iree_folder)
     assert artefact.runtime == "iree"
@@ -125,6 +124,7 @@ def test_iree_equals_jit_over_a_hundred_runs(iree_folder, jit_round):
         np.testing.assert_allclose(answer, jit_round(*given), atol=1e-3)
 
 
+@needs_iree
 def test_the_same_inputs_give_the_same_answer_again_and_again(iree_folder):
     artefact = load_artefact(iree_folder)
     placed = [artefact.put(item) for item in inputs_of(artefact.input_shapes, 0)]
@@ -133,6 +133,7 @@ def test_the_same_inputs_give_the_same_answer_again_and_again(iree_folder):
         np.testing.assert_array_equal(artefact(*placed), first)
 
 
+@needs_iree
 def test_one_thread_gives_the_numbers_of_many(iree_folder):
     many, one = load_artefact(iree_folder), load_artefact(iree_folder, driver="local-sync")
     given = inputs_of(many.input_shapes, 7)
@@ -164,7 +165,7 @@ np.save("answer.npy", artefact(*given))
 """
 
 
-@pytest.mark.parametrize("runtime", ["iree", "jax"])
+@pytest.mark.parametrize("runtime", RUNTIMES)
 def test_an_artefact_runs_without_the_library(runtime, request, tmp_path, jit_round):
     folder = request.getfixturevalue(f"{runtime}_folder")
     shutil.copy(artefact_module.__file__, tmp_path / "artefact.py")
@@ -229,7 +230,7 @@ def test_a_bare_network_has_no_scales(exported, tmp_path):
         artefact.one_hot(["calm"])
 
 
-@pytest.mark.parametrize("runtime", ["iree", "jax"])
+@pytest.mark.parametrize("runtime", RUNTIMES)
 def test_a_wrong_input_is_named(runtime, request):
     artefact = load_artefact(request.getfixturevalue(f"{runtime}_folder"), runtime=runtime)
     given = inputs_of(artefact.input_shapes, 0)
@@ -289,6 +290,7 @@ def test_a_garbled_or_altered_manifest_is_refused(jax_folder, tmp_path):
             load_artefact(copy, runtime="jax")
 
 
+@needs_iree
 def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
     def change(**values):
         return lambda manifest: manifest["targets"]["llvm-cpu"].update(values)
@@ -387,8 +389,8 @@ def test_a_trained_model_is_exported_with_its_own_schedule(trained, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["cuda-sm_80", "vulkan-spirv", "vmvx"])
+@needs_iree
 def test_other_devices_are_compiled_for_without_being_there(exported, target, tmp_path, jit_round):
-    skip_without_iree()
     folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=(target,))
     described = load_shapes(folder)
     assert list(described) == ["history", "path", "style", "noise"]
@@ -403,12 +405,13 @@ def test_other_devices_are_compiled_for_without_being_there(exported, target, tm
 
 
 @pytest.mark.slow
+@needs_iree
 def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
-    skip_without_iree()
     with pytest.raises(ValueError, match=r"IREE .* cannot compile .* for cuda-sm_20: .*Targets"):
         compile_iree(exported.stablehlo, "cuda-sm_20")
 
 
+@needs_iree
 def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatch):
     seen = []
 
@@ -421,7 +424,6 @@ def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatc
 
     monkeypatch.setattr(export_module.subprocess, "run", run)
     monkeypatch.setattr(export_module, "_operations", lambda program: set())
-    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
     assert compile_iree(b"program", "llvm-cpu") == b"module"
     assert len(seen) == 2
     with pytest.raises(ValueError, match="large vector sizes"):

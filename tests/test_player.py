@@ -464,7 +464,7 @@ def test_the_page_is_made_of_files_that_are_installed():
     assert {package / "report" / f"player.{kind}" for kind in ("html", "css", "js")} <= found
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node on this machine")
+@pytest.mark.needs("node")
 def test_the_script_is_sound():
     script = Path(player.__file__).with_name("player.js")
     subprocess.run(["node", "--check", str(script)], check=True)

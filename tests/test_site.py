@@ -256,8 +256,8 @@ def test_neither_settings_nor_styles_nor_scripts_name_an_address(settings):
     assert settings["html_theme_options"].get("analytics") is None
 
 
+@pytest.mark.needs("sphinx")
 def test_an_altered_mathjax_is_refused(tmp_path, monkeypatch):
-    pytest.importorskip("sphinx", reason="Sphinx is added by `make site-tools`")
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     companion = load(DOCS / "_ext" / "companion.py")
 

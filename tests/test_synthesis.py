@@ -57,16 +57,16 @@ def test_plain_form_runs_the_same_round():
     np.testing.assert_allclose(*results, atol=1e-4)
 
 
+@pytest.mark.needs("iree.compiler", "iree.runtime")
 @pytest.mark.parametrize("model", ["F3AMD-FNO-96", "CAMDM"])
 def test_iree_runs_a_round_of_finite_numbers(model):
-    pytest.importorskip("iree.compiler", reason="IREE is in the extra bench")
     found = np.asarray(prepare_round("IREE", task(model)).call())
     assert found.shape == (2, WINDOW, CHANNELS) and np.isfinite(found).all()
 
 
+@pytest.mark.needs("torch")
 @pytest.mark.parametrize("way", ["PyTorch", "PyTorch, oneDNN"])
 def test_pytorch_runs_a_round_of_finite_numbers(way):
-    pytest.importorskip("torch", reason="PyTorch is in the extra bench")
     found = np.asarray(prepare_round(way, task("CAMDM")).call())
     assert found.shape == (2, WINDOW, CHANNELS) and np.isfinite(found).all()
 

@@ -28,8 +28,9 @@ from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.models import zoo
 from f3amd_lib.models.conditioning import Condition
 
-torch = pytest.importorskip("torch", reason="PyTorch comes with the extra 'bench'")
+torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
 torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
+pytestmark = pytest.mark.needs("torch", "onnx", "onnxruntime")
 
 SIGMAS = VariancePreservingCosine(4).grid(4)
 KEY = jax.random.key(3)
@@ -53,8 +54,6 @@ def one_thread(monkeypatch):
 
 @pytest.fixture
 def onnx_camdm(monkeypatch):
-    for package in ("onnx", "onnxruntime"):
-        pytest.importorskip(package, reason=f"{package} comes with the extra 'bench'")
     module = importlib.import_module("f3amd_lib.benchmarking.onnx_camdm")
     monkeypatch.setattr(module, "usable_cores", lambda: 1)
     return module

@@ -355,11 +355,15 @@ def fit_normaliser(
     def measure(windows, key):
         batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
         flat = batch.future.reshape(-1, batch.future.shape[-1])
-        # A random turn makes x and z alike; measure them as one, around zero.
-        plane = jnp.sqrt(jnp.mean(flat[:, jnp.array([0, 2])] ** 2))
-        mean = flat.mean(axis=0).at[jnp.array([0, 2])].set(0.0)
-        deviation = flat.std(axis=0).at[jnp.array([0, 2])].set(plane)
-        return Normaliser(mean, jnp.maximum(deviation, 0.02), jnp.maximum(plane, 0.02))
+        mean, deviation = flat.mean(axis=0), flat.std(axis=0)
+        # A random turn makes x and z alike, of the root and of both columns of its rotation: measure
+        # them as one, around zero, so that turning commutes with normalising.
+        for first in (0, 3, 6):
+            pair = jnp.array([first, first + 2])
+            mean = mean.at[pair].set(0.0)
+            deviation = deviation.at[pair].set(jnp.sqrt(jnp.mean(flat[:, pair] ** 2)))
+        deviation = jnp.maximum(deviation, 0.02)
+        return Normaliser(mean, deviation, deviation[0])
 
     return measure(windows, key)
 

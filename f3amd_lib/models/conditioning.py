@@ -109,11 +109,13 @@ class ConditionEncoder(nnx.Module):
         window: int,
         num_history: int,
         num_heads: int = 1,
+        frames_before: int = 0,
         *,
         rngs: nnx.Rngs,
     ):
         check_num_heads(width, num_heads)
         self.width, self.window, self.num_history = width, window, num_history
+        self.frames_before = frames_before
         self.num_heads = num_heads
         self.history = nnx.Linear(channels, width, rngs=rngs)
         self.path = nnx.Linear(PATH_CHANNELS, width, rngs=rngs)
@@ -141,7 +143,7 @@ class ConditionEncoder(nnx.Module):
         return Context(self.key(tokens), self.value(tokens))
 
     def __call__(self, context: Context, sigma):
-        """Return the conditioning signal c, [B, T, D].
+        """Return the conditioning signal c, [B, T, D], or [B, frames_before + T, D].
 
         Args:
           context: from `encode`.
@@ -150,10 +152,10 @@ class ConditionEncoder(nnx.Module):
         dtype = context.keys.dtype
         noise = noise_features(jnp.asarray(sigma, dtype), self.width)
         noise = self.noise_second(nnx.silu(self.noise_first(noise)))
-        code = jnp.asarray(position_code(0, self.window, self.width), dtype)
+        code = jnp.asarray(position_code(-self.frames_before, self.window, self.width), dtype)
         # One noise level for all characters asks one question for all of them.
         asked = noise[..., None, :] + code
-        shape = (context.keys.shape[0], self.window, self.width)
+        shape = (context.keys.shape[0], self.frames_before + self.window, self.width)
         answer = attention(
             split_heads(jnp.broadcast_to(self.query(asked), shape), self.num_heads),
             split_heads(context.keys, self.num_heads),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from flax import nnx
 from f3amd_lib.models.attention import TransformerBlock, position_code
 from f3amd_lib.models.conditioning import (
     CONDITIONINGS,
+    PATH_CHANNELS,
     Condition,
     ConditionEncoder,
     Context,
@@ -67,6 +68,12 @@ class F3AMDConfig(NetworkConfig):
         paper (ours).
       residual_prior: combine the network's estimate with the noisy input as the posterior mean of a
         Gaussian residual whose variance per channel and cosine mode is learned (ours).
+      facing_frame: turn history, path and noisy input so that the path's first frame faces +Z, and
+        turn the answer back: the network is then the same for every heading instead of learning
+        that from random turns (ours; needs a normaliser that treats x and z alike).
+      history_input: let encoder, blocks and decoder see the history in front of the noisy window,
+        and the path beside it, instead of through the condition alone. The seam then lies inside
+        the period of the transform, not at its ends (ours).
 
     Raises:
       ValueError: for sizes that are not positive, unknown variants, modes out of range, or heads
@@ -99,9 +106,13 @@ class F3AMDConfig(NetworkConfig):
     output_scaling: bool = False
     decoder_hidden_width: int = 0
     residual_prior: bool = False
+    facing_frame: bool = False
+    history_input: bool = False
 
     def __post_init__(self):
         super().__post_init__()
+        if self.history_input and self.conditioning == "concatenation":
+            raise ValueError("concatenation lays c before the features: leave history_input off")
         modes = self.count_block_modes()
         if self.num_kept_modes > modes:
             raise ValueError(
@@ -120,11 +131,64 @@ class F3AMDConfig(NetworkConfig):
     @property
     def block_frames(self) -> int:
         """Frames that a backbone block sees: concatenation lays c before the features."""
-        return 2 * self.window if self.conditioning == "concatenation" else self.window
+        if self.conditioning == "concatenation":
+            return 2 * self.window
+        return self.window + self.frames_before
+
+    @property
+    def frames_before(self) -> int:
+        """Frames that encoder, blocks and decoder see before the window."""
+        return self.num_history if self.history_input else 0
 
     def count_block_modes(self) -> int:
         """Return how many modes the backbone's transform has; as many can be kept."""
         return count_modes(self.spectral_variant, self.block_frames)
+
+
+def _turned(vectors, matrix):
+    """Turn 3D vectors that lie one after the other in the channels [B, T, 3 n] by [B, 3, 3]."""
+    apart = vectors.reshape(*vectors.shape[:-1], -1, 3)
+    return jnp.einsum("bij,btnj->btni", matrix, apart).reshape(vectors.shape)
+
+
+def _turned_frames(frames, matrix):
+    """Turn features [B, T, C]: root position and the two columns of the root's rotation."""
+    return jnp.concatenate([_turned(frames[..., :9], matrix), frames[..., 9:]], axis=-1)
+
+
+def _facing_forward(condition: Condition) -> tuple[Condition, jax.Array]:
+    """Return a condition whose path begins facing +Z, and the rotation that turned it, [B, 3, 3]."""
+    path = condition.path
+    cosine, sine = path[:, 0, 2], -path[:, 0, 4]
+    length = jnp.sqrt(cosine**2 + sine**2)
+    # A path that was dropped in training is all zeros and faces nowhere.
+    known = length > 1e-6
+    scale = jnp.where(known, length, 1.0)
+    cosine, sine = jnp.where(known, cosine, 1.0) / scale, jnp.where(known, sine, 0.0) / scale
+    zero, one = jnp.zeros_like(cosine), jnp.ones_like(cosine)
+    rows = [[cosine, zero, -sine], [zero, one, zero], [sine, zero, cosine]]
+    matrix = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    place = jnp.stack([path[..., 0], jnp.zeros_like(path[..., 0]), path[..., 1]], axis=-1)
+    place = _turned(place, matrix)[..., jnp.array([0, 2])]
+    path = jnp.concatenate([place, _turned(path[..., 2:], matrix)], axis=-1)
+    history = _turned_frames(condition.history, matrix)
+    return condition._replace(history=history, path=path), matrix
+
+
+class EncodedCondition(NamedTuple):
+    """What a round knows before it starts.
+
+    Attributes:
+      tokens: keys and values of the context tokens.
+      history: normalised, [B, H, C]; turned like `path` if the config has a `facing_frame`.
+      path: [B, T, 8].
+      turn: rotations that faced them forward, [B, 3, 3]; None without a `facing_frame`.
+    """
+
+    tokens: Context
+    history: jax.Array
+    path: jax.Array
+    turn: jax.Array | None
 
 
 def _applied(layer, turned: bool):
@@ -145,10 +209,13 @@ class F3AMD(Denoiser):
             config.window,
             config.num_history,
             config.num_condition_heads,
+            config.frames_before,
             rngs=rngs,
         )
         depth = range(config.depth)
-        self.encoder = self._coder(config.channels, width, rngs)
+        # Beside the features: the path, and whether a frame is given or noisy.
+        beside = PATH_CHANNELS + 1 if config.history_input else 0
+        self.encoder = self._coder(config.channels + beside, width, rngs)
         self.blocks = nnx.List([self._base_block(rngs) for _ in depth])
         self.conditionings = nnx.List([self._conditioning_layer(rngs) for _ in depth])
         if hidden := config.decoder_hidden_width:
@@ -169,7 +236,8 @@ class F3AMD(Denoiser):
         config = self.config
         if config.encoder_decoder == "linear":
             return nnx.Linear(width_in, width_out, rngs=rngs)
-        modes = min(config.num_kept_modes, count_modes("fourier", config.window))
+        frames = config.window + config.frames_before
+        modes = min(config.num_kept_modes, count_modes("fourier", frames))
         return FNOBlock(width_in, width_out, modes, config.kernel_size, rngs=rngs)
 
     def _base_block(self, rngs: nnx.Rngs):
@@ -199,7 +267,7 @@ class F3AMD(Denoiser):
             rngs=rngs,
         )
 
-    def encode(self, condition: Condition) -> tuple[Context, jax.Array]:
+    def encode(self, condition: Condition) -> EncodedCondition:
         """Encode a condition once a round.
 
         Args:
@@ -212,7 +280,20 @@ class F3AMD(Denoiser):
           ValueError: if a shape does not fit the config.
         """
         self.config.check_condition(condition)
-        return self.condition.encode(condition), condition.history[:, -1]
+        turn = None
+        if self.config.facing_frame:
+            condition, turn = _facing_forward(condition)
+        tokens = self.condition.encode(condition)
+        return EncodedCondition(tokens, condition.history, condition.path, turn)
+
+    def _with_history(self, z, context: EncodedCondition):
+        """Lay the history before the scaled noisy window and the path beside it, [B, H + T, .]."""
+        past, future = context.history, context.path
+        unknown = jnp.zeros((*past.shape[:2], PATH_CHANNELS), z.dtype)
+        given = jnp.ones((*past.shape[:2], 1), z.dtype)
+        noisy = jnp.zeros((*z.shape[:2], 1), z.dtype)
+        before = jnp.concatenate([past, unknown, given], axis=-1)
+        return jnp.concatenate([before, jnp.concatenate([z, future, noisy], axis=-1)], axis=1)
 
     def stages(self, x_noisy, sigma, context, key=None) -> Iterator[tuple[str, jax.Array]]:
         """Yield the name and value of every station from x_noisy to x0_hat (Figure 2).
@@ -226,11 +307,14 @@ class F3AMD(Denoiser):
         """
         config = self.config
         config.check_state(x_noisy)
-        tokens, last_frame = context
         sigma = jnp.asarray(sigma, x_noisy.dtype)
-        c = self.condition(tokens, sigma)
+        c = self.condition(context.tokens, sigma)
         yield "c", c
+        if config.facing_frame:
+            x_noisy = _turned_frames(x_noisy, context.turn)
         z = scaled_input(config, x_noisy, sigma)
+        if config.history_input:
+            z = self._with_history(z, context)
         # Fourier blocks are faster with frames first, and so from encoder to decoder; attention
         # wants the batch first.
         attends = config.conditioning == "cross_attention"
@@ -252,12 +336,12 @@ class F3AMD(Denoiser):
             update = conditioning(base, z, c)
             z = z + update if config.block_residual else update
             yield f"block {number + 1}", turn(z)
-        last = jax.lax.slice_in_dim(
-            z, z.shape[frames] - config.window, z.shape[frames], axis=frames
-        )
+        # Frames of c go before the decoder; those of the history hold its period together.
+        decoded = config.window + config.frames_before
+        last = jax.lax.slice_in_dim(z, z.shape[frames] - decoded, z.shape[frames], axis=frames)
         if config.decoder_hidden_width:
             last = nnx.gelu(_applied(self.decoder_hidden, turned)(last))
-        x0_hat = turn(_applied(self.decoder, turned)(last))
+        x0_hat = turn(_applied(self.decoder, turned)(last))[:, config.frames_before :]
         yield "decoder", x0_hat
         if config.output_scaling:
             total = sigma.reshape(-1, 1, 1) ** 2 + config.sigma_data**2
@@ -265,11 +349,13 @@ class F3AMD(Denoiser):
             c_out = sigma.reshape(-1, 1, 1) * config.sigma_data / jnp.sqrt(total)
             x0_hat = c_skip * x_noisy + c_out * x0_hat
         if config.history_anchor:
-            x0_hat = x0_hat + self.anchor[...] * last_frame[:, None, :]
+            x0_hat = x0_hat + self.anchor[...] * context.history[:, -1:]
         if config.residual_prior:
             basis = jnp.asarray(cosine_basis(config.window), x_noisy.dtype)
             variance = jnp.exp(10.0 * self.residual_variance[...])
             gain = variance / (variance + sigma.reshape(-1, 1, 1) ** 2)
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)
+        if config.facing_frame:
+            x0_hat = _turned_frames(x0_hat, jnp.swapaxes(context.turn, -1, -2))
         yield "x0_hat", x0_hat

@@ -37,6 +37,7 @@ __all__ = [
     "style_parameters",
     "synthesize",
     "synthesize_with_contacts",
+    "walk_along",
 ]
 
 # ------------------------------------------------------------------------------------ skeleton
@@ -1189,13 +1190,35 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
     speed = np.maximum(_smooth(speed, 0.15, _GRID_RATE), 0.0)
     turn = _smooth(turn, 0.28, _GRID_RATE)
     wobble = style.unsteadiness * _wander(rng, count, 0.6, 1)[:, 0]
-    turn = turn + 0.45 * wobble * np.clip(speed, 0.0, 1.0)
+    turn = turn + 0.25 * wobble * np.clip(speed, 0.0, 1.0)
     yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) / _GRID_RATE
     going = yaw + np.radians(heading + style.heading_deg)
     velocity = speed[:, None] * np.stack([np.sin(going), np.cos(going)], axis=-1)
     position = np.cumsum(velocity, axis=0) / _GRID_RATE
     position -= position[int(_LEAD * _GRID_RATE)]
     return _Path(time, position, yaw, speed, turn, heading)
+
+
+def _given_path(position: np.ndarray, yaw: np.ndarray, fps: float) -> _Path:
+    """Lay a path that somebody drew on the planning grid; it goes straight on at both ends."""
+    frames = len(yaw)
+    count = int(np.ceil((frames / fps + 2 * _LEAD) * _GRID_RATE)) + 1
+    time = np.arange(count) / _GRID_RATE - _LEAD
+    drawn = np.arange(frames) / fps
+    columns = np.concatenate([position, np.unwrap(yaw)[:, None]], axis=1)
+    inside = CubicSpline(drawn, columns)(np.clip(time, 0.0, drawn[-1]))
+    # Before the first and after the last frame: as fast as there, and no further turn.
+    early = np.minimum(time, 0.0)[:, None] * (columns[1] - columns[0]) * fps
+    late = np.maximum(time - drawn[-1], 0.0)[:, None] * (columns[-1] - columns[-2]) * fps
+    inside[:, :2] += (early + late)[:, :2]
+    velocity = _smooth(np.gradient(inside, 1.0 / _GRID_RATE, axis=0), 0.08, _GRID_RATE)
+    speed = np.linalg.norm(velocity[:, :2], axis=-1)
+    angle = inside[:, 2]
+    ahead = velocity[:, 0] * np.sin(angle) + velocity[:, 1] * np.cos(angle)
+    left = velocity[:, 0] * np.cos(angle) - velocity[:, 1] * np.sin(angle)
+    heading = np.where(speed > 0.05, np.arctan2(left, ahead), 0.0)
+    heading = np.degrees(_smooth(np.unwrap(heading), 0.15, _GRID_RATE))
+    return _Path(time, inside[:, :2], angle, speed, velocity[:, 2], heading)
 
 
 # ------------------------------------------------------------------------------- 2. footfalls
@@ -1261,7 +1284,7 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
             pace = 0.5 * (path.speed[soon].max() + path.speed[middle])
             pace = max(pace + 0.2 * abs(path.turn[middle]), 0.05)
             beat = step_time * np.clip(np.sqrt(usual / pace), 0.75, 1.45)
-            beat = np.clip(beat * (1.0 + 0.03 * rng.standard_normal()), 0.22, 1.2)
+            beat = np.clip(beat * (1.0 + 0.015 * rng.standard_normal()), 0.22, 1.2)
             stride = 2.0 * beat
             swing = stride * (1.0 - style.duty)
             if standing:
@@ -1294,7 +1317,7 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
             begun = max(now + 0.03, land[foot][-1] + 0.12)
             landed = begun + 0.42
             target = landed + 0.3
-        scatter = 0.006 + 0.05 * style.unsteadiness
+        scatter = 0.004 + 0.025 * style.unsteadiness
         position, angle, left = _home(style, path, target, sides[foot], width)
         # Do not reach further ahead than the leg allows at the moment of landing.
         rest, _, _ = _home(style, path, landed, sides[foot], width)
@@ -1446,6 +1469,29 @@ def _arm(pose: ArmPose, side, swing, gesture, lean_deg, roll_deg, drift):
 # ------------------------------------------------------------------------------------ assembly
 
 
+def walk_along(style: str, position, yaw, seed: int = 0, fps: float = 30.0) -> Motion:
+    """Let the walker follow a path that somebody drew: what a generated walk is held against.
+
+    Args:
+      style: one of `STYLES`.
+      position: [T, 2], x and z in metres, T >= 4.
+      yaw: facing, [T], radians; the direction of travel is the path's own.
+      seed: as in `synthesize`.
+      fps: frames per second of path and motion.
+
+    Raises:
+      ValueError: for an unknown style, shapes that do not fit, or a number that is not finite.
+    """
+    position, yaw = np.asarray(position, np.float64), np.asarray(yaw, np.float64)
+    if position.ndim != 2 or position.shape != (len(yaw), 2) or yaw.ndim != 1 or len(yaw) < 4:
+        raise ValueError(
+            f"a path needs position [T, 2] and yaw [T], T >= 4; got {position.shape}, {yaw.shape}"
+        )
+    if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
+        raise ValueError("a path must hold finite numbers alone")
+    return _walk(style_parameters(style), style, seed, fps, len(yaw), (position, yaw))[0]
+
+
 def synthesize_with_contacts(
     style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0
 ) -> tuple[Motion, np.ndarray]:
@@ -1470,9 +1516,18 @@ def synthesize_with_contacts(
         raise ValueError(f"fps must be positive, got {fps}")
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
-    frames = int(round(seconds * fps))
+    return _walk(parameters, style, seed, fps, int(round(seconds * fps)))
+
+
+def _walk(
+    parameters: StyleParameters, style: str, seed: int, fps: float, frames: int, drawn=None
+) -> tuple[Motion, np.ndarray]:
+    """Make motion and contacts along a random path, or along a drawn one (position, yaw)."""
     rng = _generator(style, seed)
-    path = _plan_path(parameters, frames / fps, rng)
+    if drawn is None:
+        path = _plan_path(parameters, frames / fps, rng)
+    else:
+        path = _given_path(*drawn, fps)
     plants, knots, strides = _plan_footfalls(parameters, path, rng)
     drift = _wander(rng, len(path.time), 0.7, 12)
     gesture_start = rng.uniform(0.0, 2.0 * np.pi)
@@ -1485,7 +1540,7 @@ def synthesize_with_contacts(
     sampled = CubicSpline(path.time, np.concatenate(columns, axis=-1))(time)
     root_flat, yaw, speed, turn = sampled[:, :2], sampled[:, 2], sampled[:, 3], sampled[:, 4]
     heading = sampled[:, 5]
-    drift = sampled[:, 6:] * (0.6 + 4.0 * parameters.unsteadiness)
+    drift = sampled[:, 6:] * (0.4 + 2.0 * parameters.unsteadiness)
     phase = _smooth(
         PchipInterpolator(knots, strides, extrapolate=True)(np.clip(time, knots[0], knots[-1])),
         0.05,

@@ -193,7 +193,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
     """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
     preset = _preset_name(profile, preset)
-    ours = preset.endswith("-plus")
+    ours = zoo.find_preset(preset).source == "ours"
     recipe = paper_recipe if profile.name == "gpu" and not ours else short_recipe
     return recipe(
         preset,
@@ -426,7 +426,7 @@ def available_models(profile: Profile) -> list[str]:
     if profile.name == "laptop":
         folders.append(PRETRAINED_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
-    names = [name + end for end in ("", "-raw", "-plus") for name in zoo.PRESETS]
+    names = [name + end for end in ("", "-raw", "-plus", "-steady") for name in zoo.PRESETS]
     return [
         name
         for name in dict.fromkeys(names)
