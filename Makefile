@@ -19,8 +19,8 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke measure bench bench-tools test test-web web-tools lint lab clean \
-  site site-tools
+.PHONY: help install figures smoke measure bench bench-tools test test-extras test-web web-tools lint \
+  lab clean site site-tools
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
@@ -63,6 +63,11 @@ test: lint ## Lint, run the tests and check the notebooks' committed outputs
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
+# What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
+# the marker `needs`.
+test-extras: bench-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime or Sphinx
+	$(PYTEST) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
+
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
 web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if it is missing
 	@bash scripts/browser.sh
@@ -83,8 +88,9 @@ site: site-tools ## Build notebooks, claims, gallery and API as a site: docs/_bu
 	  . docs/_build/html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
-lint: $(INSTALLED) ## Check .py and .ipynb files with ruff
+lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared
 	$(PYTHON) -m ruff check .
+	@$(PYTHON) -m deptry . 2>/dev/null || $(PYTHON) -m deptry .
 
 lab: $(INSTALLED) ## Open the notebooks in JupyterLab
 	$(PYTHON) -m jupyterlab --notebook-dir=notebooks $(LAB_OPTIONS)

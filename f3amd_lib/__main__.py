@@ -12,6 +12,7 @@ bench     time synthesis and training, write records, compare with what is asked
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import logging
 import os
 import sys
@@ -213,13 +214,18 @@ def _crowd_pictures(crowd, still: Path, page: Path) -> None:
 def _export(arguments) -> None:
     from f3amd_lib.benchmarking.export import export_model
 
+    targets = arguments.target
+    if targets is None:  # nobody asked for one: compile for this processor where that can be done
+        targets = ("llvm-cpu",) if importlib.util.find_spec("iree") else ()
+        if not targets:
+            log.info("not compiled for this processor, since IREE is missing: make bench-tools")
     folder = export_model(
         _trained(arguments),
         arguments.out,
         num_steps=arguments.steps,
         batch=arguments.characters,
         sampler=arguments.sampler,
-        targets=arguments.target or ("llvm-cpu",),
+        targets=targets,
         overwrite=arguments.overwrite,
     )
     for file in sorted(Path(folder).iterdir()):
@@ -368,7 +374,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(words)
     try:
         return arguments.action(arguments) or 0
-    except (ValueError, OSError, ArithmeticError) as error:
+    except (ValueError, OSError, ArithmeticError, ImportError) as error:
         print(f"f3amd {arguments.command}: {error}", file=sys.stderr)
         return 2
 

@@ -30,6 +30,18 @@ __all__ = [
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
 RESULT_FOLDERS = ("records", "tables", "figures", "media")
+SHOWN_STYLES = (
+    "Neutral",
+    "March",
+    "Zombie",
+    "Old",
+    "LimpLeft",
+    "ArmsWide",
+    "Tiptoe",
+    "Runner",
+)
+"""Styles of `synthetic` that differ in posture, arms, rhythm and symmetry: what figures show and
+walking checks judge."""
 RESULTS_DIR_VARIABLE = "F3AMD_RESULTS_DIR"
 """Environment variable: the folder that results go under, in place of the ignored `runs/`."""
 
@@ -105,9 +117,9 @@ _PROFILE_DEFAULTS = {
         "num_characters": 2,
     },
     "laptop": {
-        "preset": "F3AMD-FNO-32-plus",
+        "preset": "F3AMD-FNO-64-steady",
         "compare_preset": "F3AMD-FNO-32",
-        "train_steps": 3_000,
+        "train_steps": 1_500,
         "batch_size": 128,
         "learning_rate": 2e-3,
         "num_characters": 8,
@@ -121,19 +133,7 @@ _PROFILE_DEFAULTS = {
 
 # Where a data set asks for something else than its profile.
 _DATASET_DEFAULTS = {
-    # Eight that differ in posture, arms, rhythm and symmetry.
-    ("laptop", "synthetic"): {
-        "evaluation_styles": (
-            "Neutral",
-            "Old",
-            "March",
-            "Zombie",
-            "LimpLeft",
-            "ArmsWide",
-            "Tiptoe",
-            "Runner",
-        ),
-    },
+    ("laptop", "synthetic"): {"evaluation_styles": SHOWN_STYLES},
     ("laptop", "bandai"): {
         "preset": "F3AMD-FNO-96-plus",
         "compare_preset": "F3AMD-FNO-96",

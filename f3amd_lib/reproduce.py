@@ -113,6 +113,60 @@ def check_parameters(notebooks: Iterable[Path], names: Iterable[str]) -> None:
                 )
 
 
+def written_since(folder: Path, start: float) -> dict[str, int]:
+    """Count the files under each folder of results that were written after a moment.
+
+    Args:
+      folder: results of one data set and profile.
+      start: seconds since the epoch.
+
+    Returns:
+      "figures", "tables", ... -> number of files, only where there are some; records beside tables
+      do not count.
+    """
+    counts = {}
+    for path in Path(folder).rglob("*"):
+        if path.suffix not in (".json", ".md") and path.is_file() and path.stat().st_mtime >= start:
+            kind = path.relative_to(folder).parts[0]
+            counts[kind] = counts.get(kind, 0) + 1
+    return counts
+
+
+def _news(path: Path, seconds: float, wrote: Mapping[str, int], left: float | None) -> str:
+    """Put into one line what a notebook took and wrote, and how long the rest will take."""
+    files = ", ".join(f"{count} {kind}" for kind, count in sorted(wrote.items())) or "no file"
+    rest = "" if not left else f"; about {_duration(left)} left"
+    return f"{path.stem:24s} {_duration(seconds):>11s}   wrote {files}{rest}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
+
+
+def _usual_seconds(results: Path) -> dict[str, float]:
+    """Return how long each notebook took in the last whole run, if there was one."""
+    summary = results / "tables" / "run_summary.csv"
+    if not summary.is_file():
+        return {}
+    table = pd.read_csv(summary)
+    return dict(zip(table["notebook"], table["seconds"], strict=True))
+
+
+def what_to_open(results: Path) -> list[str]:
+    """Return the files of a run that are worth opening first, as lines "what: path"."""
+    worth = {
+        "a walk to look at": "media/05_rollout.gif",
+        "a crowd to turn around, in a browser": "media/14_crowd.html",
+        "film strips": "figures/05_film_strip.png",
+        "do they walk, in numbers": "tables/05_walks.csv",
+    }
+    found = {what: results / name for what, name in worth.items()}
+    found["each claim of the paper with a verdict"] = (
+        profiles.repository_root() / "paper_figures" / "claims.md"
+    )
+    return [f"{what}: {_short(path)}" for what, path in found.items() if path.is_file()]
+
+
 def reproduce(
     dataset: str,
     profile: str,
@@ -162,9 +216,9 @@ def reproduce(
     with _results_root(profile):
         results = results_dir(dataset, profile)
         # Bars are for people: a log file gets the lines of `say` instead.
-        for path in tqdm(selected, desc="notebooks", unit="notebook", disable=None):
-            say(f"{path.name} is running ...")
-            start = time.monotonic()
+        usual, pace = _usual_seconds(results), []
+        for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
+            began, start = time.time(), time.monotonic()
             try:
                 _execute(path, executed_folder / path.name, parameters)
             except NotebookFailed as error:
@@ -180,7 +234,11 @@ def reproduce(
             )
             if failure:
                 break
-            say(f"{path.name} took {seconds:.0f} s")
+            if path.name in usual:
+                pace.append(seconds / max(usual[path.name], 1.0))
+            rest = sum(usual.get(later.name, 0.0) for later in selected[number + 1 :])
+            left = rest * sum(pace) / len(pace) if pace else None
+            say(_news(path, seconds, written_since(results, began), left))
 
     summary = pd.DataFrame(rows)
     complete = failure is None and len(selected) == len(available)
@@ -211,6 +269,8 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
             parameters=dict(parameters),
             kernel_name=KERNEL,
             cwd=str(path.parent),  # as in JupyterLab and nbval
+            # A kernel warns of its own connection to this process, which no reader can act on.
+            extra_arguments=["--log-level=ERROR"],
             progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
         )
     except PapermillExecutionError as error:
@@ -304,6 +364,12 @@ def _assignment(text: str) -> tuple[str, object]:
         return name, value
 
 
+def _say(line: str) -> None:
+    """Write a line at once, also where nobody sits at a terminal."""
+    tqdm.write(line)
+    sys.stdout.flush()
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; see the module's first lines.
 
@@ -343,7 +409,7 @@ def main(arguments: list[str] | None = None) -> int:
             options.profile,
             only=options.only,
             parameters=dict(options.set),
-            say=tqdm.write,
+            say=_say,
         )
     except ValueError as error:
         tqdm.write(f"Stopped: {error}", file=sys.stderr)
@@ -351,10 +417,13 @@ def main(arguments: list[str] | None = None) -> int:
     except NotebookFailed as error:
         tqdm.write(f"Stopped: {error}", file=sys.stderr)
         return 1
-    tqdm.write(
+    _say(
         f"{len(summary)} notebooks finished in {summary['seconds'].sum() / 60:.1f} minutes "
-        f"(data {options.data}, profile {options.profile})."
+        f"(data {options.data}, profile {options.profile}). To open first:"
     )
+    with _results_root(options.profile):
+        for line in what_to_open(results_dir(options.data, options.profile)):
+            _say(f"  {line}")
     return 0
 
 

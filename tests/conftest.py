@@ -22,7 +22,6 @@ import pytest
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 
-
 REMEDY = {
     "sphinx": "make site-tools",
     "selenium": "make web-tools",
@@ -32,7 +31,7 @@ REMEDY = {
 
 
 def pytest_runtest_setup(item):
-    """Skip a test that asks for an optional package, or program, which is not there: by its name."""
+    """Skip a test that asks for an optional package or program which is not there, by its name."""
     for marker in item.iter_markers("needs"):
         for name in marker.args:
             if shutil.which(name) is None and not _importable(name):

@@ -1,5 +1,6 @@
 """Commands that hand a model's work out: crowds, exports, benchmarks."""
 
+import importlib.util
 import json
 import re
 
@@ -105,6 +106,18 @@ def test_rollout_is_blended_only_if_asked(weights, tmp_path):
     keep = np.arange(30) % WINDOW >= 4
     np.testing.assert_allclose(blended[keep], plain[keep], atol=1e-5)
     assert np.abs(blended - plain).max() > 1e-3
+
+
+def test_export_without_iree_is_what_jax_alone_can_run(weights, tmp_path, monkeypatch, capsys):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "iree" else found(n))
+    out = tmp_path / "round"
+    words = ["export", "--weights", weights, "--out", str(out), "--steps", "1"]
+    assert main(words) == 0
+    assert (out / "round.jax_export").is_file() and not list(out.glob("*.vmfb"))
+    # Asked for by name, a target that cannot be had is one line and no traceback.
+    assert main([*words[:-4], "--out", str(tmp_path / "other"), "--target", "llvm-cpu"]) == 2
+    assert "make bench-tools" in capsys.readouterr().err
 
 
 @pytest.mark.needs("iree.compiler", "iree.runtime")

@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import json
 import re
-import shutil
 import subprocess
 import zlib
 from html.parser import HTMLParser

@@ -69,7 +69,31 @@ def test_notebooks_run_in_order_with_their_parameters(checkout):
     assert record["parameters"]["num_steps"] == 5
     copies = checkout / "runs" / "bandai" / "smoke" / "notebooks"
     assert sorted(path.name for path in copies.iterdir()) == ["00_first.ipynb", "01_second.ipynb"]
-    assert any("01_second.ipynb" in line for line in news)
+    # One line a notebook: its time, and what it wrote.
+    assert [line.split()[0] for line in news] == ["00_first", "01_second"]
+    assert all("wrote no file" in line for line in news)  # a record alone is no result
+
+
+def test_news_tell_what_was_written_and_how_long_the_rest_takes(tmp_path):
+    for name, when in (("figures/a.png", 5), ("figures/old.png", 1), ("media/a.gif", 9)):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        os.utime(path, (when, when))
+    (tmp_path / "figures" / "a.json").touch()  # a record, not a result
+    assert reproduce.written_since(tmp_path, 3.0) == {"figures": 1, "media": 1}
+    line = reproduce._news(Path("05_rollout.ipynb"), 100.0, {"figures": 2}, 30.0)
+    assert line.split() == "05_rollout 1.7 min wrote 2 figures; about 30 s left".split()
+
+
+def test_only_files_that_are_there_are_worth_opening(checkout):
+    results = checkout / "results"
+    assert reproduce.what_to_open(results) == []
+    gif = results / "media" / "05_rollout.gif"
+    gif.parent.mkdir(parents=True)
+    gif.touch()
+    (line,) = reproduce.what_to_open(results)
+    assert line.endswith("results/media/05_rollout.gif")
 
 
 def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):

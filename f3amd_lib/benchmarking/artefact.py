@@ -301,7 +301,8 @@ def _import_iree(version: str):
     except ImportError as error:
         raise ImportError(
             f"runtime 'iree' needs IREE's runtime ({error}): "
-            f'pip install "f3amd_lib[bench]", or iree-base-runtime=={version} alone'
+            f'make bench-tools, or pip install "f3amd_lib[bench]", or '
+            f"iree-base-runtime=={version} alone"
         ) from None
     return iree.runtime
 

@@ -285,7 +285,9 @@ def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
             "and give it its noise instead of a random key"
         )
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
-        raise ImportError('compiling needs IREE: pip install "f3amd_lib[bench]"')
+        raise ImportError(
+            'compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"'
+        )
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)

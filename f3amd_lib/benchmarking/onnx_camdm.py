@@ -23,7 +23,8 @@ try:
     from onnx import helper, numpy_helper
 except ImportError as error:
     raise ImportError(
-        'the baseline in ONNX Runtime needs onnx and onnxruntime: pip install "f3amd_lib[bench]" '
+        "the baseline in ONNX Runtime needs onnx and onnxruntime: make bench-tools, or "
+        'pip install "f3amd_lib[bench]" '
         f"(importing them said: {error})"
     ) from error
 

@@ -32,7 +32,7 @@ try:
     from torch.nn import functional
 except ImportError as error:
     raise ImportError(
-        'the baseline in PyTorch needs PyTorch: pip install "f3amd_lib[bench]" '
+        'PyTorch is not installed: make bench-tools, or pip install "f3amd_lib[bench]" '
         f"(importing torch said: {error})"
     ) from error
 

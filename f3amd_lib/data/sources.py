@@ -34,6 +34,7 @@ import pooch
 
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.skeleton import Motion, resample
+from f3amd_lib.profiles import SHOWN_STYLES
 
 __all__ = [
     "NAMES",
@@ -410,7 +411,9 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
         )
     num_takes = max(3, round(seconds_per_style / 10.0))
     seconds = seconds_per_style / num_takes
-    styles = tuple(sorted(synthetic.STYLES))[:num_styles]
+    # A few styles are those that pictures show; all of them are in alphabetical order either way.
+    others = [style for style in synthetic.STYLES if style not in SHOWN_STYLES]
+    styles = tuple(sorted([*SHOWN_STYLES, *others][:num_styles]))
     takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
     splits = assign_splits((name, style) for name, style, _ in takes)
     clips = tuple(

@@ -8,6 +8,7 @@ Python loop over samples.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -68,7 +69,7 @@ class WindowSet:
       starts: first frame of each window, [W].
       room: frames of the same clip before each window, [W].
       styles: style index of each window, [W].
-      one_hot: identity matrix of the styles, [S, S].
+      one_hot: the one-hot vector of each style of the data, [S, styles that the model knows].
     """
 
     window: int
@@ -132,6 +133,7 @@ def build_windows(
     num_history: int = 10,
     stride: int = 1,
     mirrored: bool | None = None,
+    styles: Sequence[str] = (),
 ) -> WindowSet:
     """Lay all windows of a split out on the device.
 
@@ -143,17 +145,22 @@ def build_windows(
       stride: frames between window starts.
       mirrored: add the mirror image of every clip whose style may be mirrored; by default in
         training only.
+      styles: the names that a model's one-hot vector stands for, if it knows more of them, or in
+        another order, than this data set.
 
     Returns:
       The window set.
 
     Raises:
-      ValueError: for an unknown split, or if no clip is long enough.
+      ValueError: for an unknown split, a style that `styles` lacks, or if no clip is long enough.
     """
+    names = tuple(styles) or packed.styles
+    if missing := set(packed.styles) - set(names):
+        raise ValueError(f"the model does not know the style {min(missing)!r} of this data set")
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
     mirrored = split == "train" if mirrored is None else mirrored
-    frames, paths, starts, room, styles = [], [], [], [], []
+    frames, paths, starts, room, labels = [], [], [], [], []
     offset = 0
     for clip in np.flatnonzero(np.asarray(packed.clip_split) == SPLITS.index(split)):
         motion = packed.motion(int(clip))
@@ -166,7 +173,7 @@ def build_windows(
             first = np.arange(0, len(world) - (num_history + window) + 1, stride)
             starts.append(offset + first)
             room.append(first)
-            styles.append(np.full(len(first), style))
+            labels.append(np.full(len(first), style))
             frames.append(world.astype(np.float32))
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
             offset += len(world)
@@ -182,8 +189,10 @@ def build_windows(
         paths=jnp.asarray(np.concatenate(paths, axis=1)),
         starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
         room=jnp.asarray(np.concatenate(room).astype(np.int32)),
-        styles=jnp.asarray(np.concatenate(styles).astype(np.int32)),
-        one_hot=jnp.eye(len(packed.styles), dtype=jnp.float32),
+        styles=jnp.asarray(np.concatenate(labels).astype(np.int32)),
+        one_hot=jnp.eye(len(names), dtype=jnp.float32)[
+            jnp.array([names.index(style) for style in packed.styles])
+        ],
     )
 
 
@@ -356,7 +365,7 @@ def fit_normaliser(
         batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
         flat = batch.future.reshape(-1, batch.future.shape[-1])
         mean, deviation = flat.mean(axis=0), flat.std(axis=0)
-        # A random turn makes x and z alike, of the root and of both columns of its rotation: measure
+        # A random turn makes x and z alike, of the root and of its rotation: measure
         # them as one, around zero, so that turning commutes with normalising.
         for first in (0, 3, 6):
             pair = jnp.array([first, first + 2])

@@ -7,11 +7,15 @@ floor at y = `floor`. All of this is ours: the paper has the foot-sliding ratio 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+import pandas as pd
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import find_peaks
 
-from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.evaluation.metrics import joint_acceleration
+from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 STEP_PROMINENCE = 0.015
 """How far a toe must rise over its surroundings to have taken a step, metres."""
@@ -88,7 +92,77 @@ def seam_kick(positions, window: int):
     if frames < 2 * window:
         raise ValueError(f"{frames} frames hold no seam between windows of {window} frames")
     acceleration = np.linalg.norm(np.diff(positions, n=2, axis=-3), axis=-1).mean(axis=-1)
-    # Second difference k is about frame k + 1; a jump into frame s shows in those about s - 1 and s.
+    # Second difference k is about frame k + 1; a jump into frame s shows in those about s - 1, s.
     about = np.arange(1, frames - 1)
     seam = ((about % window == 0) | (about % window == window - 1)) & (about >= window - 1)
     return acceleration[..., seam].mean(axis=-1) / acceleration[..., ~seam].mean(axis=-1)
+
+
+CHECKS = {
+    "stepping_rate": ("steps by toe height", "1/s", "within a fifth"),
+    "joint_acceleration": ("joint acceleration", "cm/frame²", "within a factor of 1.5"),
+    "slide_speed": ("slide of the lower toe", "cm/s", "at most 12"),
+    "floor_penetration": ("deepest toe under the floor", "cm", "at most 1"),
+}
+"""Key -> name, unit, and what a walking person's figure must be (our choice): the first two beside
+those of the motion that was learnt, the last two as they are."""
+
+_HOLDS = {
+    "stepping_rate": lambda value, source: abs(value - source) <= 0.2 * source,
+    "joint_acceleration": lambda value, source: source / 1.5 <= value <= 1.5 * source,
+    "slide_speed": lambda value, source: value <= 12.0,
+    "floor_penetration": lambda value, source: value <= 1.0,
+}
+
+
+def walking_figures(motion: Motion, window: int, floor: float = 0.0) -> dict[str, float]:
+    """Measure what tells somebody who walks from somebody who skates, sinks, shakes or stands.
+
+    Args:
+      motion: at least two windows long.
+      window: frames; see `seam_kick`.
+      floor: height of the floor, metres.
+
+    Returns:
+      The keys of `CHECKS`, sliding_share and seam_kick -> one number each.
+    """
+    positions, skeleton, fps = motion.positions, motion.skeleton, motion.fps
+    return {
+        "stepping_rate": float(stepping_rate(positions, skeleton, fps)),
+        "joint_acceleration": float(joint_acceleration(positions, fps=fps)),
+        "slide_speed": float(slide_speed(positions, skeleton, fps)),
+        "sliding_share": float(sliding_share(positions, skeleton, fps)),
+        "floor_penetration": float(floor_penetration(positions, skeleton, floor)),
+        "seam_kick": float(seam_kick(positions, window)),
+    }
+
+
+def check_walks(
+    walks: Mapping[str, Motion], sources: Mapping[str, Motion], window: int, floors: Mapping = {}
+) -> pd.DataFrame:
+    """Hold generated walks against the motion that they were learnt from, style by style.
+
+    Args:
+      walks: style -> generated motion.
+      sources: style -> motion of the source, best along the same path.
+      window: frames.
+      floors: style -> height of the floor, metres; 0 where a style is not named.
+
+    Returns:
+      One row per style and check: style, check, unit, source, value, wanted, holds.
+
+    Raises:
+      ValueError: for a style without a source.
+    """
+    rows = []
+    for style, motion in walks.items():
+        if style not in sources:
+            raise ValueError(f"no source motion of style {style!r} to hold the walk against")
+        floor = float(floors.get(style, 0.0))
+        found = walking_figures(motion, window, floor)
+        source = walking_figures(sources[style], window, floor)
+        for key, (name, unit, wanted) in CHECKS.items():
+            holds = bool(_HOLDS[key](found[key], source[key]))
+            given = {"style": style, "check": name, "unit": unit, "source": source[key]}
+            rows.append(given | {"value": found[key], "wanted": wanted, "holds": holds})
+    return pd.DataFrame(rows)

@@ -157,7 +157,7 @@ def _turned_frames(frames, matrix):
 
 
 def _facing_forward(condition: Condition) -> tuple[Condition, jax.Array]:
-    """Return a condition whose path begins facing +Z, and the rotation that turned it, [B, 3, 3]."""
+    """Return a condition whose path begins facing +Z, and the rotations that did it, [B, 3, 3]."""
     path = condition.path
     cosine, sine = path[:, 0, 2], -path[:, 0, 4]
     length = jnp.sqrt(cosine**2 + sine**2)

@@ -25,6 +25,7 @@ __all__ = [
     "plot_style",
     "save_figure",
     "show_figure",
+    "system_line",
     "use_style",
 ]
 
@@ -89,6 +90,8 @@ class ModelStyle:
 # Purple for FNO and green for CAMDM, as in the paper; within a family, width sets the shade.
 _FNO_SHADES = {32: "#B9A3D6", 48: "#9E7FC7", 64: "#8159B0", 96: "#542788", 128: "#2D0B55"}
 _TRANSFORMER_SHADES = {32: "#FBD29A", 48: "#F8BE6D", 64: "#F1A340", 96: "#D3831C", 128: "#A35F0C"}
+# Our own recipes stand beside the paper's models and are never to be taken for one of them.
+_OUR_COLORS = {"-plus": PALETTE["vermilion"], "-steady": PALETTE["blue"]}
 _WIDTH_MARKERS = {32: "v", 48: "^", 64: "s", 96: "o", 128: "D"}
 
 
@@ -97,7 +100,8 @@ def model_style(name: str) -> ModelStyle:
 
     Args:
       name: a preset's name ("F3AMD-FNO-96", "CAMDM", ...), "real" for real motion, "paper" for
-        a printed number; suffixes such as "-plus" or "(FiLM)" keep the family's colour.
+        a printed number; suffixes such as "(FiLM)" keep the family's colour, our own recipes
+        ("-plus", "-steady") have one of their own.
 
     Returns:
       The style. A name of no known family is drawn in grey.
@@ -115,11 +119,24 @@ def model_style(name: str) -> ModelStyle:
     if "transformer" in lowered:
         return ModelStyle(_TRANSFORMER_SHADES[width], _WIDTH_MARKERS[width], "-")
     if lowered.startswith("f3amd"):
-        line = "-"
-        for suffix, other in (("raw", ":"), ("plus", "--"), ("dct", "--")):
-            line = other if suffix in lowered else line
+        for suffix, color in _OUR_COLORS.items():
+            if lowered.split(",")[0].endswith(suffix):
+                return ModelStyle(color, _WIDTH_MARKERS[width], "-")
+        line = ":" if "raw" in lowered else "--" if "dct" in lowered else "-"
         return ModelStyle(_FNO_SHADES[width], _WIDTH_MARKERS[width], line)
     return ModelStyle(PALETTE["grey"], ".", "-")
+
+
+def system_line(label: str) -> dict:
+    """Return keyword arguments for `Axes.plot` of a model at some steps, "F3AMD-FNO-96, 8 steps".
+
+    One step is dotted, with open markers.
+    """
+    name, _, steps = label.partition(", ")
+    line = model_style(name).line
+    if steps.strip() == "1 step":
+        line |= {"linestyle": ":", "markerfacecolor": "white"}
+    return line
 
 
 def use_style() -> None:

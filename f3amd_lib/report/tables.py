@@ -11,7 +11,10 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-__all__ = ["markdown_table", "metric_heading", "wide_table", "beside_paper"]
+from f3amd_lib.profiles import repository_root
+from f3amd_lib.report.records import read_table
+
+__all__ = ["markdown_table", "metric_heading", "wide_table", "beside_paper", "stored_result"]
 
 _ARROWS = {"down": " ↓", "up": " ↑"}
 
@@ -208,3 +211,26 @@ def _looks_numeric(cell: str) -> bool:
 
 def _escape(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
+
+
+def stored_result(dataset: str, name: str, *, profile: str = "laptop", digits: int = 2) -> str:
+    """Render a table that `make figures` left, with what it was measured on.
+
+    Args:
+      dataset: a name of `profiles.DATASETS`.
+      name: of the table, without ending.
+      profile: whose results.
+      digits: decimals.
+
+    Returns:
+      Markdown: the table and a line on its origin, or a sentence that there is none yet.
+    """
+    path = repository_root() / "paper_figures" / dataset / profile / "tables" / f"{name}.csv"
+    if not path.exists():
+        return f"No stored `{name}` of `{profile}` on `{dataset}` yet: `make figures` makes it."
+    frame, record = read_table(path)
+    origin = (
+        f"Stored result: `{name}`, profile {record['profile']}, data {record['dataset']}, "
+        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}."
+    )
+    return f"{origin}\n\n{markdown_table(frame, digits=digits)}"

@@ -51,6 +51,8 @@ __all__ = [
     "train",
     "finished_model",
     "obtain_model",
+    "shown_model",
+    "shipped_history",
     "available_models",
     "find_model",
     "set_aside_unlike",
@@ -74,15 +76,21 @@ class PreparedData:
     window: int = 32
     num_history: int = 10
 
-    @functools.lru_cache(maxsize=3)  # noqa: B019  (one data set lives as long as the process)
-    def windows(self, split: str) -> WindowSet:
-        """Return the windows of a split; held-out splits take every fourth start."""
+    @functools.lru_cache(maxsize=4)  # noqa: B019  (one data set lives as long as the process)
+    def windows(self, split: str, styles: tuple[str, ...] = ()) -> WindowSet:
+        """Return the windows of a split; held-out splits take every fourth start.
+
+        Args:
+          split: "train", "validation" or "test".
+          styles: of the model that will see them, where it knows more than this data set has.
+        """
         return build_windows(
             self.packed,
             split,
             window=self.window,
             num_history=self.num_history,
             stride=1 if split == "train" else 4,
+            styles=styles,
         )
 
     @functools.cached_property
@@ -364,6 +372,43 @@ def obtain_model(
         _set_aside(files)
     set_aside_unlike(prepared, files, wanted, profile_recipe(profile, preset))
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
+
+
+def shown_model(
+    prepared: PreparedData, profile: Profile, *, progress: bool = True
+) -> tuple[TrainedModel, str]:
+    """Return the model whose motion a reader sees: what ships for the data set, in any profile.
+
+    Args:
+      prepared: the data; its styles must be among the model's.
+      profile: names the data set; where nothing ships for it, the profile's own model is obtained.
+      progress: as for `obtain_model`.
+
+    Returns:
+      (model, origin), origin as from `obtain_model`.
+    """
+    laptop = load_profile("laptop", profile.dataset)
+    shipped = model_files(laptop, folder=PRETRAINED_DIR / profile.dataset).model
+    if profile.name == "smoke" and shipped.exists():
+        trained = load_model(shipped)
+        known = set(prepared.packed.styles) <= set(trained.styles)
+        if known and trained.skeleton == prepared.packed.skeleton:
+            return trained, "shipped"
+    trained, _, origin = obtain_model(prepared, profile, progress=progress)
+    return trained, origin
+
+
+def shipped_history(profile: Profile, preset: str) -> pd.DataFrame:
+    """Return the losses of a model's training: of the shipped weights, or of a run of this profile.
+
+    Raises:
+      ValueError: if neither left any.
+    """
+    for folder in (PRETRAINED_DIR / profile.dataset, None):
+        history = model_files(profile, preset, folder=folder).history
+        if history.exists():
+            return read_table(history)[0]
+    raise ValueError(f"no losses of {preset} on {profile.dataset!r} are kept: train it first")
 
 
 def finished_model(
