@@ -132,8 +132,13 @@ def _rollout(arguments) -> None:
         raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
     generator = MotionGenerator(trained, arguments.steps, sampler=arguments.sampler)
     rollout = generator.rollout(
-        path, arguments.style, seed=arguments.seed, blend_frames=arguments.blend
+        path,
+        arguments.style,
+        seed=arguments.seed,
+        blend_frames=0 if arguments.raw else arguments.blend,
+        lock_feet=not (arguments.raw or arguments.slide) and _has_legs(trained.skeleton),
     )
+    log.info("afterwards   %s", rollout.changes or "nothing: as the network made it")
     motion = rollout.motion()
     out.mkdir(parents=True, exist_ok=True)
     write_bvh(targets[0], motion, overwrite=arguments.overwrite)
@@ -148,6 +153,18 @@ def _rollout(arguments) -> None:
     )
     for target in targets:
         log.info("wrote        %s", target)
+
+
+def _has_legs(skeleton) -> bool:
+    """Say whether feet can be held: legs of hip, knee, ankle and toe."""
+    from f3amd_lib.evaluation.foot_locking import leg_chains
+
+    try:
+        leg_chains(skeleton)
+    except ValueError as error:
+        log.info("feet         slide as they come: %s", error)
+        return False
+    return True
 
 
 def _num_frames(seconds: float) -> int:
@@ -354,9 +371,13 @@ def _parser() -> argparse.ArgumentParser:
     rollout.add_argument(
         "--blend",
         type=int,
-        default=0,
+        default=4,
         metavar="N",
         help="blend N frames after each window boundary",
+    )
+    rollout.add_argument("--slide", action="store_true", help="do not hold feet where they stand")
+    rollout.add_argument(
+        "--raw", action="store_true", help="as the network made it: no blending, no held feet"
     )
     rollout.add_argument("--out", default="out", help="folder to write to")
     return parser

@@ -34,9 +34,11 @@ from f3amd_lib.evaluation.protocol import (
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.evaluation.quality import reference_clips, row_label
+from f3amd_lib.evaluation.quality import reference_clips, row_label, style_floor
 from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.evaluation.walking import walking_figures
 from f3amd_lib.models import zoo
+from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir, runs_dir
 from f3amd_lib.report.records import kept_rows, run_record, write_table
@@ -59,6 +61,7 @@ __all__ = [
     "measure_quality",
     "measure_recipes",
     "measure_sensitivity",
+    "measure_walking",
     "main",
 ]
 
@@ -210,6 +213,78 @@ def measure_quality(
             keep("quality_by_seed", rows, digests[model])
             write_table(folder / "quality.csv", summarise(kept["quality_by_seed"]), record)
     return folder / "quality.csv"
+
+
+WALKING_SEEDS = 3
+"""Seeds of path and noise in `measure_walking`."""
+
+
+def measure_walking(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
+) -> Path:
+    """Measure feet, floor and seams of every model that has weights, at 8 steps and at 1.
+
+    Three paths with noise of their own, a quarter of the profile's rounds each; see
+    `evaluation.walking`. The row "real" is the walker itself on the same paths for `synthetic`,
+    held-out clips for captured data.
+
+    Args:
+      prepared, profile, models: as for `measure_quality`.
+
+    Returns:
+      The table, `records/walking.csv`: a row per model, steps, seed and style, with the digest of
+      the weights.
+    """
+    path = results_dir(profile.dataset, profile.name) / "records" / "walking.csv"
+    packed, seeds = prepared.packed, range(WALKING_SEEDS)
+    styles = list(profile.evaluation_styles or packed.primary_styles[: profile.num_characters])
+    num_frames = max(2, profile.rollout_rounds // 4) * profile.window
+    record = run_record(
+        profile=profile, dataset=packed, seed=profile.seed, measurement="walking",
+        num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles,
+    )  # fmt: skip
+    kept = kept_rows(path, record)
+    made = packed.dataset == "synthetic"  # its floor is at 0, and its source walks any path
+    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
+    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in seeds}
+
+    def rows(motions, seed: int, **what) -> pd.DataFrame:
+        """Measure motions, in the order of (style, motion)."""
+        table = [
+            {**what, "seed": seed, "style": style}
+            | walking_figures(motion, profile.window, floors[style])
+            for style, motion in motions
+        ]
+        return pd.DataFrame(table)
+
+    asked = [zoo.find_preset(name).name for name in models or ()]
+    todo = [(name, steps) for name in asked or available_models(profile) for steps in (8, 1)]
+    tables = []
+    if kept is None:
+        for seed in seeds if made else seeds[:1]:
+            if made:
+                drawn = zip(styles, paths[seed], strict=True)
+                motions = [(s, walk_along(s, line.position, line.yaw)) for s, line in drawn]
+            else:
+                clips = reference_clips(packed, styles, window=profile.window)
+                motions = [(packed.styles[packed.clip_style[k]], packed.motion(k)) for k in clips]
+            tables.append(rows(motions, seed, model="real", steps=0, weights=""))
+        kept = pd.concat(tables)
+    for name, steps in tqdm(todo, unit="row"):
+        trained, _, _ = obtain_model(prepared, profile, preset=name)
+        weights = weights_digest(trained.params)
+        mine = kept[(kept["model"] == name) & (kept["steps"] == steps)]
+        if name not in asked and len(mine) and set(mine["weights"]) == {weights}:
+            continue
+        generator, tables = MotionGenerator(trained, steps), []
+        for seed in seeds:
+            rollout = generator.rollout(paths[seed], styles, seed=seed)
+            motions = [(style, rollout.motion(k)) for k, style in enumerate(styles)]
+            tables.append(rows(motions, seed, model=name, steps=steps, weights=weights))
+        kept = _with_rows(kept, pd.concat(tables), ["model", "steps"])
+        write_table(path, kept, record)
+    write_table(path, kept, record)
+    return path
 
 
 def measure_sensitivity(
@@ -445,6 +520,7 @@ MEASUREMENTS: dict[str, Callable] = {
     "noise_use": measure_noise_use,
     "recipes": measure_recipes,
     "quality": measure_quality,
+    "walking": measure_walking,
     "sensitivity": measure_sensitivity,
 }
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""

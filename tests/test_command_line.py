@@ -102,7 +102,7 @@ def test_rollout_is_blended_only_if_asked(weights, tmp_path):
         assert main([*words, *more]) == 0
         return read_bvh(tmp_path / name / "calm_circle_seed0.bvh").positions
 
-    plain, blended = positions("plain"), positions("blended", "--blend", "4")
+    plain, blended = positions("plain", "--raw"), positions("blended", "--blend", "4", "--slide")
     keep = np.arange(30) % WINDOW >= 4
     np.testing.assert_allclose(blended[keep], plain[keep], atol=1e-5)
     assert np.abs(blended - plain).max() > 1e-3

@@ -15,9 +15,11 @@ from builders import (
     make_condition,
     network_of,
     tiny_config,
+    tiny_normaliser,
 )
 from flax import nnx
 
+from f3amd_lib.data.features import path_condition, turn_frames
 from f3amd_lib.models.attention import position_code
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.f3amd import F3AMDConfig
@@ -325,3 +327,84 @@ def test_a_wider_decoder_has_a_second_layer(coder):
     for layer in ("'decoder_hidden'", "'decoder'"):
         assert any(24 in shape for name, shape in shapes.items() if layer in name), layer
     assert not any(24 in np.shape(leaf[...]) for _, leaf in plain)
+
+
+def lively_network(**changes):
+    """A network whose every path is open: residual blocks start closed, with an output of zero."""
+    network = make_network(**changes)
+    graph, state = nnx.split(network)
+    leaves, tree = jax.tree.flatten(state)
+    keys = jax.random.split(jax.random.key(5), len(leaves))
+    moved = [
+        leaf + 0.05 * jax.random.normal(key, leaf.shape)
+        for leaf, key in zip(leaves, keys, strict=True)
+    ]
+    return nnx.merge(graph, jax.tree.unflatten(tree, moved))
+
+
+def a_walk(yaw):
+    """History, path and noisy state of one motion, all turned by `yaw`, [2]; path facing first."""
+    rng = np.random.default_rng(1)
+    frames = rng.standard_normal((2, HISTORY + WINDOW, CHANNELS)).astype(np.float32)
+    frames = turn_frames(frames, yaw)
+    place = rng.standard_normal((2, WINDOW, 2))
+    facing = rng.standard_normal((2, WINDOW)) + yaw[:, None]
+    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, z = place[..., 0], place[..., 1]
+    place = np.stack([x * cosine + z * sine, z * cosine - x * sine], axis=-1)
+    path = path_condition(place, facing)
+    style = jnp.eye(2)
+    condition = Condition(jnp.asarray(frames[:, :HISTORY]), jnp.asarray(path, jnp.float32), style)
+    return jnp.asarray(frames[:, HISTORY:]), condition
+
+
+@pytest.mark.parametrize("facing_frame", [True, False])
+def test_a_network_that_faces_its_path_is_the_same_for_every_heading(facing_frame):
+    network = lively_network(
+        facing_frame=facing_frame, history_anchor=True, residual_prior=True, normalise=False
+    )
+    still, turned = np.zeros(2), np.array([0.7, -2.5])
+    answers = []
+    for yaw in (still, turned):
+        x_noisy, condition = a_walk(yaw)
+        x0_hat = np.asarray(run(network, x_noisy, condition=condition))
+        answers.append(turn_frames(x0_hat, -yaw))
+    apart = np.abs(answers[0] - answers[1]).max()
+    assert apart < 1e-4 if facing_frame else apart > 1e-2
+
+
+def test_a_path_that_was_dropped_faces_nowhere_and_is_no_nan():
+    network = lively_network(facing_frame=True)
+    x_noisy, condition = a_walk(np.zeros(2))
+    dropped = condition._replace(path=jnp.zeros_like(condition.path))
+    assert np.isfinite(run(network, x_noisy, condition=dropped)).all()
+
+
+def test_history_in_the_input_lies_before_the_window_and_is_not_answered():
+    config = tiny_config(history_input=True, num_kept_modes=7)
+    assert config.block_frames == HISTORY + WINDOW
+    network = lively_network(history_input=True, num_kept_modes=7)
+    x_noisy, condition = a_walk(np.zeros(2))
+    stations = dict(network.stages(x_noisy, SIGMA, network.encode(condition)))
+    assert stations["encoder"].shape[1] == stations["block 1"].shape[1] == HISTORY + WINDOW
+    assert stations["x0_hat"].shape == x_noisy.shape
+    # The oldest frame of the history reaches the blocks although the condition is held.
+    context = network.encode(condition)
+    older = context._replace(history=context.history.at[:, 0].add(1.0))
+    moved = network(x_noisy, SIGMA, older) - network(x_noisy, SIGMA, context)
+    assert float(jnp.abs(moved).max()) > 1e-3
+    plain = lively_network()
+    context = plain.encode(condition)
+    older = context._replace(history=context.history.at[:, 0].add(1.0))
+    np.testing.assert_array_equal(plain(x_noisy, SIGMA, older), plain(x_noisy, SIGMA, context))
+    with pytest.raises(ValueError, match="leave history_input off"):
+        make_network(history_input=True, conditioning="concatenation")
+
+
+def test_normalising_commutes_with_turning():
+    normaliser = tiny_normaliser()
+    frames = jnp.asarray(np.random.default_rng(0).standard_normal((3, WINDOW, CHANNELS)))
+    yaw = jnp.array([0.4, -1.0, 3.0])
+    turned_last = turn_frames(normaliser.normalise(frames), yaw)
+    turned_first = normaliser.normalise(turn_frames(frames, yaw))
+    np.testing.assert_allclose(turned_last, turned_first, atol=2e-5)

@@ -116,13 +116,18 @@ def test_presets_say_how_they_are_trained():
         assert told == (name == "CAMDM")
 
 
-def test_any_f3amd_of_the_paper_has_a_raw_and_a_plus_form():
+def test_any_f3amd_of_the_paper_also_has_the_forms_of_ours():
     raw = zoo.build_config("F3AMD-Transformer-64-raw", **SIZE)
     assert not raw.input_scaling and not raw.normalise and raw.base_block == "transformer"
     plus = zoo.build_config("F3AMD-FNO-32-plus", **SIZE)
     assert plus.residual_prior and plus.history_anchor and plus.block_residual
     assert zoo.find_preset("F3AMD-FNO-32-plus").source == "ours"
-    for wrong in ("CAMDM-plus", "F3AMD-FNO-96-raw-plus"):
+    steady = zoo.find_preset("F3AMD-FNO-64-steady")
+    assert steady.source == "ours"
+    config = zoo.build_config(steady.name, **SIZE)
+    assert config.facing_frame and config.history_input and config.residual_prior
+    assert config.num_kept_modes == (config.window + config.num_history) // 2 + 1
+    for wrong in ("CAMDM-plus", "F3AMD-FNO-96-raw-plus", "F3AMD-FNO-96-plus-steady"):
         with pytest.raises(ValueError, match="only the paper's F3AMD"):
             zoo.find_preset(wrong)
 

@@ -26,6 +26,7 @@ from f3amd_lib.diffusion.rounds import sample_round
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.evaluation.blending import blend_rollout
+from f3amd_lib.evaluation.foot_locking import lock_rollout
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.config import cast_network
@@ -48,6 +49,7 @@ class Rollout:
       styles: what each character was asked to look like.
       window: T; window k starts at frame k * T.
       blend_frames: frames after each window boundary that were blended; 0 is as it was made.
+      feet_locked: whether feet were held where they stand (`foot_locking`).
     """
 
     skeleton: Skeleton
@@ -57,6 +59,13 @@ class Rollout:
     styles: tuple[str, ...]
     window: int
     blend_frames: int = 0
+    feet_locked: bool = False
+
+    @property
+    def changes(self) -> str:
+        """What was done to the motion after the network made it, as a phrase; "" for nothing."""
+        done = [f"blended over {self.blend_frames} frames"] if self.blend_frames else []
+        return ", ".join(done + ["feet locked"] * self.feet_locked)
 
     def motion(self, character: int = 0, *, with_history: bool = False) -> Motion:
         """Return one character's motion, from the first generated frame unless told."""
@@ -211,6 +220,7 @@ class MotionGenerator:
         seed: int = 0,
         history: np.ndarray | None = None,
         blend_frames: int = 0,
+        lock_feet: bool = False,
     ) -> Rollout:
         """Animate one or many characters along their paths.
 
@@ -223,6 +233,8 @@ class MotionGenerator:
             style, moved to the start of the path.
           blend_frames: blend so many frames after each window boundary (see `blending`); 0, as in
             all figures that do not say otherwise, leaves the frames as the network made them.
+          lock_feet: hold feet where they stand, after blending (see `foot_locking`); likewise off
+            wherever something is measured.
 
         Returns:
           The rollout, [B, frames of the path, C].
@@ -272,7 +284,8 @@ class MotionGenerator:
             styles=tuple(styles),
             window=config.window,
         )
-        return blend_rollout(rollout, blend_frames)
+        rollout = blend_rollout(rollout, blend_frames)
+        return lock_rollout(rollout) if lock_feet else rollout
 
     def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
         """Pick a stored pose for each character; those of one style take others in turn."""

@@ -1,0 +1,347 @@
+"""Foot locking: clean walks stay, artificial slides and sunken feet are cured, bones stay bones."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders import SKELETON as SHORT_LEGS
+from builders import straight_motion
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.evaluation.foot_locking import (
+    DEEPEST,
+    FARTHEST,
+    leg_chains,
+    lock_feet,
+    lock_rollout,
+    plan_contacts,
+)
+from f3amd_lib.evaluation.metrics import joint_acceleration
+from f3amd_lib.evaluation.paths import named_path
+from f3amd_lib.evaluation.rollout import Rollout
+from f3amd_lib.evaluation.walking import (
+    floor_penetration,
+    slide_speed,
+    stepping_rate,
+    toe_positions,
+)
+from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize, synthesize_with_contacts
+
+FLOOR = 0.012
+"""Height of the walker's resting toes."""
+
+
+@pytest.fixture(scope="module")
+def walk() -> Motion:
+    return synthesize("Neutral", 12)
+
+
+@pytest.fixture(scope="module")
+def locked_slide(walk):
+    """A walk whose root drifts sideways by 20 cm/s, and the same with locked feet."""
+    motion = sliding(walk, 0.2)
+    return motion, lock_feet(motion)
+
+
+def sliding(motion: Motion, speed: float) -> Motion:
+    drift = np.arange(motion.num_frames)[:, None] * np.array([speed / motion.fps, 0.0, 0.0])
+    return motion.replace(root_position=motion.root_position + drift)
+
+
+def lifted(motion: Motion, height) -> Motion:
+    height = np.broadcast_to(height, (motion.num_frames,))
+    return motion.replace(
+        root_position=motion.root_position + height[:, None] * np.array([0.0, 1.0, 0.0])
+    )
+
+
+def bone_lengths(motion: Motion) -> np.ndarray:
+    parents = list(motion.skeleton.parents[1:])
+    return np.linalg.norm(motion.positions[:, 1:] - motion.positions[:, parents], axis=-1)
+
+
+def knee_bends(motion: Motion) -> np.ndarray:
+    """Sine of each knee's bend about its thigh's own X axis, the walker's hinge, [T, 2]."""
+    turned, positions = global_rotations(motion.skeleton, motion.rotations), motion.positions
+    bends = []
+    for hip, knee, ankle, _ in leg_chains(motion.skeleton):
+        thigh = positions[:, knee] - positions[:, hip]
+        shank = positions[:, ankle] - positions[:, knee]
+        normal = np.cross(thigh, shank) / (0.43 * 0.42)
+        bends.append((normal * turned[:, hip, :, 0]).sum(axis=-1))
+    return np.stack(bends, axis=-1)
+
+
+def toe_steps(motion: Motion) -> np.ndarray:
+    """How far each toe moves over the ground in a frame, [T - 1, 2], metres."""
+    toes = toe_positions(motion.positions, motion.skeleton)
+    return np.linalg.norm(np.diff(toes, axis=0)[..., [0, 2]], axis=-1)
+
+
+def test_legs_are_found():
+    names = np.array(SYNTHETIC_SKELETON.names)[leg_chains(SYNTHETIC_SKELETON)]
+    assert names.tolist() == [
+        [f"{side}{part}" for part in ("Hip", "Knee", "Ankle", "Toe")] for side in ("Left", "Right")
+    ]
+
+
+@pytest.mark.parametrize("style", ["Neutral", "Crab", "Runner", "Tiptoe"])
+def test_plan_finds_the_walkers_own_contacts(style):
+    motion, true = synthesize_with_contacts(style, 12)
+    plan = plan_contacts(motion.positions, motion.skeleton)
+    assert (plan == true).mean() > 0.9 and not (true & ~plan).any()
+    high = toe_positions(motion.positions, motion.skeleton)[..., 1] > 0.06
+    assert high.any() and not plan[high].any()
+
+
+def test_plan_sees_through_slides_and_a_sinking_floor(walk):
+    true = plan_contacts(walk.positions, walk.skeleton)
+    for speed in (0.2, 0.4):
+        plan = plan_contacts(sliding(walk, speed).positions, walk.skeleton)
+        assert (plan == true).mean() > 0.9
+    sinking = lifted(walk, np.linspace(0.0, -0.07, walk.num_frames))
+    assert (plan_contacts(sinking.positions, walk.skeleton) == true).mean() > 0.9
+
+
+def test_plan_holds_no_short_contacts_and_no_short_gaps(walk):
+    rng = np.random.default_rng(0)
+    shaken = walk.positions + rng.normal(0.0, 0.015, walk.positions.shape)
+    plan = plan_contacts(shaken, walk.skeleton)
+    for foot in plan.T:
+        lengths = np.diff(np.flatnonzero(np.diff(foot.astype(int))))
+        assert len(lengths) and lengths.min() >= 3
+
+
+def test_a_foot_that_floats_still_carries_if_the_other_one_swings(walk):
+    true = plan_contacts(walk.positions, walk.skeleton)
+    plan = plan_contacts(lifted(walk, 0.09).positions, walk.skeleton, floor=FLOOR)
+    assert plan.mean() > 0.4 and not (plan & ~true).any() and not plan.all(axis=1).any()
+
+
+def test_feet_far_over_a_known_floor_do_not_stand(walk):
+    assert plan_contacts(lifted(walk, 0.15).positions, walk.skeleton).mean() > 0.5
+    assert not plan_contacts(lifted(walk, 0.15).positions, walk.skeleton, floor=FLOOR).any()
+
+
+def test_a_clean_walk_stays(walk):
+    locked = lock_feet(walk)
+    moved = np.linalg.norm(locked.positions - walk.positions, axis=-1)
+    assert moved.mean() < 0.002 and moved.max() < 0.05
+    before, after = joint_acceleration(walk.positions), joint_acceleration(locked.positions)
+    assert after == pytest.approx(before, rel=0.02)
+    assert stepping_rate(locked.positions, walk.skeleton) == stepping_rate(
+        walk.positions, walk.skeleton
+    )
+
+
+def test_a_slide_is_cured(locked_slide):
+    before, after = locked_slide
+    skeleton = before.skeleton
+    assert slide_speed(before.positions, skeleton) == pytest.approx(20.0, abs=1.0)
+    assert slide_speed(after.positions, skeleton) < 0.1
+    assert floor_penetration(after.positions, skeleton, FLOOR) < 0.05
+    assert stepping_rate(after.positions, skeleton) == pytest.approx(
+        stepping_rate(before.positions, skeleton), rel=0.1
+    )
+    old, new = joint_acceleration(before.positions), joint_acceleration(after.positions)
+    assert new < 1.2 * old  # a foot that stands has to catch up
+
+
+def test_a_locked_toe_stands_still(locked_slide):
+    before, after = locked_slide
+    plan = plan_contacts(before.positions, before.skeleton)
+    both = plan[1:] & plan[:-1]
+    assert toe_steps(before)[both].min() > 0.004
+    assert toe_steps(after)[both].max() < 1e-3
+    inner = both[2:-2] & both[:-4] & both[4:]  # toes may roll at the ends
+    height = toe_positions(after.positions, after.skeleton)[3:-2, :, 1]
+    np.testing.assert_allclose(height[inner], FLOOR, atol=1e-3)
+
+
+def test_bones_keep_their_lengths_and_the_root_its_path(locked_slide):
+    before, after = locked_slide
+    np.testing.assert_allclose(bone_lengths(after), bone_lengths(before), atol=1e-9)
+    lowered = before.root_position - after.root_position
+    assert np.abs(lowered[:, [0, 2]]).max() == 0.0
+    assert lowered[:, 1].min() >= 0.0 and lowered[:, 1].max() <= DEEPEST
+    gram = after.rotations @ np.swapaxes(after.rotations, -1, -2)
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-9)
+
+
+def test_only_legs_turn_and_feet_keep_their_orientation(locked_slide):
+    before, after = locked_slide
+    chains = leg_chains(before.skeleton)
+    others = np.setdiff1d(np.arange(before.skeleton.num_joints), chains[:, :3])
+    np.testing.assert_array_equal(after.rotations[:, others], before.rotations[:, others])
+    feet = [global_rotations(m.skeleton, m.rotations)[:, chains[:, 2]] for m in (before, after)]
+    np.testing.assert_allclose(feet[1], feet[0], atol=1e-9)
+
+
+def test_nothing_pops(locked_slide):
+    before, after = locked_slide
+    correction = after.positions - before.positions
+    toes = list(before.skeleton.toes)
+    velocity, bend = np.diff(correction, axis=0), np.diff(correction, n=2, axis=0)
+    # 20 cm/s are 0.7 cm a frame while a foot stands; what was won is given back in the swing.
+    assert np.linalg.norm(velocity[:, toes], axis=-1).max() < 0.03
+    assert np.linalg.norm(velocity, axis=-1).max() < 0.05
+    assert np.linalg.norm(bend[:, toes], axis=-1).max() < 0.016
+
+
+def test_knees_keep_their_side(walk, locked_slide):
+    assert knee_bends(walk).min() > 0.2
+    for motion in (locked_slide[1], lock_feet(sliding(walk, -0.6)), lock_feet(lifted(walk, 0.03))):
+        assert knee_bends(motion).min() > 0.0
+
+
+def test_a_knee_bent_backwards_comes_to_the_usual_side(walk):
+    chain = leg_chains(walk.skeleton)[0]
+    rotations = walk.rotations.copy()
+    rotations[100:110, chain[1]] = Rotation.from_rotvec([-0.1, 0.0, 0.0]).as_matrix()
+    motion = walk.replace(rotations=rotations)
+    assert knee_bends(motion)[100:110, 0].max() < -0.05
+    assert knee_bends(lock_feet(motion, floor=FLOOR)).min() > 0.0
+
+
+def test_sunken_feet_come_up(walk):
+    sunken = lifted(walk, -0.05)
+    assert floor_penetration(sunken.positions, walk.skeleton, FLOOR) == pytest.approx(5.0, abs=0.01)
+    locked = lock_feet(sunken, floor=FLOOR)
+    assert floor_penetration(locked.positions, walk.skeleton, FLOOR) < 0.05
+    assert slide_speed(locked.positions, walk.skeleton) < 0.1
+    np.testing.assert_array_equal(locked.root_position, sunken.root_position)
+    # Without a floor to go by, the feet themselves say where it is.
+    assert np.abs(lock_feet(sunken).positions - sunken.positions).mean() < 0.002
+
+
+def test_a_swing_is_lifted_over_the_floor_without_any_contact(walk):
+    dip = -0.04 * np.exp(-0.5 * ((np.arange(walk.num_frames) - 150) / 4.0) ** 2)
+    none = np.zeros((walk.num_frames, 2), bool)
+    locked = lock_feet(lifted(walk, dip), contacts=none, floor=FLOOR)
+    assert floor_penetration(locked.positions, walk.skeleton, FLOOR) < 0.05
+    correction = locked.positions - lifted(walk, dip).positions
+    assert np.linalg.norm(np.diff(correction, n=2, axis=0), axis=-1).max() < 0.012
+    far = np.abs(np.arange(walk.num_frames) - 150) > 90
+    np.testing.assert_allclose(locked.positions[far], walk.positions[far], atol=1e-3)
+
+
+def test_without_contacts_nothing_changes(walk):
+    none = np.zeros((walk.num_frames, 2), bool)
+    locked = lock_feet(walk, contacts=none, floor=FLOOR - 0.01)
+    np.testing.assert_allclose(locked.positions, walk.positions, atol=1e-9)
+    np.testing.assert_allclose(locked.rotations, walk.rotations, atol=1e-9)
+
+
+def test_a_leg_that_cannot_reach_lets_go(walk):
+    assert 0.0 < DEEPEST < 0.1
+    high, contacts = lifted(walk, 0.12), plan_contacts(walk.positions, walk.skeleton)
+    locked = lock_feet(high, contacts, floor=FLOOR)
+    np.testing.assert_allclose(bone_lengths(locked), bone_lengths(high), atol=1e-9)
+    assert (high.root_position - locked.root_position).max() <= DEEPEST
+    height = toe_positions(locked.positions, walk.skeleton)[..., 1]
+    assert np.median(height[contacts]) > 0.1
+    # Just out of reach, the root gives way, and feet stand.
+    locked = lock_feet(lifted(walk, 0.03), floor=FLOOR)
+    lowered = lifted(walk, 0.03).root_position - locked.root_position
+    assert 0.005 < lowered[:, 1].max() <= DEEPEST
+    assert slide_speed(locked.positions, walk.skeleton) < 0.1
+
+
+def test_a_long_slide_becomes_small_steps(walk):
+    contacts = walk.contacts
+    pose = int(np.flatnonzero(contacts.all(axis=1))[0])
+    still = np.repeat(walk.rotations[pose : pose + 1], 150, axis=0)
+    root = np.repeat(walk.root_position[pose : pose + 1], 150, axis=0)
+    motion = sliding(walk.replace(root_position=root, rotations=still), 0.3)  # 1.5 m in all
+    locked = lock_feet(motion, floor=FLOOR)
+    stands = toe_steps(locked) < 1e-3
+    assert stands.mean() > 0.6
+    old, new = (toe_positions(one.positions, walk.skeleton) for one in (motion, locked))
+    moved = np.linalg.norm((new - old)[..., [0, 2]], axis=-1)
+    assert moved[1:][stands].max() <= FARTHEST + 1e-3
+    assert (new[..., 1].max(axis=0) > FLOOR + 0.004).all()
+    assert stepping_rate(locked.positions, walk.skeleton) == 0.0
+    assert np.linalg.norm(np.diff(locked.positions, axis=0), axis=-1).max() < 0.12
+
+
+def test_the_frame_rate_does_not_matter():
+    for fps in (24.0, 60.0):
+        motion = sliding(synthesize("Neutral", 6, fps=fps), 0.2)
+        locked = lock_feet(motion)
+        assert slide_speed(motion.positions, motion.skeleton, fps) > 19.0
+        assert slide_speed(locked.positions, motion.skeleton, fps) < 0.1
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 5])
+def test_very_short_motions_pass(walk, frames):
+    motion = walk.slice(0, frames)
+    locked = lock_feet(motion)
+    assert locked.num_frames == frames
+    np.testing.assert_allclose(locked.positions, motion.positions, atol=0.05)
+    np.testing.assert_allclose(bone_lengths(locked), bone_lengths(motion), atol=1e-9)
+
+
+def test_bad_input_is_refused(walk):
+    positions = walk.positions.copy()
+    positions[7, 3, 1] = np.nan
+    with pytest.raises(ValueError, match="frame 7"):
+        plan_contacts(positions, walk.skeleton)
+    with pytest.raises(ValueError, match=r"\[T, 23, 3\]"):
+        plan_contacts(walk.positions[:, :-1], walk.skeleton)
+    with pytest.raises(ValueError, match="floor"):
+        lock_feet(walk, floor=np.nan)
+    with pytest.raises(ValueError, match="floor"):
+        plan_contacts(walk.positions, walk.skeleton, floor=np.inf)
+    with pytest.raises(ValueError, match="contacts"):
+        lock_feet(walk, contacts=np.zeros((walk.num_frames, 3), bool))
+    with pytest.raises(ValueError, match="hip, knee, ankle, toe"):
+        lock_feet(straight_motion(20))
+    with pytest.raises(ValueError, match="left_toe"):
+        leg_chains(Skeleton(("Hips", "LeftHip", "RightHip"), (-1, 0, 0), np.ones((3, 3))))
+    assert SHORT_LEGS.toes  # known, yet too near to the hips
+
+
+def rollout_of(*motions: Motion, past: int = 30) -> Rollout:
+    frames = np.stack([world_frames(motion) for motion in motions]).astype(np.float32)
+    return Rollout(
+        skeleton=SYNTHETIC_SKELETON,
+        frames=frames[:, past:],
+        history=frames[:, :past],
+        paths=(named_path("straight", frames.shape[1] - past),) * len(motions),
+        styles=("Neutral",) * len(motions),
+        window=32,
+    )
+
+
+def test_all_characters_of_a_rollout_are_locked(walk):
+    # The second one sinks by and by, after a history that stood on the floor.
+    sinks = np.interp(np.arange(walk.num_frames), [40, 80], [0.0, -0.05])
+    rollout = rollout_of(sliding(walk, 0.2), lifted(walk, sinks))
+    locked = lock_rollout(rollout)
+    assert locked.frames.dtype == np.float32 and locked.frames.shape == rollout.frames.shape
+    np.testing.assert_array_equal(locked.history, rollout.history)
+    skeleton = rollout.skeleton
+    assert slide_speed(rollout.motion(0).positions, skeleton) > 19.0
+    assert slide_speed(locked.motion(0).positions, skeleton) < 0.5
+    assert floor_penetration(rollout.motion(1).positions, skeleton, FLOOR) > 4.9
+    for character in range(2):
+        positions = locked.motion(character).positions
+        assert floor_penetration(positions, skeleton, FLOOR) < 0.1
+    # Told of a floor 5 cm lower, the second one stays as it was.
+    told = lock_rollout(rollout, floor=[FLOOR, FLOOR - 0.05])
+    assert floor_penetration(told.motion(1).positions, skeleton, FLOOR) > 4.9
+
+
+def test_a_rollout_says_that_its_feet_are_locked(walk):
+    @dataclasses.dataclass(frozen=True)
+    class Marked(Rollout):
+        feet_locked: bool = False
+
+    rollout = rollout_of(walk)
+    fields = {field.name: getattr(rollout, field.name) for field in dataclasses.fields(Rollout)}
+    locked = lock_rollout(Marked(**{**fields, "feet_locked": False}))
+    assert locked.feet_locked is True
+    with pytest.raises(ValueError, match="already"):
+        lock_rollout(locked)
