@@ -155,7 +155,8 @@ def _usual_seconds(results: Path) -> dict[str, float]:
 def what_to_open(results: Path) -> list[str]:
     """Return the files of a run that are worth opening first, as lines "what: path"."""
     worth = {
-        "a walk to look at": "media/05_rollout.gif",
+        "a walk to look at": "media/00_first_walk.gif",
+        "and the longer one of notebook 05": "media/05_rollout.gif",
         "a crowd to turn around, in a browser": "media/14_crowd.html",
         "film strips": "figures/05_film_strip.png",
         "do they walk, in numbers": "tables/05_walks.csv",

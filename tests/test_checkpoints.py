@@ -260,7 +260,7 @@ def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, mon
             continue
         kept += 1
         step = np.abs(before).max(axis=-2, keepdims=True) / 127.0
-        assert np.all(np.abs(after - before) <= 0.5 * step * (1 + 1e-4) + 1e-12)
+        assert np.all(np.abs(after - before) <= 0.5 * step * (1 + 1e-3) + 1e-12)
         assert np.any(after != before) or not before.any()
     assert kept > 3
     # Written again, what was in 8 bits already loses no more than rounding.

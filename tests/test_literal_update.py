@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -75,6 +76,12 @@ def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, s
 def test_a_network_that_uses_its_input_shows_it(model_that):
     # The exact denoiser of features that are normal: it keeps the share 1 / (1 + sigma^2).
     trained = model_that(lambda x_noisy, sigma: x_noisy / (1.0 + sigma**2))
+    # Around a root that faces ahead: features of 0 shall be a pose, not a rotation of no direction.
+    normaliser = trained.normaliser
+    mean = normaliser.mean.at[3:9].set(jnp.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
+    deviation = normaliser.deviation.at[3:9].set(0.2)
+    normaliser = normaliser._replace(mean=mean, deviation=deviation)
+    trained = dataclasses.replace(trained, normaliser=normaliser)
     table = window_figures(walk_windows(trained, tiny_windows(), (8, 1), **FEW))
     assert one(table, "literal", 1, "from_rescaled") == 0.0
     assert one(table, "literal", 8, "from_rescaled") > 1.0

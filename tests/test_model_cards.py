@@ -52,7 +52,7 @@ def test_shipped_weights_stay_within_twenty_megabytes():
 
 
 def quality(weights: str, **figures) -> pd.DataFrame:
-    real = {"foot_alternation": 2.0, "foot_sliding": 0.1, "joint_acceleration": 0.6, "FID": 10.0}
+    real = {"stepping_rate": 2.0, "slide_speed": 4.0, "joint_acceleration": 0.6, "FID": 10.0}
     rows = [("real", 0, "real", name, value) for name, value in real.items()]
     rows += [("F3AMD-FNO-96-plus", 8, weights, name, value) for name, value in figures.items()]
     columns = ["model", "steps", "weights", "metric", "value"]
@@ -67,11 +67,15 @@ def test_limits_follow_from_the_figures():
         card = model_cards.model_card(path, quality(weights, **figures))
         return card.split("## Limits")[1].split("## Use")[0]
 
-    good = {"x0_error_ratio": 0.2, "foot_alternation": 2.0, "foot_sliding": 0.1}
-    assert "noisy input" not in limits(**good) and "slide" not in limits(**good)
+    good = {"x0_error_ratio": 0.2, "stepping_rate": 1.9, "slide_speed": 6.0}
+    for word in ("noisy input", "skates", "rarely", "sink"):
+        assert word not in limits(**good)
     assert "hardly uses its noisy input" in limits(**good | {"x0_error_ratio": 0.95})
-    assert "does not keep walking" in limits(**good | {"foot_alternation": 0.9})
-    assert "slide 6 times" in limits(**good | {"foot_sliding": 0.6})
+    assert "steps too rarely: 0.9" in limits(**good | {"stepping_rate": 0.9})
+    assert "skates: its lower toe moves over the ground at 84 cm/s" in limits(
+        **good | {"slide_speed": 84.0}
+    )
+    assert "Toes sink" in limits(**good, floor_penetration=2.0)
     assert "trembles" in limits(**good, joint_acceleration=1.0)
 
 

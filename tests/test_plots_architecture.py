@@ -1,13 +1,10 @@
 """Figures on networks: the diagram of Figure 2 says what the config says, and can be read."""
 
-import matplotlib.colors
 import numpy as np
-import pandas as pd
 import pytest
 
 from f3amd_lib.models.zoo import build_config
 from f3amd_lib.report import plots_architecture as draw
-from f3amd_lib.report.figures import PALETTE
 
 SIZES = {"channels": 129, "num_styles": 15}
 
@@ -25,6 +22,11 @@ def test_figure2_has_the_numbers_of_the_config():
     assert {"2 ×", "m = 5 of 33", "64 × 129", "64 → 5", "conv 5"} <= set(other)
 
 
+def test_figure2_shows_what_no_preset_sets():
+    texts = set(diagram_texts("F3AMD-FNO-96", output_scaling=True, decoder_hidden_width=64))
+    assert {"skip\n$c_{skip}$ x", "96 → 64 → 129"} <= texts
+
+
 @pytest.mark.parametrize(
     ("name", "shown", "absent"),
     [
@@ -38,6 +40,11 @@ def test_figure2_has_the_numbers_of_the_config():
         ("F3AMD-FNO-96-AdaLN-zero", {"AdaLN-zero", "96 → 3 × 96", "gate"}, {"FiLM"}),
         ("F3AMD-FNO-96-cross-attention", {"z asks c"}, {"FiLM"}),
         ("F3AMD-FNO-96-plus", {"4 heads", "gain on\nresidual"}, set()),
+        (
+            "F3AMD-FNO-96-steady",
+            {"to face\nthe path", "42 × 138", "m = 22 of 22", "c   42 × 96", "turned\nback"},
+            {"c   32 × 96", "m = 17 of 17"},
+        ),
         ("F3AMD-FNO-96-raw", {"FNO block"}, {"$c_{in}$"}),
         ("CAMDM", {"76 tokens", "4 heads, 76 × 76", "1 of 8", "256 → 129"}, {"FiLM"}),
         ("CAMDM-code", {"108 tokens", "32 × 2", "32 × 6"}, {"32 × 8"}),
@@ -68,6 +75,7 @@ def test_camdms_tokens_add_up():
         "F3AMD-FNO-96-AdaLN-zero",
         "F3AMD-FNO-96-cross-attention",
         "F3AMD-FNO-96-plus",
+        "F3AMD-FNO-96-steady",
         "CAMDM-code",
     ],
 )
@@ -88,45 +96,6 @@ def test_no_text_of_the_diagram_lies_on_another_or_outside(name):
             assert (overlap < 3.0).any(), (text, other)  # lines of one box may touch
 
 
-def test_token_strips_have_a_square_for_each_token():
-    strips = {"one": [("style", 1), ("noisy frames", 4)], "two": [("path", 3)]}
-    axis = draw.token_strips(strips).axes[0]
-    colors = [matplotlib.colors.to_hex(bar.get_facecolor()).upper() for bar in axis.patches]
-    wanted = ["vermilion"] + 4 * ["purple"] + 3 * ["green"]
-    assert colors == [PALETTE[color].upper() for color in wanted]
-    assert {"5", "3", "one", "two"} <= {text.get_text() for text in axis.texts}
-
-
-def small_counts():
-    rows = [
-        ("FNO", variable, part, value, operations * value, exponent)
-        for variable in ("T", "D")
-        for part, operations, exponent in (("transform", 1e6, 1.0), ("as an FFT", 2e5, 1.2))
-        for value in (32, 64)
-    ]
-    columns = ["block", "variable", "part", "value", "operations", "exponent"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def test_complexity_lines_carry_their_exponents():
-    shares = pd.DataFrame(
-        {
-            "model": ["a", "a", "b"],
-            "part": ["transform", "mode product", "feed-forward"],
-            "operations": [1e6, 2e6, 5e6],
-        }
-    )
-    figure = draw.complexity_curves(small_counts(), shares)
-    panel, bars = figure.axes[0], figure.axes[-1]
-    assert panel.get_title(loc="left") == "FNO: against T"
-    np.testing.assert_allclose(panel.lines[0].get_ydata(), [32.0, 64.0])
-    assert [line.get_linestyle() for line in panel.lines] == ["-", ":"]
-    assert [text.get_text() for text in panel.texts] == ["1.2", "1.0"]
-    tops = [bar.get_y() + bar.get_height() for bar in bars.patches]
-    np.testing.assert_allclose(tops, [1.0, 3.0, 5.0])
-    assert [text.get_text() for text in bars.texts] == ["3.0", "5.0"]
-
-
 def test_influence_maps_share_a_scale():
     maps = {"weak": np.full((4, 4), 0.5), "strong": np.eye(4) * 3}
     for highest, end in ((None, 3.0), (2.0, 2.0)):
@@ -134,3 +103,5 @@ def test_influence_maps_share_a_scale():
         images = [axis.images[0] for axis in figure.axes[:2]]
         assert [image.get_clim() for image in images] == [(0.0, end)] * 2
         assert figure.axes[0].get_ylabel() == "there"
+        # An arrow on the colour bar where something lies beyond it.
+        assert figure.axes[-1]._colorbar.extend == ("max" if end < 3 else "neither")

@@ -4,7 +4,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.report import plots_speed
 from f3amd_lib.report.papers import load_paper_table
 from f3amd_lib.report.speed_tables import (
     fastest_ways,
@@ -142,38 +141,3 @@ def test_training_is_compared_by_quotients():
     fno = beside[(beside["model"] == "F3AMD-FNO-96") & (beside["window_frames"] == 32)].iloc[0]
     assert fno["our_over_camdm"] == 0.25
     np.testing.assert_allclose(fno["paper_over_camdm"], 5.07 / 12.50)
-
-
-def test_figures_draw_what_they_are_given():
-    paper = load_paper_table(1).query("device == 'CPU'")
-    figure = plots_speed.speedup_panels({"paper": speedups(paper), "again": speedups(paper)})
-    assert len(figure.axes) == 2
-    # Ten sizes, and the line at 1.
-    assert len(figure.axes[0].lines) == 11
-    line = next(line for line in figure.axes[0].lines if line.get_label() == "FNO-96")
-    expected = speedups(paper).query("model == 'F3AMD-FNO-96'").sort_values("characters")
-    np.testing.assert_allclose(line.get_ydata(), expected["speedup"])
-
-    by_steps = speedups(load_paper_table(4).query("device == 'CPU'")).query("model != 'CAMDM'")
-    figure = plots_speed.speedup_panels({"paper": by_steps}, by="steps")
-    labels = [line.get_label() for line in figure.axes[0].lines[:-1]]
-    assert labels == ["8 steps", "4 steps", "2 steps", "1 step"]
-
-    figure = plots_speed.way_bars(measured(*GOOD[:5]))
-    assert len(figure.axes) == 3
-    widths = [bar.get_width() for bar in figure.axes[1].patches]
-    np.testing.assert_allclose(widths, [60.0])
-
-    figure = plots_speed.time_curves(measured(*GOOD[:1]).assign(label="one"))
-    np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), [12.0])
-
-    table = pd.DataFrame(
-        {
-            "characters": 1,
-            "without": ["nothing", "FiLM"],
-            "value": [2.0, 1.5],
-            "saved": [np.nan, 0.25],
-        }
-    )
-    figure = plots_speed.part_bars(table)
-    np.testing.assert_allclose([bar.get_width() for bar in figure.axes[0].patches], [25.0])

@@ -20,8 +20,8 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton
 STEP_PROMINENCE = 0.015
 """How far a toe must rise over its surroundings to have taken a step, metres."""
 
-SHORTEST_STEP = 0.25
-"""Seconds between two steps of one foot, at least."""
+SHORTEST_STEP = 0.4
+"""Seconds between two steps of one foot, at least: a toe raised before it lands is no step."""
 
 FAST_SLIDE = 30.0
 """cm/s over which anybody sees a foot slide."""
@@ -35,7 +35,7 @@ def toe_positions(positions, skeleton: Skeleton) -> np.ndarray:
 def stepping_rate(positions, skeleton: Skeleton, fps: float = 30.0):
     """Count steps by toe height, of both feet together, per second.
 
-    A step is a peak of one toe's height that stands out by 1.5 cm, at least a quarter second after
+    A step is a peak of one toe's height that stands out by 1.5 cm, at least 0.4 s after
     that foot's last one; heights are averaged over 0.1 s first, so that shaking is no step. A foot
     that skates while its leg swings counts here: `slide_speed` is what sees it.
     """

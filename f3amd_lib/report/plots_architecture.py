@@ -1,4 +1,4 @@
-"""Figures of the notebooks on networks; each function draws numbers and computes nothing new."""
+"""Pictures that several notebooks on networks share: Figure 2 from a config, and influence maps."""
 
 from __future__ import annotations
 
@@ -7,78 +7,16 @@ from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
-import pandas as pd
 
 from f3amd_lib.models.camdm import CAMDMConfig
+from f3amd_lib.models.conditioning import PATH_CHANNELS
 from f3amd_lib.models.config import NetworkConfig
 from f3amd_lib.models.f3amd import F3AMDConfig
 from f3amd_lib.models.spectral import count_modes
 from f3amd_lib.report.figures import PALETTE, new_figure
-from f3amd_lib.report.plots import shades, styled
+from f3amd_lib.report.plots import styled
 
-__all__ = [
-    "spectral_kernel",
-    "kept_modes",
-    "influence_maps",
-    "film_gate",
-    "attention_maps",
-    "token_strips",
-    "complexity_curves",
-    "prediction_error",
-    "architecture_diagram",
-]
-
-
-@styled
-def spectral_kernel(weights, kernel, signal, response):
-    """Draw a spectral layer of one channel: weights on modes, kernel in time, what it does.
-
-    Args:
-      weights: complex, [m]; kernel: the same in time, [T]; signal, response: [T].
-    """
-    figure, axes = new_figure(8.8, 2.9, 1, 3)
-    mode = np.arange(len(weights))
-    axes[0].bar(mode, np.abs(weights), color=PALETTE["purple"])
-    axes[0].set_title("weights |W| on modes")
-    axes[0].set_xlabel("mode (turns a window)")
-    frame = np.arange(len(kernel))
-    axes[1].plot(frame, kernel, ".-", color=PALETTE["green"])
-    axes[1].set_title("the same as a kernel")
-    axes[1].set_xlabel("lag (frames, circular)")
-    axes[2].plot(frame, signal, color=PALETTE["grey"], label="in")
-    axes[2].plot(frame, response, color=PALETTE["purple"], label="out")
-    axes[2].set_title("what it does to a signal")
-    axes[2].set_xlabel("frame")
-    axes[2].legend()
-    return figure
-
-
-@styled
-def kept_modes(signal, cut: Mapping[int, np.ndarray], label: str):
-    """Draw a signal [T] and what is left of it when only the first m modes are kept."""
-    figure, axes = new_figure(8.8, 2.6, 1, len(cut), sharey=True, squeeze=False)
-    for axis, (modes, values) in zip(axes[0], cut.items(), strict=True):
-        axis.plot(signal, color=PALETTE["grey"], linewidth=3.0, label="in")
-        axis.plot(values, color=PALETTE["purple"], linewidth=1.6, label="kept")
-        axis.set_title(f"m = {modes}")
-        axis.set_xlabel("frame")
-    axes[0, 0].set_ylabel(label)
-    axes[0, 0].legend(fontsize=8)
-    return figure
-
-
-def _map_row(
-    maps: Mapping[str, np.ndarray], height: float, label: str, highest=None, **image_options
-):
-    """Draw maps side by side under one colour scale from 0; return the figure and its axes."""
-    figure, axes = new_figure(8.8, height, 1, len(maps), sharey=True, squeeze=False)
-    highest = highest or max(values.max() for values in maps.values())
-    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
-        image = axis.imshow(values, cmap="viridis", vmin=0.0, vmax=highest, **image_options)
-        axis.set_title(title)
-        axis.grid(visible=False)
-    figure.colorbar(image, ax=list(axes[0]), label=label, shrink=0.85)
-    return figure, list(axes[0])
+__all__ = ["TOKEN_COLORS", "influence_maps", "architecture_diagram"]
 
 
 @styled
@@ -94,69 +32,25 @@ def influence_maps(
     Args:
       maps: title -> [T out, T in], not negative.
       across, down: what the columns and the rows are.
-      highest: where the colour scale ends; by default at the largest value.
+      highest: where the colour scale ends, all above in its last colour; by default at the largest
+        value.
       label: of the colour scale.
     """
     height = 3.2 if len(maps) < 4 else 2.6
-    figure, axes = _map_row(maps, height, label, highest)
-    for axis in axes:
+    figure, axes = new_figure(
+        len(maps) * (height - 0.75) + 1.4, height, 1, len(maps), sharey=True, squeeze=False
+    )
+    limits = {"vmin": 0.0, "vmax": highest or max(values.max() for values in maps.values())}
+    for axis, (title, values) in zip(axes[0], maps.items(), strict=True):
+        image = axis.imshow(values, cmap="viridis", **limits)
+        axis.set_title(title)
         axis.set_xlabel(across)
-    axes[0].set_ylabel(down)
-    return figure
-
-
-@styled
-def film_gate(gamma, gate, z_base, z_tilde, gammas: Sequence[float]):
-    """Draw the gate of Eq. 6 against gamma, and a signal under a few settings of it.
-
-    Args:
-      gamma, gate: [P]; z_base: [T]; z_tilde: one signal [T] for each of `gammas`.
-    """
-    figure, (left, right) = new_figure(8.2, 3.0, 1, 2)
-    left.plot(gamma, gate, color=PALETTE["purple"], linewidth=2.4)
-    left.axhline(1, color=PALETTE["grey"], linewidth=0.8)
-    left.set_xlabel("γ")
-    left.set_title("gate 1 + tanh γ")
-    left.set_ylim(-0.1, 2.1)
-    right.plot(z_base, color=PALETTE["black"], linewidth=3, alpha=0.35, label="z base")
-    for value, signal, shade in zip(gammas, z_tilde, shades(len(gammas)), strict=True):
-        right.plot(signal, color=shade, label=f"γ = {value:g}")
-    right.set_title("a channel behind the gate (β = 0)")
-    right.set_xlabel("frame")
-    right.legend(fontsize=8, loc="upper right", ncols=2)
-    right.set_ylim(top=1.75 * right.get_ylim()[1])
-    return figure
-
-
-@styled
-def attention_maps(maps: Mapping[str, np.ndarray], num_history: int, window: int):
-    """Draw attention of each future frame (row) to the context tokens, [T, H + T + 1] each."""
-    figure, axes = _map_row(maps, 3.5, "attention weight", aspect="auto")
-    for axis in axes:
-        for edge in (num_history - 0.5, num_history + window - 0.5):
-            axis.axvline(edge, color="white", linewidth=1.5)
-        axis.set_xticks(
-            [(num_history - 1) / 2, num_history + (window - 1) / 2, num_history + window],
-            ["history", "path", "style"],
-        )
-        axis.set_xlabel("context token")
-    axes[0].set_ylabel("future frame that asks")
-    return figure
-
-
-@styled
-def prediction_error(sigmas, errors: Mapping[str, np.ndarray]):
-    """Draw the error of the clean estimate against the noise level for kinds of prediction, [S]."""
-    figure, axis = new_figure(6.6, 3.3)
-    for (label, values), color, line in zip(
-        errors.items(), ("purple", "vermilion", "orange"), ("-", "--", "-."), strict=False
-    ):
-        axis.plot(sigmas, values, color=PALETTE[color], linestyle=line, label=label)
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.set_xlabel("noise level σ")
-    axis.set_ylabel("error of the clean estimate")
-    axis.legend()
+        axis.grid(visible=False)
+    axes[0, 0].set_ylabel(down)
+    beyond = any(values.max() > limits["vmax"] for values in maps.values())
+    figure.colorbar(
+        image, ax=list(axes[0]), label=label, shrink=0.85, extend="max" if beyond else "neither"
+    )
     return figure
 
 
@@ -168,120 +62,6 @@ TOKEN_COLORS = {
     "noisy frames": "purple",
 }
 """Kinds of tokens, in CAMDM's order."""
-
-
-@styled
-def token_strips(strips: Mapping[str, Sequence[tuple[str, int]]]):
-    """Draw the sequences that networks read, a square for each token.
-
-    Args:
-      strips: title -> (kind of `TOKEN_COLORS`, number of tokens) in order.
-    """
-    figure, axis = new_figure(8.8, 0.5 + 0.52 * len(strips))
-    longest = max(sum(count for _, count in strip) for strip in strips.values())
-    for row, (title, strip) in enumerate(strips.items()):
-        first = 0
-        for kind, count in strip:
-            axis.bar(
-                first + np.arange(count) + 0.5, 0.56, width=0.86, bottom=-row - 0.28,
-                color=PALETTE[TOKEN_COLORS[kind]], label=kind if row == 0 else None, linewidth=0,
-            )  # fmt: skip
-            first += count
-        axis.text(-1.5, -row, title, ha="right", va="center", fontsize=9)
-        axis.text(first + 1, -row, f"{first}", va="center", fontsize=9)
-    handles = [
-        matplotlib.patches.Patch(color=PALETTE[color], label=kind)
-        for kind, color in TOKEN_COLORS.items()
-    ]
-    axis.set_xlim(-0.15 * longest, 1.06 * longest)
-    axis.set_ylim(0.5 - len(strips), 0.5)
-    axis.axis("off")
-    figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=8,
-                  handlelength=1.0, columnspacing=1.4)  # fmt: skip
-    return figure
-
-
-PART_COLORS = {
-    "transform": "sky",
-    "mode product": "purple",
-    "local convolutions": "vermilion",
-    "scores and averages": "green",
-    "query, key, value, output": "blue",
-    "feed-forward": "orange",
-}
-"""Parts of a base block whose operations are counted apart."""
-
-
-@styled
-def complexity_curves(counts: pd.DataFrame, shares: pd.DataFrame):
-    """Draw counted operations of base blocks against each of their sizes, and at the real sizes.
-
-    Args:
-      counts: columns block, variable, part, value (of the variable), operations, exponent (fitted
-        over all values); a panel for each block and variable. A part that `PART_COLORS` lacks is
-        drawn dotted.
-      shares: columns model, part, operations.
-    """
-    panels = list(counts.groupby(["block", "variable"], sort=False))
-    figure, axes = new_figure(8.8, 5.4, 2, 3)
-    for axis, ((block, variable), rows) in zip(axes.flat, panels, strict=False):
-        for part, line in rows.groupby("part", sort=False):
-            color = PALETTE[PART_COLORS.get(part, "grey")]
-            style = "o-" if part in PART_COLORS else ":"
-            axis.plot(line["value"], line["operations"] / 1e6, style, color=color, markersize=4)
-        values = sorted(rows["value"].unique())
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xticks(values, [f"{value:g}" for value in values])
-        axis.minorticks_off()
-        axis.margins(x=0.16)
-        _write_exponents(axis, rows)
-        axis.set_title(f"{block}: against {variable}")
-        axis.set_xlabel(variable)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("MFLOP")
-    _share_bars(axes.flat[-1], shares)
-    handles = [
-        matplotlib.patches.Patch(color=PALETTE[color], label=part)
-        for part, color in PART_COLORS.items()
-    ]
-    others = [part for part in counts["part"].unique() if part not in PART_COLORS]
-    handles += [
-        matplotlib.lines.Line2D([], [], linestyle=":", color=PALETTE["grey"], label=part)
-        for part in others
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
-    return figure
-
-
-def _write_exponents(axis, rows: pd.DataFrame) -> None:
-    """Write each line's exponent at its end, lifted where two would lie on each other."""
-    ends = rows.groupby("part", sort=False).last().sort_values("operations")
-    low, high = np.log10(axis.get_ylim())
-    step, previous = 0.085 * (high - low), -np.inf
-    for part, end in ends.iterrows():
-        previous = max(np.log10(end["operations"] / 1e6), previous + step)
-        axis.annotate(
-            f"{end['exponent']:.1f}", (end["value"], 10**previous), (6, 0), va="center",
-            textcoords="offset points", fontsize=8.5,
-            color=PALETTE[PART_COLORS.get(part, "grey")],
-        )  # fmt: skip
-
-
-def _share_bars(axis, shares: pd.DataFrame) -> None:
-    """Draw operations by part, a bar for each model."""
-    models = list(shares["model"].unique())
-    for place, model in enumerate(models):
-        base = 0.0
-        rows = shares.loc[shares["model"] == model, ["part", "operations"]]
-        for part, operations in rows.itertuples(index=False):
-            axis.bar(place, operations / 1e6, 0.62, base, color=PALETTE[PART_COLORS[part]])
-            base += operations / 1e6
-        axis.text(place, base, f"{base:.1f}", ha="center", va="bottom", fontsize=9)
-    axis.set_xticks(range(len(models)), models)
-    axis.margins(y=0.12)
-    axis.grid(axis="x", visible=False)
-    axis.set_title("one block, T = 32")
 
 
 # ------------------------------------------------------------------------ Figure 2, from a config
@@ -433,11 +213,13 @@ def _state(config: NetworkConfig, name: str) -> _Part:
     return _Part(f"{name}\n{config.window} × {config.channels}", "text", 0.72)
 
 
-def _coder_part(config: F3AMDConfig, name: str, width_in: int, width_out: int) -> _Part:
+def _coder_part(config: F3AMDConfig, name: str, *widths: int) -> _Part:
+    shown = " → ".join(map(str, widths))
     if config.encoder_decoder == "linear":
-        return _Part(f"{name}\nlinear\n{width_in} → {width_out}", "linear", 1.02)
-    modes = min(config.num_kept_modes, count_modes("fourier", config.window))
-    return _Part(f"{name}\nFNO, m = {modes}\n{width_in} → {width_out}", "fno", 1.02)
+        return _Part(f"{name}\nlinear\n{shown}", "linear", 1.02)
+    frames = config.window + config.frames_before
+    modes = min(config.num_kept_modes, count_modes("fourier", frames))
+    return _Part(f"{name}\nFNO, m = {modes}\n{shown}", "fno", 1.02)
 
 
 def _base_part(config: NetworkConfig) -> _Part:
@@ -454,10 +236,16 @@ def _base_part(config: NetworkConfig) -> _Part:
 def _draw_f3amd(config: F3AMDConfig) -> _Sheet:
     width, frames = config.latent_width, config.block_frames
     way = config.conditioning
-    parts = [_state(config, "noisy x")]
+    parts, width_in = [_state(config, "noisy x")], config.channels
+    if config.facing_frame:
+        parts.append(_node("↻", "to face\nthe path", ours=True))
     if config.input_scaling:
         parts.append(_node("×", r"$c_{in}$", ours=True))
-    parts.append(_coder_part(config, "encoder", config.channels, width))
+    if config.history_input:
+        width_in += PATH_CHANNELS + 1  # the last one says which frames are given
+        text = f"history, then x\nbeside it the path\n{frames} × {width_in}"
+        parts.append(_Part(text, "inside", 1.12, ours=True))
+    parts.append(_coder_part(config, "encoder", width_in, width))
     place = {}
     if way == "concatenation":
         place["c"] = len(parts)
@@ -481,11 +269,18 @@ def _draw_f3amd(config: F3AMDConfig) -> _Sheet:
     place["last"] = len(parts) - 1
     if way == "concatenation":
         parts.append(_Part(f"last\n{config.window}", "step", 0.5))
-    parts.append(_coder_part(config, "decoder", width, config.channels))
+    hidden = [config.decoder_hidden_width] if config.decoder_hidden_width else []
+    parts.append(_coder_part(config, "decoder", width, *hidden, config.channels))
+    if config.history_input:
+        parts.append(_Part(f"last\n{config.window}", "step", 0.5, ours=True))
+    if config.output_scaling:
+        parts.append(_node("+", "skip\n$c_{skip}$ x", ours=True))
     if config.history_anchor:
         parts.append(_node("+", "last\nframe", ours=True))
     if config.residual_prior:
         parts.append(_node("g", "gain on\nresidual", ours=True))
+    if config.facing_frame:
+        parts.append(_node("↺", "turned\nback", ours=True))
     parts.append(_state(config, "clean x̂₀"))
 
     total = max(9.0, sum(part.width for part in parts) + 0.3 * (len(parts) - 1) + 0.2)
@@ -566,7 +361,10 @@ def _draw_condition(sheet: _Sheet, config: F3AMDConfig, y, end) -> None:
     sheet.arrow((2.66, upper), (4.2, upper), (4.2, middle + 0.25))
     sheet.text(4.26, upper - 0.16, "question", 7.5, ha="left", color="#444444")
     sheet.arrow((2.9, middle), (3.6, middle))
-    label = (f"c   {config.window} × {width}", 8)
+    if config.facing_frame:
+        sheet.text(0.1, _LOW, "history and path turned (↻) as x is", 7.5, ha="left",
+                   color="#444444")  # fmt: skip
+    label = (f"c   {config.window + config.frames_before} × {width}", 8)
     if end < 4.9:  # the box is not to the right of the cross-attention: go down first
         sheet.arrow((4.2, middle - 0.25), (4.2, _LOW), (end, _LOW), (end, y + 0.31))
         sheet.text(4.27, _LOW + 0.02, *label, ha="left", va="bottom")
@@ -610,7 +408,7 @@ def _draw_fno(sheet: _Sheet, config: F3AMDConfig, left, right) -> None:
     }[variant]  # fmt: skip
     transform = _TRANSFORMS[variant]
     high, low, mid = 1.16, 0.4, 0.78
-    first, last = left + 0.28, right - 0.72
+    first, last = left + 0.28, right - 0.77
     sheet.text(left + 0.02, mid, "z", 8.5, ha="left", fontweight="bold")
     bins = f"{config.block_frames} → {modes}"
     upper = (
@@ -632,8 +430,8 @@ def _draw_fno(sheet: _Sheet, config: F3AMDConfig, left, right) -> None:
         sheet.arrow((first, mid), (first, y), (inner[0], y))
         side = 1 if y > mid else -1
         sheet.arrow((inner[1], y), (last + 0.1, y), (last + 0.1, mid + 0.13 * side))
-    sheet.arrow((last + 0.23, mid), (right - 0.38, mid))
-    sheet.text(right - 0.36, mid, "z base", 8.5, ha="left", fontweight="bold")
+    sheet.arrow((last + 0.23, mid), (right - 0.43, mid))
+    sheet.text(right - 0.41, mid, "z base", 8.5, ha="left", fontweight="bold")
 
 
 def _draw_conditioning(sheet: _Sheet, config: F3AMDConfig, left, right) -> None:

@@ -8,6 +8,7 @@ disk but the paper's numbers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -253,7 +254,11 @@ README_ROWS = {
     "IRD": ("IRD (cm)", 1),
     "IRD_excess": ("IRD excess (cm)", 1),
     "joint_acceleration": ("joint acceleration (cm/frame²)", 2),
-    "foot_alternation": ("foot alternation (1/s)", 2),
+    "foot_alternation": ("changes of the resting foot (1/s)", 2),
+    "stepping_rate": ("steps by toe height (1/s)", 2),
+    "slide_speed": ("slide of the lower toe (cm/s)", 0),
+    "sliding_share": ("share of frames that slide over 30 cm/s", 2),
+    "seam_kick": ("kick at the seams", 1),
     "x0_error_ratio": ("x0 error, low over high noise", 2),
 }
 """Metrics of README's table, with their headings and decimals."""
@@ -288,7 +293,8 @@ def readme_table(quality: pd.DataFrame, window: int = 32) -> str:
             row[title] = "–"
             if (model, steps, metric) in own.index:
                 value, low, high = own.loc[(model, steps, metric), ["value", "low", "high"]]
-                half = 0.5 * (high - low)
-                row[title] = f"{value:.{decimals}f} ± {half:.{decimals}f}"
+                row[title] = f"{value:.{decimals}f}"
+                if not math.isnan(high - low):  # one clip, or one seed, has no interval
+                    row[title] += f" ± {0.5 * (high - low):.{decimals}f}"
         rows.append(row)
     return markdown_table(pd.DataFrame(rows))

@@ -221,7 +221,9 @@ def _in_eight_bits(leaf) -> dict | jax.Array:
         return leaf.astype(jnp.bfloat16)
     largest = jnp.max(jnp.abs(leaf), axis=-2, keepdims=True)
     scale = jnp.where(largest > 0, largest, 1.0).astype(jnp.float32) / 127.0
-    return {"eight_bits": jnp.round(leaf / scale).astype(jnp.int8), "scale": scale}
+    scale = scale.astype(jnp.float16).astype(jnp.float32)  # used as it is kept
+    eight_bits = jnp.clip(jnp.round(leaf / scale), -127, 127).astype(jnp.int8)
+    return {"eight_bits": eight_bits, "scale": scale.astype(jnp.float16)}
 
 
 def _from_eight_bits(leaf):
@@ -300,11 +302,14 @@ def _model_template(metadata: dict) -> dict:
             "written by version 0.1 of this project, before models named their family and noise; "
             "train it again (the file can stay under another name)"
         )
+    single = jax.ShapeDtypeStruct
     config = config_from_dict(metadata["model"])
     params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
     if metadata.get("weights") == "int8":
         params = jax.eval_shape(lambda tree: jax.tree.map(_in_eight_bits, tree), params)
-    single = jax.ShapeDtypeStruct
+        # Scales of earlier files have single precision; both are read as what they are.
+        wide = lambda leaf: single(leaf.shape, jnp.float32) if leaf.dtype == jnp.float16 else leaf
+        params = jax.tree.map(wide, params)
     return {
         "params": params,
         "normaliser": {

@@ -51,6 +51,7 @@ __all__ = [
     "train",
     "finished_model",
     "obtain_model",
+    "shipped_weights",
     "shown_model",
     "shipped_history",
     "available_models",
@@ -374,6 +375,12 @@ def obtain_model(
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
+def shipped_weights(dataset: str) -> Path | None:
+    """Return the weights whose motion is shown of a data set, None where none ship."""
+    weights = model_files(load_profile("laptop", dataset), folder=PRETRAINED_DIR / dataset).model
+    return weights if weights.is_file() else None
+
+
 def shown_model(
     prepared: PreparedData, profile: Profile, *, progress: bool = True
 ) -> tuple[TrainedModel, str]:
@@ -387,9 +394,8 @@ def shown_model(
     Returns:
       (model, origin), origin as from `obtain_model`.
     """
-    laptop = load_profile("laptop", profile.dataset)
-    shipped = model_files(laptop, folder=PRETRAINED_DIR / profile.dataset).model
-    if profile.name == "smoke" and shipped.exists():
+    shipped = shipped_weights(profile.dataset)
+    if profile.name == "smoke" and shipped:
         trained = load_model(shipped)
         known = set(prepared.packed.styles) <= set(trained.styles)
         if known and trained.skeleton == prepared.packed.skeleton:
