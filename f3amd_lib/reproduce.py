@@ -44,6 +44,8 @@ __all__ = [
 ]
 
 KERNEL = "python3"
+_SETTLED = 60.0
+"""Seconds at the usual pace that are taken for granted before a run's own pace counts."""
 
 
 class NotebookFailed(RuntimeError):
@@ -217,7 +219,7 @@ def reproduce(
     with _results_root(profile):
         results = results_dir(dataset, profile)
         # Bars are for people: a log file gets the lines of `say` instead.
-        usual, pace = _usual_seconds(results), []
+        usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
         for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
             began, start = time.time(), time.monotonic()
             try:
@@ -236,9 +238,9 @@ def reproduce(
             if failure:
                 break
             if path.name in usual:
-                pace.append(seconds / max(usual[path.name], 1.0))
+                took, usually = took + seconds, usually + usual[path.name]
             rest = sum(usual.get(later.name, 0.0) for later in selected[number + 1 :])
-            left = rest * sum(pace) / len(pace) if pace else None
+            left = rest * took / usually
             say(_news(path, seconds, written_since(results, began), left))
 
     summary = pd.DataFrame(rows)

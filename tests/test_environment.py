@@ -26,7 +26,7 @@ MACHINES = ("x86_64", "aarch64")
 HASHED = ("web",)
 """Extras with a requirements file of their own, hashed and in step with the lock."""
 
-CONDA_NAMES = {"matplotlib": "matplotlib-base"}
+CONDA_NAMES = {"flatbuffers": "python-flatbuffers", "matplotlib": "matplotlib-base"}
 """What conda-forge calls a package that PyPI calls otherwise."""
 
 IMPORT_NAMES = {
