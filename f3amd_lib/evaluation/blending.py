@@ -22,18 +22,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import motion_from_frames, split_frames, world_frames
+from f3amd_lib.evaluation.generated import Rollout
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion
-
-if TYPE_CHECKING:  # rollout.py offers blending as an option
-    from f3amd_lib.evaluation.rollout import Rollout
 
 __all__ = [
     "blend_motion",

@@ -24,7 +24,6 @@ stretched bones.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -40,11 +39,9 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import frame_positions, world_frames
+from f3amd_lib.evaluation.generated import Rollout
 from f3amd_lib.evaluation.walking import STEP_PROMINENCE, toe_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, global_rotations
-
-if TYPE_CHECKING:  # rollout.py may offer locking as an option
-    from f3amd_lib.evaluation.rollout import Rollout
 
 __all__ = ["DEEPEST", "FARTHEST", "leg_chains", "lock_feet", "lock_rollout", "plan_contacts"]
 

@@ -20,6 +20,7 @@ from scipy.signal import savgol_filter
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.evaluation.generated import Rollout
 from f3amd_lib.evaluation.metrics import (
     METRICS,
     first_metrics,
@@ -28,7 +29,6 @@ from f3amd_lib.evaluation.metrics import (
     tidy_metrics,
 )
 from f3amd_lib.evaluation.paths import RootPath, path_from_motion, tangent_yaw
-from f3amd_lib.evaluation.rollout import Rollout
 from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, facing_yaw
 from f3amd_lib.report.papers import load_paper_table

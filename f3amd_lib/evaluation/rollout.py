@@ -8,7 +8,6 @@ jitted scan.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,6 @@ import numpy as np
 from f3amd_lib.data.features import (
     bend_path,
     center_window,
-    motion_from_frames,
     orthonormalise,
     path_condition,
     turn_frames,
@@ -27,52 +25,14 @@ from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.evaluation.blending import blend_rollout
 from f3amd_lib.evaluation.foot_locking import lock_rollout
+from f3amd_lib.evaluation.generated import Rollout
 from f3amd_lib.evaluation.paths import RootPath
 from f3amd_lib.models.conditioning import Condition
 from f3amd_lib.models.config import cast_network
-from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.names import nearest_hint
 from f3amd_lib.training.checkpoints import TrainedModel
 
 __all__ = ["MotionGenerator", "Rollout", "as_fast_as", "path_start", "pose_speed"]
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """What a rollout made.
-
-    Attributes:
-      skeleton: of the characters.
-      frames: world frames, [B, F, C], F frames as in the path; metres and 6D, orthonormal.
-      history: the frames before the first window, [B, H, C].
-      paths: what each character was asked to follow.
-      styles: what each character was asked to look like.
-      window: T; window k starts at frame k * T.
-      blend_frames: frames after each window boundary that were blended; 0 is as it was made.
-      feet_locked: whether feet were held where they stand (`foot_locking`).
-    """
-
-    skeleton: Skeleton
-    frames: np.ndarray
-    history: np.ndarray
-    paths: tuple[RootPath, ...]
-    styles: tuple[str, ...]
-    window: int
-    blend_frames: int = 0
-    feet_locked: bool = False
-
-    @property
-    def changes(self) -> str:
-        """What was done to the motion after the network made it, as a phrase; "" for nothing."""
-        done = [f"blended over {self.blend_frames} frames"] if self.blend_frames else []
-        return ", ".join(done + ["feet locked"] * self.feet_locked)
-
-    def motion(self, character: int = 0, *, with_history: bool = False) -> Motion:
-        """Return one character's motion, from the first generated frame unless told."""
-        frames = self.frames[character]
-        if with_history:
-            frames = np.concatenate([self.history[character], frames])
-        return motion_from_frames(self.skeleton, frames, name=self.styles[character])
 
 
 class MotionGenerator:
