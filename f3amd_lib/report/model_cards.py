@@ -208,11 +208,11 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
         weights = by_seed[[*keys, "weights"]].drop_duplicates(keys)
         tables.append(table.merge(weights, on=keys, how="left"))
     if (folder / "walking.csv").exists():
-        tables.append(_walking_rows(*read_table(folder / "walking.csv")))
+        tables.append(_walking_rows(read_table(folder / "walking.csv")[0]))
     return pd.concat(tables, ignore_index=True) if tables else None
 
 
-def _walking_rows(walking: pd.DataFrame, _record: dict) -> pd.DataFrame:
+def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     """Sum `records/walking.csv` up in the form of the protocol's table."""
     rows = []
     figures = [name for name in CARD_FIGURES if name in walking and name != "joint_acceleration"]

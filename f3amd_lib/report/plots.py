@@ -15,9 +15,7 @@ from PIL import Image
 
 from f3amd_lib.report.figures import plot_style, save_figure, show_figure
 
-__all__ = ["ORDER", "styled", "shades", "keep_figure"]
-
-ORDER = ("purple", "orange", "green", "vermilion", "blue", "sky")
+__all__ = ["styled", "shades", "keep_figure"]
 
 
 def styled(draw):

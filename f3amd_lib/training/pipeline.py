@@ -202,7 +202,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
     """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
     preset = _preset_name(profile, preset)
-    ours = zoo.find_preset(preset).source == "ours"
+    ours = preset.endswith(("-plus", "-steady"))
     recipe = paper_recipe if profile.name == "gpu" and not ours else short_recipe
     return recipe(
         preset,
