@@ -115,6 +115,7 @@ _STEADY_TRAINING = {
         "position": 60.0,
         "joint_velocity": 600.0,
         "foot": 1500.0,
+        "floor": 3000.0,
     },
 }
 

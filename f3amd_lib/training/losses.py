@@ -16,7 +16,7 @@ from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
 
 __all__ = ["LossWeights", "LOSS_TERMS", "loss_terms", "total_loss"]
 
-LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "ird")
+LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "floor", "ird")
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class LossWeights:
       position: lambda of Eq. 12.
       feature_velocity, joint_velocity: lambda of the two halves of Eq. 13 (the paper has one).
       foot: lambda of the foot-contact term.
+      floor: lambda of our term against sinking; the paper has none.
       ird: lambda of Eq. 10.
       ird_form: "literal" is Eq. 10, the distance between the last frame before the seam and the
         first after it, which asks the character to stand still there; "excess" measures the step
@@ -42,6 +43,7 @@ class LossWeights:
     feature_velocity: float = 1.0
     joint_velocity: float = 1.0
     foot: float = 1.0
+    floor: float = 0.0
     ird: float = 1.0
     ird_form: str = "literal"
 
@@ -99,6 +101,8 @@ def loss_terms(
         joint_velocity    E |d FK(x0_hat) - d FK(x0)|^2                 (Eq. 13, second half)
         foot              E |contact * d FK(x0_hat)_toes|^2             (Appendix B; contact where
                           the reference toe moves under 1 cm in a frame)
+        floor             E max(lowest reference toe of the window - FK(x0_hat)_toes, 0)^2 along +Y
+                          (ours)
         ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or its excess form
 
     Raises:
@@ -116,6 +120,8 @@ def loss_terms(
     step = positions[:, 1:] - positions[:, :-1]
     toes = jnp.array(skeleton.toes)
     contact = jnp.linalg.norm(step[:, :, toes], axis=-1) < CONTACT_SPEED
+    floor = jnp.min(positions[:, :, toes, 1], axis=(1, 2), keepdims=True)
+    below = jnp.maximum(floor - positions_hat[:, :, toes, 1], 0.0)
     seam = positions_hat[:, 0] - before
     if ird_form == "excess":
         seam = seam - (positions[:, 0] - before)
@@ -127,10 +133,11 @@ def loss_terms(
         ),
         "joint_velocity": mean_square(step_hat - step),
         "foot": mean_square(step_hat[:, :, toes] * contact[..., None]),
+        "floor": _mean(below * below, weights),
         "ird": _mean(_norm(seam), weights),
     }
 
 
 def total_loss(terms: dict, weights: LossWeights):
-    """Return the weighted sum of the terms (Eq. 14 plus lambda_IRD of section 4.1)."""
+    """Return the weighted sum of the terms (Eq. 14 plus lambda_IRD of section 4.1, and our floor)."""
     return sum(getattr(weights, name) * terms[name] for name in LOSS_TERMS)
