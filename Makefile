@@ -47,7 +47,7 @@ SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
-	  $(PYTHON) -m f3amd_lib.measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
+	  $(PYTHON) -m f3amd_lib.experiments.measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
 
 bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=options; bench-tools adds peers)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \

@@ -36,11 +36,7 @@ LOADS = {  # attributes by which a page makes the browser ask for something whil
     ("video", "poster"),
     ("video", "src"),
 }
-SEVERAL = {
-    ("img", "srcset"),
-    ("link", "imagesrcset"),
-    ("source", "srcset"),
-}  # of which one is taken
+SEVERAL = {("img", "srcset"), ("link", "imagesrcset"), ("source", "srcset")}  # of which one is taken
 UNLOADED = {"canonical", "index", "search", "next", "prev", "author", "copyright"}  # of <link>
 
 
@@ -129,9 +125,7 @@ def check_site(folder: Path) -> tuple[list[str], int]:
       ValueError: if there is no page in the folder.
     """
     folder = folder.resolve()
-    pages = {
-        path: Page(path.read_text(encoding="utf-8")) for path in sorted(folder.rglob("*.html"))
-    }
+    pages = {path: Page(path.read_text(encoding="utf-8")) for path in sorted(folder.rglob("*.html"))}
     if not pages:
         raise ValueError(f"{folder}: no pages; build the site first (make site)")
     faults, outside = [], set()

@@ -59,11 +59,7 @@ myst_links_external_new_tab = False
 
 # Equations: MathJax's own single file, which draws with paths and so needs no fonts.
 mathjax_path = "mathjax/tex-svg-full.js"
-mathjax3_config = {
-    "svg": {"fontCache": "global"},
-    "tex": {"tags": "none"},
-    "options": {"enableMenu": True},
-}
+mathjax3_config = {"svg": {"fontCache": "global"}, "tex": {"tags": "none"}, "options": {"enableMenu": True}}
 
 # The library's docstrings: Google's sections, code between single backticks.
 default_role = "py:obj"

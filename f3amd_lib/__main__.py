@@ -23,7 +23,7 @@ log = logging.getLogger("f3amd")
 
 
 def _profile(arguments, **overrides):
-    from f3amd_lib.profiles import load_profile
+    from f3amd_lib.ground.profiles import load_profile
 
     given = {name: value for name, value in overrides.items() if value is not None}
     return load_profile(arguments.profile, arguments.data, **given)
@@ -49,8 +49,8 @@ def _data(arguments) -> None:
 
 
 def _presets(arguments) -> None:
-    from f3amd_lib.models import zoo
-    from f3amd_lib.report.tables import markdown_table
+    from f3amd_lib.ground.tables import markdown_table
+    from f3amd_lib.networks import zoo
 
     table = zoo.table(channels=arguments.channels, num_styles=arguments.styles)
     log.info("%s", markdown_table(table))
@@ -61,8 +61,8 @@ UNFINISHED = 3
 
 
 def _train(arguments) -> int:
+    from f3amd_lib.experiments.family import train_family
     from f3amd_lib.training import parallel
-    from f3amd_lib.training.family import train_family
     from f3amd_lib.training.pipeline import model_files, prepare
 
     together = (arguments.coordinator, arguments.processes, arguments.process)
@@ -95,7 +95,7 @@ def _train(arguments) -> int:
 
 
 def _path(text: str, num_frames: int, speed: float, seed: int):
-    from f3amd_lib.evaluation.paths import named_path, read_path_csv
+    from f3amd_lib.motion.root_paths import named_path, read_path_csv
 
     if text.lower().endswith(".csv"):
         return read_path_csv(text)
@@ -115,11 +115,11 @@ def _trained(arguments):
 
 
 def _rollout(arguments) -> None:
-    from f3amd_lib.evaluation.rollout import MotionGenerator
+    from f3amd_lib.drawing.pictures import film_strip, write_gif
+    from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.generation.rollout import MotionGenerator
     from f3amd_lib.motion.bvh import write_bvh
-    from f3amd_lib.report.figures import save_figure
-    from f3amd_lib.report.pictures import film_strip, write_gif
-    from f3amd_lib.report.player import rollout_scene, write_player
+    from f3amd_lib.serving.player import rollout_scene, write_player
 
     trained = _trained(arguments)
     num_frames = _num_frames(arguments.seconds)
@@ -157,7 +157,7 @@ def _rollout(arguments) -> None:
 
 def _has_legs(skeleton) -> bool:
     """Say whether feet can be held: legs of hip, knee, ankle and toe."""
-    from f3amd_lib.evaluation.foot_locking import leg_chains
+    from f3amd_lib.generation.foot_locking import leg_chains
 
     try:
         leg_chains(skeleton)
@@ -175,8 +175,8 @@ def _num_frames(seconds: float) -> int:
 
 
 def _crowd(arguments) -> None:
-    from f3amd_lib.evaluation.crowd import generate_crowd
-    from f3amd_lib.evaluation.rollout import MotionGenerator
+    from f3amd_lib.generation.crowd import generate_crowd
+    from f3amd_lib.generation.rollout import MotionGenerator
 
     num_frames, out = _num_frames(arguments.seconds), Path(arguments.out)
     pictures = []
@@ -210,18 +210,16 @@ def _crowd(arguments) -> None:
 
 def _crowd_pictures(crowd, still: Path, page: Path) -> None:
     """Draw a crowd half way through, and write a page that plays up to 100 of it."""
-    from f3amd_lib.report import plots_crowd as draw
-    from f3amd_lib.report.figures import save_figure
-    from f3amd_lib.report.player import Character, Scene, write_player
+    from f3amd_lib.drawing import plots_crowd as draw
+    from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.serving.player import Character, Scene, write_player
 
     few, model = min(100, len(crowd)), crowd.settings["model"]
     motions = [crowd.motion(k) for k in range(few)]
     colors = draw.crowd_colors([motion.name for motion in motions])
     picture = draw.CrowdPicture(motions, colors, model["name"])
     figure = draw.crowd_figure([picture], crowd.num_frames // 2, columns=1)
-    characters = [
-        Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)
-    ]
+    characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
     credit = ", ".join(filter(None, (model["dataset_credit"], model["dataset_licence"])))
     scene = Scene(characters, title=model["name"])
     write_player(page, scene, strip=False, credit=credit)
@@ -229,7 +227,7 @@ def _crowd_pictures(crowd, still: Path, page: Path) -> None:
 
 
 def _export(arguments) -> None:
-    from f3amd_lib.benchmarking.export import export_model
+    from f3amd_lib.serving.export import export_model
 
     targets = arguments.target
     if targets is None:  # nobody asked for one: compile for this processor where that can be done
@@ -272,7 +270,7 @@ def _parser() -> argparse.ArgumentParser:
         return command
 
     def with_data(command):
-        from f3amd_lib.profiles import DATASETS, PROFILES
+        from f3amd_lib.ground.profiles import DATASETS, PROFILES
 
         command.add_argument("--data", default="synthetic", choices=DATASETS)
         command.add_argument("--profile", default="laptop", choices=PROFILES)
@@ -292,13 +290,9 @@ def _parser() -> argparse.ArgumentParser:
         help="such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order",
     )
     train.add_argument(
-        "--minutes",
-        type=float,
-        help="stop then, with a checkpoint that a later call goes on from, and exit status 3",
+        "--minutes", type=float, help="stop then, with a checkpoint that a later call goes on from, and exit status 3"
     )
-    train.add_argument(
-        "--all-devices", action="store_true", help="share each batch among the devices JAX sees"
-    )
+    train.add_argument("--all-devices", action="store_true", help="share each batch among the devices JAX sees")
     train.add_argument("--processes", type=int, help="train in so many processes together")
     train.add_argument("--process", type=int, help="number of this one, from 0")
     train.add_argument("--coordinator", metavar="HOST:PORT", help="of process 0")
@@ -315,14 +309,12 @@ def _parser() -> argparse.ArgumentParser:
 
     def with_model(command):
         command.add_argument("--steps", type=int, default=8, help="denoising steps a round")
-        command.add_argument(
-            "--sampler", help="ddim, ddpm, euler, heun; by default the model's own"
-        )
+        command.add_argument("--sampler", help="ddim, ddpm, euler, heun; by default the model's own")
         command.add_argument("--data", default="synthetic", help="use the model of this data set")
         command.add_argument("--weights", help="a weights file, instead of the data set's own")
         command.add_argument("--overwrite", action="store_true", help="replace what lies there")
 
-    from f3amd_lib.evaluation.crowd_planning import MIN_DISTANCE
+    from f3amd_lib.generation.crowd_planning import MIN_DISTANCE
 
     crowd = add("crowd", _crowd, "animate any number of characters; goes on where it was stopped")
     with_model(crowd)
@@ -339,46 +331,28 @@ def _parser() -> argparse.ArgumentParser:
         metavar="METRES",
         help=f"paths that keep this far apart at every frame ({MIN_DISTANCE} without a number)",
     )
-    crowd.add_argument(
-        "--pictures", action="store_true", help="draw OUT.png and the player page OUT.html as well"
-    )
+    crowd.add_argument("--pictures", action="store_true", help="draw OUT.png and the player page OUT.html as well")
     crowd.add_argument("--out", default="out/crowd", help="folder to write to")
 
     export = add("export", _export, "make a round that runs without the model code")
     with_model(export)
     export.add_argument("--characters", type=int, default=1, help="of one call")
-    export.add_argument(
-        "--target", action="append", help="llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable"
-    )
+    export.add_argument("--target", action="append", help="llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable")
     export.add_argument("--out", default="out/round", help="folder to write to")
 
     bench = add("bench", _bench, "time synthesis and training (bench --help tells more)")
     bench.add_argument("words", nargs=argparse.REMAINDER, help="options of the benchmarks")
 
-    rollout = add(
-        "rollout", _rollout, "animate one character: BVH, film strip, GIF (its first 12 s), player"
-    )
+    rollout = add("rollout", _rollout, "animate one character: BVH, film strip, GIF (its first 12 s), player")
     rollout.add_argument("--style", required=True)
     rollout.add_argument("--path", default="figure-eight", help="a named path, or a CSV file")
     rollout.add_argument("--seed", type=int, default=0)
-    rollout.add_argument(
-        "--seconds", type=float, default=20.0, help="length of a named path; a CSV has its own"
-    )
-    rollout.add_argument(
-        "--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own"
-    )
+    rollout.add_argument("--seconds", type=float, default=20.0, help="length of a named path; a CSV has its own")
+    rollout.add_argument("--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own")
     with_model(rollout)
-    rollout.add_argument(
-        "--blend",
-        type=int,
-        default=4,
-        metavar="N",
-        help="blend N frames after each window boundary",
-    )
+    rollout.add_argument("--blend", type=int, default=4, metavar="N", help="blend N frames after each window boundary")
     rollout.add_argument("--slide", action="store_true", help="do not hold feet where they stand")
-    rollout.add_argument(
-        "--raw", action="store_true", help="as the network made it: no blending, no held feet"
-    )
+    rollout.add_argument("--raw", action="store_true", help="as the network made it: no blending, no held feet")
     rollout.add_argument("--out", default="out", help="folder to write to")
     return parser
 

@@ -27,21 +27,12 @@ from nbclient.exceptions import DeadKernelError
 from papermill.exceptions import PapermillExecutionError
 from tqdm import tqdm
 
-from f3amd_lib import profiles
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE
-from f3amd_lib.names import nearest_hint
-from f3amd_lib.profiles import load_profile, results_dir, runs_dir
-from f3amd_lib.report.records import run_record, write_table
-
-__all__ = [
-    "NotebookFailed",
-    "find_notebooks",
-    "select_notebooks",
-    "check_parameters",
-    "reproduce",
-    "main",
-]
+from f3amd_lib.ground import profiles
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
+from f3amd_lib.ground.records import run_record, write_table
 
 KERNEL = "python3"
 _SETTLED = 60.0
@@ -63,9 +54,7 @@ def find_notebooks(folder) -> list[Path]:
     """
     found = sorted(Path(folder).glob("[0-9][0-9]_*.ipynb"))
     if not found:
-        raise ValueError(
-            f"{folder}: no numbered notebooks here; run this in a checkout of the repository"
-        )
+        raise ValueError(f"{folder}: no numbered notebooks here; run this in a checkout of the repository")
     return found
 
 
@@ -110,9 +99,7 @@ def check_parameters(notebooks: Iterable[Path], names: Iterable[str]) -> None:
         known = papermill.inspect_notebook(str(path))
         for name in names:
             if name not in known:
-                raise ValueError(
-                    f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}"
-                )
+                raise ValueError(f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}")
 
 
 def written_since(folder: Path, start: float) -> dict[str, int]:
@@ -164,9 +151,7 @@ def what_to_open(results: Path) -> list[str]:
         "do they walk, in numbers": "tables/05_walks.csv",
     }
     found = {what: results / name for what, name in worth.items()}
-    found["each claim of the paper with a verdict"] = (
-        profiles.repository_root() / "paper_figures" / "claims.md"
-    )
+    found["each claim of the paper with a verdict"] = profiles.repository_root() / "paper_figures" / "claims.md"
     return [f"{what}: {_short(path)}" for what, path in found.items() if path.is_file()]
 
 
@@ -209,11 +194,7 @@ def reproduce(
     own_folder = runs_dir(dataset, profile)
     executed_folder = own_folder / "notebooks"
     executed_folder.mkdir(parents=True, exist_ok=True)
-    record_extras = {
-        "parameters": parameters,
-        "notebooks": [path.name for path in selected],
-        **_machine(),
-    }
+    record_extras = {"parameters": parameters, "notebooks": [path.name for path in selected], **_machine()}
     rows = []
     failure = None
     with _results_root(profile):
@@ -247,15 +228,8 @@ def reproduce(
     complete = failure is None and len(selected) == len(available)
     # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
     # its memory from the notebooks.
-    record = run_record(
-        profile=profile,
-        dataset=dataset,
-        seed=parameters.get("seed", defaults.seed),
-        **record_extras,
-    )
-    write_table(
-        (results / "tables" if complete else own_folder) / "run_summary.csv", summary, record
-    )
+    record = run_record(profile=profile, dataset=dataset, seed=parameters.get("seed", defaults.seed), **record_extras)
+    write_table((results / "tables" if complete else own_folder) / "run_summary.csv", summary, record)
     if failure:
         raise failure
     return summary
@@ -290,10 +264,7 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
 
 
 def _failure(path: Path, cell: str, cause: str, copy: Path, log: Path) -> str:
-    return (
-        f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n"
-        f"  executed so far: {_short(copy)}"
-    )
+    return f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n  executed so far: {_short(copy)}"
 
 
 def _last_started_cell(copy: Path) -> str:
@@ -388,9 +359,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--data", default="synthetic", help=f"{', '.join(profiles.DATASETS)}")
     parser.add_argument("--profile", default="laptop", help=f"{', '.join(profiles.PROFILES)}")
-    parser.add_argument(
-        "--only", action="append", default=[], metavar="NUMBER", help="this notebook; repeatable"
-    )
+    parser.add_argument("--only", action="append", default=[], metavar="NUMBER", help="this notebook; repeatable")
     parser.add_argument(
         "--set",
         action="append",
@@ -407,13 +376,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Papermill names each notebook twice at INFO; warnings are news.
     logging.getLogger("papermill").setLevel(logging.WARNING)
     try:
-        summary = reproduce(
-            options.data,
-            options.profile,
-            only=options.only,
-            parameters=dict(options.set),
-            say=_say,
-        )
+        summary = reproduce(options.data, options.profile, only=options.only, parameters=dict(options.set), say=_say)
     except ValueError as error:
         tqdm.write(f"Stopped: {error}", file=sys.stderr)
         return 2

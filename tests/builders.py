@@ -15,13 +15,13 @@ from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import build_windows, fit_normaliser, seed_histories
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
-from f3amd_lib.models.camdm import CAMDMConfig
-from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.config import NetworkConfig
-from f3amd_lib.models.f3amd import F3AMDConfig
-from f3amd_lib.models.zoo import build_from_config
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.networks.camdm import CAMDMConfig
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.f3amd import F3AMDConfig
+from f3amd_lib.networks.zoo import build_from_config
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import Trainer, TrainingConfig
 
@@ -32,14 +32,7 @@ SKELETON = Skeleton(
     names=("Hips", "Spine", "LeftUpLeg", "LeftToeBase", "RightUpLeg", "RightToeBase"),
     parents=(-1, 0, 0, 2, 0, 4),
     offsets=np.array(
-        [
-            [0.0, 0.0, 0.0],
-            [0.0, 0.5, 0.0],
-            [0.1, -0.05, 0.0],
-            [0.0, -0.8, 0.1],
-            [-0.1, -0.05, 0.0],
-            [0.0, -0.8, 0.1],
-        ]
+        [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.1, -0.05, 0.0], [0.0, -0.8, 0.1], [-0.1, -0.05, 0.0], [0.0, -0.8, 0.1]]
     ),
     end_sites=((1, (0.0, 0.2, 0.0)),),
 )
@@ -79,9 +72,7 @@ def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedM
         skeleton=motions[0].skeleton,
         styles=tuple(styles),
         root_position=np.concatenate([m.root_position for m in motions]).astype(np.float32),
-        rotation_6d=np.concatenate([rotation_6d_from_matrix(m.rotations) for m in motions]).astype(
-            np.float16
-        ),
+        rotation_6d=np.concatenate([rotation_6d_from_matrix(m.rotations) for m in motions]).astype(np.float16),
         clip_start=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
         clip_names=names,
         clip_contents=("walk",) * len(clips),
@@ -111,14 +102,7 @@ def tiny_packed(mirror_styles=("calm",)) -> PackedMotion:
     )
 
 
-_TINY = {
-    "channels": CHANNELS,
-    "num_styles": 2,
-    "window": WINDOW,
-    "num_history": HISTORY,
-    "latent_width": 8,
-    "depth": 1,
-}
+_TINY = {"channels": CHANNELS, "num_styles": 2, "window": WINDOW, "num_history": HISTORY, "latent_width": 8, "depth": 1}
 
 
 def tiny_config(**changes) -> F3AMDConfig:

@@ -12,9 +12,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ["MPLBACKEND"] = "Agg"
 # Many tests compile the same small networks, in processes that run side by side.
-os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax")
-)
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import pytest
@@ -22,11 +20,7 @@ import pytest
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 
-REMEDY = {
-    "sphinx": "make site-tools",
-    "selenium": "make web-tools",
-    "node": "your system's package manager",
-}
+REMEDY = {"sphinx": "make site-tools", "selenium": "make web-tools", "node": "your system's package manager"}
 """What brings an optional part of the tests, where it is not `make bench-tools`."""
 
 

@@ -7,9 +7,9 @@ import pytest
 from flax import nnx
 from scipy.special import erf
 
-from f3amd_lib.models import attention as attention_module
-from f3amd_lib.models import conditioning
-from f3amd_lib.models.attention import (
+from f3amd_lib.networks import attention as attention_module
+from f3amd_lib.networks import conditioning
+from f3amd_lib.networks.attention import (
     MultiHeadAttention,
     TransformerBlock,
     attention,
@@ -47,12 +47,7 @@ def plain_attention(query, key, value):
 def plain_multi_head(layer, asking, answering):
     heads = lambda x: x.reshape(*x.shape[:2], layer.num_heads, -1)
     query, key, value = (
-        heads(linear(part, x))
-        for part, x in (
-            (layer.query, asking),
-            (layer.key, answering),
-            (layer.value, answering),
-        )
+        heads(linear(part, x)) for part, x in ((layer.query, asking), (layer.key, answering), (layer.value, answering))
     )
     return linear(layer.output, plain_attention(query, key, value).reshape(asking.shape))
 
@@ -69,10 +64,7 @@ def make_block(dropout=0.0, activation="gelu"):
     rng = np.random.default_rng(1)
     nnx.update(
         block,
-        jax.tree.map(
-            lambda leaf: jnp.asarray(0.4 * rng.standard_normal(leaf.shape), leaf.dtype),
-            nnx.state(block),
-        ),
+        jax.tree.map(lambda leaf: jnp.asarray(0.4 * rng.standard_normal(leaf.shape), leaf.dtype), nnx.state(block)),
     )
     return block
 
@@ -82,9 +74,7 @@ def test_position_code_by_hand():
     assert code.shape == (5, 4)
     np.testing.assert_allclose(code[2], [0.0, 1.0, 0.0, 1.0], atol=1e-15)  # frame 0
     rate = 1000.0 ** (-2 / 4)
-    np.testing.assert_allclose(
-        code[3], [np.sin(1), np.cos(1), np.sin(rate), np.cos(rate)], atol=1e-15
-    )
+    np.testing.assert_allclose(code[3], [np.sin(1), np.cos(1), np.sin(rate), np.cos(rate)], atol=1e-15)
     # History frames are the negatives of future ones: sine odd, cosine even.
     np.testing.assert_allclose(code[1], code[3] * [-1, 1, -1, 1], atol=1e-15)
     assert position_code(0, 3, 5).shape == (3, 5)
@@ -95,9 +85,7 @@ def test_position_code_with_the_base_of_vaswani_et_al():
     code = position_code(0, 76, 256, base=10_000.0)
     for frame, pair in ((0, 0), (7, 3), (75, 127)):
         angle = frame / 10_000.0 ** (2 * pair / 256)
-        np.testing.assert_allclose(
-            code[frame, 2 * pair : 2 * pair + 2], [np.sin(angle), np.cos(angle)], atol=1e-13
-        )
+        np.testing.assert_allclose(code[frame, 2 * pair : 2 * pair + 2], [np.sin(angle), np.cos(angle)], atol=1e-13)
 
 
 def test_cached_codes_cannot_be_spoilt_by_a_caller():
@@ -114,9 +102,7 @@ def test_dropout_keeps_the_mean(rate):
     np.testing.assert_allclose(dropped[kept], x[kept] / (1.0 - rate), rtol=1e-6)
     assert dropped.mean() == pytest.approx(x.mean(), rel=0.01)
     other = dropout(jnp.asarray(x), rate, jax.random.key(1))
-    assert (np.asarray(other != 0.0) != kept).mean() == pytest.approx(
-        2.0 * rate * (1.0 - rate), abs=0.005
-    )
+    assert (np.asarray(other != 0.0) != kept).mean() == pytest.approx(2.0 * rate * (1.0 - rate), abs=0.005)
 
 
 def test_dropout_of_nothing_changes_nothing_and_of_all_is_refused():
@@ -129,9 +115,7 @@ def test_dropout_of_nothing_changes_nothing_and_of_all_is_refused():
 
 @pytest.mark.parametrize("heads", [1, 3])
 def test_attention_equals_a_plain_loop(heads):
-    query, key, value = (
-        2.0 * draw(2, frames, heads, 4, seed=seed) for seed, frames in enumerate((5, 7, 7))
-    )
+    query, key, value = (2.0 * draw(2, frames, heads, 4, seed=seed) for seed, frames in enumerate((5, 7, 7)))
     expected = plain_attention(query, key, value)
     np.testing.assert_allclose(attention(query, key, value), expected, atol=1e-5)
     # The form that can drop weights, when it drops none.
@@ -155,9 +139,7 @@ def test_attention_drops_weights_and_keeps_their_mean():
     value = jnp.broadcast_to(jnp.eye(4)[None, :, None, :], (1, 4, 2, 4))
     weights = jnp.swapaxes(attention_weights(query, key), 1, 2)
     keys = jax.random.split(jax.random.key(0), 4000)
-    dropped = jax.vmap(lambda k: attention(query, key, value, dropout_rate=0.25, dropout_key=k))(
-        keys
-    )
+    dropped = jax.vmap(lambda k: attention(query, key, value, dropout_rate=0.25, dropout_key=k))(keys)
     there = np.asarray(dropped) != 0.0
     assert there.mean() == pytest.approx(0.75, abs=0.01)
     full = np.broadcast_to(weights / 0.75, there.shape)
@@ -209,10 +191,7 @@ def test_section_3_4_1_block_has_the_weights_of_an_encoder_layer():
 @pytest.mark.parametrize("activation", ["gelu", "relu"])
 def test_section_3_4_1_block_equals_a_plain_loop(activation):
     block, z = make_block(activation=activation), draw(2, 5, WIDTH)
-    kinds = {
-        "gelu": lambda x: 0.5 * x * (1.0 + erf(x / np.sqrt(2.0))),
-        "relu": lambda x: np.maximum(x, 0.0),
-    }
+    kinds = {"gelu": lambda x: 0.5 * x * (1.0 + erf(x / np.sqrt(2.0))), "relu": lambda x: np.maximum(x, 0.0)}
     middle = plain_norm(block.attention_norm, z + plain_multi_head(block.attention, z, z))
     hidden = kinds[activation](linear(block.hidden, middle))
     expected = plain_norm(block.output_norm, middle + linear(block.output, hidden))

@@ -80,9 +80,7 @@ def test_two_bone_arm_by_hand():
 def test_rotations_act_in_the_order_of_the_channels(order, expected):
     channels = " ".join(f"{axis}rotation" for axis in order)
     text = body(
-        f"ROOT A {{ OFFSET 0 0 0 CHANNELS 3 {channels}",
-        "JOINT B { OFFSET 100 0 0 CHANNELS 0 } }",
-        rows=["90 90 90"],
+        f"ROOT A {{ OFFSET 0 0 0 CHANNELS 3 {channels}", "JOINT B { OFFSET 100 0 0 CHANNELS 0 } }", rows=["90 90 90"]
     )
     np.testing.assert_allclose(parse_bvh(text, "order").positions[0, 1], expected, atol=1e-12)
 
@@ -119,12 +117,8 @@ def test_scale_is_metres_per_unit():
         pytest.param(lambda text: text.replace(" ", "\t"), id="tabs"),
         pytest.param(lambda text: text.replace("Frames: ", "Frames:\t"), id="tab after Frames:"),
         pytest.param(lambda text: text.replace("0 10 0", "0e0 1.0E+1 -0"), id="exponent in OFFSET"),
-        pytest.param(
-            lambda text: text.replace("100 50 0", "+1.0e+2 5000E-2 -9.88446e-17"), id="exponents"
-        ),
-        pytest.param(
-            lambda text: text.replace("\n100", "\n\n 100").rstrip() + " \n\n", id="blanks"
-        ),
+        pytest.param(lambda text: text.replace("100 50 0", "+1.0e+2 5000E-2 -9.88446e-17"), id="exponents"),
+        pytest.param(lambda text: text.replace("\n100", "\n\n 100").rstrip() + " \n\n", id="blanks"),
         pytest.param(lambda text: text.rstrip("\n"), id="no last line end"),
         pytest.param(lambda text: text.lower().replace("base", "Base"), id="lower case"),
         pytest.param(lambda text: text.upper(), id="upper case"),
@@ -142,9 +136,7 @@ def test_same_motion_however_it_is_typed(change):
 
 
 def test_joint_names_may_hold_blanks():
-    assert (
-        parse_bvh(ARM.replace("Elbow", "Left Fore Arm"), "a").skeleton.names[1] == "Left Fore Arm"
-    )
+    assert parse_bvh(ARM.replace("Elbow", "Left Fore Arm"), "a").skeleton.names[1] == "Left Fore Arm"
 
 
 SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
@@ -155,10 +147,7 @@ def test_position_channels_replace_the_offset():
         f"ROOT Hips {{ OFFSET 900 900 900 {SIX}",
         f"JOINT Left {{ OFFSET 0 777 0 {SIX} }}",
         f"JOINT Right {{ OFFSET -10 0 0 {SIX} }} }}",
-        rows=[
-            "1 90 2 0 0 0  10 0 0 0 0 0  -10 0 0 0 0 0",
-            "3 91 4 0 0 90  10 0 0 5 6 7  -10 0 0 0 0 0",
-        ],
+        rows=["1 90 2 0 0 0  10 0 0 0 0 0  -10 0 0 0 0 0", "3 91 4 0 0 90  10 0 0 5 6 7  -10 0 0 0 0 0"],
     )
     motion = parse_bvh(text, "six")
     assert motion.skeleton.names == ("Hips", "Left", "Right")
@@ -208,12 +197,8 @@ def stretching_bone(second: str) -> str:
 
 
 def test_bones_must_be_rigid():
-    assert parse_bvh(stretching_bone("10.1"), "jitter").skeleton.offsets[1, 0] == pytest.approx(
-        0.1005
-    )
-    with pytest.raises(
-        ValueError, match=r"rubber\.bvh, line (8|9): .*'Left' move.* 2\.0 mm .*rigid"
-    ):
+    assert parse_bvh(stretching_bone("10.1"), "jitter").skeleton.offsets[1, 0] == pytest.approx(0.1005)
+    with pytest.raises(ValueError, match=r"rubber\.bvh, line (8|9): .*'Left' move.* 2\.0 mm .*rigid"):
         parse_bvh(stretching_bone("10.4"), "rubber.bvh")
 
 
@@ -247,11 +232,7 @@ BROKEN = {
     "no Frames line": (swap("Frames: 2\n", ""), 23, "expected a line like 'Frames: 120'"),
     "no Frame Time line": (swap("Frame Time: 0.05\n", ""), 24, "like 'Frame Time: 0.0333333'"),
     "ends after MOTION": (lambda text: text[: text.index("Frames")], 22, "the file ends"),
-    "two ROOTs": (
-        swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"),
-        21,
-        "second ROOT .*'Base' in l",
-    ),
+    "two ROOTs": (swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"), 21, "second ROOT .*'Base' in l"),
     "ROOT inside ROOT": (swap("JOINT Wrist", "ROOT Wrist"), 10, "second ROOT"),
     "missing brace": (swap("}\n\nMOTION", "\n\nMOTION"), 22, "'{' of 'Base' .line 2. is still"),
     "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' too many"),
@@ -324,9 +305,7 @@ def random_motion(seed: int = 0, frames: int = 7) -> Motion:
         end_sites=((3, (0.0, -0.1, 0.2)),),
     )
     angles = random.uniform(-180, 180, size=(frames, 5, 3))
-    return Motion(
-        skeleton, 20 * random.normal(size=(frames, 3)), matrix_from_euler("XYZ", angles), 30.0
-    )
+    return Motion(skeleton, 20 * random.normal(size=(frames, 3)), matrix_from_euler("XYZ", angles), 30.0)
 
 
 def positions_by_name(motion: Motion) -> dict[str, np.ndarray]:

@@ -65,15 +65,10 @@ def test_the_rest_pose_is_the_skeleton(tmp_path, walk):
     place = bvh.node_index
     for joint, name in enumerate(skeleton.names):
         np.testing.assert_allclose(rest[place[name]], ours[joint], atol=1e-6, err_msg=name)
-    parents = {
-        node.name: node.parent.name if node.parent else None
-        for node in bvh.nodes
-        if not node.is_end_site()
-    }
+    parents = {node.name: node.parent.name if node.parent else None for node in bvh.nodes if not node.is_end_site()}
     names = skeleton.names
     assert parents == {
-        name: names[parent] if parent >= 0 else None
-        for name, parent in zip(names, skeleton.parents, strict=True)
+        name: names[parent] if parent >= 0 else None for name, parent in zip(names, skeleton.parents, strict=True)
     }
 
 

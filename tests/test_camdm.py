@@ -6,22 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import (
-    CHANNELS,
-    HISTORY,
-    WINDOW,
-    draw,
-    evaluate,
-    make_condition,
-    network_of,
-    tiny_camdm,
-)
+from builders import CHANNELS, HISTORY, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm
 from flax import nnx
 
-from f3amd_lib.models import zoo
-from f3amd_lib.models.attention import position_code
-from f3amd_lib.models.camdm import CAMDMConfig, step_features
-from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.attention import position_code
+from f3amd_lib.networks.camdm import CAMDMConfig, step_features
+from f3amd_lib.networks.conditioning import Condition
 
 LEVELS = tiny_camdm().noise_levels
 

@@ -7,27 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import (
-    CHANNELS,
-    HISTORY,
-    SKELETON,
-    WINDOW,
-    evaluate,
-    random_frames,
-    same_tree,
-    tiny_trained,
-)
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, evaluate, random_frames, same_tree, tiny_trained
 from safetensors.numpy import save_file
 
-from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import checkpoints
-from f3amd_lib.training.checkpoints import (
-    OutdatedFile,
-    load_model,
-    load_tree,
-    save_model,
-    save_tree,
-)
+from f3amd_lib.training.checkpoints import OutdatedFile, load_model, load_tree, save_model, save_tree
 
 TREE = {
     "a": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
@@ -115,13 +100,10 @@ def test_model_can_be_kept_in_full_precision(trained, tmp_path):
     assert same_tree(loaded.params, trained.params)
     frames = jnp.asarray(random_frames((1, WINDOW)), jnp.float32)
     condition = Condition(
-        jnp.asarray(random_frames((1, HISTORY)), jnp.float32),
-        jnp.zeros((1, WINDOW, 8)),
-        jnp.eye(2)[:1],
+        jnp.asarray(random_frames((1, HISTORY)), jnp.float32), jnp.zeros((1, WINDOW, 8)), jnp.eye(2)[:1]
     )
     np.testing.assert_array_equal(
-        evaluate(loaded.network(), frames, 2.0, condition),
-        evaluate(trained.network(), frames, 2.0, condition),
+        evaluate(loaded.network(), frames, 2.0, condition), evaluate(trained.network(), frames, 2.0, condition)
     )
 
 
@@ -157,9 +139,7 @@ def test_garbled_headers_are_refused_by_name(copied):
             load_model(copied)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"HIERARCHY\nROOT Hips\n", b"\x80\x04\x95pickle", bytes(1000)]
-)
+@pytest.mark.parametrize("content", [b"", b"HIERARCHY\nROOT Hips\n", b"\x80\x04\x95pickle", bytes(1000)])
 def test_foreign_files_are_refused_by_name(tmp_path, content):
     path = tmp_path / "foreign.safetensors"
     path.write_bytes(content)
@@ -207,9 +187,7 @@ def test_weights_that_do_not_fit_their_config_are_refused_by_name(saved, tmp_pat
         load_model(rewritten(saved, path, lambda m: m["model"].update(depth=2)))
 
 
-@pytest.mark.parametrize(
-    "change", [lambda m: m["model"].pop("family"), lambda m: m.pop("diffusion")]
-)
+@pytest.mark.parametrize("change", [lambda m: m["model"].pop("family"), lambda m: m.pop("diffusion")])
 def test_files_of_an_earlier_version_are_told_as_such(saved, tmp_path, change):
     with pytest.raises(OutdatedFile, match=r"odd\.safetensors: written by version 0\.1"):
         load_model(rewritten(saved, tmp_path / "odd.safetensors", change))
@@ -217,11 +195,7 @@ def test_files_of_an_earlier_version_are_told_as_such(saved, tmp_path, change):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        lambda m: m["model"].update(latent_widht=8),
-        lambda m: m["model"].pop("channels"),
-        lambda m: m.pop("styles"),
-    ],
+    [lambda m: m["model"].update(latent_widht=8), lambda m: m["model"].pop("channels"), lambda m: m.pop("styles")],
 )
 def test_odd_descriptions_are_refused_by_name(saved, tmp_path, change):
     with pytest.raises(ValueError, match=r"odd\.safetensors: .*(latent_widht|channels|styles)"):
@@ -251,9 +225,7 @@ def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, mon
     again = load_model(path)
     assert checkpoints.describe(path)["weights"] == "int8"
     kept = 0
-    for ours, theirs in zip(
-        jax.tree.leaves(trained.params), jax.tree.leaves(again.params), strict=True
-    ):
+    for ours, theirs in zip(jax.tree.leaves(trained.params), jax.tree.leaves(again.params), strict=True):
         before, after = np.asarray(ours, np.float32), np.asarray(theirs, np.float32)
         if before.ndim < 2 or before.size < 64:
             np.testing.assert_array_equal(after, before.astype(jnp.bfloat16).astype(np.float32))

@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.report import claims
-from f3amd_lib.report.ledger.evidence import (
+from f3amd_lib.ground.records import write_table
+from f3amd_lib.reports import claims
+from f3amd_lib.reports.ledger.evidence import (
     NINE_METRICS,
     Figure,
     NotMeasured,
@@ -17,7 +18,7 @@ from f3amd_lib.report.ledger.evidence import (
     ratio,
     recorded_evidence,
 )
-from f3amd_lib.report.ledger.verdicts import (
+from f3amd_lib.reports.ledger.verdicts import (
     CPU_COUNTS,
     FAILS,
     FEW,
@@ -35,7 +36,6 @@ from f3amd_lib.report.ledger.verdicts import (
     ordered,
     within,
 )
-from f3amd_lib.report.records import write_table
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -226,18 +226,13 @@ def gradient(values):
 
 
 def crowds(fno, t64):
-    return synthesis(
-        *(times(device, counts, (FNO, fno), (T64, t64)) for device, counts in LARGE_CROWD.items())
-    )
+    return synthesis(*(times(device, counts, (FNO, fno), (T64, t64)) for device, counts in LARGE_CROWD.items()))
 
 
 def steps_times(gains):
     """FNO-96 with 8 and 1 steps; gains by (device, characters)."""
     return synthesis(
-        *(
-            times(device, (count,), (FNO, 100.0), (FNO, 100.0 / gain, 1))
-            for (device, count), gain in gains.items()
-        )
+        *(times(device, (count,), (FNO, 100.0), (FNO, 100.0 / gain, 1)) for (device, count), gain in gains.items())
     )
 
 
@@ -255,19 +250,12 @@ def modes(few, some, many):
     """FNO-96 and m = 4, which saves so many percent."""
     parts = ((FEW, few), (SOME, some), (MANY, many))
     return synthesis(
-        *(
-            times("GPU", counts, (FNO, 100.0), (f"{FNO}-m4", 100.0 - saved), spread=0.001)
-            for counts, saved in parts
-        )
+        *(times("GPU", counts, (FNO, 100.0), (f"{FNO}-m4", 100.0 - saved), spread=0.001) for counts, saved in parts)
     )
 
 
 def conditioning(concatenation, cross_attention, adaln):
-    others = {
-        "concatenation": concatenation,
-        "cross-attention": cross_attention,
-        "AdaLN-zero": adaln,
-    }
+    others = {"concatenation": concatenation, "cross-attention": cross_attention, "AdaLN-zero": adaln}
     settings = [(f"{FNO}-{kind}", 100.0 * factor) for kind, factor in others.items()]
     return synthesis(times("GPU", (1024,), (FNO, 100.0), *settings))
 
@@ -321,14 +309,8 @@ MODES = [f"{FNO}-m{m}" for m in (14, 12, 8, 4)]
 # Claim -> (tables for which it must hold, tables for which it must not).
 CASES = {
     "E1": (
-        synthesis(
-            times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)),
-            times("GPU", (1024,), (CAMDM, 500.0), (FNO, 100.0)),
-        ),
-        synthesis(
-            times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)),
-            times("GPU", (1024,), (CAMDM, 150.0), (FNO, 100.0)),
-        ),
+        synthesis(times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)), times("GPU", (1024,), (CAMDM, 500.0), (FNO, 100.0))),
+        synthesis(times("GPU", (16,), (CAMDM, 20.0), (FNO, 10.0)), times("GPU", (1024,), (CAMDM, 150.0), (FNO, 100.0))),
     ),
     "E2": (
         synthesis(times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))),
@@ -341,16 +323,8 @@ CASES = {
     "E4": (small_against_many(6.0, 3.5, 2.5), small_against_many(3.0, 2.0, 1.5)),
     "E5": (crowds(85.0, 100.0), crowds(100.0, 85.0)),
     "E6": (
-        {
-            "training_time": training(
-                (CAMDM, 32, 2.5), (FNO, 32, 1.0), (CAMDM, 64, 3.4), (FNO, 64, 1)
-            )
-        },
-        {
-            "training_time": training(
-                (CAMDM, 32, 1.0), (FNO, 32, 1.0), (CAMDM, 64, 1.0), (FNO, 64, 1)
-            )
-        },
+        {"training_time": training((CAMDM, 32, 2.5), (FNO, 32, 1.0), (CAMDM, 64, 3.4), (FNO, 64, 1))},
+        {"training_time": training((CAMDM, 32, 1.0), (FNO, 32, 1.0), (CAMDM, 64, 1.0), (FNO, 64, 1))},
     ),
     "E7": (
         steps_times({("CPU", 1): 6.4, ("CPU", 32): 3.4, ("GPU", 1): 2.9, ("GPU", 1024): 6.5}),
@@ -374,23 +348,9 @@ CASES = {
     "E12": (headline(88.0, 22.0, 4.3), headline(88.0, 50.0, 20.0)),
     "E13": (epochs(fno=30, camdm=40), epochs(fno=40, camdm=30)),
     "E14": (
+        synthesis(times("GPU", FEW, *((f"F3AMD-{k}-{w}", 5) for k in ("FNO", "Transformer") for w in (64, 96)))),
         synthesis(
-            times(
-                "GPU",
-                FEW,
-                *((f"F3AMD-{k}-{w}", 5) for k in ("FNO", "Transformer") for w in (64, 96)),
-            )
-        ),
-        synthesis(
-            times(
-                "GPU",
-                FEW,
-                *(
-                    (f"F3AMD-{k}-{w}", t)
-                    for k, t in (("FNO", 5), ("Transformer", 8))
-                    for w in (64, 96)
-                ),
-            )
+            times("GPU", FEW, *((f"F3AMD-{k}-{w}", t) for k, t in (("FNO", 5), ("Transformer", 8)) for w in (64, 96)))
         ),
     ),
     "E15": (
@@ -412,30 +372,16 @@ CASES = {
         qualities(quality(FNO), quality(T64), quality(CAMDM, FID=12.0, IRD=1.0)),
     ),
     "Q4": (
-        qualities(
-            quality(FNO),
-            quality(FNO, window=64, harm=1.2),
-            quality(CAMDM),
-            quality(CAMDM, window=64, FID=40.0),
-        ),
-        qualities(
-            quality(FNO),
-            quality(FNO, window=64, harm=2.0),
-            quality(CAMDM),
-            quality(CAMDM, window=64),
-        ),
+        qualities(quality(FNO), quality(FNO, window=64, harm=1.2), quality(CAMDM), quality(CAMDM, window=64, FID=40.0)),
+        qualities(quality(FNO), quality(FNO, window=64, harm=2.0), quality(CAMDM), quality(CAMDM, window=64)),
     ),
     "Q5": (
         qualities(quality(FNO), *(quality(FNO, steps=n, harm=1.03) for n in (4, 2, 1))),
         qualities(quality(FNO), *(quality(FNO, steps=n, harm=1.5) for n in (4, 2, 1))),
     ),
     "Q6": (
-        qualities(
-            *(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.1), (2, 1.6), (1, 3)))
-        ),
-        qualities(
-            *(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.6), (2, 1.0), (1, 1)))
-        ),
+        qualities(*(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.1), (2, 1.6), (1, 3)))),
+        qualities(*(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1), (4, 1.6), (2, 1.0), (1, 1)))),
     ),
     "Q7": (
         {
@@ -452,12 +398,8 @@ CASES = {
         qualities(quality(FNO), quality(f"{FNO}-linear", style_coverage=95.0, diversity=25.0)),
     ),
     "Q9": (
-        qualities(
-            quality(FNO), quality(f"{FNO}-m1", harm=2.0), *(quality(m, harm=1.1) for m in MODES)
-        ),
-        qualities(
-            quality(FNO), quality(f"{FNO}-m1", harm=0.5), *(quality(m, harm=2.0) for m in MODES)
-        ),
+        qualities(quality(FNO), quality(f"{FNO}-m1", harm=2.0), *(quality(m, harm=1.1) for m in MODES)),
+        qualities(quality(FNO), quality(f"{FNO}-m1", harm=0.5), *(quality(m, harm=2.0) for m in MODES)),
     ),
     "Q10": (variants(OTHER_FNO, 1.1), variants(OTHER_FNO, 2.0)),
     "Q11": (variants(KINDS, 0.9), variants(KINDS, 0.5)),
@@ -618,10 +560,7 @@ def test_a_claim_follows_from_its_statements(parts, verdict):
 
 @pytest.mark.parametrize("claim_id", ["Q3", "Q8", "Q13"])
 def test_a_difference_inside_its_interval_cannot_be_told_apart(tmp_path, claim_id):
-    rows = [
-        {**row, "low": 0.3 * row["value"], "high": 1.7 * row["value"]}
-        for row in CASES[claim_id][0]["quality"]
-    ]
+    rows = [{**row, "low": 0.3 * row["value"], "high": 1.7 * row["value"]} for row in CASES[claim_id][0]["quality"]]
     assert judge(keep(tmp_path, {"quality": rows}), claim_id).verdict == OPEN
 
 
@@ -696,20 +635,10 @@ ON_GPU = times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))
     [
         ("Q13", {"quality": GOOD + GOOD[:1]}, {}, "two rows of"),
         ("Q13", {"quality": [{**GOOD[0], "model": "FNO-96"}]}, {}, "unknown model 'FNO-96'"),
-        (
-            "Q13",
-            {"quality": [{**GOOD[3], "unit": "cm"}]},
-            {},
-            "trajectory_error is in cm, not in m",
-        ),
+        ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, {}, "trajectory_error is in cm, not in m"),
         ("Q13", {"quality": [{"model": FNO, "value": 1.0}]}, {}, "needs a column 'window_frames'"),
         ("E2", {"synthesis_time": ON_GPU}, {"device_platform": "cpu"}, "knows only a CPU"),
-        (
-            "E2",
-            {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]},
-            {},
-            "device must be CPU or GPU",
-        ),
+        ("E2", {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]}, {}, "device must be CPU or GPU"),
         ("Q13", {"quality": [{**GOOD[-1], "low": 9.0}]}, {}, "outside its interval"),
     ],
 )
@@ -757,20 +686,13 @@ def paper_figures(claim_id):
 
 # Claim -> verdict and figures that the paper's own tables give.
 PAPERS_OWN = {
-    "E1": (
-        HOLDS,
-        {
-            "GPU, 16 characters": "1.39 to 1.88x",
-            "GPU, FNO-96 with 8 steps": "above 4 at 128, 256, 1,024",
-        },
-    ),
+    "E1": (HOLDS, {"GPU, 16 characters": "1.39 to 1.88x", "GPU, FNO-96 with 8 steps": "above 4 at 128, 256, 1,024"}),
     "E4": (
         IN_PART,
         {
             "CPU, FNO-96 at 4 to 8": "4.43 to 4.71x",
             "CPU, FNO-96 at 16 to 32": "2.76 to 4.04x",
-            "CPU, 1 to 32 characters: Transformer 2 to 3 times": "1.71 to 6.57x, 10 of 30 in the "
-            "range",
+            "CPU, 1 to 32 characters: Transformer 2 to 3 times": "1.71 to 6.57x, 10 of 30 in the range",
         },
     ),
     "E5": (
@@ -786,8 +708,7 @@ PAPERS_OWN = {
         IN_PART,
         {
             "CPU, 32 characters": "JAX / PyTorch 1.8",
-            "GPU, 1 to 16 characters: alike within a fifth": "JAX / PyTorch 0.346 to 0.717, 0 of "
-            "5 in the range",
+            "GPU, 1 to 16 characters: alike within a fifth": "JAX / PyTorch 0.346 to 0.717, 0 of 5 in the range",
         },
     ),
     "E12": (
@@ -797,8 +718,7 @@ PAPERS_OWN = {
             "CPU, FNO-96 with 1 step": "above 20 at 8",
             "CPU, 32 characters: over 20 times": "10.4x",
             "CPU, F3AMD-FNO-96 (1 step) against CAMDM in PyTorch": "3.63 to 5.77x",
-            "CPU, F3AMD-FNO-96 (8 steps) against CAMDM in PyTorch": "0.639 to 1.53x, slower at "
-            "1, 2, 4",
+            "CPU, F3AMD-FNO-96 (8 steps) against CAMDM in PyTorch": "0.639 to 1.53x, slower at 1, 2, 4",
         },
     ),
     "E15": (IN_PART, {"CPU, 8 -> 1 steps": "6.44x at 1 and 3.76x at 32"}),
@@ -815,21 +735,14 @@ PAPERS_OWN = {
         {
             "FNO-96 at 4, 2 and 1 steps: every metric within 10 % of 8 steps": "9 of 9 metrics; "
             "largest change: IRD -3.68 % at 2 steps",
-            "largest change from one number of steps to the next": "8 to 4 0.056 %, 4 to 2 3.6 %, "
-            "2 to 1 0.058 %",
+            "largest change from one number of steps to the next": "8 to 4 0.056 %, 4 to 2 3.6 %, 2 to 1 0.058 %",
         },
     ),
     "Q9": (
         IN_PART,
-        {
-            "m = 1 is worse than m = 17, metric by metric": "worse in 6 of 9, better in EMD, "
-            "direction_error, smoothness",
-        },
+        {"m = 1 is worse than m = 17, metric by metric": "worse in 6 of 9, better in EMD, direction_error, smoothness"},
     ),
-    "Q11": (
-        IN_PART,
-        {"FiLM is last of the four in": "FID, EMD, style_coverage, trajectory_error"},
-    ),
+    "Q11": (IN_PART, {"FiLM is last of the four in": "FID, EMD, style_coverage, trajectory_error"}),
     "Q13": (UNMEASURED, {}),
     "Q17": (HOLDS, {}),
 }
@@ -893,19 +806,17 @@ def committed():
 
 
 def test_the_verdicts_are_the_accepted_ones(committed):
-    changes = claims.changed_verdicts(
-        claims.ledger(judgements=committed), claims.accepted_verdicts()
-    )
+    changes = claims.changed_verdicts(claims.ledger(judgements=committed), claims.accepted_verdicts())
     assert not changes, (
         "\n".join(changes) + "\nIf these are right, accept on purpose with "
-        "`python -m f3amd_lib.report.claims --accept`"
+        "`python -m f3amd_lib.reports.claims --accept`"
     )
 
 
 def test_the_committed_page_is_up_to_date(committed):
     page = claims.repository_root() / "paper_figures" / "claims.md"
     assert page.read_text(encoding="utf-8") == claims.ledger_markdown(committed), (
-        "paper_figures/claims.md is stale: run `python -m f3amd_lib.report.claims`"
+        "paper_figures/claims.md is stale: run `python -m f3amd_lib.reports.claims`"
     )
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from builders import SKELETON, packed_from, same_tree
 
-from f3amd_lib.evaluation import classifier as module
-from f3amd_lib.evaluation.classifier import (
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.measures import classifier as module
+from f3amd_lib.measures.classifier import (
     ACCURACY_BAR,
     CLASSIFIER_JOINTS,
     NUM_CHANNELS,
@@ -29,7 +30,6 @@ from f3amd_lib.evaluation.classifier import (
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
-from f3amd_lib.profiles import load_profile
 from f3amd_lib.training.checkpoints import save_tree
 
 STYLES = ("ArmsOverhead", "Runner", "Zombie")
@@ -162,9 +162,7 @@ def test_place_and_direction_of_each_frame_are_not_seen():
     motion = walk()
     rng = np.random.default_rng(0)
     turn = matrix_from_yaw(rng.uniform(-3, 3, motion.num_frames))
-    moved = motion.positions @ np.swapaxes(turn, -1, -2) + rng.normal(
-        size=(motion.num_frames, 1, 3)
-    )
+    moved = motion.positions @ np.swapaxes(turn, -1, -2) + rng.normal(size=(motion.num_frames, 1, 3))
     expected = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
     np.testing.assert_allclose(classifier_frames(moved, SYNTHETIC_SKELETON), expected, atol=1e-12)
     assert expected.std(axis=0).max() > 0.02  # something is seen
@@ -235,11 +233,7 @@ def numpy_forward(network: StyleNetwork, windows: np.ndarray):
         kernel = number(block.convolution.kernel)
         padded = np.pad(z, ((0, 0), (1, 1), (0, 0)))
         convolved = np.stack(
-            [
-                sum(padded[:, frame + tap] @ kernel[tap] for tap in range(3))
-                for frame in range(z.shape[1])
-            ],
-            axis=1,
+            [sum(padded[:, frame + tap] @ kernel[tap] for tap in range(3)) for frame in range(z.shape[1])], axis=1
         ) + number(block.convolution.bias)
         z = leaky(normalise(block.norm, convolved)) + linear(block.shortcut, z)
     z = leaky(normalise(network.hidden_norm, linear(network.hidden, z.reshape(len(z), -1))))
@@ -251,8 +245,7 @@ def test_network_equals_its_layers_written_out(trained):
     """With batch statistics far from what they are at first, and features of both signs."""
     rng = np.random.default_rng(0)
     statistics = jax.tree.map(
-        lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32),
-        trained.statistics,
+        lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32), trained.statistics
     )
     windows = rng.normal(size=(4, WINDOW, NUM_CHANNELS)).astype(np.float32)
     features, scores = module._answers(CONFIG, trained.params, statistics, windows)
@@ -548,9 +541,7 @@ def test_profiles_train_for_different_lengths(packed, tmp_path, trained, monkeyp
     asked = {}
     for name in ("smoke", "laptop", "gpu"):
         monkeypatch.setattr(
-            module,
-            "train_classifier",
-            lambda packed, name=name, **settings: asked.update({name: settings}) or trained,
+            module, "train_classifier", lambda packed, name=name, **settings: asked.update({name: settings}) or trained
         )
         obtain_classifier(packed, load_profile(name, "synthetic"), progress=False)
     samples = [asked[name]["num_steps"] * asked[name]["batch_size"] for name in asked]

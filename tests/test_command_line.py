@@ -10,8 +10,8 @@ from builders import WINDOW, tiny_trained
 
 from f3amd_lib.__main__ import main
 from f3amd_lib.benchmarking.__main__ import main as bench
-from f3amd_lib.evaluation.crowd import read_crowd
-from f3amd_lib.evaluation.crowd_planning import closest_approach
+from f3amd_lib.generation.crowd import read_crowd
+from f3amd_lib.generation.crowd_planning import closest_approach
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model
 
@@ -19,10 +19,7 @@ from f3amd_lib.training.checkpoints import save_model
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "tiny.safetensors"
-    save_model(
-        path,
-        tiny_trained({"dataset": "tiny", "dataset_licence": "none", "dataset_credit": "nobody"}),
-    )
+    save_model(path, tiny_trained({"dataset": "tiny", "dataset_licence": "none", "dataset_credit": "nobody"}))
     return str(path)
 
 
@@ -122,7 +119,7 @@ def test_export_without_iree_is_what_jax_alone_can_run(weights, tmp_path, monkey
 
 @pytest.mark.needs("iree.compiler", "iree.runtime")
 def test_export_is_an_artefact_that_loads(weights, tmp_path):
-    from f3amd_lib.benchmarking.artefact import load_artefact
+    from f3amd_lib.serving.artefact import load_artefact
 
     out = tmp_path / "round"
     words = ["export", "--weights", weights, "--out", str(out), "--steps", "2"]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from f3amd_lib.models import conditioning
-from f3amd_lib.models.attention import TransformerBlock, position_code
-from f3amd_lib.models.conditioning import (
+from f3amd_lib.networks import conditioning
+from f3amd_lib.networks.attention import TransformerBlock, position_code
+from f3amd_lib.networks.conditioning import (
     CONDITIONINGS,
     AdaLNZero,
     Concatenation,
@@ -19,7 +19,7 @@ from f3amd_lib.models.conditioning import (
     conditioning_layer,
     noise_features,
 )
-from f3amd_lib.models.spectral import FNOBlock
+from f3amd_lib.networks.spectral import FNOBlock
 
 CHANNELS, STYLES, WIDTH, WINDOW, HISTORY = 9, 3, 8, 6, 4
 
@@ -39,10 +39,7 @@ def linear(layer, x):
 def randomise(module, seed=0):
     """Replace every weight of a module, zero ones too, by a random number; return the module."""
     rng = np.random.default_rng(seed)
-    state = jax.tree.map(
-        lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype),
-        nnx.state(module),
-    )
+    state = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), nnx.state(module))
     nnx.update(module, state)
     return module
 
@@ -56,9 +53,7 @@ def make_condition(batch=2, seed=0):
 
 
 def make_encoder(num_heads=1):
-    return ConditionEncoder(
-        CHANNELS, STYLES, WIDTH, WINDOW, HISTORY, num_heads, rngs=nnx.Rngs(params=0)
-    )
+    return ConditionEncoder(CHANNELS, STYLES, WIDTH, WINDOW, HISTORY, num_heads, rngs=nnx.Rngs(params=0))
 
 
 def test_eq01_noise_features_by_hand():
@@ -136,9 +131,7 @@ def test_c_varies_over_frames():
 
 
 def test_without_a_position_code_c_is_the_same_in_every_frame(monkeypatch):
-    monkeypatch.setattr(
-        conditioning, "position_code", lambda first, last, width: np.zeros((last - first, width))
-    )
+    monkeypatch.setattr(conditioning, "position_code", lambda first, last, width: np.zeros((last - first, width)))
     encoder = make_encoder()
     c = encoder(encoder.encode(make_condition()), 3.0)
     np.testing.assert_allclose(c, jnp.broadcast_to(c[:, :1], c.shape), atol=1e-6)
@@ -169,9 +162,7 @@ def film_with(gamma, beta):
     """A FiLM whose modulation is constant and whose output layer passes z_tilde on to SiLU."""
     film = FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0))
     film.modulation.kernel[...] = jnp.zeros((5, 2 * WIDTH))
-    film.modulation.bias[...] = jnp.concatenate(
-        [jnp.full(WIDTH, float(gamma)), jnp.full(WIDTH, float(beta))]
-    )
+    film.modulation.bias[...] = jnp.concatenate([jnp.full(WIDTH, float(gamma)), jnp.full(WIDTH, float(beta))])
     film.output.kernel[...] = jnp.eye(WIDTH)
     film.output.bias[...] = jnp.zeros(WIDTH)
     return film
@@ -193,9 +184,7 @@ def test_eq06_gate_stays_within_zero_and_two(gamma):
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
     gate = 1.0 + np.tanh(gamma)
     assert 0.0 <= gate <= 2.0
-    np.testing.assert_allclose(
-        film_with(gamma, 0.7).modulate(z, c), silu(gate * z + 0.7), atol=1e-5
-    )
+    np.testing.assert_allclose(film_with(gamma, 0.7).modulate(z, c), silu(gate * z + 0.7), atol=1e-5)
 
 
 def test_eq05_to_eq07_equal_plain_numpy():
@@ -304,9 +293,7 @@ def test_table_11_gradients_are_finite_and_reach_every_weight(name):
     class Block(nnx.Module):
         def __init__(self):
             self.base = FNOBlock(WIDTH, WIDTH, 4, rngs=nnx.Rngs(params=0))
-            self.layer = conditioning_layer(
-                name, WIDTH, WIDTH, num_heads=2, rngs=nnx.Rngs(params=1)
-            )
+            self.layer = conditioning_layer(name, WIDTH, WIDTH, num_heads=2, rngs=nnx.Rngs(params=1))
 
     block = randomise(Block())
     z, c, wanted = (draw(3, WINDOW, WIDTH, seed=seed) for seed in range(3))
@@ -322,10 +309,7 @@ def test_table_11_gradients_are_finite_and_reach_every_weight(name):
 
 
 def test_table_11_names_make_their_layers():
-    made = [
-        type(conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(params=0)))
-        for name in CONDITIONINGS
-    ]
+    made = [type(conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(params=0))) for name in CONDITIONINGS]
     assert made == [FiLM, Concatenation, AdaLNZero, CrossAttention]
     layer = conditioning_layer("cross_attention", WIDTH, 5, num_heads=4, rngs=nnx.Rngs(params=0))
     assert layer.attention.num_heads == 4 and layer.attention.key.kernel[...].shape == (5, WIDTH)
@@ -354,6 +338,4 @@ def test_encoder_runs_under_jit_like_outside():
         module = nnx.merge(graph, state)
         return module(module.encode(condition), sigma)
 
-    np.testing.assert_allclose(
-        run(state, condition, 2.0), encoder(encoder.encode(condition), 2.0), atol=1e-5
-    )
+    np.testing.assert_allclose(run(state, condition, 2.0), encoder(encoder.encode(condition), 2.0), atol=1e-5)

@@ -7,15 +7,9 @@ import pytest
 from builders import wandering_motion
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.evaluation import distributions, metrics
-from f3amd_lib.evaluation.corruptions import (
-    CORRUPTIONS,
-    corrupt,
-    frozen_pose,
-    noisy_motion,
-    shuffled_frames,
-)
-from f3amd_lib.evaluation.quality import own_path
+from f3amd_lib.experiments.quality import own_path
+from f3amd_lib.measures import distributions, metrics
+from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt, frozen_pose, noisy_motion, shuffled_frames
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.synthetic import synthesize
 
@@ -136,9 +130,7 @@ def test_noise_has_the_stated_size():
     # One draw for all strengths: half the noise is the same noise, halved.
     half = noisy_motion(motion, seed=1, strength=0.5)
     np.testing.assert_allclose(
-        half.root_position - motion.root_position,
-        0.5 * (noisy.root_position - motion.root_position),
-        atol=1e-12,
+        half.root_position - motion.root_position, 0.5 * (noisy.root_position - motion.root_position), atol=1e-12
     )
     only_root = noisy_motion(motion, seed=1, rotation_scale=0.0, root_scale=0.1)
     np.testing.assert_allclose(only_root.rotations, motion.rotations, atol=1e-7)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from f3amd_lib.models.counting import count_flops
+from f3amd_lib.networks.counting import count_flops
 
 
 def zeros(*shape):
@@ -17,9 +17,7 @@ def test_a_matrix_product_is_two_operations_a_term():
 
 
 def test_batched_products_and_einsum():
-    count = count_flops(
-        lambda a, b: jnp.einsum("bij,bjk->bki", a, b), zeros(4, 3, 5), zeros(4, 5, 2)
-    )
+    count = count_flops(lambda a, b: jnp.einsum("bij,bjk->bki", a, b), zeros(4, 3, 5), zeros(4, 5, 2))
     assert count == 2 * 4 * 3 * 5 * 2
 
 
@@ -29,9 +27,7 @@ def test_elementwise_work_is_left_out():
 
 def test_convolution():
     def convolve(x, kernel):
-        return jax.lax.conv_general_dilated(
-            x, kernel, (1,), "SAME", dimension_numbers=("NWC", "WIO", "NWC")
-        )
+        return jax.lax.conv_general_dilated(x, kernel, (1,), "SAME", dimension_numbers=("NWC", "WIO", "NWC"))
 
     assert count_flops(convolve, zeros(2, 9, 3), zeros(5, 3, 4)) == 2 * 2 * 9 * 4 * 5 * 3
 

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from test_rollout import obedient
 
 from f3amd_lib.data.features import frame_yaw, motion_from_frames, turn_frames
-from f3amd_lib.evaluation import crowd as crowds
-from f3amd_lib.evaluation.crowd import PATHS, crowd_paths, generate_crowd, read_crowd
-from f3amd_lib.evaluation.paths import NAMES, named_path
-from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.generation import crowd as crowds
+from f3amd_lib.generation.crowd import PATHS, crowd_paths, generate_crowd, read_crowd
+from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.motion.root_paths import NAMES, named_path
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.training.checkpoints import weights_digest
 
@@ -48,11 +48,7 @@ def still(trained):
         return np.repeat(history[:, -1:], yaw.shape[1], axis=1)
 
     return SimpleNamespace(
-        trained=trained,
-        dtype=np.dtype("float32"),
-        sampler="ddim",
-        sigmas=np.array([1.0, 0.0]),
-        generate=generate,
+        trained=trained, dtype=np.dtype("float32"), sampler="ddim", sigmas=np.array([1.0, 0.0]), generate=generate
     )
 
 
@@ -90,17 +86,13 @@ def test_characters_do_not_depend_on_the_size_of_the_crowd(generator, eleven, tm
 
 
 @pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
-def test_each_character_is_the_one_generated_alone_with_its_key(
-    trained, generator, tmp_path, monkeypatch, sampler
-):
+def test_each_character_is_the_one_generated_alone_with_its_key(trained, generator, tmp_path, monkeypatch, sampler):
     # One character with one key goes through the plain batched code, of which others have tests.
     # DDIM draws where a round starts, DDPM fresh noise at every step.
     if sampler != generator.sampler:
         generator = MotionGenerator(trained, num_steps=2, sampler=sampler)
     asked, generate = [], generator.generate
-    monkeypatch.setattr(
-        generator, "generate", lambda *given: asked.append(given) or generate(*given)
-    )
+    monkeypatch.setattr(generator, "generate", lambda *given: asked.append(given) or generate(*given))
     crowd = generate_crowd(generator, 5, FRAMES, tmp_path, chunk=4, seed=5)
     for character in (0, 3, 4):
         *arrays, _ = asked[character // 4]
@@ -123,10 +115,7 @@ def test_noise_differs_between_characters_and_seeds(tmp_path):
     # Style, starting pose and path are the same: what differs is the noise.
     trained = tiny_trained_with({"calm": tiny_trained().seeds["calm"][:1]})
     generator = MotionGenerator(trained, num_steps=1)
-    made = [
-        generate_crowd(generator, 4, WINDOW, tmp_path / str(seed), paths=same_way, seed=seed)
-        for seed in (0, 1)
-    ]
+    made = [generate_crowd(generator, 4, WINDOW, tmp_path / str(seed), paths=same_way, seed=seed) for seed in (0, 1)]
     rotations = np.concatenate([crowd.rotations for crowd in made]).astype(float)
     for first in range(8):
         for second in range(first):
@@ -157,8 +146,7 @@ def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
     # Of each pose there is a second one that moves three times as fast.
     fast = np.where(np.isin(np.arange(CHANNELS), [0, 2]), 3.0, 1.0)
     seeds = {
-        style: np.concatenate([poses, poses * fast]).astype(np.float32)
-        for style, poses in still.trained.seeds.items()
+        style: np.concatenate([poses, poses * fast]).astype(np.float32) for style, poses in still.trained.seeds.items()
     }
     still.trained = tiny_trained_with(seeds)
     histories, generate = [], still.generate
@@ -258,9 +246,7 @@ def test_starting_places_are_evenly_apart_in_crowds_of_any_size():
 
 
 def test_a_perfect_network_follows_every_path_of_the_crowd(trained, tmp_path):
-    crowd = generate_crowd(
-        follower(trained), 9, 3 * WINDOW - 2, tmp_path, chunk=4, paths=list(NAMES)
-    )
+    crowd = generate_crowd(follower(trained), 9, 3 * WINDOW - 2, tmp_path, chunk=4, paths=list(NAMES))
     for character in range(9):
         motion, target = crowd.motion(character), crowd.target(character)
         np.testing.assert_allclose(motion.root_position[:, [0, 2]], target.position, atol=1e-4)
@@ -359,9 +345,7 @@ def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
 
 
 @pytest.mark.parametrize("writes", [0, 1, 4, 5, 6, 7, 11])
-def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(
-    generator, eleven, tmp_path, monkeypatch, writes
-):
+def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(generator, eleven, tmp_path, monkeypatch, writes):
     append, left = crowds._append, [writes]
 
     def stop(file, rows):
@@ -380,9 +364,7 @@ def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(
     with pytest.raises(ValueError, match=f"only {writes // 4 * 4} of 11 characters"):
         read_crowd(tmp_path)
     made, make = [], crowds.crowd_paths
-    monkeypatch.setattr(
-        crowds, "crowd_paths", lambda *given, **how: made.append(given[0]) or make(*given, **how)
-    )
+    monkeypatch.setattr(crowds, "crowd_paths", lambda *given, **how: made.append(given[0]) or make(*given, **how))
     resumed = call()
     # What was finished is not made again; the first paths are looked at, to be the same ones.
     assert [part.start for part in made] == sorted({0, *range(writes // 4 * 4, 11, 4)})
@@ -418,9 +400,7 @@ def test_a_finished_crowd_is_replaced_only_if_asked(still, tmp_path):
         ({"styles": "calm"}, "styles_in_turn"),
     ],
 )
-def test_a_stopped_run_does_not_go_on_with_other_settings(
-    still, tmp_path, monkeypatch, changed, named
-):
+def test_a_stopped_run_does_not_go_on_with_other_settings(still, tmp_path, monkeypatch, changed, named):
     settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
     stopped = stop_after(still, 1)
     with pytest.raises(KeyboardInterrupt):
@@ -444,9 +424,7 @@ def along(direction):
 
 @pytest.mark.parametrize("stopped_after", [0, 1])
 @pytest.mark.parametrize("min_distance", [None, 0.5])
-def test_a_stopped_run_does_not_go_on_with_other_paths_of_one_name(
-    still, tmp_path, stopped_after, min_distance
-):
+def test_a_stopped_run_does_not_go_on_with_other_paths_of_one_name(still, tmp_path, stopped_after, min_distance):
     settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
     settings["min_distance"] = min_distance
     with pytest.raises(KeyboardInterrupt):
@@ -529,10 +507,7 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
         (lambda folder: cut(folder / "path.npy", more=True), r"path.npy: has \d+ bytes"),
         (lambda folder: (folder / "styles.npy").write_bytes(b"\x93NUM"), r"styles.npy: "),
         (lambda folder: (folder / "styles.npy").unlink(), r"styles.npy: missing"),
-        (
-            lambda folder: np.save(folder / "rotations.npy", np.zeros((3, 5, 6, 6))),
-            r"rotations.npy: holds float64",
-        ),
+        (lambda folder: np.save(folder / "rotations.npy", np.zeros((3, 5, 6, 6))), r"rotations.npy: holds float64"),
     ],
 )
 def test_damaged_and_foreign_crowds_are_refused(still, tmp_path, damage, message):

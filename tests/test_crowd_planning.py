@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from f3amd_lib.evaluation.crowd import PATHS, crowd_paths, plan_crowd
-from f3amd_lib.evaluation.crowd_planning import (
-    MIN_DISTANCE,
-    SPEED_BOUNDS,
-    closest_approach,
-    keep_apart,
-)
-from f3amd_lib.evaluation.paths import tangent_yaw
+from f3amd_lib.generation.crowd import PATHS, crowd_paths, plan_crowd
+from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, SPEED_BOUNDS, closest_approach, keep_apart
+from f3amd_lib.motion.root_paths import tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 
 FRAMES = 150
@@ -25,9 +20,7 @@ def smallest_distances(position):
 def two_who_meet(sideways=0.0):
     """Two who walk towards each other along z, 6 m apart, each 1.2 m/s."""
     z = 1.2 * np.arange(FRAMES) / 30.0
-    position = np.stack(
-        [np.stack([0 * z, z], axis=-1), np.stack([0 * z + sideways, 6.0 - z], axis=-1)]
-    )
+    position = np.stack([np.stack([0 * z, z], axis=-1), np.stack([0 * z + sideways, 6.0 - z], axis=-1)])
     yaw = np.stack([0 * z, np.pi + 0 * z])
     return position, yaw
 

@@ -10,8 +10,8 @@ import pytest
 from builders import tiny_camdm, tiny_config, tiny_trained, tiny_windows
 
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
-from f3amd_lib.evaluation import denoising
-from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.experiments import denoising
+from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import network_inputs
 
@@ -97,9 +97,7 @@ def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch
     monkeypatch.setattr(generator, "sample_window", shifted)
     spread = denoising.seed_spread(generator, tiny_windows(), num_conditions=4)
     assert spread == pytest.approx(0.0, abs=1e-3)
-    monkeypatch.setattr(
-        generator, "sample_window", lambda key, c: x0 + 0.3 * jax.random.normal(key, x0.shape)
-    )
+    monkeypatch.setattr(generator, "sample_window", lambda key, c: x0 + 0.3 * jax.random.normal(key, x0.shape))
     assert denoising.seed_spread(generator, tiny_windows(), num_conditions=4) > 1.0
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.evaluation import distributions as d
+from f3amd_lib.measures import distributions as d
 from f3amd_lib.motion.rotations import matrix_from_yaw
 
 
@@ -30,9 +30,7 @@ def covariance_of(dimensions, seed, rank=None):
 
 def test_fid_of_two_gaussians_with_parallel_axes():
     """Means 5 apart; deviations 2 and 3 against 1 and 1: 25 + 1 + 4."""
-    answer = d.frechet_distance_from_moments(
-        [3.0, 4.0], np.diag([4.0, 9.0]), [0.0, 0.0], np.diag([1.0, 1.0])
-    )
+    answer = d.frechet_distance_from_moments([3.0, 4.0], np.diag([4.0, 9.0]), [0.0, 0.0], np.diag([1.0, 1.0]))
     assert answer == pytest.approx(30.0)
 
 
@@ -66,9 +64,7 @@ def test_fid_agrees_with_scipy_sqrtm(dimensions):
 
 def test_fid_of_flat_gaussians():
     """Covariances without full rank, as fewer windows than features have."""
-    answer = d.frechet_distance_from_moments(
-        np.zeros(2), np.diag([4.0, 0.0]), np.zeros(2), np.diag([1.0, 9.0])
-    )
+    answer = d.frechet_distance_from_moments(np.zeros(2), np.diag([4.0, 0.0]), np.zeros(2), np.diag([1.0, 9.0]))
     assert answer == pytest.approx(1.0 + 9.0)
     # Two thin clouds in 30 dimensions: scipy's root exists to about half of its digits.
     one, two = cloud(7, 30, 1), cloud(11, 30, 2)
@@ -116,9 +112,7 @@ def test_moments_are_those_of_numpy():
 
 def test_fid_in_the_scale_of_camdm_has_a_name_of_its_own():
     one, two = cloud(30, 8, 1), cloud(30, 8, 2, shift=1.0)
-    assert d.frechet_distance_per_dimension(one, two) == pytest.approx(
-        d.frechet_distance(one, two) / 8
-    )
+    assert d.frechet_distance_per_dimension(one, two) == pytest.approx(d.frechet_distance(one, two) / 8)
 
 
 def test_camdm_fid_is_the_mean_over_styles_each_with_its_own_reference():
@@ -323,13 +317,9 @@ def test_interval_of_three_repeats():
     """Student's t for two degrees of freedom is 4.3027 at 95 % and 2.9200 at 90 %."""
     row = d.mean_and_interval([1.0, 2.0, 3.0])
     assert row == pytest.approx(
-        {"value": 2.0, "low": 2 - 4.30265 / np.sqrt(3), "high": 2 + 4.30265 / np.sqrt(3)}
-        | {"repeats": 3},
-        rel=1e-5,
+        {"value": 2.0, "low": 2 - 4.30265 / np.sqrt(3), "high": 2 + 4.30265 / np.sqrt(3)} | {"repeats": 3}, rel=1e-5
     )
-    assert d.mean_and_interval([1.0, 2.0, 3.0], 0.90)["high"] == pytest.approx(
-        2 + 2.91999 / np.sqrt(3), rel=1e-5
-    )
+    assert d.mean_and_interval([1.0, 2.0, 3.0], 0.90)["high"] == pytest.approx(2 + 2.91999 / np.sqrt(3), rel=1e-5)
 
 
 def test_interval_of_one_repeat_or_none():

@@ -79,11 +79,7 @@ def all_requirements(pyproject: dict) -> dict[str, SpecifierSet]:
     lines = [
         *pyproject["project"]["dependencies"],
         *pyproject["build-system"]["requires"],
-        *(
-            line
-            for extra in pyproject["project"]["optional-dependencies"].values()
-            for line in extra
-        ),
+        *(line for extra in pyproject["project"]["optional-dependencies"].values() for line in extra),
     ]
     requirements = [Requirement(line) for line in lines]
     return {canonicalize_name(item.name): item.specifier for item in requirements}
@@ -120,9 +116,7 @@ LOCK = read_lock(LOCK_TEXT)
 
 def test_every_range_has_both_ends():
     open_ended = [
-        name
-        for name, specifier in DIRECT.items()
-        if sorted(item.operator for item in specifier) != ["<", ">="]
+        name for name, specifier in DIRECT.items() if sorted(item.operator for item in specifier) != ["<", ">="]
     ]
     assert open_ended == []
 
@@ -166,18 +160,14 @@ def test_environment_yml_asks_for_a_python_that_the_package_takes():
 
 def test_bootstrap_takes_the_same_pythons():
     script = (ROOT / "scripts" / "bootstrap.sh").read_text(encoding="utf-8")
-    oldest, newest = (
-        re.search(rf"^{word}=(\d+)", script, re.M)[1] for word in ("oldest", "newest")
-    )
+    oldest, newest = (re.search(rf"^{word}=(\d+)", script, re.M)[1] for word in ("oldest", "newest"))
     taken = read_environment(ENVIRONMENT_TEXT)["python"]
     assert f"3.{oldest}" in taken and f"3.{int(oldest) - 1}" not in taken
     assert f"3.{newest}" in taken and f"3.{int(newest) + 1}" not in taken
 
 
 def test_the_lock_was_asked_for_exactly_the_direct_dependencies():
-    asked_for = {
-        canonicalize_name(entry.name) for entry, _, comment in LOCK if "(pyproject.toml" in comment
-    }
+    asked_for = {canonicalize_name(entry.name) for entry, _, comment in LOCK if "(pyproject.toml" in comment}
     assert asked_for == set(DIRECT)
 
 
@@ -233,11 +223,7 @@ def test_readers_notice_differences():
     )
     assert (str(first[0].specifier), first[1]) == ("==0.10.2", ["sha256:aa", "sha256:bb"])
     assert "(pyproject.toml" in first[2]
-    assert (second[0].name, second[1], "(pyproject.toml" in second[2]) == (
-        "zipp",
-        ["sha256:cc"],
-        False,
-    )
+    assert (second[0].name, second[1], "(pyproject.toml" in second[2]) == ("zipp", ["sha256:cc"], False)
 
 
 def imported_packages(paths) -> set[str]:

@@ -5,18 +5,18 @@ import json
 import pandas as pd
 import pytest
 
-from f3amd_lib.models.camdm import CAMDMConfig
-from f3amd_lib.models.f3amd import F3AMDConfig
-from f3amd_lib.models.zoo import find_preset
-from f3amd_lib.report.equation_map import (
+from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.networks.camdm import CAMDMConfig
+from f3amd_lib.networks.f3amd import F3AMDConfig
+from f3amd_lib.networks.zoo import find_preset
+from f3amd_lib.reports.equation_map import (
     EQUATIONS,
     equation_map,
     mentioned_equations,
     notebook_sections,
     running_times,
 )
-from f3amd_lib.report.readings import READINGS, Reading, readings_table
-from f3amd_lib.report.records import run_record, write_table
+from f3amd_lib.reports.readings import READINGS, Reading, readings_table
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,9 @@ def test_mentions_are_read(text, expected):
 
 
 def test_a_small_checkout_is_mapped(tmp_path):
-    for folder in ("f3amd_lib/models", "tests", "notebooks"):
+    for folder in ("f3amd_lib/networks", "tests", "notebooks"):
         (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "f3amd_lib/models/block.py").write_text(
+    (tmp_path / "f3amd_lib/networks/block.py").write_text(
         'class Block:\n    """Sum (Eq. 4)."""\n\n    def local(self):\n        """Eq. 3."""\n\n\n'
         'class Config:\n    """Settings.\n\n    Attributes:\n      k: of Eq. 3.\n    """\n'
     )
@@ -55,8 +55,8 @@ def test_a_small_checkout_is_mapped(tmp_path):
     ]
     (tmp_path / "notebooks/03_blocks.ipynb").write_text(json.dumps({"cells": cells}))
     rows = equation_map(root=tmp_path).set_index("equation")
-    assert rows.loc["Eq. 3", "functions"] == "models/block: Block.local"
-    assert rows.loc["Eq. 4", "functions"] == "models/block: Block"
+    assert rows.loc["Eq. 3", "functions"] == "networks/block: Block.local"
+    assert rows.loc["Eq. 4", "functions"] == "networks/block: Block"
     assert rows.loc["Eq. 3", "tests"] == "test_block: test_eq03_to_eq04_sum"
     assert rows.loc["Appendix F", "tests"] == "test_block: test_appendix_f_step"
     assert rows.loc["Eq. 4", "notebooks"] == "03_blocks"
@@ -99,9 +99,7 @@ def test_sections_know_their_equations_and_figures(tmp_path):
 
 def test_the_map_points_to_sections_and_their_figures(tmp_path):
     write_notebook(tmp_path / "notebooks/04_losses.ipynb", *LOSSES)
-    write_notebook(
-        tmp_path / "notebooks/13_exercise_solutions.ipynb", ("text", "## 13.1\n\nEq. 11")
-    )
+    write_notebook(tmp_path / "notebooks/13_exercise_solutions.ipynb", ("text", "## 13.1\n\nEq. 11"))
     write_notebook(tmp_path / "notebooks/00_guide.ipynb", ("text", "## 0.1 Map\n\nEq. 11"))
     rows = equation_map(root=tmp_path).set_index("equation")
     assert rows.loc["Eq. 11", ["notebooks", "cells", "figures"]].tolist() == [
@@ -143,12 +141,7 @@ def test_every_equation_that_is_used_has_a_figure_that_a_notebook_draws(whole_ma
 def record_of_a_run(root, dataset, *, seconds, finished=(True, True), **changes):
     record = run_record(profile="laptop", dataset=dataset, seed=0) | changes
     summary = pd.DataFrame(
-        {
-            "notebook": ["00_guide.ipynb", "04_losses.ipynb"],
-            "seconds": seconds,
-            "cells": 1,
-            "finished": finished,
-        }
+        {"notebook": ["00_guide.ipynb", "04_losses.ipynb"], "seconds": seconds, "cells": 1, "finished": finished}
     )
     write_table(root / f"paper_figures/{dataset}/laptop/tables/run_summary.csv", summary, record)
 

@@ -117,9 +117,7 @@ def test_an_unknown_number_is_refused_with_the_nearest(number):
 @pytest.mark.parametrize("number", list(CHECKS))
 @pytest.mark.parametrize("answer", [None, ..., (..., 1.0), [(1.0, None)]], ids=repr)
 def test_a_missing_answer_is_not_yet(number, answer):
-    assert (
-        repr(check(number, answer)) == f"{number}: not yet: put your answer in the place of `...`"
-    )
+    assert repr(check(number, answer)) == f"{number}: not yet: put your answer in the place of `...`"
 
 
 def broken(*args, **kwargs):
@@ -127,9 +125,7 @@ def broken(*args, **kwargs):
 
 
 @pytest.mark.parametrize("number", list(CHECKS))
-@pytest.mark.parametrize(
-    "answer", ["no", object(), -1e9, np.full((3, 4), np.nan), broken, {}], ids=lambda a: type(a)
-)
+@pytest.mark.parametrize("answer", ["no", object(), -1e9, np.full((3, 4), np.nan), broken, {}], ids=lambda a: type(a))
 def test_a_senseless_answer_is_not_yet_and_never_an_error(number, answer):
     verdict = check(number, answer)
     assert not verdict.right and verdict.hint

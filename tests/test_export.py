@@ -15,18 +15,13 @@ import jax
 import numpy as np
 import pytest
 
-from f3amd_lib.benchmarking import artefact as artefact_module
-from f3amd_lib.benchmarking import export as export_module
-from f3amd_lib.benchmarking.artefact import load_artefact, manifest_digest
-from f3amd_lib.benchmarking.export import (
-    compile_iree,
-    export_model,
-    export_round,
-    save_artefact,
-)
-from f3amd_lib.diffusion.rounds import sample_round
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
-from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.serving import artefact as artefact_module
+from f3amd_lib.serving import export as export_module
+from f3amd_lib.serving.artefact import load_artefact, manifest_digest
+from f3amd_lib.serving.export import compile_iree, export_model, export_round, save_artefact
 
 BATCH = 2
 SIGMAS = VarianceExploding().grid(2)
@@ -173,18 +168,11 @@ def test_an_artefact_runs_without_the_library(runtime, request, tmp_path, jit_ro
     script = _ALONE.format(refused=refused, folder=str(folder), runtime=runtime)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     shapes = {item: tuple(shape) for item, shape in load_shapes(folder).items()}
-    np.testing.assert_allclose(
-        np.load(tmp_path / "answer.npy"), jit_round(*inputs_of(shapes, 11)), atol=1e-3
-    )
+    np.testing.assert_allclose(np.load(tmp_path / "answer.npy"), jit_round(*inputs_of(shapes, 11)), atol=1e-3)
 
 
 def load_shapes(folder: Path) -> dict:
@@ -326,9 +314,7 @@ def test_a_missing_runtime_is_named_with_the_remedy(jax_folder, exported, tmp_pa
     with pytest.raises(ValueError, match="'llvm-cpu' .*compile some, or pass runtime='jax'"):
         load_artefact(jax_folder)
     target = {"iree_version": "3.13.0"}
-    copy = altered(
-        jax_folder, tmp_path / "copy", lambda manifest: manifest["targets"].update(x=target)
-    )
+    copy = altered(jax_folder, tmp_path / "copy", lambda manifest: manifest["targets"].update(x=target))
     monkeypatch.setitem(sys.modules, "iree", None)
     monkeypatch.setitem(sys.modules, "iree.runtime", None)
     with pytest.raises(ImportError, match=r"f3amd_lib\[bench\].*iree-base-runtime==3\.13\.0"):
@@ -340,9 +326,7 @@ def test_a_missing_runtime_is_named_with_the_remedy(jax_folder, exported, tmp_pa
 
 def test_nothing_of_a_user_is_overwritten(exported, tmp_path):
     folder = tmp_path / "round"
-    save = lambda **settings: save_artefact(
-        folder, exported, targets=(), **{"name": "tiny", **settings}
-    )
+    save = lambda **settings: save_artefact(folder, exported, targets=(), **{"name": "tiny", **settings})
     save()
     with pytest.raises(ValueError, match="exists already; .*overwrite=True"):
         save()

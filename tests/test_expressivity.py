@@ -7,10 +7,10 @@ import pytest
 from builders import SKELETON
 from flax import nnx
 
-from f3amd_lib.evaluation import expressivity as ex
-from f3amd_lib.models.conditioning import CONDITIONINGS, conditioning_layer
-from f3amd_lib.models.spectral import SpectralConvolution
+from f3amd_lib.experiments import expressivity as ex
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
+from f3amd_lib.networks.conditioning import CONDITIONINGS, conditioning_layer
+from f3amd_lib.networks.spectral import SpectralConvolution
 
 # -------------------------------------------------------------------------------------- modes
 
@@ -83,9 +83,7 @@ def test_the_squares_of_a_spectrum_add_up_to_the_variance():
         for band in ("fourier", "cosine"):
             rows = table[(table["band"] == band) & (table["group"] == group)]
             np.testing.assert_allclose(rows["frequency_hz"], np.arange(9.0))
-            np.testing.assert_allclose(
-                np.sum(rows["amplitude_cm"].to_numpy()[1:] ** 2), spread, rtol=1e-9, atol=1e-12
-            )
+            np.testing.assert_allclose(np.sum(rows["amplitude_cm"].to_numpy()[1:] ** 2), spread, rtol=1e-9, atol=1e-12)
 
 
 def test_a_spectrum_has_its_peak_at_the_frequency_of_a_swing():
@@ -243,8 +241,7 @@ def test_three_blocks_of_two_channels_have_all_eight_delays():
 
 WIDTH, WINDOW = 3, 6
 BASES = {
-    frames: SpectralConvolution(WIDTH, WIDTH, frames // 2 + 1, rngs=nnx.Rngs(2))
-    for frames in (WINDOW, 2 * WINDOW)
+    frames: SpectralConvolution(WIDTH, WIDTH, frames // 2 + 1, rngs=nnx.Rngs(2)) for frames in (WINDOW, 2 * WINDOW)
 }
 
 
@@ -252,9 +249,7 @@ BASES = {
 def blocks():
     """Name of a way in -> (z, c) [1, T, D] to one block before its SiLU."""
     rng = np.random.default_rng(0)
-    ways = {
-        name: conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(1)) for name in CONDITIONINGS
-    }
+    ways = {name: conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(1)) for name in CONDITIONINGS}
     modulation = ways["adaln_zero"].modulation.kernel
     modulation[...] = jnp.asarray(0.5 * rng.standard_normal(modulation.shape), jnp.float32)
 

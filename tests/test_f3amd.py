@@ -6,23 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import (
-    CHANNELS,
-    HISTORY,
-    WINDOW,
-    draw,
-    evaluate,
-    make_condition,
-    network_of,
-    tiny_config,
-    tiny_normaliser,
-)
+from builders import CHANNELS, HISTORY, WINDOW, draw, evaluate, make_condition, network_of, tiny_config, tiny_normaliser
 from flax import nnx
 
 from f3amd_lib.data.features import path_condition, turn_frames
-from f3amd_lib.models.attention import position_code
-from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.f3amd import F3AMDConfig
+from f3amd_lib.networks.attention import position_code
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.f3amd import F3AMDConfig
 
 SIGMA = jnp.array([0.3, 20.0])
 
@@ -36,9 +26,7 @@ def run(network, x_noisy, sigma=SIGMA, condition=None):
     return evaluate(network, x_noisy, sigma, condition)
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"history_anchor": True, "sigma_data": 0.5, "conditioning": "adaln_zero"}]
-)
+@pytest.mark.parametrize("changes", [{}, {"history_anchor": True, "sigma_data": 0.5, "conditioning": "adaln_zero"}])
 def test_config_survives_json(changes):
     config = tiny_config(**changes)
     again = F3AMDConfig.from_dict(json.loads(json.dumps(config.to_dict())))
@@ -119,9 +107,7 @@ def test_output_depends_on_noise_level_style_path_and_history():
 
 def test_scalar_noise_level_equals_one_per_character():
     network, x_noisy = make_network(), draw(2, WINDOW, CHANNELS)
-    np.testing.assert_allclose(
-        run(network, x_noisy, 2.0), run(network, x_noisy, jnp.full(2, 2.0)), atol=1e-5
-    )
+    np.testing.assert_allclose(run(network, x_noisy, 2.0), run(network, x_noisy, jnp.full(2, 2.0)), atol=1e-5)
 
 
 def test_input_scaling_is_c_in():
@@ -234,9 +220,7 @@ def test_table_8_variants_leave_encoder_and_decoder_alone():
         network = make_network(**VARIANTS[name])
         standard = make_network()
         for part in ("encoder", "decoder"):
-            shapes = [
-                jax.tree.map(jnp.shape, nnx.state(getattr(n, part))) for n in (network, standard)
-            ]
+            shapes = [jax.tree.map(jnp.shape, nnx.state(getattr(n, part))) for n in (network, standard)]
             assert shapes[0] == shapes[1], (name, part)
 
 
@@ -261,9 +245,7 @@ def test_table_11_concatenation_runs_its_blocks_on_twice_the_frames():
 def test_table_11_adaln_zero_starts_as_decoder_of_encoder():
     network, x_noisy = make_network(conditioning="adaln_zero", depth=3), draw(2, WINDOW, CHANNELS)
     scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
-    np.testing.assert_allclose(
-        run(network, x_noisy), network.decoder(network.encoder(scaled)), atol=1e-5
-    )
+    np.testing.assert_allclose(run(network, x_noisy), network.decoder(network.encoder(scaled)), atol=1e-5)
 
 
 def test_section_3_4_1_transformer_blocks_see_the_order_of_frames():
@@ -335,10 +317,7 @@ def lively_network(**changes):
     graph, state = nnx.split(network)
     leaves, tree = jax.tree.flatten(state)
     keys = jax.random.split(jax.random.key(5), len(leaves))
-    moved = [
-        leaf + 0.05 * jax.random.normal(key, leaf.shape)
-        for leaf, key in zip(leaves, keys, strict=True)
-    ]
+    moved = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
     return nnx.merge(graph, jax.tree.unflatten(tree, moved))
 
 
@@ -360,9 +339,7 @@ def a_walk(yaw):
 
 @pytest.mark.parametrize("facing_frame", [True, False])
 def test_a_network_that_faces_its_path_is_the_same_for_every_heading(facing_frame):
-    network = lively_network(
-        facing_frame=facing_frame, history_anchor=True, residual_prior=True, normalise=False
-    )
+    network = lively_network(facing_frame=facing_frame, history_anchor=True, residual_prior=True, normalise=False)
     still, turned = np.zeros(2), np.array([0.7, -2.5])
     answers = []
     for yaw in (still, turned):

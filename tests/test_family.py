@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, wandering_motion
 
-from f3amd_lib import measure
 from f3amd_lib.__main__ import main
-from f3amd_lib.models import zoo
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table
-from f3amd_lib.training import checkpoints, family, pipeline
+from f3amd_lib.experiments import family, measure
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.networks import zoo
+from f3amd_lib.training import checkpoints, pipeline
 from f3amd_lib.training.pipeline import PreparedData, profile_recipe
 
 SHORT = {"num_steps": 4, "batch_size": 2, "learning_rate": 1e-3}
@@ -46,9 +46,7 @@ def test_a_learning_curve_starts_before_the_first_step(prepared):
 
 def test_the_table_says_what_fell():
     def curve(model, losses, held_out):
-        return pd.DataFrame(
-            {"model": model, "step": [0, 1, 2], "loss": losses, "held_out_loss": held_out}
-        )
+        return pd.DataFrame({"model": model, "step": [0, 1, 2], "loss": losses, "held_out_loss": held_out})
 
     nan = float("nan")
     table = family.learning_table(

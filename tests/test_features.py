@@ -113,18 +113,14 @@ def test_centring_by_hand():
 
 def test_turns_add_up_and_undo_each_other():
     frames, a, b = random_frames((2, 5)), np.array([0.4, -2.0]), np.array([1.1, 2.9])
-    np.testing.assert_allclose(
-        turn_frames(turn_frames(frames, a), b), turn_frames(frames, a + b), atol=1e-12
-    )
+    np.testing.assert_allclose(turn_frames(turn_frames(frames, a), b), turn_frames(frames, a + b), atol=1e-12)
     np.testing.assert_allclose(turn_frames(turn_frames(frames, a), -a), frames, atol=1e-12)
     np.testing.assert_allclose(turn_frames(frames, np.full(2, 2 * np.pi)), frames, atol=1e-12)
 
 
 def test_turning_frames_is_turning_the_motion():
     motion = wandering_motion(10)
-    np.testing.assert_allclose(
-        turn_frames(world_frames(motion), 0.8), world_frames(turn(motion, 0.8)), atol=1e-12
-    )
+    np.testing.assert_allclose(turn_frames(world_frames(motion), 0.8), world_frames(turn(motion, 0.8)), atol=1e-12)
 
 
 @pytest.mark.parametrize("yaw", [-3.0, 0.7, 2.0])
@@ -161,9 +157,7 @@ def test_orthonormalise_leaves_rotations_and_mends_the_rest():
         np.testing.assert_allclose(np.linalg.norm(vector, axis=-1), 1.0, atol=1e-12)
     np.testing.assert_allclose((first * second).sum(-1), 0.0, atol=1e-12)
     # The pose that kinematics sees does not change.
-    np.testing.assert_allclose(
-        frame_positions(SKELETON, mended), frame_positions(SKELETON, noisy), atol=1e-12
-    )
+    np.testing.assert_allclose(frame_positions(SKELETON, mended), frame_positions(SKELETON, noisy), atol=1e-12)
     np.testing.assert_allclose(orthonormalise(mended), mended, atol=1e-12)
 
 

@@ -9,23 +9,11 @@ from builders import straight_motion
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.evaluation.foot_locking import (
-    DEEPEST,
-    FARTHEST,
-    leg_chains,
-    lock_feet,
-    lock_rollout,
-    plan_contacts,
-)
-from f3amd_lib.evaluation.metrics import joint_acceleration
-from f3amd_lib.evaluation.paths import named_path
-from f3amd_lib.evaluation.rollout import Rollout
-from f3amd_lib.evaluation.walking import (
-    floor_penetration,
-    slide_speed,
-    stepping_rate,
-    toe_positions,
-)
+from f3amd_lib.generation.foot_locking import DEEPEST, FARTHEST, leg_chains, lock_feet, lock_rollout, plan_contacts
+from f3amd_lib.generation.rollout import Rollout
+from f3amd_lib.measures.metrics import joint_acceleration
+from f3amd_lib.measures.walking import floor_penetration, slide_speed, stepping_rate, toe_positions
+from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize, synthesize_with_contacts
 
@@ -52,9 +40,7 @@ def sliding(motion: Motion, speed: float) -> Motion:
 
 def lifted(motion: Motion, height) -> Motion:
     height = np.broadcast_to(height, (motion.num_frames,))
-    return motion.replace(
-        root_position=motion.root_position + height[:, None] * np.array([0.0, 1.0, 0.0])
-    )
+    return motion.replace(root_position=motion.root_position + height[:, None] * np.array([0.0, 1.0, 0.0]))
 
 
 def bone_lengths(motion: Motion) -> np.ndarray:
@@ -131,9 +117,7 @@ def test_a_clean_walk_stays(walk):
     assert moved.mean() < 0.002 and moved.max() < 0.05
     before, after = joint_acceleration(walk.positions), joint_acceleration(locked.positions)
     assert after == pytest.approx(before, rel=0.02)
-    assert stepping_rate(locked.positions, walk.skeleton) == stepping_rate(
-        walk.positions, walk.skeleton
-    )
+    assert stepping_rate(locked.positions, walk.skeleton) == stepping_rate(walk.positions, walk.skeleton)
 
 
 def test_a_slide_is_cured(locked_slide):
@@ -142,9 +126,7 @@ def test_a_slide_is_cured(locked_slide):
     assert slide_speed(before.positions, skeleton) == pytest.approx(20.0, abs=1.0)
     assert slide_speed(after.positions, skeleton) < 0.1
     assert floor_penetration(after.positions, skeleton, FLOOR) < 0.05
-    assert stepping_rate(after.positions, skeleton) == pytest.approx(
-        stepping_rate(before.positions, skeleton), rel=0.1
-    )
+    assert stepping_rate(after.positions, skeleton) == pytest.approx(stepping_rate(before.positions, skeleton), rel=0.1)
     old, new = joint_acceleration(before.positions), joint_acceleration(after.positions)
     assert new < 1.2 * old  # a foot that stands has to catch up
 

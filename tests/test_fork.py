@@ -159,20 +159,14 @@ def test_paths_are_sampled_as_the_librarys_sampler_does(diffusion):
     sigmas = diffusion.grid(4)
     start = sigmas[0] * jax.random.normal(key_init, (4, 8, 2))
     expected = samplers.sample(
-        diffusion.sampler,
-        lambda x, sigma: SMALL.denoise(x, sigma, told),
-        start,
-        sigmas,
-        key=key_steps,
+        diffusion.sampler, lambda x, sigma: SMALL.denoise(x, sigma, told), start, sigmas, key=key_steps
     )
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_exact_one_step_hits_the_wall_eight_choose_and_told_ones_need_no_choice():
     for diffusion in (EXPLODING, PRESERVING):
-        table = toy.outcome_table(FORK, diffusion, (1, 8), num_samples=400).set_index(
-            ["steps", "told"]
-        )
+        table = toy.outcome_table(FORK, diffusion, (1, 8), num_samples=400).set_index(["steps", "told"])
         assert table.loc[(1, False), "wall"] == 1.0
         assert table.loc[(8, False), "wall"] < 0.06
         assert 0.4 < table.loc[(8, False), "left"] < 0.6
@@ -250,9 +244,7 @@ def test_a_scaled_network_is_the_zoos_own_with_input_scaling(trained):
 
 
 def test_a_training_that_diverges_says_so(trained, monkeypatch):
-    monkeypatch.setattr(
-        toy, "_train", lambda *a: (trained[0], np.array([1.0, 2.0, np.inf, np.nan]))
-    )
+    monkeypatch.setattr(toy, "_train", lambda *a: (trained[0], np.array([1.0, 2.0, np.inf, np.nan])))
     recipe = toy.fork_recipe(PRESERVING, 400, batch_size=16, learning_rate=8e-3)
     with pytest.raises(ArithmeticError, match="at step 3: lower the learning rate 0.008"):
         toy.train_fork(SMALL, recipe, latent_width=8, depth=1)

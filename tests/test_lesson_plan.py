@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from f3amd_lib.exercises import CHECKS, check
-from f3amd_lib.report.equation_map import notebook_sections
+from f3amd_lib.reports.equation_map import notebook_sections
 
 PLAN = Path(__file__).resolve().parents[1] / "docs/lesson_plan.md"
 TEXT = PLAN.read_text(encoding="utf-8")

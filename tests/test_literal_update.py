@@ -9,13 +9,12 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
 
-from f3amd_lib import measure
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
-from f3amd_lib.evaluation import literal_update
-from f3amd_lib.evaluation.denoising import held_out_batch
-from f3amd_lib.evaluation.literal_update import (
+from f3amd_lib.experiments import literal_update, measure
+from f3amd_lib.experiments.denoising import held_out_batch
+from f3amd_lib.experiments.literal_update import (
     UPDATES,
     WINDOW_METRICS,
     WindowWalks,
@@ -24,9 +23,9 @@ from f3amd_lib.evaluation.literal_update import (
     walk_windows,
     window_figures,
 )
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table, run_record
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
@@ -98,9 +97,7 @@ def test_the_walks_are_those_of_the_samplers_by_name():
         sample = SAMPLERS[name]
         x = jax.jit(
             lambda noise, condition, sample=sample: sample(
-                lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)),
-                128.0 * noise,
-                grid,
+                lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)), 128.0 * noise, grid
             )
         )(noise, condition)
         joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
@@ -139,10 +136,7 @@ def measurement(tmp_path, monkeypatch):
     """`measure_literal_update` on tiny models, with rollouts of a made-up value."""
     prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
     schedule = VariancePreservingCosine(4)
-    models = {
-        "F3AMD-FNO-32": tiny_trained(),
-        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=schedule),
-    }
+    models = {"F3AMD-FNO-32": tiny_trained(), "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=schedule)}
     calls = []
 
     def measure_model(generator, *arguments, name):
@@ -203,9 +197,7 @@ def test_the_measurement_goes_on_and_notices_other_weights(measurement):
     assert run(["F3AMD-FNO-32"])[1] == first
     pd.testing.assert_frame_equal(read_table(path)[0], before["literal_update.csv"])
     trained = models["F3AMD-FNO-32"]
-    models["F3AMD-FNO-32"] = dataclasses.replace(
-        trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params)
-    )
+    models["F3AMD-FNO-32"] = dataclasses.replace(trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params))
     assert run()[1] == first
     assert len(read_table(path)[0]) == 5
 

@@ -68,9 +68,7 @@ def test_eq13_joint_velocity_by_hand():
     assert terms["joint_velocity"] == pytest.approx((4e-4 + 1e-4) / 3, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("reference_step", "counts"), [(0.0, 1), (0.009, 1), (0.011, 0), (0.05, 0)]
-)
+@pytest.mark.parametrize(("reference_step", "counts"), [(0.0, 1), (0.009, 1), (0.011, 0), (0.05, 0)])
 def test_appendix_b_foot_counts_only_where_the_reference_is_planted(reference_step, counts):
     moving = standing(step=(0.03, 0.0, 0.0))
     terms = terms_of(moving, standing(step=(reference_step, 0.0, 0.0)))
@@ -131,11 +129,7 @@ def test_perfect_prediction_leaves_only_the_real_seam_and_foot_motion():
 @pytest.mark.parametrize("case", ["perfect", "zero 6D", "parallel columns"])
 def test_gradients_are_finite(form, case):
     future = jnp.asarray(random_frames((2, FRAMES)), jnp.float32)
-    at = {
-        "perfect": future,
-        "zero 6D": jnp.zeros_like(future),
-        "parallel columns": jnp.ones_like(future),
-    }[case]
+    at = {"perfect": future, "zero 6D": jnp.zeros_like(future), "parallel columns": jnp.ones_like(future)}[case]
     # In a perfect literal seam the distance itself is zero too.
     last_history = future[:, 0]
 
@@ -194,16 +188,12 @@ def test_kinematics_of_the_loss_is_that_of_the_features():
     future = jnp.asarray(random_frames((2, FRAMES)), jnp.float32)
     other = jnp.asarray(random_frames((2, FRAMES), seed=1), jnp.float32)
     difference = frame_positions(SKELETON, other) - frame_positions(SKELETON, future)
-    assert terms_of(other, future)["position"] == pytest.approx(
-        float(jnp.mean(difference**2)), rel=1e-5
-    )
+    assert terms_of(other, future)["position"] == pytest.approx(float(jnp.mean(difference**2)), rel=1e-5)
 
 
 def test_weights_count_samples_and_equal_ones_change_nothing():
     """Twice the weight of a sample is that sample twice, in every term."""
-    future_hat, future = (
-        jnp.asarray(random_frames((2, FRAMES), seed), jnp.float32) for seed in (0, 1)
-    )
+    future_hat, future = (jnp.asarray(random_frames((2, FRAMES), seed), jnp.float32) for seed in (0, 1))
 
     def terms(rows, weights):
         hat, real = future_hat[rows], future[rows]

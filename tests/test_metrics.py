@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.evaluation import metrics
-from f3amd_lib.evaluation.paths import RootPath, named_path
+from f3amd_lib.measures import metrics
+from f3amd_lib.motion.root_paths import RootPath, named_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Skeleton
 
@@ -14,9 +14,7 @@ SKELETON = Skeleton(
     (-1, 0, 0, 1, 2),
     np.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0], [0, -0.9, 0.1], [0, -0.9, 0.1]]),
 )
-POSE = np.array(
-    [[0, 0.9, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1]], dtype=float
-)
+POSE = np.array([[0, 0.9, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1]], dtype=float)
 
 
 def glide(num_frames=4 * WINDOW, step=0.04, direction=0.0):
@@ -85,9 +83,7 @@ def test_inter_frame_step_at_the_spacing_of_seams_is_ird():
 
 def test_excess_at_every_frame_is_the_joint_acceleration():
     positions = wobble()
-    everywhere = np.mean(
-        [metrics.ird_excess(positions[start : start + 3], 2) for start in range(len(positions) - 2)]
-    )
+    everywhere = np.mean([metrics.ird_excess(positions[start : start + 3], 2) for start in range(len(positions) - 2)])
     assert metrics.joint_acceleration(positions) == pytest.approx(everywhere)
 
 
@@ -108,9 +104,7 @@ def test_ten_degrees_off():
     path = named_path("straight", 4 * WINDOW, speed=1.2)
     positions = glide(step=0.04, direction=np.deg2rad(10.0))
     apart = 2 * np.sin(np.deg2rad(5.0))
-    assert metrics.trajectory_error(positions, path, WINDOW) == pytest.approx(
-        apart * 0.04 * (WINDOW - 1) / 2
-    )
+    assert metrics.trajectory_error(positions, path, WINDOW) == pytest.approx(apart * 0.04 * (WINDOW - 1) / 2)
     assert metrics.path_drift(positions, path) == pytest.approx(apart)
 
 
@@ -144,9 +138,7 @@ def test_remainder_after_the_last_window_is_left_out_of_window_errors():
     positions = glide(step=0.04, direction=0.3)
     whole = metrics.trajectory_error(positions, path, WINDOW)
     cut = slice(0, 3 * WINDOW + 7)
-    assert metrics.trajectory_error(positions[cut], path.position[cut], WINDOW) == pytest.approx(
-        whole
-    )
+    assert metrics.trajectory_error(positions[cut], path.position[cut], WINDOW) == pytest.approx(whole)
 
 
 # ------------------------------------------------------------------------------------- smoothness
@@ -215,9 +207,7 @@ def test_two_centimetres_a_frame_at_one_metre_a_second():
 def test_floor_is_the_lowest_toe_unless_given():
     resting_high = slider(rest=0.0425)  # Bandai's toe joint
     assert metrics.foot_sliding(resting_high, (3, 4)) == pytest.approx((0.6, 0.5))
-    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0425) == pytest.approx(
-        (0.6, 0.5)
-    )
+    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0425) == pytest.approx((0.6, 0.5))
     assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0) == (0.0, 0.0)
 
 
@@ -292,9 +282,7 @@ def test_camdm_does_not_wrap_steps_across_the_cut():
 def test_camdm_constant_wrong_facing_is_an_orientation_error():
     yaw = np.full(4 * WINDOW, np.deg2rad(10.0))
     assert metrics.camdm_orientation_error(yaw, np.zeros(4 * WINDOW)) == pytest.approx(10.0)
-    assert metrics.camdm_orientation_error(yaw + 6 * np.pi, np.zeros(4 * WINDOW)) == pytest.approx(
-        10.0
-    )
+    assert metrics.camdm_orientation_error(yaw + 6 * np.pi, np.zeros(4 * WINDOW)) == pytest.approx(10.0)
 
 
 def test_camdm_direction_of_what_stands_is_undefined():
@@ -342,9 +330,7 @@ def test_camdm_metrics_and_the_place_and_turn_of_the_world():
     positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
     path = named_path("slalom", len(positions))
     before = metrics.camdm_metrics(positions, None, path, SKELETON)
-    moved = metrics.camdm_metrics(
-        positions + shift, None, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON
-    )
+    moved = metrics.camdm_metrics(positions + shift, None, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON)
     assert moved == pytest.approx(before)
     turned = positions @ matrix_from_yaw(np.float64(angle)).T
     after = metrics.camdm_metrics(turned, None, path.placed((0, 0), angle), SKELETON)
@@ -416,8 +402,7 @@ def test_history_is_left_out_of_every_figure():
     after = metrics.first_metrics(positions, None, path, WINDOW, SKELETON, history=history)
     assert after == alone
     longer = RootPath(
-        np.concatenate([np.zeros((history, 2)), path.position]),
-        np.concatenate([np.zeros(history), path.yaw]),
+        np.concatenate([np.zeros((history, 2)), path.position]), np.concatenate([np.zeros(history), path.yaw])
     )
     again = metrics.first_metrics(positions, None, longer, WINDOW, SKELETON, history=history)
     assert again == pytest.approx(alone)
@@ -425,11 +410,7 @@ def test_history_is_left_out_of_every_figure():
 
 def test_real_motion_needs_no_path():
     values = metrics.first_metrics(wobble(), None, None, WINDOW, SKELETON)
-    assert set(metrics.METRICS) - set(values) == {
-        "trajectory_error_m",
-        "direction_error_deg",
-        "path_drift",
-    }
+    assert set(metrics.METRICS) - set(values) == {"trajectory_error_m", "direction_error_deg", "path_drift"}
 
 
 def test_tidy_rows_average_and_count():

@@ -6,8 +6,8 @@ import re
 import pandas as pd
 import pytest
 
-from f3amd_lib.profiles import repository_root
-from f3amd_lib.report import model_cards
+from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.reports import model_cards
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -18,7 +18,7 @@ SHIPPED = sorted(PRETRAINED_DIR.glob("*/*.safetensors"))
 def test_every_shipped_model_has_its_card(path):
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     assert card == model_cards.model_card(path, model_cards.committed_quality(path.parent.name)), (
-        "write the cards anew: python -m f3amd_lib.report.model_cards"
+        "write the cards anew: python -m f3amd_lib.reports.model_cards"
     )
     record = describe(path)["record"]
     assert record["dataset_licence"] in card and record["dataset_credit"] in card
@@ -32,7 +32,7 @@ def test_readme_shows_what_is_on_record(tmp_path):
     copy.write_text(readme.read_text(encoding="utf-8"), encoding="utf-8")
     model_cards.write_readme_table(copy, model_cards.committed_quality("bandai"))
     assert copy.read_text(encoding="utf-8") == readme.read_text(encoding="utf-8"), (
-        "write the table anew: python -m f3amd_lib.report.model_cards"
+        "write the table anew: python -m f3amd_lib.reports.model_cards"
     )
     copy.write_text("no marks", encoding="utf-8")
     with pytest.raises(ValueError, match="no `<!-- measured: begin -->`"):
@@ -72,9 +72,7 @@ def test_limits_follow_from_the_figures():
         assert word not in limits(**good)
     assert "hardly uses its noisy input" in limits(**good | {"x0_error_ratio": 0.95})
     assert "steps too rarely: 0.9" in limits(**good | {"stepping_rate": 0.9})
-    assert "skates: its lower toe moves over the ground at 84 cm/s" in limits(
-        **good | {"slide_speed": 84.0}
-    )
+    assert "skates: its lower toe moves over the ground at 84 cm/s" in limits(**good | {"slide_speed": 84.0})
     assert "Toes sink" in limits(**good, floor_penetration=2.0)
     assert "trembles" in limits(**good, joint_acceleration=1.0)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from f3amd_lib.names import nearest_hint, nearest_names, refuse_unknown
+from f3amd_lib.ground.names import nearest_hint, nearest_names, refuse_unknown
 
 
 @dataclass(frozen=True)
@@ -15,9 +15,7 @@ class Settings:
 
 
 def test_the_nearest_name_comes_first_and_case_is_ignored():
-    assert nearest_names("f3amd-fno-69", ["CAMDM", "F3AMD-FNO-96", "F3AMD-FNO-32"])[0] == (
-        "F3AMD-FNO-96"
-    )
+    assert nearest_names("f3amd-fno-69", ["CAMDM", "F3AMD-FNO-96", "F3AMD-FNO-32"])[0] == ("F3AMD-FNO-96")
     assert nearest_names("zzz", ["CAMDM"]) == []
 
 

@@ -120,9 +120,7 @@ def repository_faults(paths, root: Path) -> list[str]:
         shipped = re.fullmatch(r"f3amd_lib/pretrained/[^/]+/[^/]+\.safetensors", name)
         if path.stat().st_size > LARGEST_FILE and not shipped:
             faults.append(f"{name}: {path.stat().st_size} bytes, limit {LARGEST_FILE}")
-        if path.suffix in (".bvh", ".zip") and not re.fullmatch(
-            r"paper_figures/[^/]+/[^/]+/media/[^/]+\.bvh", name
-        ):
+        if path.suffix in (".bvh", ".zip") and not re.fullmatch(r"paper_figures/[^/]+/[^/]+/media/[^/]+\.bvh", name):
             faults.append(f"{name}: motion data does not belong in the repository")
         if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/(standalone/)?[^/]+", name):
             faults.append(f"{name}: notebooks lie in notebooks/ or notebooks/standalone/")
@@ -149,9 +147,7 @@ def test_notebooks_are_numbered_without_gaps():
 
 
 def test_no_committed_figure_is_cut_off():
-    figures = [
-        path for path in tracked_files() if path.suffix == ".png" and "figures" in path.parts
-    ]
+    figures = [path for path in tracked_files() if path.suffix == ".png" and "figures" in path.parts]
     assert figures
     assert [path.relative_to(ROOT).as_posix() for path in figures if cut_off(path)] == []
 
@@ -233,24 +229,15 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (set_verdict(metadata={"papermill": {}}), "papermill metadata"),
         (lambda notebook: notebook["metadata"].update(papermill={}), "papermill metadata"),
         (lambda notebook: notebook["metadata"].update(widgets={}), "widget state"),
-        (
-            lambda notebook: notebook["metadata"]["kernelspec"].update(name="my-env"),
-            "kernel is not python3",
-        ),
+        (lambda notebook: notebook["metadata"]["kernelspec"].update(name="my-env"), "kernel is not python3"),
         (set_parameters('profile = "laptop"\ndata = "synthetic"'), "profile is not 'smoke'"),
         (set_parameters('profile = "smoke"\ndata = "bandai"'), "data is not 'synthetic'"),
         (
             set_parameters('profile = "smoke"\ndata = "synthetic"\nrounds = 2 * 40'),
             "more than literals: 'rounds = 2 * 40'",
         ),
-        (
-            set_parameters('import os\nprofile = "smoke"\ndata = "synthetic"'),
-            "more than literals: 'import os'",
-        ),
-        (
-            lambda notebook: notebook["cells"][0]["metadata"].update(tags=[]),
-            "0 cells are tagged parameters",
-        ),
+        (set_parameters('import os\nprofile = "smoke"\ndata = "synthetic"'), "more than literals: 'import os'"),
+        (lambda notebook: notebook["cells"][0]["metadata"].update(tags=[]), "0 cells are tagged parameters"),
     ],
 )
 def test_each_fault_of_a_notebook_is_found(tmp_path, spoil, fault):

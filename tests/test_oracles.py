@@ -37,18 +37,14 @@ def test_score_is_the_slope_of_the_log_density():
     for sigma in (0.1, 2.0):
         for axis in range(2):
             move = np.eye(2)[axis] * step
-            slope = (PLANE.log_density(x + move, sigma) - PLANE.log_density(x - move, sigma)) / (
-                2 * step
-            )
+            slope = (PLANE.log_density(x + move, sigma) - PLANE.log_density(x - move, sigma)) / (2 * step)
             np.testing.assert_allclose(PLANE.score(x, sigma)[:, axis], slope, rtol=1e-6, atol=1e-6)
 
 
 def test_tweedie_joins_score_and_denoiser():
     x = np.random.default_rng(0).normal(scale=3.0, size=(50, 2))
     sigma = np.linspace(0.05, 20.0, 50)[:, None]
-    np.testing.assert_allclose(
-        PLANE.denoise(x, sigma), x + sigma**2 * PLANE.score(x, sigma), atol=1e-9
-    )
+    np.testing.assert_allclose(PLANE.denoise(x, sigma), x + sigma**2 * PLANE.score(x, sigma), atol=1e-9)
 
 
 def test_limits_without_noise_and_with_nothing_but_noise():
@@ -88,8 +84,7 @@ def test_eq08_noisy_samples_follow_the_noisy_density():
     inner = 0.5 * (edges[1:] + edges[:-1])
     # Simpson's rule over each bin
     density = sum(
-        w * np.exp(TWO.log_density(x[:, None], 0.7))
-        for w, x in ((1, edges[:-1]), (4, inner), (1, edges[1:]))
+        w * np.exp(TWO.log_density(x[:, None], 0.7)) for w, x in ((1, edges[:-1]), (4, inner), (1, edges[1:]))
     )
     np.testing.assert_allclose(count / len(noisy), density * 0.5 / 6, atol=0.008)
 

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from f3amd_lib.data import packed as packed_module
-from f3amd_lib.data.packed import (
-    PackedMotion,
-    cache_path,
-    load_packed,
-    pack,
-    packed_dataset,
-    save_packed,
-)
+from f3amd_lib.data.packed import PackedMotion, cache_path, load_packed, pack, packed_dataset, save_packed
 from f3amd_lib.data.sources import SPLITS, Clip, Dataset, open_dataset
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton

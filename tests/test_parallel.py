@@ -59,9 +59,7 @@ def weights_of(tree) -> list[np.ndarray]:
     Adam makes steps of full length out of rounding.
     """
     named = jax.tree_util.tree_leaves_with_path(tree)
-    kept = [
-        leaf for path, leaf in named if "'key'" not in (name := str(path)) or "bias" not in name
-    ]
+    kept = [leaf for path, leaf in named if "'key'" not in (name := str(path)) or "bias" not in name]
     assert len(kept) == len(named) - 1
     return [np.asarray(leaf) for leaf in kept]
 

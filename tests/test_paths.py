@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.evaluation.paths import (
-    NAMES,
-    RootPath,
-    named_path,
-    path_from_motion,
-    read_path_csv,
-)
+from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path, path_from_motion, read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 
@@ -211,11 +205,7 @@ def test_csv_that_is_no_text(tmp_path):
 
 
 def test_path_from_motion():
-    skeleton = Skeleton(
-        ("Hips", "LeftHip", "RightHip"),
-        (-1, 0, 0),
-        np.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]]),
-    )
+    skeleton = Skeleton(("Hips", "LeftHip", "RightHip"), (-1, 0, 0), np.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]]))
     root = np.array([[1.0, 0.9, 2.0], [1.0, 0.9, 2.1]])
     motion = Motion(skeleton, root, np.tile(np.eye(3), (2, 3, 1, 1)), fps=60.0)
     path = path_from_motion(motion)

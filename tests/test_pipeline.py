@@ -11,9 +11,9 @@ import f3amd_lib.training.pipeline as pipeline
 from f3amd_lib.__main__ import main
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.bvh import read_bvh
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +60,7 @@ def test_changed_settings_set_the_old_files_aside(trained_once, same_runs, monke
     files = pipeline.model_files(profile)
     before = files.model.read_bytes()
     asked = {}
-    monkeypatch.setattr(
-        pipeline, "train", lambda *args, **kwargs: asked.setdefault("yes", (None, None))
-    )
+    monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: asked.setdefault("yes", (None, None)))
     pipeline.obtain_model(prepared, dataclasses.replace(profile, seed=5), progress=False)
     assert asked
     name = profile.preset
@@ -113,9 +111,7 @@ def test_presets_may_be_called_by_the_papers_names(trained_once):
     profile = trained_once[2]
     name = "F3AMD-FNO-96, m=14"
     assert pipeline.model_files(profile, name).model.name == "F3AMD-FNO-96-m14.safetensors"
-    assert pipeline.profile_recipe(profile, name) == pipeline.profile_recipe(
-        profile, "F3AMD-FNO-96-m14"
-    )
+    assert pipeline.profile_recipe(profile, name) == pipeline.profile_recipe(profile, "F3AMD-FNO-96-m14")
 
 
 def test_models_that_lie_there_are_listed(trained_once, same_runs, monkeypatch, tmp_path):
@@ -133,8 +129,7 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
     laptop = dataclasses.replace(profile, name="laptop")
     shipped = folder / "pretrained" / "synthetic"
     other = dataclasses.replace(
-        model,
-        skeleton=dataclasses.replace(model.skeleton, offsets=1.5 * model.skeleton.offsets),
+        model, skeleton=dataclasses.replace(model.skeleton, offsets=1.5 * model.skeleton.offsets)
     )
     files = pipeline.model_files(laptop, folder=shipped)
     pipeline.save_model(files.model, other)

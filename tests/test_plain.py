@@ -4,23 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import (
-    CHANNELS,
-    WINDOW,
-    draw,
-    evaluate,
-    make_condition,
-    network_of,
-    tiny_camdm,
-    tiny_config,
-)
+from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm, tiny_config
 
-from f3amd_lib.benchmarking.plain import (
-    fourier_transform_convolution,
-    framework_convolution,
-    plain_form,
-)
-from f3amd_lib.models.spectral import spectral_convolution
+from f3amd_lib.benchmarking.plain import fourier_transform_convolution, framework_convolution, plain_form
+from f3amd_lib.networks.spectral import spectral_convolution
 
 
 @pytest.mark.parametrize("num_frames", [32, 64, 33])
@@ -38,9 +25,7 @@ def test_eq03_framework_convolution_sees_the_neighbours():
     z = jnp.arange(5.0)[None, :, None]
     kernel = jnp.asarray([1.0, 10.0, 100.0])[:, None, None]
     found = framework_convolution(z, kernel, jnp.asarray([0.5]))[0, :, 0]
-    by_hand = [
-        0.5 + 10 * t + (t - 1 if t else 0) + (100 * (t + 1) if t < 4 else 0) for t in range(5)
-    ]
+    by_hand = [0.5 + 10 * t + (t - 1 if t else 0) + (100 * (t + 1) if t < 4 else 0) for t in range(5)]
     np.testing.assert_allclose(found, by_hand)
 
 

@@ -14,13 +14,14 @@ import pytest
 from builders import SKELETON, straight_motion, wandering_motion
 from PIL import Image
 
-from f3amd_lib.evaluation.paths import RootPath, named_path, path_from_motion
-from f3amd_lib.evaluation.rollout import Rollout
+from f3amd_lib.drawing.pictures import film_strip, write_film_strip, write_gif
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, limb_side
+from f3amd_lib.generation.rollout import Rollout
+from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
-from f3amd_lib.report import player
-from f3amd_lib.report.pictures import film_strip, write_film_strip, write_gif
-from f3amd_lib.report.player import (
+from f3amd_lib.serving import player
+from f3amd_lib.serving.player import (
     Character,
     Scene,
     player_page,
@@ -29,7 +30,6 @@ from f3amd_lib.report.player import (
     show_player,
     write_player,
 )
-from f3amd_lib.report.stick_figures import LIMB_COLORS, limb_side
 
 FRAMES = 40
 
@@ -173,9 +173,7 @@ def test_unlike_skeletons_share_a_page():
     data = page_data(player_page([wandering_motion(FRAMES), pole, pole]))
     assert [scene["characters"][0]["skeleton"] for scene in data["scenes"]] == [0, 1, 1]
     tracks = read_tracks(data)[1][0]
-    np.testing.assert_array_equal(
-        tracks["global"][7], [[250] * 3, [250, 1250, 250], [250, 2250, 250]]
-    )
+    np.testing.assert_array_equal(tracks["global"][7], [[250] * 3, [250, 1250, 250], [250, 2250, 250]])
     # No contacts, and a camera along +Z.
     assert tracks["contacts"] is None and data["skeletons"][1]["toes"] is None
 
@@ -460,7 +458,7 @@ def test_the_page_is_made_of_files_that_are_installed():
     patterns = listed["package-data"]["f3amd_lib"]
     package = root / "f3amd_lib"
     found = {path for pattern in patterns for path in package.glob(pattern)}
-    assert {package / "report" / f"player.{kind}" for kind in ("html", "css", "js")} <= found
+    assert {package / "serving" / f"player.{kind}" for kind in ("html", "css", "js")} <= found
 
 
 @pytest.mark.needs("node")

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 
-from f3amd_lib.report import plots_ablations as draw
-from f3amd_lib.report.records import run_record, write_table
+from f3amd_lib.drawing import plots_ablations as draw
+from f3amd_lib.ground.records import run_record, write_table
 
 
 def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):

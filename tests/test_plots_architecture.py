@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.models.zoo import build_config
-from f3amd_lib.report import plots_architecture as draw
+from f3amd_lib.drawing import plots_architecture as draw
+from f3amd_lib.networks.zoo import build_config
 
 SIZES = {"channels": 129, "num_styles": 15}
 
@@ -83,9 +83,7 @@ def test_no_text_of_the_diagram_lies_on_another_or_outside(name):
     figure = draw.architecture_diagram(build_config(name, **SIZES), name)
     renderer = figure.canvas.get_renderer()
     boxes = [
-        (text.get_text(), text.get_window_extent(renderer))
-        for text in figure.axes[0].texts
-        if text.get_text().strip()
+        (text.get_text(), text.get_window_extent(renderer)) for text in figure.axes[0].texts if text.get_text().strip()
     ]
     sheet = figure.bbox
     for number, (text, box) in enumerate(boxes):

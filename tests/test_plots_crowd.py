@@ -6,15 +6,8 @@ from builders import wandering_motion
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 
-from f3amd_lib.report.figures import model_style
-from f3amd_lib.report.plots_crowd import (
-    CrowdPicture,
-    Eye,
-    crowd_colors,
-    crowd_figure,
-    crowd_from_above,
-    group_shades,
-)
+from f3amd_lib.drawing.plots_crowd import CrowdPicture, Eye, crowd_colors, crowd_figure, crowd_from_above, group_shades
+from f3amd_lib.drawing.style import model_style
 
 
 def standing_at(x, z, seed=0, num_frames=20):
@@ -145,10 +138,7 @@ def test_discs_have_the_distance_as_their_diameter(picture):
         (lambda p: crowd_from_above(p, [], 0), "0 paths for 6 motions"),
         (lambda p: CrowdPicture([], []), "at least one motion"),
         (lambda p: CrowdPicture(p.motions, ["red"]), "1 colors for 6 motions"),
-        (
-            lambda p: CrowdPicture([p.motions[0].replace(fps=60.0), p.motions[1]], "kk"),
-            "frame rate",
-        ),
+        (lambda p: CrowdPicture([p.motions[0].replace(fps=60.0), p.motions[1]], "kk"), "frame rate"),
     ],
 )
 def test_bad_input_is_refused(picture, draw, message):

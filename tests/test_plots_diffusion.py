@@ -5,11 +5,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report import plots_ablations
-from f3amd_lib.report import plots_diffusion as draw
-from f3amd_lib.report.figures import new_figure
-from f3amd_lib.report.records import run_record, write_table
+from f3amd_lib.drawing import plots_ablations
+from f3amd_lib.drawing import plots_diffusion as draw
+from f3amd_lib.drawing.style import new_figure
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import run_record, write_table
 
 
 def dots(places):

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.report import plots_family
-from f3amd_lib.report.figures import model_style
+from f3amd_lib.drawing import plots_family
+from f3amd_lib.drawing.style import model_style
 
 
 def lines(axis) -> dict:
@@ -51,14 +51,10 @@ def test_steps_beside_real_marks_eight_and_one():
         ("real", 0, 2.0), ("CAMDM", 8, 3.0), ("CAMDM", 1, 4.0), ("CAMDM", 2, 9.0),
     ]  # fmt: skip
     table = pd.DataFrame(rows, columns=["model", "steps", "value"]).assign(
-        metric="FID",
-        low=lambda frame: frame["value"] - 0.5,
-        high=lambda frame: frame["value"] + 0.5,
+        metric="FID", low=lambda frame: frame["value"] - 0.5, high=lambda frame: frame["value"] + 0.5
     )
     axis = plots_family.steps_beside_real(table, {"FID": "FID"}).axes[0]
-    points = [
-        (c.lines[0].get_xdata()[0], c.lines[0].get_markerfacecolor()) for c in axis.containers
-    ]
+    points = [(c.lines[0].get_xdata()[0], c.lines[0].get_markerfacecolor()) for c in axis.containers]
     assert [value for value, _ in points] == [3.0, 4.0]
     assert points[0][1] != "white" and points[1][1] == "white"
     assert [text.get_text() for text in axis.get_yticklabels()] == ["CAMDM"]

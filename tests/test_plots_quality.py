@@ -4,9 +4,9 @@ import matplotlib.colors
 import pytest
 from builders import straight_motion, wandering_motion
 
-from f3amd_lib.evaluation.corruptions import CORRUPTIONS
-from f3amd_lib.report import plots_quality as draw
-from f3amd_lib.report.figures import model_style, new_figure
+from f3amd_lib.drawing import plots_quality as draw
+from f3amd_lib.drawing.style import model_style, new_figure
+from f3amd_lib.measures.corruptions import CORRUPTIONS
 
 
 def same_color(first, second) -> bool:
@@ -19,10 +19,7 @@ def titles(figure):
 
 def test_every_bad_generator_has_a_colour_that_no_network_has():
     assert set(draw.BAD_COLORS) == set(CORRUPTIONS)
-    networks = (
-        *("F3AMD-FNO-96", "F3AMD-FNO-96-plus", "F3AMD-FNO-96-steady", "F3AMD-Transformer-64"),
-        "CAMDM",
-    )
+    networks = (*("F3AMD-FNO-96", "F3AMD-FNO-96-plus", "F3AMD-FNO-96-steady", "F3AMD-Transformer-64"), "CAMDM")
     for name in CORRUPTIONS:
         for model in ("real", *networks):
             assert not same_color(draw.color_of(name), draw.color_of(model))

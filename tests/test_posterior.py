@@ -18,14 +18,13 @@ from builders import (
 )
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib import measure
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
-from f3amd_lib.evaluation import posterior
-from f3amd_lib.evaluation.denoising import held_out_batch
+from f3amd_lib.experiments import measure, posterior
+from f3amd_lib.experiments.denoising import held_out_batch
+from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
+from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn
-from f3amd_lib.profiles import RESULTS_DIR_VARIABLE, load_profile
-from f3amd_lib.report.records import read_table
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
@@ -61,9 +60,7 @@ def windows_of(clips):
 
 
 def spreads(clips, **settings):
-    return posterior.continuation_spread(SKELETON, *windows_of(clips), **settings).set_index(
-        "given"
-    )
+    return posterior.continuation_spread(SKELETON, *windows_of(clips), **settings).set_index("given")
 
 
 # ------------------------------------------------------------------------------- real motion
@@ -123,9 +120,7 @@ def test_windows_that_overlap_are_not_counted_twice_and_nobody_is_their_own_neig
     assert posterior._apart(np.array([1, 0, 2, 3, 4]), starts, 10, 4) == [1, 3, 4]
     assert posterior._apart(np.array([4, 2, 1]), starts, 10, 2) == [4, 2]
     windows, _ = windows_of([(kick(sign * SWING), 0) for sign in (1, -1, -1, -1)])
-    table = posterior.continuation_spread(
-        SKELETON, windows, windows, num_neighbours=3, given=["style, path, history"]
-    )
+    table = posterior.continuation_spread(SKELETON, windows, windows, num_neighbours=3, given=["style, path, history"])
     # The one who kicks up sees three who kick down, each of those sees one up and two down.
     expected = np.sqrt(3 / 4) * spread_of(1, 2)
     assert table["value"].item() == pytest.approx(expected, rel=1e-3)
@@ -208,10 +203,7 @@ def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
     schedule = VariancePreservingCosine(4)
     config = tiny_camdm(noise_levels=tuple(schedule.sigmas.tolist()))
     trained = model_that(lambda x_noisy: x_noisy, config=config, diffusion=schedule)
-    for sigmas, expected in (
-        ((0.01, 3.0), schedule.sigmas[:3]),
-        ((1e-3, 1e-2), [schedule.sigma_max]),
-    ):
+    for sigmas, expected in (((0.01, 3.0), schedule.sigmas[:3]), ((1e-3, 1e-2), [schedule.sigma_max])):
         table = posterior.answer_spread(trained, tiny_windows(), sigmas, num_windows=2, num_draws=2)
         np.testing.assert_allclose(sorted(set(table["sigma"])), expected, rtol=1e-6)
 
@@ -235,9 +227,7 @@ def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeyp
     path = posterior.measure_posterior(prepared, profile)
     assert path == tmp_path / "synthetic" / "smoke" / "records" / "posterior.csv"
     table, record = read_table(path)
-    assert (
-        record["measurement"] == "posterior" and record["settings"] == posterior.POSTERIOR["smoke"]
-    )
+    assert record["measurement"] == "posterior" and record["settings"] == posterior.POSTERIOR["smoke"]
     real = table[table["model"] == "real"]
     assert list(real["given"]) == list(posterior.GIVEN) and real["sigma"].isna().all()
     mine = table[table["model"] == "F3AMD-FNO-32"]

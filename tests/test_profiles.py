@@ -6,15 +6,13 @@ import itertools
 import numpy as np
 import pytest
 
-from f3amd_lib import profiles
 from f3amd_lib.data import sources
-from f3amd_lib.models import zoo
-from f3amd_lib.profiles import Profile, load_profile, results_dir, runs_dir
+from f3amd_lib.ground import profiles
+from f3amd_lib.ground.profiles import Profile, load_profile, results_dir, runs_dir
+from f3amd_lib.networks import zoo
 
 
-@pytest.mark.parametrize(
-    "name, dataset", list(itertools.product(profiles.PROFILES, profiles.DATASETS))
-)
+@pytest.mark.parametrize("name, dataset", list(itertools.product(profiles.PROFILES, profiles.DATASETS)))
 def test_every_pair_gives_a_profile_of_a_known_network(name, dataset):
     profile = load_profile(name, dataset)
     assert (profile.name, profile.dataset) == (name, dataset)
@@ -149,4 +147,4 @@ def test_results_dir_refuses_unknown_names(dataset, profile, tmp_path):
 
 
 def test_repository_root_is_this_checkout():
-    assert (profiles.repository_root() / "f3amd_lib" / "profiles.py").is_file()
+    assert (profiles.repository_root() / "f3amd_lib" / "ground" / "profiles.py").is_file()

@@ -8,14 +8,12 @@ import pandas as pd
 import pytest
 from builders import packed_from
 
-from f3amd_lib import measure
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.windows import seed_histories
 from f3amd_lib.diffusion.schedules import VarianceExploding
-from f3amd_lib.evaluation import protocol as module
-from f3amd_lib.evaluation.classifier import train_classifier
-from f3amd_lib.evaluation.paths import RootPath, named_path
-from f3amd_lib.evaluation.protocol import (
+from f3amd_lib.experiments import measure
+from f3amd_lib.experiments import protocol as module
+from f3amd_lib.experiments.protocol import (
     PROTOCOL_METRICS,
     REFERENCE_MODELS,
     Protocol,
@@ -26,13 +24,15 @@ from f3amd_lib.evaluation.protocol import (
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.evaluation.quality import sideways_share
-from f3amd_lib.evaluation.rollout import MotionGenerator
-from f3amd_lib.models import zoo
+from f3amd_lib.experiments.quality import sideways_share
+from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.motion.root_paths import RootPath, named_path
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.papers import load_paper_table
-from f3amd_lib.report.records import read_table
+from f3amd_lib.networks import zoo
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -67,11 +67,7 @@ def classifier(packed):
 @pytest.fixture(scope="module")
 def generator(packed, prepared):
     config = zoo.build_config(
-        "F3AMD-FNO-32",
-        channels=num_channels(packed.skeleton),
-        num_styles=2,
-        depth=1,
-        latent_width=8,
+        "F3AMD-FNO-32", channels=num_channels(packed.skeleton), num_styles=2, depth=1, latent_width=8
     )
     network = jax.jit(lambda key: module_state(config, key))(jax.random.key(0))
     trained = TrainedModel(
@@ -107,9 +103,7 @@ def one(rows: pd.DataFrame, metric: str, seed: int = 0) -> float:
 def test_section_4_4_all_nine_metrics_are_measured_under_the_papers_names(measured):
     rows, _ = measured
     printed = load_paper_table(3)
-    for metric, unit, better in set(
-        zip(printed["metric"], printed["unit"], printed["better"], strict=True)
-    ):
+    for metric, unit, better in set(zip(printed["metric"], printed["unit"], printed["better"], strict=True)):
         assert metric in set(rows["metric"])
         ours = PROTOCOL_METRICS[metric]
         # Ours name two of them "near real": standing still at a seam is no virtue.
@@ -118,9 +112,7 @@ def test_section_4_4_all_nine_metrics_are_measured_under_the_papers_names(measur
 
 def test_a_models_rows_are_tidy(measured):
     rows, rounds = measured
-    assert list(rows) == [
-        *("model", "window_frames", "steps", "varies", "seed", "metric", "unit", "better", "value")
-    ]
+    assert list(rows) == [*("model", "window_frames", "steps", "varies", "seed", "metric", "unit", "better", "value")]
     assert not rows.duplicated(["model", "steps", "seed", "metric"]).any()
     assert set(rows["model"]) == {"F3AMD-FNO-8"} and set(rows["window_frames"]) == {32}
     assert np.isfinite(rows["value"]).all()
@@ -145,10 +137,7 @@ def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, cl
 
 
 def test_bad_generators_are_told_apart(packed, classifier):
-    tables = {
-        model: measure_real(packed, classifier, SMALL, window=32, model=model)
-        for model in REFERENCE_MODELS
-    }
+    tables = {model: measure_real(packed, classifier, SMALL, window=32, model=model) for model in REFERENCE_MODELS}
     real = tables["real"]
     assert one(tables["frozen pose"], "bone_swing") < 0.1 * one(real, "bone_swing")
     assert one(tables["frozen pose"], "foot_alternation") < 0.5 * one(real, "foot_alternation")
@@ -260,9 +249,7 @@ def test_classes_that_nobody_walks_do_not_count(generator, packed, prepared, cla
     assert one(rows, "FID") < one(both, "FID") + 1.0
 
 
-def test_the_measurement_keeps_its_rows_and_goes_on(
-    prepared, classifier, generator, tmp_path, monkeypatch
-):
+def test_the_measurement_keeps_its_rows_and_goes_on(prepared, classifier, generator, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     profile = load_profile("smoke", "synthetic", rollout_rounds=3)
     name = "F3AMD-FNO-32"
@@ -294,9 +281,7 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     assert calls == [1]
     assert len(read_table(path)[0]) == len(table)
     # Other weights under the same name are another model.
-    trained = dataclasses.replace(
-        trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params)
-    )
+    trained = dataclasses.replace(trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params))
     measure.measure_quality(prepared, profile)
     assert calls == [1, 1]
     # Other settings start anew, and lose nothing.
@@ -307,9 +292,7 @@ def test_the_measurement_keeps_its_rows_and_goes_on(
     pd.testing.assert_frame_equal(kept, before)
 
 
-def test_the_metrics_own_sensitivity_is_measured(
-    prepared, classifier, generator, tmp_path, monkeypatch
-):
+def test_the_metrics_own_sensitivity_is_measured(prepared, classifier, generator, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     profile = load_profile("smoke", "synthetic", rollout_rounds=3, num_steps=1)
     name = "F3AMD-FNO-32"

@@ -6,9 +6,10 @@ import pytest
 from builders import SKELETON, packed_from, straight_motion, wandering_motion
 
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.evaluation import metrics, quality
-from f3amd_lib.evaluation.paths import RootPath, named_path, path_from_motion
-from f3amd_lib.evaluation.rollout import Rollout
+from f3amd_lib.experiments import quality
+from f3amd_lib.generation.rollout import Rollout
+from f3amd_lib.measures import metrics
+from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 
 TRAIN, VALIDATION, TEST = 0, 1, 2
 WINDOW = 8
@@ -75,9 +76,7 @@ def test_a_stiff_figure_swings_nothing_however_it_turns():
     frozen = np.repeat(motion.positions[:1], 40, axis=0)
     assert quality.bone_swing(frozen, SKELETON) == pytest.approx(0.0, abs=1e-4)
     angle = np.linspace(0.0, 4.0, 40)
-    turn = np.stack(
-        [[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in angle]
-    )
+    turn = np.stack([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in angle])
     turning = np.einsum("tab,tjb->tja", turn, frozen)
     assert quality.bone_swing(turning, SKELETON) == pytest.approx(0.0, abs=1e-4)
     assert quality.bone_swing(motion.positions, SKELETON) > 5.0
@@ -256,11 +255,7 @@ def test_rounds_show_where_the_path_is_lost():
 def test_quality_table_starts_with_the_real_row(packed):
     real = quality.measure_clips(packed, [4, 9], window=WINDOW)
     table = quality.quality_table(real, {("F3AMD-FNO-96", 8): real, ("F3AMD-FNO-96", 1): real})
-    assert list(dict.fromkeys(table["label"])) == [
-        "real",
-        "F3AMD-FNO-96, 8 steps",
-        "F3AMD-FNO-96, 1 step",
-    ]
+    assert list(dict.fromkeys(table["label"])) == ["real", "F3AMD-FNO-96, 8 steps", "F3AMD-FNO-96, 1 step"]
     assert list(dict.fromkeys(table["steps"])) == [0, 8, 1]
     rows = table[table["label"] == "real"].set_index("metric")
     assert rows.loc["IRD", "value"] == pytest.approx(real["ird_cm"].mean())

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from f3amd_lib.report.quality_bars import BAR_MODELS, quality_bars
+from f3amd_lib.reports.quality_bars import BAR_MODELS, quality_bars
 
 REAL = {
     "style_coverage": 99.0, "FID": 10.0, "EMD": 5.0, "IRD": 4.0, "IRD_excess": 0.7,

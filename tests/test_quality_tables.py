@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.models import zoo
-from f3amd_lib.report.papers import load_paper_table
-from f3amd_lib.report.quality_tables import (
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.networks import zoo
+from f3amd_lib.reports.quality_tables import (
     FIGURES,
     NOT_MEASURED,
     NOTE,
@@ -18,13 +18,7 @@ from f3amd_lib.report.quality_tables import (
     wide_rows,
 )
 
-UNITS = {
-    "style_coverage": "%",
-    "trajectory_error": "m",
-    "direction_error": "deg",
-    "diversity": "cm",
-    "IRD": "cm",
-}
+UNITS = {"style_coverage": "%", "trajectory_error": "m", "direction_error": "deg", "diversity": "cm", "IRD": "cm"}
 
 
 def figures(model="F3AMD-FNO-96", steps=8, window_frames=32, value=10.0, half=1.0, metrics=None):
@@ -73,9 +67,7 @@ def test_every_row_of_the_paper_is_there_as_printed_with_ours_below(number):
     assert (rows.groupby("line").size() == 9).all()
     papers = rows[rows["source"] == PAPER_SOURCE]
     columns = ["model", "window_frames", "steps", "metric", "unit", "better", "printed", "value"]
-    pd.testing.assert_frame_equal(
-        papers[columns].reset_index(drop=True), printed[columns].reset_index(drop=True)
-    )
+    pd.testing.assert_frame_equal(papers[columns].reset_index(drop=True), printed[columns].reset_index(drop=True))
     for line, cells in papers.groupby("line"):
         ours = rows[rows["line"] == line + 1]
         assert set(ours["source"]) == {LABEL}
@@ -131,9 +123,7 @@ def test_wide_rows_say_what_is_missing_in_the_papers_own_line():
     assert fno["steps"].tolist() == ["8", "8", "4", "2", "1", "1"]
     missing = f"{PAPER_SOURCE}; ours {NOT_MEASURED}"
     assert fno["source"].tolist() == [PAPER_SOURCE, LABEL, missing, missing, PAPER_SOURCE, LABEL]
-    assert fno["FID ↓"].tolist() == [
-        *("0.189", "10.00 ± 1.00", "0.189", "0.184", "0.184", "20.00 ± 1.00")
-    ]
+    assert fno["FID ↓"].tolist() == [*("0.189", "10.00 ± 1.00", "0.189", "0.184", "0.184", "20.00 ± 1.00")]
     assert "frames" in wide_rows(beside_paper(3, QUALITY, LABEL))
 
 

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
 
-from f3amd_lib import measure
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
-from f3amd_lib.models import zoo
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table
-from f3amd_lib.training import recipes
+from f3amd_lib.experiments import measure, recipes
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.networks import zoo
 from f3amd_lib.training.loop import paper_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -60,9 +59,7 @@ def two_recipes(monkeypatch):
     monkeypatch.setattr(
         zoo,
         "build_config",
-        lambda *a, **k: build(
-            *a, **{**k, "depth": 1, "latent_width": 8, "num_kept_modes": WINDOW // 2 + 1}
-        ),
+        lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8, "num_kept_modes": WINDOW // 2 + 1}),
     )
     rows = {name: recipes.RECIPES[name] for name in ("paper", "residual-prior")}
     monkeypatch.setattr(measure, "RECIPES", rows)
@@ -71,9 +68,7 @@ def two_recipes(monkeypatch):
     return rows
 
 
-def test_recipes_are_trained_measured_and_gone_on_with(
-    prepared, two_recipes, tmp_path, monkeypatch
-):
+def test_recipes_are_trained_measured_and_gone_on_with(prepared, two_recipes, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     monkeypatch.setattr(measure, "runs_dir", lambda *names: tmp_path.joinpath("runs", *names))
     path = measure.measure_recipes(prepared, PROFILE)

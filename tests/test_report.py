@@ -15,10 +15,12 @@ from builders import cut_off
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from f3amd_lib.evaluation.paths import named_path
+from f3amd_lib.drawing import pictures, stick_figures
+from f3amd_lib.drawing import style as figures
+from f3amd_lib.ground import papers, records, tables
+from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_euler, matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.report import figures, papers, pictures, records, stick_figures, tables
 
 
 def make_motion(num_frames=120, fps=30.0, name="test walk"):
@@ -29,13 +31,7 @@ def make_motion(num_frames=120, fps=30.0, name="test walk"):
         first = len(parents)
         names += (f"{side}Shoulder", f"{side}Wrist", f"{side}Hip", f"{side}Ankle", f"{side}Toe")
         parents += [1, first, 0, first + 2, first + 3]
-        offsets += [
-            [sign * 0.18, 0.2, 0],
-            [0, -0.5, 0.05],
-            [sign * 0.1, 0, 0],
-            [0, -0.85, 0],
-            [0, -0.05, 0.13],
-        ]
+        offsets += [[sign * 0.18, 0.2, 0], [0, -0.5, 0.05], [sign * 0.1, 0, 0], [0, -0.85, 0], [0, -0.05, 0.13]]
     skeleton = Skeleton(names, tuple(parents), np.array(offsets), ((3, (0.0, 0.2, 0.0)),))
     time = np.arange(num_frames) / fps
     rotations = np.tile(np.eye(3), (num_frames, len(names), 1, 1))
@@ -90,7 +86,7 @@ def test_record_tells_no_folder_of_the_machine(tmp_path):
     assert home + "/" not in text and tempfile.gettempdir() + "/" not in text
     assert made["weights"].endswith("models/best.safetensors")
     assert made["elsewhere"] == ".../walk.csv"
-    assert made["inside"] == "./f3amd_lib/report/records.py"
+    assert made["inside"] == "./f3amd_lib/ground/records.py"
 
 
 def test_record_refuses_taken_names_and_odd_values():
@@ -120,10 +116,7 @@ def test_git_state_of_a_checkout(tmp_path, monkeypatch):
     def git(*arguments):
         identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
         done = subprocess.run(
-            ["git", "-C", str(tmp_path), *identity, *arguments],
-            check=True,
-            capture_output=True,
-            text=True,
+            ["git", "-C", str(tmp_path), *identity, *arguments], check=True, capture_output=True, text=True
         )
         return done.stdout.strip()
 
@@ -230,9 +223,7 @@ def test_paper_tables_are_whole_and_tidy(number):
 def test_the_headline_row_is_the_same_in_every_table():
     def row(number, model):
         frame = papers.load_paper_table(number)
-        chosen = frame[
-            (frame["model"] == model) & (frame["window_frames"] == 32) & (frame["steps"] == 8)
-        ]
+        chosen = frame[(frame["model"] == model) & (frame["window_frames"] == 32) & (frame["steps"] == 8)]
         shared = chosen[~chosen["metric"].str.startswith("synthesis")]
         return dict(zip(shared["metric"], shared["printed"], strict=True))
 
@@ -263,9 +254,7 @@ def test_paper_tables_are_copies_and_end_at_twelve():
 
 
 def test_markdown_has_units_dashes_and_alignment():
-    frame = pd.DataFrame(
-        {"model": ["a|b", "c"], "time (ms)": [1234.5678, float("nan")], "printed": ["0.250", ""]}
-    )
+    frame = pd.DataFrame({"model": ["a|b", "c"], "time (ms)": [1234.5678, float("nan")], "printed": ["0.250", ""]})
     lines = tables.markdown_table(frame).splitlines()
     assert len({len(line) for line in lines}) == 1
     cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
@@ -276,8 +265,7 @@ def test_markdown_has_units_dashes_and_alignment():
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0.000"), (3.26049, "3.260"), (93.98, "93.98"), (1e-5, "1.00e-05"), (-12.5, "-12.50")],
+    ("value", "text"), [(0.0, "0.000"), (3.26049, "3.260"), (93.98, "93.98"), (1e-5, "1.00e-05"), (-12.5, "-12.50")]
 )
 def test_numbers_show_four_digits(value, text):
     assert f" {text} |" in tables.markdown_table(pd.DataFrame({"a": [value]}))
@@ -354,9 +342,7 @@ def test_model_styles_follow_the_family():
     style = figures.model_style
     assert style("F3AMD-FNO-96 (FiLM)") == style("F3AMD-FNO-96")
     # Our own recipes have a colour each, whatever the width, and never that of a paper's model.
-    ours = {
-        style(f"F3AMD-FNO-{width}{end}").color for width in (32, 96) for end in ("-plus", "-steady")
-    }
+    ours = {style(f"F3AMD-FNO-{width}{end}").color for width in (32, 96) for end in ("-plus", "-steady")}
     assert len(ours) == 2 and not ours & {style(name).color for name in ("F3AMD-FNO-96", "CAMDM")}
     assert style("F3AMD-FNO-96-plus, 1 step").color == style("F3AMD-FNO-96-plus").color
     sizes = [style(f"F3AMD-FNO-{width}") for width in (32, 48, 64, 96, 128)]
@@ -437,9 +423,7 @@ def count_near(image, color, tolerance=12):
 
 def test_film_strip_has_a_row_a_motion(tmp_path):
     motion = make_motion()
-    figure = pictures.film_strip(
-        [motion, motion.slice(0, 60)], paths=[named_path("straight", 120), None], num_poses=5
-    )
+    figure = pictures.film_strip([motion, motion.slice(0, 60)], paths=[named_path("straight", 120), None], num_poses=5)
     assert len(figure.axes) == 4
     assert figure.axes[0].get_title(loc="left") == "test walk"
     shown = [text.get_text() for text in figure.axes[0].texts]
@@ -474,9 +458,7 @@ def test_film_strip_errors():
 
 def test_gif_plays_in_real_time_and_stays_small(tmp_path):
     motion = make_motion(240)
-    path = pictures.write_gif(
-        tmp_path / "deep" / "walk.gif", motion, target_paths=named_path("slalom", 240)
-    )
+    path = pictures.write_gif(tmp_path / "deep" / "walk.gif", motion, target_paths=named_path("slalom", 240))
     assert path.stat().st_size < 300_000
     with Image.open(path) as image:
         assert image.n_frames == 80 and image.size == (256, 256) and image.info["loop"] == 0

@@ -8,13 +8,14 @@ import nbformat
 import pandas as pd
 import pytest
 
-from f3amd_lib import profiles, reproduce
-from f3amd_lib.report.records import read_table
+from f3amd_lib import reproduce
+from f3amd_lib.ground import profiles
+from f3amd_lib.ground.records import read_table
 
 PARAMETERS = 'profile = "smoke"\ndata = "synthetic"\nnum_steps = 2'
 WRITE_WHAT_I_SAW = """
 import json, os, pathlib
-from f3amd_lib.profiles import results_dir
+from f3amd_lib.ground.profiles import results_dir
 seen = dict(profile=profile, data=data, num_steps=num_steps, cwd=pathlib.Path.cwd().name)
 (results_dir(data, profile) / "tables" / "seen.json").write_text(json.dumps(seen))
 """
@@ -25,11 +26,7 @@ def write_notebook(folder, name, *sources):
     cells = [nbformat.v4.new_code_cell(source) for source in sources]
     cells[0].metadata["tags"] = ["parameters"]
     notebook = nbformat.v4.new_notebook(cells=cells)
-    notebook.metadata["kernelspec"] = {
-        "name": "python3",
-        "display_name": "Python 3",
-        "language": "python",
-    }
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     folder.mkdir(exist_ok=True)
     nbformat.write(notebook, folder / f"{name}.ipynb")
     return folder / f"{name}.ipynb"
@@ -49,9 +46,7 @@ def test_notebooks_run_in_order_with_their_parameters(checkout):
     folder = checkout / "notebooks"
     # The second leans on what the first wrote, and was written to disk before it.
     write_notebook(folder, "01_second", PARAMETERS, "assert open('note.txt').read() == 'first'")
-    write_notebook(
-        folder, "00_first", PARAMETERS, "open('note.txt', 'w').write('first')", WRITE_WHAT_I_SAW
-    )
+    write_notebook(folder, "00_first", PARAMETERS, "open('note.txt', 'w').write('first')", WRITE_WHAT_I_SAW)
     write_notebook(folder, "scratch", PARAMETERS, "raise SystemError('not numbered: must not run')")
     news = []
 
@@ -123,9 +118,7 @@ def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):
 
 
 def test_a_killed_kernel_is_told_with_its_cell(checkout):
-    write_notebook(
-        checkout / "notebooks", "00_hungry", PARAMETERS, "import os\nos._exit(9)", "1 + 1"
-    )
+    write_notebook(checkout / "notebooks", "00_hungry", PARAMETERS, "import os\nos._exit(9)", "1 + 1")
     with pytest.raises(reproduce.NotebookFailed, match=r"cell In \[3\], 'import os'") as caught:
         reproduce.reproduce("synthetic", "smoke")
     assert "Kernel died" in str(caught.value)
@@ -193,9 +186,7 @@ def test_a_folder_without_notebooks_is_refused(checkout):
         ("smoke", "elsewhere", "elsewhere"),
     ],
 )
-def test_only_real_runs_write_into_the_committed_folder(
-    checkout, monkeypatch, profile, already_set, expected
-):
+def test_only_real_runs_write_into_the_committed_folder(checkout, monkeypatch, profile, already_set, expected):
     name = profiles.RESULTS_DIR_VARIABLE
     if already_set is None:
         monkeypatch.delenv(name)
@@ -230,8 +221,7 @@ def test_broken_assignments_are_refused(text, capsys):
 
 
 @pytest.mark.parametrize(
-    "number, parameters",
-    [("05", ["num_steps"]), ("04", ["train_steps"]), ("04", ["compare_preset"])],
+    "number, parameters", [("05", ["num_steps"]), ("04", ["train_steps"]), ("04", ["compare_preset"])]
 )
 def test_parameters_that_the_documents_name_exist(number, parameters):
     notebooks = reproduce.find_notebooks(profiles.repository_root() / "notebooks")

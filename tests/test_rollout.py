@@ -7,8 +7,8 @@ from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_camdm, tiny_train
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
-from f3amd_lib.evaluation.paths import RootPath, named_path
-from f3amd_lib.evaluation.rollout import MotionGenerator
+from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.motion.root_paths import RootPath, named_path
 from f3amd_lib.motion.rotations import wrap_angle
 
 POSE = np.tile(np.float32([1, 0, 0, 0, 1, 0]), SKELETON.num_joints)
@@ -40,13 +40,7 @@ def obedient(trained, window=WINDOW):
         count = jnp.arange(1, window + 1)[None, :, None]
         height = history[:, -1:, 1:2] + count
         pose = jnp.broadcast_to(jnp.asarray(POSE[6:]), (*height.shape[:2], len(POSE) - 6))
-        frames = [
-            displacement[..., :1],
-            height,
-            displacement[..., 1:],
-            condition.path[..., 2:],
-            pose,
-        ]
+        frames = [displacement[..., :1], height, displacement[..., 1:], condition.path[..., 2:], pose]
         return normaliser.normalise(jnp.concatenate(frames, axis=-1))
 
     generator.sample_window = sample_window
@@ -60,9 +54,7 @@ def test_a_perfect_network_walks_exactly_on_the_path(trained, name):
     frames = rollout.frames[0]
     assert frames.shape == (3 * WINDOW, CHANNELS)
     np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=1e-5)
-    np.testing.assert_allclose(
-        wrap_angle(frame_yaw(SKELETON, frames.astype(float)) - path.yaw), 0.0, atol=1e-4
-    )
+    np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, frames.astype(float)) - path.yaw), 0.0, atol=1e-4)
 
 
 def test_paths_anywhere_facing_anywhere_are_followed(trained):
@@ -89,9 +81,7 @@ def test_histories_may_be_longer_than_windows():
     window, history = 3, 5
     trained = tiny_trained(window=window, num_history=history, num_kept_modes=2)
     start = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, history, 1))
-    rollout = obedient(trained, window=window).rollout(
-        named_path("straight", 4 * window), "calm", history=start
-    )
+    rollout = obedient(trained, window=window).rollout(named_path("straight", 4 * window), "calm", history=start)
     np.testing.assert_allclose(rollout.frames[0, :, 1], 0.9 + np.arange(1, 13), rtol=1e-5)
 
 
@@ -162,9 +152,7 @@ def test_one_path_or_one_style_serves_all(network_generator):
 
 def test_noise_comes_from_the_seed_alone(network_generator):
     path = named_path("straight", 20)
-    first, again, other = (
-        network_generator.rollout(path, "calm", seed=seed).frames for seed in (1, 1, 2)
-    )
+    first, again, other = (network_generator.rollout(path, "calm", seed=seed).frames for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
 
@@ -240,9 +228,7 @@ def test_counts_and_lengths_that_do_not_fit_are_refused(network_generator):
 
 def test_wrong_histories_are_refused(network_generator):
     with pytest.raises(ValueError, match=rf"\(1, {HISTORY}, {CHANNELS}\), got \(1, 3, "):
-        network_generator.rollout(
-            named_path("straight", 10), "calm", history=np.zeros((1, 3, CHANNELS))
-        )
+        network_generator.rollout(named_path("straight", 10), "calm", history=np.zeros((1, 3, CHANNELS)))
 
 
 def test_styles_without_a_starting_pose_need_a_history():

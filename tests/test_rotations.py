@@ -34,9 +34,7 @@ def random_matrices(count: int, seed: int = 0) -> np.ndarray:
 
 def test_6d_is_the_first_two_columns():
     matrix = np.arange(9.0).reshape(3, 3)
-    np.testing.assert_array_equal(
-        rotations.rotation_6d_from_matrix(matrix), [0.0, 3.0, 6.0, 1.0, 4.0, 7.0]
-    )
+    np.testing.assert_array_equal(rotations.rotation_6d_from_matrix(matrix), [0.0, 3.0, 6.0, 1.0, 4.0, 7.0])
 
 
 def test_6d_round_trip():
@@ -68,10 +66,7 @@ def test_gram_schmidt_has_finite_gradients_at_zero():
     assert np.all(np.isfinite(np.asarray(gradient)))
 
 
-@pytest.mark.parametrize(
-    ("yaw_deg", "facing"),
-    [(0, (0, 0, 1)), (90, (1, 0, 0)), (180, (0, 0, -1)), (-90, (-1, 0, 0))],
-)
+@pytest.mark.parametrize(("yaw_deg", "facing"), [(0, (0, 0, 1)), (90, (1, 0, 0)), (180, (0, 0, -1)), (-90, (-1, 0, 0))])
 def test_positive_yaw_turns_from_z_to_x(yaw_deg, facing):
     matrix = rotations.matrix_from_yaw(np.radians(float(yaw_deg)))
     np.testing.assert_allclose(matrix @ [0.0, 0.0, 1.0], facing, atol=1e-12)
@@ -86,9 +81,7 @@ def test_left_of_a_turned_body():
 
 def test_yaw_comes_back_from_6d_and_from_direction():
     yaw = np.linspace(-3.1, 3.1, 41)
-    np.testing.assert_allclose(
-        rotations.yaw_from_rotation_6d(rotations.rotation_6d_from_yaw(yaw)), yaw, atol=1e-12
-    )
+    np.testing.assert_allclose(rotations.yaw_from_rotation_6d(rotations.rotation_6d_from_yaw(yaw)), yaw, atol=1e-12)
     facing = rotations.matrix_from_yaw(yaw) @ np.array([0.0, 0.0, 2.5]) + [0.0, 7.0, 0.0]
     np.testing.assert_allclose(rotations.yaw_from_direction(facing), yaw, atol=1e-12)
 
@@ -103,8 +96,7 @@ def test_wrap_angle_by_hand():
 def test_euler_order_is_that_of_the_file(order):
     degrees = np.array([[20.0, -35.0, 50.0], [-100.0, 10.0, 5.0]])
     expected = [
-        np.linalg.multi_dot([elementary(a, np.radians(d)) for a, d in zip(order, row, strict=True)])
-        for row in degrees
+        np.linalg.multi_dot([elementary(a, np.radians(d)) for a, d in zip(order, row, strict=True)]) for row in degrees
     ]
     matrices = rotations.matrix_from_euler(order, degrees)
     np.testing.assert_allclose(matrices, expected, atol=1e-12)

@@ -12,9 +12,9 @@ import pytest
 from builders import CHANNELS, WINDOW, make_condition, network_of, tiny_config
 from jax.sharding import Mesh
 
-from f3amd_lib.diffusion.rounds import sample_round, sample_round_on_devices
 from f3amd_lib.diffusion.samplers import sample_ddim, sample_ddpm
 from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
 
 BATCH = 4
 SIGMAS = np.asarray(VarianceExploding().grid(3), np.float32)
@@ -52,9 +52,7 @@ def test_wrong_noise_or_none_is_refused(network):
     with pytest.raises(ValueError, match="noise must have shape"):
         sample_round(network, given, SIGMAS, noise=jnp.zeros((BATCH, WINDOW - 1, CHANNELS)))
     with pytest.raises(ValueError, match="key"):
-        sample_round(
-            network, given, SIGMAS, noise=jnp.zeros((BATCH, WINDOW, CHANNELS)), sampler="ddpm"
-        )
+        sample_round(network, given, SIGMAS, noise=jnp.zeros((BATCH, WINDOW, CHANNELS)), sampler="ddpm")
 
 
 def test_mesh_must_have_one_axis_and_divide_the_characters(network):

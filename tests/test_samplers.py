@@ -145,9 +145,7 @@ def test_unrolled_program_has_no_loop(name):
 def test_one_step_returns_the_denoiser_at_sigma_max(sample):
     x_init = jnp.asarray(start(16), jnp.float32)
     seen = two_modes(width=100.0)(x_init, 128.0)
-    np.testing.assert_allclose(
-        sample(two_modes(width=100.0), x_init, SCHEDULE.grid(1)), seen, rtol=1e-5, atol=1e-5
-    )
+    np.testing.assert_allclose(sample(two_modes(width=100.0), x_init, SCHEDULE.grid(1)), seen, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("sample", DETERMINISTIC)
@@ -196,10 +194,7 @@ def test_appendix_f_literal_step_is_the_right_one_made_smaller():
         right = ddim_step(x_noisy, x0_hat, sigma, sigma_next)
         np.testing.assert_allclose(literal * np.hypot(1.0, sigma_next), right, rtol=1e-12)
         z = ddim_step_vp(
-            x_noisy / np.hypot(1.0, sigma),
-            x0_hat,
-            alpha_bar_from_sigma(sigma),
-            alpha_bar_from_sigma(sigma_next),
+            x_noisy / np.hypot(1.0, sigma), x0_hat, alpha_bar_from_sigma(sigma), alpha_bar_from_sigma(sigma_next)
         )
         np.testing.assert_allclose(literal, z, atol=1e-12)
     np.testing.assert_array_equal(ddim_step_literal(x_noisy, x0_hat, 0.01, 0.0), x0_hat)
@@ -442,13 +437,7 @@ def test_heun_step_by_hand():
 
 @pytest.mark.parametrize(
     ("sampler", "order", "to_zero"),
-    [
-        ("ddim", 1.0, True),
-        ("ddim_vp", 1.0, True),
-        ("euler", 1.0, True),
-        ("heun", 2.0, True),
-        ("heun", 2.0, False),
-    ],
+    [("ddim", 1.0, True), ("ddim_vp", 1.0, True), ("euler", 1.0, True), ("heun", 2.0, True), ("heun", 2.0, False)],
 )
 def test_order_of_convergence_on_the_mixture_oracle(sampler, order, to_zero):
     # The grid t = linspace(0, 1, N) of Eq. 9. Its step from sigma_min to 0 answers with the

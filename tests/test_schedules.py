@@ -38,15 +38,11 @@ def test_eq09_hand_values_of_a_three_step_grid():
     # t = 0, 1/2, 1: 2^3, 1.5^3, 1^3, then clean.
     np.testing.assert_allclose(HAND.grid(3), [8.0, 3.375, 1.0, 0.0], rtol=1e-14)
     # 128^(1/3) = 5.0396842, 0.01^(1/3) = 0.2154435; their mean cubed.
-    np.testing.assert_allclose(
-        VarianceExploding().grid(3), [128.0, 2.62756385**3, 0.01, 0.0], rtol=1e-7
-    )
+    np.testing.assert_allclose(VarianceExploding().grid(3), [128.0, 2.62756385**3, 0.01, 0.0], rtol=1e-7)
 
 
 def test_eq09_uniform_spacing_by_hand():
-    np.testing.assert_allclose(
-        HAND.grid(4, "uniform"), [8.0, 1.75**3, 1.5**3, 1.25**3, 0.0], rtol=1e-14
-    )
+    np.testing.assert_allclose(HAND.grid(4, "uniform"), [8.0, 1.75**3, 1.5**3, 1.25**3, 0.0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
@@ -81,9 +77,7 @@ def test_eq09_larger_rho_puts_more_steps_at_low_noise():
 def test_eq09_serves_jax_arrays_and_gradients():
     schedule = VarianceExploding()
     t = jnp.linspace(0.0, 1.0, 7)
-    np.testing.assert_allclose(
-        jax.jit(schedule.sigma)(t), schedule.sigma(np.linspace(0.0, 1.0, 7)), rtol=1e-4
-    )
+    np.testing.assert_allclose(jax.jit(schedule.sigma)(t), schedule.sigma(np.linspace(0.0, 1.0, 7)), rtol=1e-4)
     # d sigma / dt = rho (low - high) (..)^(rho - 1); at t = 0 of HAND: 3 * (1 - 2) * 2^2.
     assert jax.grad(HAND.sigma)(0.0) == pytest.approx(-12.0, rel=1e-6)
 
@@ -127,11 +121,7 @@ def test_eq09_training_draws_t_uniformly():
     [
         (4, "betas", [0.152988, 0.416958, 0.707859, 0.999]),
         (4, "alpha_bars", [0.847012, 0.493844, 0.144272, 0.000144]),
-        (
-            8,
-            "alpha_bars",
-            [0.957805, 0.847012, 0.684227, 0.493844, 0.304395, 0.144272, 0.037472, 0.000037],
-        ),
+        (8, "alpha_bars", [0.957805, 0.847012, 0.684227, 0.493844, 0.304395, 0.144272, 0.037472, 0.000037]),
     ],
 )
 def test_cosine_levels_are_camdms(num_levels, name, expected):
@@ -166,9 +156,7 @@ def test_cosine_levels_follow_the_cosine_until_the_last():
     np.testing.assert_allclose(schedule.betas[5], 0.99, rtol=1e-12)
     # Twice as many levels visit these ones, and one more between each.
     np.testing.assert_allclose(
-        VariancePreservingCosine(8).alpha_bars[1:-1:2],
-        VariancePreservingCosine(4).alpha_bars[:3],
-        rtol=1e-12,
+        VariancePreservingCosine(8).alpha_bars[1:-1:2], VariancePreservingCosine(4).alpha_bars[:3], rtol=1e-12
     )
 
 
@@ -193,9 +181,7 @@ def test_variance_preserving_levels_rise_and_fit_together(schedule):
     assert schedule.alpha_bars.shape == (schedule.num_levels,)
     assert np.all(np.diff(schedule.sigmas) > 0) and schedule.sigmas[-1] == schedule.sigma_max
     np.testing.assert_allclose(np.cumprod(1.0 - schedule.betas), schedule.alpha_bars, rtol=1e-11)
-    np.testing.assert_allclose(
-        alpha_bar_from_sigma(schedule.sigmas), schedule.alpha_bars, rtol=1e-12
-    )
+    np.testing.assert_allclose(alpha_bar_from_sigma(schedule.sigmas), schedule.alpha_bars, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -266,21 +252,11 @@ def test_drawn_levels_are_single_precision_everywhere(schedule):
         ),
         (
             VariancePreservingCosine(4, 0.01, 0.99),
-            {
-                "kind": "variance_preserving_cosine",
-                "num_levels": 4,
-                "offset": 0.01,
-                "max_beta": 0.99,
-            },
+            {"kind": "variance_preserving_cosine", "num_levels": 4, "offset": 0.01, "max_beta": 0.99},
         ),
         (
             VariancePreservingLinear(50, 0.2, 12.0),
-            {
-                "kind": "variance_preserving_linear",
-                "num_levels": 50,
-                "beta_min": 0.2,
-                "beta_max": 12.0,
-            },
+            {"kind": "variance_preserving_linear", "num_levels": 50, "beta_min": 0.2, "beta_max": 12.0},
         ),
     ],
 )
@@ -344,9 +320,7 @@ def test_impossible_linear_schedules_are_refused(settings, message):
 
 
 def test_appendix_f_alpha_bar_by_hand():
-    np.testing.assert_allclose(
-        alpha_bar_from_sigma(np.array([0.0, 1.0, 2.0, 3.0])), [1.0, 0.5, 0.2, 0.1], rtol=1e-15
-    )
+    np.testing.assert_allclose(alpha_bar_from_sigma(np.array([0.0, 1.0, 2.0, 3.0])), [1.0, 0.5, 0.2, 0.1], rtol=1e-15)
     np.testing.assert_allclose(sigma_from_alpha_bar(np.array([0.5, 0.2, 1.0])), [1.0, 2.0, 0.0])
 
 
@@ -363,9 +337,7 @@ def test_round_trips_between_the_three_names():
     np.testing.assert_allclose(sigma_from_log_snr(log_snr_from_sigma(sigma)), sigma, rtol=1e-13)
     # The signal-to-noise ratio of the VP state is alpha_bar / (1 - alpha_bar).
     alpha_bar = alpha_bar_from_sigma(sigma)
-    np.testing.assert_allclose(
-        log_snr_from_sigma(sigma), np.log(alpha_bar / (1.0 - alpha_bar)), atol=1e-11
-    )
+    np.testing.assert_allclose(log_snr_from_sigma(sigma), np.log(alpha_bar / (1.0 - alpha_bar)), atol=1e-11)
 
 
 def test_log_snr_and_alpha_bar_by_hand():

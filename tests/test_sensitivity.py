@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from builders import packed_from, straight_motion, wandering_motion
 
-from f3amd_lib.evaluation.protocol import Protocol
-from f3amd_lib.evaluation.sensitivity import (
+from f3amd_lib.experiments.protocol import Protocol
+from f3amd_lib.experiments.sensitivity import (
     foot_spectrum,
     graded_corruptions,
     rank_agreement,
@@ -32,9 +32,7 @@ class PlainClassifier:
     def __init__(self, **clouds):
         """Each cloud is (features, clip of each window); the first half is "calm"."""
         self.references = {
-            split: SimpleNamespace(
-                features=features, clips=clips, styles=np.arange(len(features)) * 2 // len(features)
-            )
+            split: SimpleNamespace(features=features, clips=clips, styles=np.arange(len(features)) * 2 // len(features))
             for split, (features, clips) in clouds.items()
         }
 
@@ -96,17 +94,13 @@ def test_rows_are_tidy_and_the_same_again(graded, packed, classifier):
     assert list(graded) == ["corruption", "strength", "seed", "metric", "value"]
     assert len(graded) == 3 * 3 * 2 * 3
     assert set(graded["metric"]) == {"FID", "EMD", "style_accuracy"}
-    again = graded_corruptions(
-        packed, classifier, PROTOCOL, (0.5,), corruptions=("noisy motion",), splits=("test",)
-    )
+    again = graded_corruptions(packed, classifier, PROTOCOL, (0.5,), corruptions=("noisy motion",), splits=("test",))
     before = graded[(graded["corruption"] == "noisy motion") & (graded["strength"] == 0.5)]
     pd.testing.assert_frame_equal(again, before.reset_index(drop=True))
 
 
 def test_strength_0_is_real_motion_whatever_the_recipe(graded):
-    real = graded[graded["strength"] == 0.0].pivot(
-        index=["seed", "metric"], columns="corruption", values="value"
-    )
+    real = graded[graded["strength"] == 0.0].pivot(index=["seed", "metric"], columns="corruption", values="value")
     np.testing.assert_allclose(real, real[["frozen pose"]].to_numpy().repeat(3, axis=1))
     assert (real.xs("style_accuracy", level="metric") == 100.0).all(axis=None)
     # Draws of two seeds differ.
@@ -169,9 +163,7 @@ def test_bad_input_to_graded_corruptions_is_refused(packed, classifier):
 
 def gaussian_clouds(train, held_out):
     rng = np.random.default_rng(0)
-    return PlainClassifier(
-        train=(rng.normal(size=(train, 6)), None), held_out=(rng.normal(size=(held_out, 6)), None)
-    )
+    return PlainClassifier(train=(rng.normal(size=(train, 6)), None), held_out=(rng.normal(size=(held_out, 6)), None))
 
 
 def test_settling_of_two_clouds_of_one_distribution_falls_towards_0():
@@ -221,9 +213,7 @@ def test_claim_q15_power_of_a_swaying_foot():
     assert real.loc["toe_power", "value"] == pytest.approx((power(0.1) + power(0.2)) / 2, rel=1e-3)
     assert real.loc["toe_power", "repeats"] == 2
     assert table.loc[("real", 0, "5-15 Hz", "toe_power"), "value"] < 1e-6
-    assert (
-        table.xs("toe_power_over_real", level="metric").loc["real"]["value"].tolist() == [1.0] * 3
-    )
+    assert table.xs("toe_power_over_real", level="metric").loc["real"]["value"].tolist() == [1.0] * 3
 
     only = {key: [pair for pair in pairs if pair[0] == "calm"] for key, pairs in systems.items()}
     table = foot_spectrum(only).set_index(["model", "band", "metric"])["value"]

@@ -57,11 +57,7 @@ def documents(*patterns: str) -> set[str]:
     """Pages of the repository without their suffix, as Sphinx names them."""
     found = {path for pattern in patterns for path in ROOT.glob(pattern)}
     hidden = (".ipynb_checkpoints", "_build")
-    return {
-        path.relative_to(ROOT).with_suffix("").as_posix()
-        for path in found
-        if not set(hidden) & set(path.parts)
-    }
+    return {path.relative_to(ROOT).with_suffix("").as_posix() for path in found if not set(hidden) & set(path.parts)}
 
 
 def listed(entries: list[str], names: set[str]) -> set[str]:
@@ -121,9 +117,7 @@ def test_every_data_set_has_a_gallery_page_that_inserts_it():
     for folder in pages.result_folders():
         page = DOCS / "gallery" / f"{folder.parent.name}.md"
         assert page.is_file(), f"{folder.parent.name}: add docs/gallery/{page.name}"
-        assert ("gallery", folder.parent.name) in pages.INSERT.findall(
-            page.read_text(encoding="utf-8")
-        )
+        assert ("gallery", folder.parent.name) in pages.INSERT.findall(page.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("dataset", ["bandai", "synthetic"])
@@ -317,10 +311,7 @@ def test_a_whole_site_has_no_faults(tmp_path):
         ("<iframe srcdoc='<img src=gone.png alt=x>'></iframe>", "gone.png leads nowhere"),
         ("<iframe srcdoc='<script src=//a.org/a.js></script>'></iframe>", "asks //a.org/a.js"),
         ("<p id='p'><iframe srcdoc='<a href=#p>b</a>'></iframe>", "#p: no such place"),
-        (
-            "<iframe srcdoc='<iframe srcdoc=&quot;<style>p{src:url(//a.org/f)}</style>&quot;>'>",
-            "asks //a.org/f",
-        ),
+        ("<iframe srcdoc='<iframe srcdoc=&quot;<style>p{src:url(//a.org/f)}</style>&quot;>'>", "asks //a.org/f"),
         ("<img src='style.css'>", "image style.css has no alternative text"),
         ("<img src='style.css' alt='a_1.png'>", "image style.css has no alternative text"),
     ],
@@ -396,9 +387,7 @@ def test_actions_are_pinned_to_commits():
 
 def test_continuous_integration_builds_the_site_before_a_browser_looks_at_it():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    order = [
-        script.index(f"make {name}") for name in ("test\n", "site-tools", "site\n", "test-web")
-    ]
+    order = [script.index(f"make {name}") for name in ("test\n", "site-tools", "site\n", "test-web")]
     assert order == sorted(order)
 
 

@@ -53,9 +53,7 @@ def legs(**changes) -> Skeleton:
     values = {
         "names": ("Hips", "LeftHip", "LeftToe", "RightHip", "RightToe"),
         "parents": (-1, 0, 1, 0, 3),
-        "offsets": np.array(
-            [[0, 0, 0], [0.1, 0, 0], [0, -0.9, 0.1], [-0.1, 0, 0], [0, -0.9, 0.1]], dtype=float
-        ),
+        "offsets": np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.9, 0.1], [-0.1, 0, 0], [0, -0.9, 0.1]], dtype=float),
     }
     return Skeleton(**(values | changes))
 
@@ -122,9 +120,7 @@ def test_kinematics_in_jax_equal_those_in_numpy():
 def test_kinematics_take_leading_batch_axes():
     motion = random_motion(SYNTHETIC_SKELETON, frames=6)
     positions = skeleton.forward_kinematics(
-        SYNTHETIC_SKELETON,
-        motion.root_position.reshape(2, 3, 3),
-        motion.rotations.reshape(2, 3, -1, 3, 3),
+        SYNTHETIC_SKELETON, motion.root_position.reshape(2, 3, 3), motion.rotations.reshape(2, 3, -1, 3, 3)
     )
     np.testing.assert_allclose(positions.reshape(6, -1, 3), motion.positions, atol=1e-12)
 
@@ -192,9 +188,7 @@ def test_a_single_frame_counts_as_contact():
 
 
 @pytest.mark.parametrize(
-    ("rig", "tolerance"),
-    [(SYNTHETIC_SKELETON, 1e-12), (BANDAI, 6e-4)],
-    ids=["100style-like", "bandai"],
+    ("rig", "tolerance"), [(SYNTHETIC_SKELETON, 1e-12), (BANDAI, 6e-4)], ids=["100style-like", "bandai"]
 )
 def test_mirror_shows_the_mirrored_positions(rig, tolerance):
     motion = random_motion(rig)
@@ -247,9 +241,7 @@ def test_mirror_of_an_axis_aligned_rig_negates_two_quaternion_components():
     mirrored = skeleton.mirror(motion)
     reflect = np.diag([-1.0, 1.0, 1.0])
     left, right = SYNTHETIC_SKELETON.index("LeftElbow"), SYNTHETIC_SKELETON.index("RightElbow")
-    np.testing.assert_allclose(
-        mirrored.rotations[:, left], reflect @ motion.rotations[:, right] @ reflect, atol=1e-12
-    )
+    np.testing.assert_allclose(mirrored.rotations[:, left], reflect @ motion.rotations[:, right] @ reflect, atol=1e-12)
 
 
 def test_mirror_turns_a_left_turn_into_a_right_turn():
@@ -301,9 +293,7 @@ def test_other_ratios_interpolate(fps):
     time = np.arange(61) / 30.0
     np.testing.assert_allclose(out.root_position[:, 0], 1.5 * time, atol=1e-9)
     np.testing.assert_allclose(out.root_position[:, 2], -0.5 * time, atol=1e-9)
-    np.testing.assert_allclose(
-        out.rotations[:, 0], rotations.matrix_from_yaw(2.0 * time), atol=1e-9
-    )
+    np.testing.assert_allclose(out.rotations[:, 0], rotations.matrix_from_yaw(2.0 * time), atol=1e-9)
 
 
 @pytest.mark.parametrize("fps", [0.0, -30.0, np.nan, np.inf])

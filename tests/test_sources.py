@@ -54,9 +54,7 @@ def test_splits_are_the_same_everywhere():
     assert assign_splits((name, "walk") for name in reversed(names)) == splits
 
 
-@pytest.mark.parametrize(
-    "count, held_out", [(1, 0), (2, 0), (3, 1), (7, 1), (14, 1), (15, 2), (25, 3), (100, 10)]
-)
+@pytest.mark.parametrize("count, held_out", [(1, 0), (2, 0), (3, 1), (7, 1), (14, 1), (15, 2), (25, 3), (100, 10)])
 def test_splits_are_stratified(count, held_out):
     pairs = [(f"{style}_{number}", style) for style in "ab" for number in range(count)]
     splits = assign_splits(pairs)
@@ -93,10 +91,7 @@ def test_synthetic_options():
     dataset = open_dataset("synthetic", seconds_per_style=6.0, num_styles=2)
     assert len(dataset.styles) == 2 and len(dataset.clips) == 6
     assert dataset.clips[0].load().num_frames == 60
-    assert (
-        dataset.fingerprint
-        == open_dataset("synthetic", seconds_per_style=6, num_styles=2).fingerprint
-    )
+    assert dataset.fingerprint == open_dataset("synthetic", seconds_per_style=6, num_styles=2).fingerprint
     others = [
         open_dataset("synthetic", seconds_per_style=7.0, num_styles=2),
         open_dataset("synthetic", seconds_per_style=6.0, num_styles=3),
@@ -119,11 +114,7 @@ def test_folder_of_bvh(tmp_path, monkeypatch, no_network):
     (tmp_path / "notes.txt").write_text("not motion")
     dataset = open_dataset("folder", path=tmp_path)
     found = [(clip.name, clip.style, clip.content) for clip in dataset.clips]
-    assert found == [
-        ("happy/a", "happy", "a"),
-        ("happy/b", "happy", "b"),
-        ("sad_walk_01", "sad", "walk_01"),
-    ]
+    assert found == [("happy/a", "happy", "a"), ("happy/b", "happy", "b"), ("sad_walk_01", "sad", "walk_01")]
     assert dataset.styles == ("happy", "sad")
     assert dataset.mirror_styles == frozenset()
     assert [clip.load().num_frames for clip in dataset.clips] == [50, 51, 52]
@@ -171,9 +162,7 @@ def write_100style(top: Path, *, dash: str = "–") -> Path:
     """
     folder = top / "100STYLE"
     ranges = {"FW": (21, 181), "ID": (20, 120), "TR1": (0, 200)}
-    header = ",".join(
-        ["STYLE_NAME", *(f"{code}_{end}" for code in CODES for end in ("START", "STOP"))]
-    )
+    header = ",".join(["STYLE_NAME", *(f"{code}_{end}" for code in CODES for end in ("START", "STOP"))])
     rows = [header]
     for style in ("Aeroplane", "LimpLeft"):
         cells = [str(value) for code in CODES for value in ranges.get(code, ("N/A", "N/A"))]
@@ -210,9 +199,7 @@ def test_100style_tree(tmp_path, monkeypatch, no_network, packing):
     assert dataset.mirror_styles == {"Aeroplane"}
     assert (dataset.licence, dataset.notes) == ("CC BY 4.0", ())
     assert [(clip.name, clip.style, clip.content) for clip in dataset.clips] == [
-        (f"{style}_{code}", style, code)
-        for style in ("Aeroplane", "LimpLeft")
-        for code in ("FW", "ID", "TR1")
+        (f"{style}_{code}", style, code) for style in ("Aeroplane", "LimpLeft") for code in ("FW", "ID", "TR1")
     ]
     for style in dataset.styles:
         splits = sorted(clip.split for clip in dataset.clips if clip.style == style)
@@ -269,18 +256,8 @@ def test_100style_file_shorter_than_its_cut(tmp_path):
 @pytest.mark.parametrize(
     "table, old, new, message",
     [
-        (
-            "Frame_Cuts.csv",
-            "21,181",
-            "181,21",
-            r"line 2: FW of Aeroplane has the range '181' to '21'",
-        ),
-        (
-            "Frame_Cuts.csv",
-            "21,181",
-            "21,N/A",
-            r"line 2: FW of Aeroplane has the range '21' to 'N/A'",
-        ),
+        ("Frame_Cuts.csv", "21,181", "181,21", r"line 2: FW of Aeroplane has the range '181' to '21'"),
+        ("Frame_Cuts.csv", "21,181", "21,N/A", r"line 2: FW of Aeroplane has the range '21' to 'N/A'"),
         ("Frame_Cuts.csv", "LimpLeft", "Aeroplane", "line 3: style Aeroplane is listed twice"),
         ("Frame_Cuts.csv", "\nLimpLeft", "\n", "line 3: no STYLE_NAME"),
         ("Dataset_List.csv", "No,Yes", "No,Maybe", "line 2: .* Yes or No .* 'Maybe'"),
@@ -356,11 +333,7 @@ def small_bandai(tmp_path, monkeypatch) -> Path:
             data = text.encode()
             listed.append(
                 sources._ListedFile(
-                    name,
-                    40 + 5 * number,
-                    len(data),
-                    zlib.crc32(data),
-                    sources.hashlib.sha256(data).hexdigest()[:16],
+                    name, 40 + 5 * number, len(data), zlib.crc32(data), sources.hashlib.sha256(data).hexdigest()[:16]
                 )
             )
     monkeypatch.setattr(sources, "_bandai_list", lambda: tuple(listed))
@@ -423,9 +396,7 @@ def test_bandai_refuses_missing_and_doubled_files(small_bandai):
         open_dataset("bandai", path=small_bandai)
     (small_bandai / walk.name).unlink()
     walk.unlink()
-    with pytest.raises(
-        ValueError, match=r"1 of the 7 .* missing, the first is dataset-1_walk_angry"
-    ):
+    with pytest.raises(ValueError, match=r"1 of the 7 .* missing, the first is dataset-1_walk_angry"):
         open_dataset("bandai", path=small_bandai)
 
 
@@ -469,9 +440,7 @@ def test_bandai_refuses_flipped_bits_inside_a_zip(small_bandai, tmp_path):
 def test_several_archives_are_not_guessed_between(small_bandai, tmp_path):
     zip_folder(small_bandai, tmp_path / "bandai-a.zip")
     zip_folder(small_bandai, tmp_path / "bandai-b.zip")
-    with pytest.raises(
-        ValueError, match=r"several archives may be meant \(bandai-a\.zip, bandai-b"
-    ):
+    with pytest.raises(ValueError, match=r"several archives may be meant \(bandai-a\.zip, bandai-b"):
         open_dataset("bandai", path=tmp_path)
 
 
@@ -514,11 +483,7 @@ def test_downloads_are_pinned(small_bandai, tmp_path, monkeypatch):
             None,
             f"Bandai-Namco-Research-Motiondataset-{commit}.zip",
         ),
-        (
-            "doi:10.5281/zenodo.8127870/100STYLE.zip",
-            "md5:3cf627852fd8192024c04a8d0ef49583",
-            "100STYLE.zip",
-        ),
+        ("doi:10.5281/zenodo.8127870/100STYLE.zip", "md5:3cf627852fd8192024c04a8d0ef49583", "100STYLE.zip"),
     ]
 
 

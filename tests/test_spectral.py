@@ -7,7 +7,7 @@ import pytest
 import scipy.fft
 from flax import nnx
 
-from f3amd_lib.models.spectral import (
+from f3amd_lib.networks.spectral import (
     SPECTRAL_VARIANTS,
     FNOBlock,
     SpectralConvolution,
@@ -35,8 +35,7 @@ def fft_convolution(z, weight_real, weight_imag):
 
 
 @pytest.mark.parametrize(
-    ("num_frames", "modes"),
-    [(32, 17), (32, 12), (32, 1), (31, 16), (31, 5), (7, 4), (8, 5), (2, 2), (1, 1)],
+    ("num_frames", "modes"), [(32, 17), (32, 12), (32, 1), (31, 16), (31, 5), (7, 4), (8, 5), (2, 2), (1, 1)]
 )
 def test_eq02_equals_numpy_fft(num_frames, modes):
     z = draw(3, num_frames, 5)
@@ -52,9 +51,7 @@ def test_eq02_in_float64_equals_numpy_fft_to_rounding():
     weight_real, weight_imag = draw(17, 5, 4, seed=1), draw(17, 5, 4, seed=2)
     with jax.enable_x64(True):
         got = spectral_convolution(
-            jnp.asarray(z),
-            jnp.asarray(weight_real, jnp.float64),
-            jnp.asarray(weight_imag, jnp.float64),
+            jnp.asarray(z), jnp.asarray(weight_real, jnp.float64), jnp.asarray(weight_imag, jnp.float64)
         )
         np.testing.assert_allclose(got, fft_convolution(z, weight_real, weight_imag), atol=1e-12)
 
@@ -113,9 +110,7 @@ def test_eq02_modes_out_of_range_are_refused(num_frames, modes):
 @pytest.mark.parametrize("variant", SPECTRAL_VARIANTS)
 def test_eq02_initial_weights_keep_the_variance(variant, num_frames):
     modes = count_modes(variant, num_frames)
-    layer = SpectralConvolution(
-        64, 64, modes, variant, rank=32, initial_gain=1.0, rngs=nnx.Rngs(params=0)
-    )
+    layer = SpectralConvolution(64, 64, modes, variant, rank=32, initial_gain=1.0, rngs=nnx.Rngs(params=0))
     # Of a complex weight, the real part alone acts on bins 0 and T / 2: half of their variance.
     halved = {"cosine": 0.0}.get(variant, (2 - num_frames % 2) / num_frames / 2)
     variance = layer(draw(256, num_frames, 64)).var()
@@ -163,12 +158,7 @@ def test_default_layer_has_the_weights_that_files_hold():
 @pytest.mark.parametrize(("num_frames", "fourier", "cosine"), [(32, 17, 32), (31, 16, 31)])
 def test_table_8_modes_there_are(num_frames, fourier, cosine):
     counted = {variant: count_modes(variant, num_frames) for variant in SPECTRAL_VARIANTS}
-    assert counted == {
-        "fourier": fourier,
-        "cosine": cosine,
-        "reduced_rank": fourier,
-        "weighted": fourier,
-    }
+    assert counted == {"fourier": fourier, "cosine": cosine, "reduced_rank": fourier, "weighted": fourier}
 
 
 @pytest.mark.parametrize("num_frames", [1, 2, 7, 8, 32])
@@ -229,9 +219,7 @@ def test_table_8_cosine_ends_do_not_meet():
 @pytest.mark.parametrize(("num_frames", "modes"), [(8, 5), (9, 5), (9, 2)])
 def test_eq02_unit_gains_equal_the_dense_layer(num_frames, modes):
     dense = SpectralConvolution(3, 4, modes, rngs=nnx.Rngs(params=0))
-    weighted = SpectralConvolution(
-        3, 4, modes, "weighted", initial_gain=1.0, rngs=nnx.Rngs(params=0)
-    )
+    weighted = SpectralConvolution(3, 4, modes, "weighted", initial_gain=1.0, rngs=nnx.Rngs(params=0))
     z = draw(2, num_frames, 3)
     np.testing.assert_allclose(weighted(z), dense(z), atol=1e-6)
 

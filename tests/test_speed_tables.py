@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.report.papers import load_paper_table
-from f3amd_lib.report.speed_tables import (
+from f3amd_lib.benchmarking.speed_tables import (
     fastest_ways,
     speed_bars,
     speedups,
@@ -13,6 +12,7 @@ from f3amd_lib.report.speed_tables import (
     times_beside_paper,
     training_beside_paper,
 )
+from f3amd_lib.ground.papers import load_paper_table
 
 
 def measured(*rows):
@@ -120,9 +120,7 @@ def test_ours_stand_beside_the_papers_cells():
 
 
 def test_frameworks_are_not_confused():
-    jax, torch = (
-        ("CAMDM", 8, way, 8, value, 0.5) for way, value in (("jit", 10.0), ("PyTorch", 7.0))
-    )
+    jax, torch = (("CAMDM", 8, way, 8, value, 0.5) for way, value in (("jit", 10.0), ("PyTorch", 7.0)))
     table = measured(jax, torch)
     table["framework"] = ["jax", "torch"]
     beside = times_beside_paper(table, 7, "CPU").query("characters == 8").set_index("model")

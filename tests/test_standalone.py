@@ -115,14 +115,10 @@ def test_eq01_mixture_is_the_librarys(standalone, means, width, sigma):
 @pytest.mark.parametrize("sigma", [0.0, 0.01, 1.0, 128.0])
 def test_eq08_noise_and_labels_are_the_librarys(standalone, states, sigma):
     x0, noise = states["x"], states["noise"]
-    np.testing.assert_array_equal(
-        standalone["add_noise"](x0, sigma, noise), samplers.add_noise(x0, sigma, noise)
-    )
+    np.testing.assert_array_equal(standalone["add_noise"](x0, sigma, noise), samplers.add_noise(x0, sigma, noise))
     level = np.array([sigma + 1e-3])
     for name in ("alpha_bar_from_sigma", "log_snr_from_sigma"):
-        np.testing.assert_allclose(
-            standalone[name](level), getattr(schedules, name)(level), rtol=1e-14
-        )
+        np.testing.assert_allclose(standalone[name](level), getattr(schedules, name)(level), rtol=1e-14)
     share = np.array([0.999, 0.5, 1e-4])
     np.testing.assert_allclose(
         standalone["sigma_from_alpha_bar"](share), schedules.sigma_from_alpha_bar(share), rtol=1e-14
@@ -146,9 +142,7 @@ def test_appendix_f_steps_are_the_librarys(standalone, states, sigma, sigma_next
     x, x0_hat, noise = states["x"], states["x0_hat"], states["noise"]
     exact = dict(rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(
-        standalone["ddim_step"](x, x0_hat, sigma, sigma_next),
-        samplers.ddim_step(x, x0_hat, sigma, sigma_next),
-        **exact,
+        standalone["ddim_step"](x, x0_hat, sigma, sigma_next), samplers.ddim_step(x, x0_hat, sigma, sigma_next), **exact
     )
     np.testing.assert_allclose(
         standalone["ddpm_step"](x, x0_hat, sigma, sigma_next, noise),
@@ -162,18 +156,13 @@ def test_appendix_f_steps_are_the_librarys(standalone, states, sigma, sigma_next
     )
     powers = [1.0 / (1.0 + level**2) for level in (sigma, sigma_next)]
     np.testing.assert_allclose(
-        standalone["ddim_step_vp"](x, x0_hat, *powers),
-        samplers.ddim_step_vp(x, x0_hat, *powers),
-        **exact,
+        standalone["ddim_step_vp"](x, x0_hat, *powers), samplers.ddim_step_vp(x, x0_hat, *powers), **exact
     )
-    np.testing.assert_allclose(
-        standalone["ddpm_posterior"](*powers), samplers.ddpm_posterior(*powers), **exact
-    )
+    np.testing.assert_allclose(standalone["ddpm_posterior"](*powers), samplers.ddpm_posterior(*powers), **exact)
 
 
 @pytest.mark.parametrize(
-    ("step", "sampler"),
-    [("euler_step", "euler"), ("ve_step", "ddim"), ("vp_step", "ddim_vp"), ("heun_step", "heun")],
+    ("step", "sampler"), [("euler_step", "euler"), ("ve_step", "ddim"), ("vp_step", "ddim_vp"), ("heun_step", "heun")]
 )
 @pytest.mark.parametrize("num_steps", [1, 8])
 def test_walks_end_where_the_librarys_samplers_end(standalone, step, sampler, num_steps):

@@ -9,12 +9,12 @@ from f3amd_lib.benchmarking import measurements, parts, synthesis, ways
 from f3amd_lib.benchmarking.parts import PARTS, time_parts, without
 from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
 from f3amd_lib.benchmarking.ways import NotPossible, Task, prepare_round, random_condition
-from f3amd_lib.diffusion.rounds import sample_round
 from f3amd_lib.diffusion.samplers import num_evaluations
-from f3amd_lib.models import zoo
-from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.conditioning import Condition
 
 QUICK = {"min_rounds": 3, "min_seconds": 0.0, "fewest_rounds": 2, "warmup": 1}
 

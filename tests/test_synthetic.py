@@ -388,9 +388,7 @@ def test_sided_styles_are_mirror_images():
     motion = synthesize("WaveLeft", 5.0)
     flipped = mirror(motion)
     hand, other = (SYNTHETIC_SKELETON.index(f"{side}Wrist") for side in ("Left", "Right"))
-    np.testing.assert_allclose(
-        flipped.positions[:, other, 1], motion.positions[:, hand, 1], atol=1e-9
-    )
+    np.testing.assert_allclose(flipped.positions[:, other, 1], motion.positions[:, hand, 1], atol=1e-9)
 
 
 def test_a_free_arm_hangs_down_under_a_sideways_lean(all_styles):

@@ -10,12 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from f3amd_lib.benchmarking.machine import (
-    describe_machine,
-    fast_xla_flags,
-    matmul_precision,
-    matmul_probe,
-)
+from f3amd_lib.benchmarking.machine import describe_machine, fast_xla_flags, matmul_precision, matmul_probe
 from f3amd_lib.benchmarking.timing import take_turns
 
 
@@ -66,9 +61,7 @@ def test_a_slow_candidate_stops_by_its_seconds_and_the_quick_one_goes_on():
 
 def test_even_the_slowest_gets_its_fewest_rounds():
     clock = Clock()
-    found = take_turns(
-        {"slow": clock.work("slow", [100.0] * 99)}, fewest_rounds=5, min_seconds=10.0, clock=clock
-    )
+    found = take_turns({"slow": clock.work("slow", [100.0] * 99)}, fewest_rounds=5, min_seconds=10.0, clock=clock)
     assert found["slow"].rounds == 5
 
 
@@ -78,9 +71,7 @@ def test_a_sleep_of_known_length():
     assert timing.rounds == 5
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"min_rounds": 0}, {"fewest_rounds": 0}, {"warmup": 0}, {"min_seconds": -1.0}]
-)
+@pytest.mark.parametrize("wrong", [{"min_rounds": 0}, {"fewest_rounds": 0}, {"warmup": 0}, {"min_seconds": -1.0}])
 def test_counts_that_would_time_nothing_are_refused(wrong):
     with pytest.raises(ValueError, match="at least"):
         take_turns({"a": lambda: None}, **wrong)

@@ -10,23 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import (
-    CHANNELS,
-    WINDOW,
-    draw,
-    evaluate,
-    make_condition,
-    network_of,
-    tiny_camdm,
-    tiny_config,
-)
+from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm, tiny_config
 from flax import nnx
 
 from f3amd_lib.benchmarking.timing import Timing
-from f3amd_lib.diffusion.rounds import sample_round
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
-from f3amd_lib.models import zoo
-from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.conditioning import Condition
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
 torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
@@ -129,9 +120,7 @@ def test_round_gives_the_numbers_of_jax(layout, sampler, onnx_camdm):
     for products in torch_camdm.PRODUCTS:
         module = torch_camdm.torch_camdm(network, products=products)
         found = torch_camdm.torch_round(module, SIGMAS, sampler)(
-            torch_camdm.torch_condition(condition),
-            noise=as_tensor(noise),
-            step_noise=as_tensor(step_noise),
+            torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise)
         )
         np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
     run = onnx_camdm.onnx_round(network, SIGMAS, sampler)
@@ -145,18 +134,12 @@ def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round(onnx_camdm):
     network = lively(zoo.build_config("CAMDM", channels=135, num_styles=100))
     config, sigmas = network.config, preset.diffusion.grid(2)
     condition = Condition(
-        draw(1, config.num_history, config.channels, seed=1),
-        draw(1, config.window, 8, seed=2),
-        jnp.eye(100)[7:8],
+        draw(1, config.num_history, config.channels, seed=1), draw(1, config.window, 8, seed=2), jnp.eye(100)[7:8]
     )
     noise, step_noise = given_noise(1, 2, config)
     expected = jax_round(network, condition, sigmas, preset.diffusion.sampler)
     run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), sigmas)
-    found = run(
-        torch_camdm.torch_condition(condition),
-        noise=as_tensor(noise),
-        step_noise=as_tensor(step_noise),
-    )
+    found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
     np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
     run = onnx_camdm.onnx_round(network, sigmas)
     found = run(Condition(*map(np.asarray, condition)), noise=noise, step_noise=step_noise)
@@ -236,9 +219,7 @@ def test_compiled_round_takes_more_batch_sizes_than_pytorch_may_allow(eager_comp
     with torch._dynamo.config.patch(recompile_limit=1):
         for batch in (1, 2, 3):
             condition = torch_camdm.torch_condition(make_condition(batch))
-            found, expected = (
-                run(condition, torch.Generator().manual_seed(batch)) for run in (quick, plain)
-            )
+            found, expected = (run(condition, torch.Generator().manual_seed(batch)) for run in (quick, plain))
             torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
 
 
@@ -254,18 +235,12 @@ def test_compiler_that_fails_says_why(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    not any(map(shutil.which, ("g++", "clang++"))), reason="torch.compile needs a C++ compiler"
-)
+@pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++"))), reason="torch.compile needs a C++ compiler")
 def test_compiled_code_gives_the_numbers_of_jax():
     network, condition = lively(small()), make_condition()
     noise, step_noise = given_noise(2, 4, network.config)
     run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, compiled=True)
-    found = run(
-        torch_camdm.torch_condition(condition),
-        noise=as_tensor(noise),
-        step_noise=as_tensor(step_noise),
-    )
+    found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
     expected = jax_round(network, condition, SIGMAS, "ddpm")
     np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
 
@@ -281,9 +256,7 @@ def test_number_of_threads_is_lent_and_given_back(monkeypatch):
         assert torch.get_num_threads() == 5
     module = torch_camdm.torch_camdm(lively(small()))
     denoise = module.denoise
-    monkeypatch.setattr(
-        module, "denoise", lambda *given: seen.append(torch.get_num_threads()) or denoise(*given)
-    )
+    monkeypatch.setattr(module, "denoise", lambda *given: seen.append(torch.get_num_threads()) or denoise(*given))
     for threads, expected in ((None, 5), (3, 3)):
         run = torch_camdm.torch_round(module, SIGMAS[-2:], threads=threads)
         run(torch_camdm.torch_condition(make_condition()))
@@ -349,9 +322,7 @@ def test_wrong_shapes_are_refused_by_name(onnx_camdm):
             run(fitting._replace(path=fitting.path[..., :7]))
 
 
-@pytest.mark.parametrize(
-    ("missing", "module"), [("torch", "torch_camdm"), ("onnxruntime", "onnx_camdm")]
-)
+@pytest.mark.parametrize(("missing", "module"), [("torch", "torch_camdm"), ("onnxruntime", "onnx_camdm")])
 def test_what_is_not_installed_is_named_with_its_extra(missing, module, monkeypatch):
     name = f"f3amd_lib.benchmarking.{module}"
     monkeypatch.setitem(sys.modules, missing, None)

@@ -12,7 +12,7 @@ from builders import CHANNELS, HISTORY, WINDOW, same_tree, tiny_config, tiny_tra
 
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
-from f3amd_lib.models.conditioning import Condition
+from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import loop
 from f3amd_lib.training.loop import (
     TrainingConfig,
@@ -59,9 +59,7 @@ def test_other_schedules_by_hand():
     root = learning_rate_schedule(TrainingConfig(10, schedule="inverse_sqrt"))
     assert root(0) == pytest.approx(5e-4)
     assert root(3e5) == pytest.approx(2.5e-4)
-    cosine = learning_rate_schedule(
-        TrainingConfig(110, schedule="warmup_cosine", warmup_steps=10, learning_rate=1e-2)
-    )
+    cosine = learning_rate_schedule(TrainingConfig(110, schedule="warmup_cosine", warmup_steps=10, learning_rate=1e-2))
     assert float(cosine(0)) == 0.0
     assert float(cosine(5)) == pytest.approx(5e-3)
     assert float(cosine(10)) == pytest.approx(1e-2)
@@ -120,9 +118,7 @@ def test_config_names_unknown_keys():
 def test_network_inputs_by_hand(trainer):
     windows, normaliser = trainer.windows, trainer.normaliser
     index = jnp.array([0, 5])
-    batch = gather_windows(
-        windows, index, jnp.zeros(2), jnp.zeros(2, jnp.int32), window=WINDOW, num_history=HISTORY
-    )
+    batch = gather_windows(windows, index, jnp.zeros(2), jnp.zeros(2, jnp.int32), window=WINDOW, num_history=HISTORY)
     x0, condition = network_inputs(batch, normaliser)
     standard = lambda x: (np.asarray(x) - normaliser.mean) / normaliser.deviation
     np.testing.assert_allclose(x0, standard(batch.future), atol=1e-5)
@@ -229,18 +225,12 @@ def test_saved_state_comes_back_exactly(trainer, finished, tmp_path):
 
 @pytest.mark.parametrize(
     ("settings", "name"),
-    [
-        ({"learning_rate": 1e-3}, "learning_rate"),
-        ({"seed": 1}, "seed"),
-        ({"loss": LossWeights(ird=0.5)}, "loss"),
-    ],
+    [({"learning_rate": 1e-3}, "learning_rate"), ({"seed": 1}, "seed"), ({"loss": LossWeights(ird=0.5)}, "loss")],
 )
 def test_checkpoints_of_other_settings_are_refused(trainer, tmp_path, settings, name):
     path = tmp_path / "state.safetensors"
     trainer.save(path, trainer.initial_state())
-    other = tiny_trainer(
-        **{"num_steps": STEPS, "learning_rate": 1e-2, "ema_decay": 0.9, **settings}
-    )
+    other = tiny_trainer(**{"num_steps": STEPS, "learning_rate": 1e-2, "ema_decay": 0.9, **settings})
     with pytest.raises(ValueError, match=rf"state\.safetensors.*other training settings.*{name}"):
         other.restore(path)
 
@@ -376,9 +366,7 @@ def test_log_normal_noise_has_the_mean_and_deviation_it_names():
     mean, deviation = loop.LOG_NORMAL_SIGMA
     assert log_sigma.mean() == pytest.approx(mean, abs=0.03)
     assert log_sigma.std() == pytest.approx(deviation, abs=0.03)
-    narrow = TrainingConfig(
-        10, noise="log_normal", diffusion=VarianceExploding(sigma_max=1.0, sigma_min=0.5)
-    )
+    narrow = TrainingConfig(10, noise="log_normal", diffusion=VarianceExploding(sigma_max=1.0, sigma_min=0.5))
     sigma = np.asarray(loop.draw_sigma(jax.random.key(3), 1000, narrow))
     assert sigma.min() == pytest.approx(0.5) and sigma.max() == pytest.approx(1.0)
 
@@ -409,17 +397,14 @@ def test_condition_dropout_hides_history_path_and_style_together():
 def test_weighted_noise_changes_training_but_not_the_held_out_loss():
     plain, weighted = tiny_trainer(), tiny_trainer(noise_weighting="low_noise")
     state = plain.initial_state()
-    assert plain.held_out_terms(state.ema, tiny_windows()) == weighted.held_out_terms(
-        state.ema, tiny_windows()
-    )
+    assert plain.held_out_terms(state.ema, tiny_windows()) == weighted.held_out_terms(state.ema, tiny_windows())
     one, _ = plain.advance(plain.initial_state(), 2)
     two, _ = weighted.advance(weighted.initial_state(), 2)
     assert largest_change(one.params, two.params) > 1e-5
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "hint"),
-    [("noise", "mixd", "'mixed'"), ("noise_weighting", "low_nose", "'low_noise'")],
+    ("field", "value", "hint"), [("noise", "mixd", "'mixed'"), ("noise_weighting", "low_nose", "'low_noise'")]
 )
 def test_misspelt_noise_is_refused(field, value, hint):
     with pytest.raises(ValueError, match=f"unknown {field} '{value}'.*{hint}"):

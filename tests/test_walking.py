@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.evaluation import walking
-from f3amd_lib.evaluation.paths import named_path
+from f3amd_lib.ground.profiles import SHOWN_STYLES
+from f3amd_lib.measures import walking
+from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.synthetic import style_parameters, synthesize, walk_along
-from f3amd_lib.profiles import SHOWN_STYLES
 
 WINDOW = 32
 
@@ -65,8 +65,7 @@ def test_slide_is_the_speed_of_the_lower_toe(walk):
     assert walking.sliding_share(skating, walk.skeleton) > 0.9
     two = np.stack([walk.positions, skating])
     np.testing.assert_allclose(
-        walking.slide_speed(two, walk.skeleton),
-        [walking.slide_speed(one, walk.skeleton) for one in two],
+        walking.slide_speed(two, walk.skeleton), [walking.slide_speed(one, walk.skeleton) for one in two]
     )
 
 

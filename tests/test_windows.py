@@ -41,14 +41,10 @@ from f3amd_lib.motion.skeleton import mirror
 SPAN = WINDOW + HISTORY
 SIZES = {"window": WINDOW, "num_history": HISTORY}
 
-gather = jax.jit(
-    lambda windows, index, yaw, smoothing: gather_windows(windows, index, yaw, smoothing, **SIZES)
-)
+gather = jax.jit(lambda windows, index, yaw, smoothing: gather_windows(windows, index, yaw, smoothing, **SIZES))
 
 # Every batch here is handed on as numpy arrays, which saves compiling each test's own arithmetic.
-_sample = jax.jit(
-    lambda windows, key, size: sample_windows(windows, key, size, **SIZES), static_argnums=2
-)
+_sample = jax.jit(lambda windows, key, size: sample_windows(windows, key, size, **SIZES), static_argnums=2)
 _fit = jax.jit(lambda windows, key: fit_normaliser(windows, key, **SIZES))
 
 
@@ -68,9 +64,7 @@ def train(packed):
 
 def all_windows(windows, yaw=0.0, smoothing=0) -> Batch:
     count = windows.num_windows
-    batch = gather(
-        windows, jnp.arange(count), jnp.full(count, yaw), jnp.full(count, smoothing, jnp.int32)
-    )
+    batch = gather(windows, jnp.arange(count), jnp.full(count, yaw), jnp.full(count, smoothing, jnp.int32))
     return jax.tree.map(np.asarray, batch)
 
 
@@ -100,13 +94,9 @@ def test_mirror_images_follow_their_clip_in_training_only(packed, train):
     motion = packed.motion(0)
     expected = slices(packed, (motion, mirror(motion), packed.motion(1), packed.motion(3)))
     batch = all_windows(train)
-    np.testing.assert_allclose(
-        np.concatenate([batch.history, batch.future], axis=1), expected, atol=1e-6
-    )
+    np.testing.assert_allclose(np.concatenate([batch.history, batch.future], axis=1), expected, atol=1e-6)
     held_out = build_windows(packed, "validation", **SIZES)
-    np.testing.assert_allclose(
-        all_windows(held_out).future, slices(packed, [packed.motion(2)])[:, HISTORY:], atol=1e-6
-    )
+    np.testing.assert_allclose(all_windows(held_out).future, slices(packed, [packed.motion(2)])[:, HISTORY:], atol=1e-6)
     asked = build_windows(packed, "validation", mirrored=True, **SIZES)
     assert asked.num_windows == 2 * held_out.num_windows
 
@@ -121,9 +111,7 @@ def test_mirrored_windows_show_the_mirrored_figure(packed, train):
     np.testing.assert_allclose(reflected, expected, atol=1e-5)
     # A mirrored path turns the other way.
     np.testing.assert_allclose(
-        batch.path[count : 2 * count],
-        batch.path[:count] * np.array([-1, 1, 1, 1, -1, 1, 1, 1]),
-        atol=1e-5,
+        batch.path[count : 2 * count], batch.path[:count] * np.array([-1, 1, 1, 1, -1, 1, 1, 1]), atol=1e-5
     )
 
 
@@ -154,9 +142,7 @@ def test_earlier_windows_end_where_the_later_begin(packed, train):
     shared = before.future[:, -HISTORY:]
     np.testing.assert_allclose(later.history[..., 3:], shared[..., 3:], atol=1e-6)
     np.testing.assert_allclose(
-        later.history[..., :3] - later.history[:, :1, :3],
-        shared[..., :3] - shared[:, :1, :3],
-        atol=1e-5,
+        later.history[..., :3] - later.history[:, :1, :3], shared[..., :3] - shared[:, :1, :3], atol=1e-5
     )
 
 
@@ -205,9 +191,7 @@ def test_smoothed_paths_turn_with_the_window(train, smoothing):
     ground = np.concatenate([plain.path[..., :1], pad, plain.path[..., 1:2]], axis=-1)
     np.testing.assert_allclose(turned.path[..., :2], (ground @ matrix.T)[..., [0, 2]], atol=1e-5)
     for column in (slice(2, 5), slice(5, 8)):
-        np.testing.assert_allclose(
-            turned.path[..., column], plain.path[..., column] @ matrix.T, atol=1e-5
-        )
+        np.testing.assert_allclose(turned.path[..., column], plain.path[..., column] @ matrix.T, atol=1e-5)
 
 
 def test_smoothing_keeps_a_straight_path():
@@ -225,9 +209,7 @@ def test_smoothing_takes_out_the_sway_of_each_step():
     motion = straight_motion(200)
     root = motion.root_position.copy()
     root[:, 0] += 0.05 * np.sin(2 * np.pi * np.arange(200) / 30)
-    windows = build_windows(
-        packed_from([(motion.replace(root_position=root), 0, 0)]), "train", **SIZES
-    )
+    windows = build_windows(packed_from([(motion.replace(root_position=root), 0, 0)]), "train", **SIZES)
     line = np.array([0.3, -0.2]) + np.arange(200)[:, None] * [0.03, 0.04]
     sway = np.abs(np.asarray(windows.paths)[:, 60:140, :2] - line[60:140]).max(axis=(1, 2))
     # A Gaussian of width w frames leaves exp(-(2 pi w / 30)^2 / 2) of a period of 30 frames.
@@ -257,10 +239,7 @@ def test_section_3_2_facing_of_samples_is_uniform(sampled):
 def test_samples_cover_all_windows_evenly(train, sampled):
     # Turning leaves the local rotations, which tell the windows apart.
     known = np.asarray(all_windows(train).future[:, 0, 9:])
-    which = [
-        int(np.flatnonzero((known == row).all(axis=1))[0])
-        for row in np.asarray(sampled.future[:, 0, 9:])
-    ]
+    which = [int(np.flatnonzero((known == row).all(axis=1))[0]) for row in np.asarray(sampled.future[:, 0, 9:])]
     counts = np.bincount(which, minlength=train.num_windows)
     assert np.all(counts > 0) and counts.max() < 30
     expected = np.asarray(train.one_hot[train.styles])[which]
@@ -338,9 +317,7 @@ def test_restarting_measures_from_where_the_character_stands():
     np.testing.assert_array_equal(after.history[:, -1, [0, 2]], 0.0)
     np.testing.assert_array_equal(after.history[..., 3:], history[..., 3:])
     np.testing.assert_allclose(
-        after.history[..., :3] - after.history[:, :1, :3],
-        history[..., :3] - history[:, :1, :3],
-        atol=1e-5,
+        after.history[..., :3] - after.history[:, :1, :3], history[..., :3] - history[:, :1, :3], atol=1e-5
     )
 
 
@@ -387,9 +364,7 @@ def test_windows_of_64_frames():
     long = packed_from([(straight_motion(120), 0, 0)])
     windows = build_windows(long, "train", window=64, num_history=10)
     assert windows.num_windows == 120 - 74 + 1
-    batch = gather_windows(
-        windows, jnp.arange(2), jnp.zeros(2), jnp.zeros(2, int), window=64, num_history=10
-    )
+    batch = gather_windows(windows, jnp.arange(2), jnp.zeros(2), jnp.zeros(2, int), window=64, num_history=10)
     assert batch.future.shape[:2] == batch.path.shape[:2] == (2, 64)
     step = np.diff(np.asarray(batch.future[..., [0, 2]]), axis=1)
     np.testing.assert_allclose(step, np.broadcast_to([0.03, 0.04], step.shape), atol=1e-5)

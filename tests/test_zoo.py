@@ -15,8 +15,8 @@ from flax import nnx
 
 from f3amd_lib.data.windows import build_windows, fit_normaliser
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
-from f3amd_lib.models import zoo
-from f3amd_lib.report.papers import load_paper_table
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.networks import zoo
 from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
 
 COMMITTED_TABLE = Path(__file__).parent / "zoo_table.csv"
@@ -47,8 +47,7 @@ def test_table_is_the_committed_one():
 
 
 @pytest.mark.parametrize(
-    ("width", "parameters"),
-    [(32, 745505), (48, 1361889), (64, 1806113), (96, 3501921), (128, 4334241)],
+    ("width", "parameters"), [(32, 745505), (48, 1361889), (64, 1806113), (96, 3501921), (128, 4334241)]
 )
 def test_section_4_5_parameter_counts(width, parameters):
     config = zoo.build_config(f"F3AMD-FNO-{width}", channels=135, num_styles=100)
@@ -79,10 +78,7 @@ def test_section_4_5_depths_modes_and_appendix_a_heads(kind, width, depth):
         ("F3AMD-FNO-96, m=14", {"num_kept_modes": 14}),
         ("F3AMD-FNO-96, m=1", {"num_kept_modes": 1}),
         ("F3AMD-FNO-96, m=17", {}),
-        (
-            "F3AMD-FNO-96 (concatenation)",
-            {"conditioning": "concatenation", "num_kept_modes": 33},
-        ),
+        ("F3AMD-FNO-96 (concatenation)", {"conditioning": "concatenation", "num_kept_modes": 33}),
         ("F3AMD-FNO-96 (AdaLN-zero)", {"conditioning": "adaln_zero"}),
         ("F3AMD-FNO-96 (cross-attention)", {"conditioning": "cross_attention"}),
         ("F3AMD-FNO-96-no-IRD", {}),
@@ -169,8 +165,7 @@ def test_counted_parameters_are_those_of_the_built_network():
 
 def test_counted_operations_of_a_linear_coder_by_hand():
     linear, spectral = (
-        zoo.count_flops(zoo.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
-        for kind in ("linear", "fno")
+        zoo.count_flops(zoo.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind)) for kind in ("linear", "fno")
     )
     width, frames, modes = 96, 32, 17
     dense = 2 * 2 * frames * CHANNELS * width
@@ -185,9 +180,7 @@ def test_counted_operations_of_a_linear_coder_by_hand():
 
 def test_zoo_builds_the_same_network_from_the_same_key():
     settings = {**SIZE, "latent_width": 8, "depth": 1, "window": 8, "num_kept_modes": 2}
-    first, again, other = (
-        nnx.state(zoo.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2)
-    )
+    first, again, other = (nnx.state(zoo.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2))
     assert same_tree(first, again) and not same_tree(first, other)
 
 

@@ -24,11 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 INSERT = re.compile(r"^<!-- insert: (\w+) ?([\w.]*) -->$", re.M)
 
 # Licences whose terms a caption must repeat in words.
-TERMS = {
-    "CC BY-NC 4.0": "for non-commercial use",
-    "CC BY 4.0": "with credit",
-    "Apache-2.0": "as the code",
-}
+TERMS = {"CC BY-NC 4.0": "for non-commercial use", "CC BY 4.0": "with credit", "Apache-2.0": "as the code"}
 
 
 # Rooms of the library -----------------------------------------------------------------------------
@@ -38,7 +34,7 @@ def modules_of(room: str) -> list[str]:
     """Return the public modules of a package, subpackages included, or the module itself.
 
     Args:
-      room: dotted name, such as "f3amd_lib.motion" or "f3amd_lib.profiles".
+      room: dotted name, such as "f3amd_lib.motion" or "f3amd_lib.ground.profiles".
 
     Raises:
       ValueError: if there is neither such a folder nor such a file.
@@ -280,9 +276,7 @@ def bulleted(block: list[str]) -> list[str]:
     depths = [len(line) - len(line.lstrip()) for line in block]
     if not any(depths):
         return block
-    hanging = any(
-        ITEM.match(line) and deeper for line, deeper in zip(block, depths[1:], strict=False)
-    )
+    hanging = any(ITEM.match(line) and deeper for line, deeper in zip(block, depths[1:], strict=False))
     entry = 0 if hanging else min(filter(None, depths))
     result, listing = [], False
     for line, depth in zip(block, depths, strict=True):

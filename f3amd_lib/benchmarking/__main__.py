@@ -9,16 +9,12 @@ import argparse
 import logging
 import sys
 
-from f3amd_lib.benchmarking.measurements import (
-    measure_round_parts,
-    measure_synthesis_time,
-    measure_training_time,
-)
+from f3amd_lib.benchmarking.measurements import measure_round_parts, measure_synthesis_time, measure_training_time
+from f3amd_lib.benchmarking.speed_tables import speed_bars
 from f3amd_lib.benchmarking.synthesis import SUITES
-from f3amd_lib.profiles import load_profile
-from f3amd_lib.report.records import read_table
-from f3amd_lib.report.speed_tables import speed_bars
-from f3amd_lib.report.tables import markdown_table
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.training.pipeline import prepare
 
 log = logging.getLogger("f3amd")
@@ -36,17 +32,11 @@ def main(arguments: list[str] | None = None) -> int:
         prepared = prepare(profile, path=options.source)
         if options.suite or not (options.training or options.parts):
             path = measure_synthesis_time(
-                prepared,
-                profile,
-                options.suite,
-                characters=options.characters,
-                again=options.again,
+                prepared, profile, options.suite, characters=options.characters, again=options.again
             )
             ways = path.with_name("synthesis_ways.csv")
             suite = "bars" if options.suite == ["bars"] else "main"
-            log.info(
-                "\n%s\n", markdown_table(speed_bars(read_table(ways)[0], suite=suite), digits=3)
-            )
+            log.info("\n%s\n", markdown_table(speed_bars(read_table(ways)[0], suite=suite), digits=3))
             log.info("every way    %s\nfastest      %s", ways, path)
         if options.parts:
             log.info("parts        %s", measure_round_parts(prepared, profile))
@@ -60,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `f3amd bench` to a parser."""
-    from f3amd_lib.profiles import DATASETS, PROFILES
+    from f3amd_lib.ground.profiles import DATASETS, PROFILES
 
     parser.add_argument("--data", default="synthetic", choices=DATASETS, help="its sizes are taken")
     parser.add_argument("--profile", default="laptop", choices=PROFILES)

@@ -14,15 +14,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-__all__ = [
-    "PRECISIONS",
-    "describe_machine",
-    "device_name",
-    "matmul_precision",
-    "matmul_probe",
-    "fast_xla_flags",
-]
-
 PRECISIONS = {
     "float32": ("float32", jnp.float32),
     "tf32": ("tensorfloat32", jnp.float32),
@@ -45,9 +36,7 @@ def matmul_precision(precision: str):
 
 def device_name() -> str:
     """Return "CPU", "GPU" or "TPU" for the device that JAX computes on."""
-    return {"cuda": "GPU", "rocm": "GPU"}.get(
-        jax.devices()[0].platform, jax.devices()[0].platform.upper()
-    )
+    return {"cuda": "GPU", "rocm": "GPU"}.get(jax.devices()[0].platform, jax.devices()[0].platform.upper())
 
 
 def _processor() -> str:
@@ -85,9 +74,7 @@ def describe_machine() -> dict:
     clock = psutil.cpu_freq()
     return {
         "processor": _processor(),
-        "cores": len(psutil.Process().cpu_affinity())
-        if sys.platform == "linux"
-        else os.cpu_count(),
+        "cores": len(psutil.Process().cpu_affinity()) if sys.platform == "linux" else os.cpu_count(),
         "physical_cores": psutil.cpu_count(logical=False),
         "clock_mhz": round(clock.current) if clock and clock.current else None,
         "clock_max_mhz": round(clock.max) if clock and clock.max else None,
@@ -99,9 +86,7 @@ def describe_machine() -> dict:
     }
 
 
-def matmul_probe(
-    precision: str = "float32", size: int | None = None
-) -> tuple[Callable[[], object], int]:
+def matmul_probe(precision: str = "float32", size: int | None = None) -> tuple[Callable[[], object], int]:
     """Return a product of two square matrices to time, the yardstick for what a machine can do.
 
     Args:

@@ -12,30 +12,19 @@ from tqdm import tqdm
 
 from f3amd_lib.benchmarking.machine import describe_machine, device_name
 from f3amd_lib.benchmarking.parts import time_parts
+from f3amd_lib.benchmarking.speed_tables import fastest_ways
 from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.benchmarking.ways import Task
-from f3amd_lib.models import zoo
-from f3amd_lib.profiles import Profile, results_dir
-from f3amd_lib.report.records import kept_rows, read_table, run_record, write_table
-from f3amd_lib.report.speed_tables import fastest_ways
+from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
+from f3amd_lib.networks import zoo
 from f3amd_lib.training.loop import short_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
-__all__ = [
-    "DEFAULT_SUITES",
-    "measure_round_parts",
-    "measure_synthesis_time",
-    "measure_training_time",
-]
-
 log = logging.getLogger("f3amd")
 
-DEFAULT_SUITES = {
-    "smoke": ["smoke"],
-    "laptop": ["main", "family", "windows", "curve"],
-    "gpu": ["gpu"],
-}
+DEFAULT_SUITES = {"smoke": ["smoke"], "laptop": ["main", "family", "windows", "curve"], "gpu": ["gpu"]}
 """What a profile times."""
 
 _TURNS = {"smoke": {"min_rounds": 10, "min_seconds": 1.0, "fewest_rounds": 3}}
@@ -133,10 +122,7 @@ def measure_synthesis_time(
                 continue
             circumstances = _circumstances()
             rows, not_possible = time_group(
-                candidates,
-                lambda model, window: prepared.model_config(model, window=window),
-                progress=True,
-                **turns,
+                candidates, lambda model, window: prepared.model_config(model, window=window), progress=True, **turns
             )
             for label, reason in not_possible.items():
                 log.warning("not possible here: %s: %s", label, reason)
@@ -153,9 +139,7 @@ def measure_synthesis_time(
     return folder / "synthesis_time.csv"
 
 
-def measure_round_parts(
-    prepared: PreparedData, profile: Profile, counts: Iterable[int] = (1, 32)
-) -> Path:
+def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterable[int] = (1, 32)) -> Path:
     """Time F3AMD-FNO-96 with 1 step whole and without each of its parts (see `parts`).
 
     Args:
@@ -168,19 +152,14 @@ def measure_round_parts(
     """
     model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
     config = prepared.model_config(model)
-    rows = [
-        time_parts(Task(model, config, 1, characters), progress=True, **turns)
-        for characters in counts
-    ]
+    rows = [time_parts(Task(model, config, 1, characters), progress=True, **turns) for characters in counts]
     path = results_dir(profile.dataset, profile.name) / "records" / "round_parts.csv"
     record = _record(prepared, profile, "round_parts", **_circumstances())
     write_table(path, pd.concat(rows), record)
     return path
 
 
-def measure_training_time(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None
-) -> Path:
+def measure_training_time(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Time training steps by turns, all models in one run (Table 2).
 
     Args:
@@ -201,9 +180,7 @@ def measure_training_time(
         trainer = prepared.trainer(name, recipe)
         memory[name] = trainer.plan_memory(chunk)
         calls[name] = _training_call(trainer, chunk)
-    timings = take_turns(
-        calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True
-    )
+    timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows = prepared.windows("train").num_windows
     rows = [
         {
@@ -224,9 +201,7 @@ def measure_training_time(
         for name, timing in timings.items()
     ]
     path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
-    record = _record(
-        prepared, profile, "training_time", steps=steps, chunk=chunk, **_circumstances()
-    )
+    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk, **_circumstances())
     write_table(path, pd.DataFrame(rows), record)
     return path
 

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from f3amd_lib.benchmarking.torch_camdm import prepare_steps, usable_cores, walk
-from f3amd_lib.models.attention import position_code
-from f3amd_lib.models.camdm import CAMDM, POSITION_BASE
-from f3amd_lib.models.conditioning import PATH_CHANNELS
+from f3amd_lib.networks.attention import position_code
+from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE
+from f3amd_lib.networks.conditioning import PATH_CHANNELS
 
 try:
     import onnx
@@ -27,8 +27,6 @@ except ImportError as error:
         'pip install "f3amd_lib[bench]" '
         f"(importing them said: {error})"
     ) from error
-
-__all__ = ["onnx_encoder", "onnx_denoiser", "onnx_round"]
 
 _OPSET, _IR_VERSION = 23, 11  # the first with Attention, and the file version that goes with it
 _BATCH = "characters"
@@ -75,9 +73,7 @@ class _Graph:
     def model(self, output: str, shape: tuple[int, ...]) -> onnx.ModelProto:
         """Return the checked model with one output."""
         self.nodes.append(helper.make_node("Identity", [output], ["output"]))
-        graph = helper.make_graph(
-            self.nodes, self.name, self.inputs, [self._value("output", shape)], self.constants
-        )
+        graph = helper.make_graph(self.nodes, self.name, self.inputs, [self._value("output", shape)], self.constants)
         opsets = [helper.make_opsetid("", _OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)
         onnx.checker.check_model(model)
@@ -149,12 +145,7 @@ def onnx_denoiser(network: CAMDM) -> onnx.ModelProto:
     window, channels, width = config.window, config.channels, config.latent_width
     tokens, code = config.num_tokens, _code(config)
     graph = _Graph(
-        "denoiser",
-        {
-            "x_scaled": (window, channels),
-            "features": (width,),
-            "context": (tokens - window - 1, width),
-        },
+        "denoiser", {"x_scaled": (window, channels), "features": (width,), "context": (tokens - window - 1, width)}
     )
     hidden = graph.linear(network.noise_first, "features")
     hidden = graph.node("Mul", hidden, graph.node("Sigmoid", hidden))
@@ -186,15 +177,13 @@ def _session(model: onnx.ModelProto, threads: int) -> onnxruntime.InferenceSessi
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def onnx_round(
     network: CAMDM, sigmas, sampler: str = "ddpm", *, threads: int | None = None
 ) -> Callable[..., np.ndarray]:
-    """Make a round ready: noise, one encoding and the walk, as `diffusion.rounds.sample_round`.
+    """Make a round ready: noise, one encoding and the walk, as `generation.rounds.sample_round`.
 
     Args:
       network: CAMDM of any config.

@@ -15,12 +15,10 @@ from flax import nnx
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.benchmarking.ways import Task, random_condition
-from f3amd_lib.diffusion.rounds import sample_round
-from f3amd_lib.models import zoo
-from f3amd_lib.models.f3amd import F3AMD
-from f3amd_lib.models.spectral import FNOBlock, FrameLayer
-
-__all__ = ["PARTS", "without", "time_parts"]
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.f3amd import F3AMD
+from f3amd_lib.networks.spectral import FNOBlock, FrameLayer
 
 PARTS = ("spectral branches", "local branches", "FiLM", "conditioning signal", "noise")
 """What can be left out of a round of an F3AMD network with Fourier blocks and FiLM."""
@@ -68,11 +66,7 @@ def without(network: F3AMD, part: str) -> F3AMD:
       ValueError: for another network or part.
     """
     config = network.config
-    if (
-        not isinstance(network, F3AMD)
-        or config.base_block != "fno"
-        or config.conditioning != "film"
-    ):
+    if not isinstance(network, F3AMD) or config.base_block != "fno" or config.conditioning != "film":
         raise ValueError("parts are known of F3AMD networks of Fourier blocks with FiLM only")
     if part not in PARTS[:-1]:
         raise ValueError(f"unknown part {part!r}: use one of {', '.join(PARTS[:-1])}")

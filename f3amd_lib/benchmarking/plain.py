@@ -1,6 +1,6 @@
 """F3AMD as one would first write it down: complex FFTs and the framework's own convolution.
 
-The library computes the same numbers by real matrix products (see `models.spectral`). This form is
+The library computes the same numbers by real matrix products (see `networks.spectral`). This form is
 what that is compared with, in speed and in value.
 """
 
@@ -10,10 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from f3amd_lib.models.f3amd import F3AMD
-from f3amd_lib.models.spectral import FNOBlock
-
-__all__ = ["fourier_transform_convolution", "framework_convolution", "plain_form"]
+from f3amd_lib.networks.f3amd import F3AMD
+from f3amd_lib.networks.spectral import FNOBlock
 
 
 def fourier_transform_convolution(z, weight_real, weight_imag):

@@ -15,22 +15,7 @@ from tqdm import tqdm
 
 from f3amd_lib.benchmarking.machine import device_name, matmul_probe
 from f3amd_lib.benchmarking.timing import Timing, take_turns
-from f3amd_lib.benchmarking.ways import (
-    WAYS,
-    NotPossible,
-    Task,
-    framework_probe,
-    prepare_round,
-    round_flops,
-)
-
-__all__ = [
-    "SUITES",
-    "Candidate",
-    "group_key",
-    "plan",
-    "time_group",
-]
+from f3amd_lib.benchmarking.ways import WAYS, NotPossible, Task, framework_probe, prepare_round, round_flops
 
 
 @dataclass(frozen=True)
@@ -47,10 +32,7 @@ class Candidate:
     def __str__(self) -> str:
         steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
         characters = f"{self.characters} character{'s' if self.characters > 1 else ''}"
-        return (
-            f"{self.model}, {steps}, {characters}, {self.window} frames, {self.way}, "
-            f"{self.precision}"
-        )
+        return f"{self.model}, {steps}, {characters}, {self.window} frames, {self.way}, {self.precision}"
 
 
 _FEW = (1, 2, 4, 8, 16, 32)
@@ -233,10 +215,7 @@ def time_group(
     calls = {candidate: done.call for candidate, done in ready.items()}
     calls |= {framework: multiply for framework, (multiply, _) in products.items()}
     timings = take_turns(calls, progress=progress, **turns)
-    peaks = {
-        framework: flops / timings[framework].median / 1e9
-        for framework, (_, flops) in products.items()
-    }
+    peaks = {framework: flops / timings[framework].median / 1e9 for framework, (_, flops) in products.items()}
     rows = [
         _row(candidate, ready[candidate], tasks[candidate], timings[candidate])
         | _shares(tasks[candidate], timings[candidate], peaks[probes[WAYS[candidate.way][0]]])
@@ -269,9 +248,4 @@ def _row(candidate: Candidate, done, task: Task, timing: Timing) -> dict:
 def _shares(task: Task, timing: Timing, peak: float) -> dict:
     flops = round_flops(task)
     reached = flops / timing.median / 1e9
-    return {
-        "flops": flops,
-        "gflops": reached,
-        "peak_gflops": peak,
-        "share_of_peak": reached / peak,
-    }
+    return {"flops": flops, "gflops": reached, "peak_gflops": peak, "share_of_peak": reached / peak}

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-__all__ = ["Timing", "take_turns"]
-
 
 @dataclass(frozen=True)
 class Timing:

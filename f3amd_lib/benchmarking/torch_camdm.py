@@ -1,6 +1,6 @@
 """CAMDM in PyTorch, with the weights of ours: the baseline of the speed benchmarks.
 
-The network is `models.camdm` once more, in float32, as fast as we could make it on a CPU: one
+The network is `networks.camdm` once more, in float32, as fast as we could make it on a CPU: one
 product for query, key and value, kernels stored as the products want them, attention by
 `scaled_dot_product_attention`, residuals and biases added in place, noise tokens of all steps made
 at once. On a Xeon it was at least as fast as `nn.TransformerEncoderLayer` on its fast path, as
@@ -20,11 +20,11 @@ import numpy as np
 
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.diffusion.samplers import ddim_step, ddpm_step
-from f3amd_lib.models.attention import position_code
-from f3amd_lib.models.camdm import CAMDM, POSITION_BASE, CAMDMConfig, step_features
-from f3amd_lib.models.conditioning import Condition, noise_features
-from f3amd_lib.models.config import scaled_input
-from f3amd_lib.names import nearest_hint
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.networks.attention import position_code
+from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE, CAMDMConfig, step_features
+from f3amd_lib.networks.conditioning import Condition, noise_features
+from f3amd_lib.networks.config import scaled_input
 
 try:
     import torch
@@ -32,25 +32,8 @@ try:
     from torch.nn import functional
 except ImportError as error:
     raise ImportError(
-        'PyTorch is not installed: make bench-tools, or pip install "f3amd_lib[bench]" '
-        f"(importing torch said: {error})"
+        f'PyTorch is not installed: make bench-tools, or pip install "f3amd_lib[bench]" (importing torch said: {error})'
     ) from error
-
-__all__ = [
-    "PRODUCTS",
-    "ROUND_SAMPLERS",
-    "Steps",
-    "TorchCAMDM",
-    "prepare_steps",
-    "torch_camdm",
-    "torch_condition",
-    "torch_matmul_peak",
-    "torch_matmul_probe",
-    "torch_round",
-    "torch_threads",
-    "usable_cores",
-    "walk",
-]
 
 PRODUCTS = ("blas", "onednn")
 """Libraries within PyTorch that can do the large products. "blas" is what everybody gets, and on
@@ -135,9 +118,7 @@ class _PackedLinear(nn.Module):
         return torch.ops.mkldnn._linear_pointwise(rows, self.packed, self.bias, "gelu", [], "none")
 
     def added_to(self, residual, rows):
-        return torch.ops.mkldnn._linear_pointwise.binary(
-            rows, residual, self.packed, self.bias, "add"
-        )
+        return torch.ops.mkldnn._linear_pointwise.binary(rows, residual, self.packed, self.bias, "add")
 
 
 class _LayerNorm(nn.Module):
@@ -147,13 +128,11 @@ class _LayerNorm(nn.Module):
         self.bias = nn.Parameter(_tensor(layer.bias), requires_grad=False)
 
     def forward(self, rows):
-        return functional.layer_norm(
-            rows, self.scale.shape, self.scale, self.bias, _LAYER_NORM_EPSILON
-        )
+        return functional.layer_norm(rows, self.scale.shape, self.scale, self.bias, _LAYER_NORM_EPSILON)
 
 
 class _Block(nn.Module):
-    """Encoder block (`models.attention.TransformerBlock`) on the rows of all characters."""
+    """Encoder block (`networks.attention.TransformerBlock`) on the rows of all characters."""
 
     def __init__(self, block, linear):
         super().__init__()
@@ -164,9 +143,7 @@ class _Block(nn.Module):
             torch.cat([_tensor(layer.kernel) for layer in asked], dim=1),
             torch.cat([_tensor(layer.bias) for layer in asked]),
         )
-        self.attention_output = linear(
-            _tensor(attention.output.kernel), _tensor(attention.output.bias)
-        )
+        self.attention_output = linear(_tensor(attention.output.kernel), _tensor(attention.output.bias))
         self.attention_norm = _LayerNorm(block.attention_norm)
         self.hidden = linear(_tensor(block.hidden.kernel), _tensor(block.hidden.bias))
         self.output = linear(_tensor(block.output.kernel), _tensor(block.output.bias))
@@ -301,9 +278,7 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     if products not in PRODUCTS:
         raise ValueError(f"unknown products {products!r}{nearest_hint(products, PRODUCTS)}")
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
-        raise ValueError(
-            f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'"
-        )
+        raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     return TorchCAMDM(network, products).eval()
 
 
@@ -354,9 +329,7 @@ def prepare_steps(config: CAMDMConfig, sigmas, sampler: str) -> Steps:
       ValueError: for another sampler, or sigmas that make no step.
     """
     if sampler not in ROUND_SAMPLERS:
-        raise ValueError(
-            f"unknown sampler {sampler!r} outside of JAX{nearest_hint(sampler, ROUND_SAMPLERS)}"
-        )
+        raise ValueError(f"unknown sampler {sampler!r} outside of JAX{nearest_hint(sampler, ROUND_SAMPLERS)}")
     sigmas = np.array(sigmas, np.float32)
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(
@@ -420,9 +393,7 @@ def _compiled(function):
         except Exception as error:
             # The first line may only tell who spoke; advice on debugging comes after the second.
             told = [line for line in str(error).splitlines() if line.strip()][:2]
-            raise RuntimeError(
-                f"torch.compile does not work here: {type(error).__name__}: {' '.join(told)}"
-            ) from error
+            raise RuntimeError(f"torch.compile does not work here: {type(error).__name__}: {' '.join(told)}") from error
         known.add(shape)
         return answer
 
@@ -430,14 +401,9 @@ def _compiled(function):
 
 
 def torch_round(
-    module: TorchCAMDM,
-    sigmas,
-    sampler: str = "ddpm",
-    *,
-    compiled: bool = False,
-    threads: int | None = None,
+    module: TorchCAMDM, sigmas, sampler: str = "ddpm", *, compiled: bool = False, threads: int | None = None
 ) -> Callable[..., torch.Tensor]:
-    """Make a round ready: noise, one encoding and the walk, as `diffusion.rounds.sample_round`.
+    """Make a round ready: noise, one encoding and the walk, as `generation.rounds.sample_round`.
 
     Args:
       module: from `torch_camdm`.

@@ -20,24 +20,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision
 from f3amd_lib.benchmarking.plain import plain_form
-from f3amd_lib.diffusion.rounds import sample_round, sample_round_on_devices
 from f3amd_lib.diffusion.samplers import num_evaluations
-from f3amd_lib.models import zoo
-from f3amd_lib.models.camdm import CAMDMConfig
-from f3amd_lib.models.conditioning import PATH_CHANNELS, Condition
-from f3amd_lib.models.config import NetworkConfig, cast_network
-from f3amd_lib.names import nearest_hint
-
-__all__ = [
-    "framework_probe",
-    "WAYS",
-    "NotPossible",
-    "Round",
-    "Task",
-    "prepare_round",
-    "random_condition",
-    "round_flops",
-]
+from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.camdm import CAMDMConfig
+from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
+from f3amd_lib.networks.config import NetworkConfig, cast_network
 
 
 class NotPossible(RuntimeError):
@@ -95,7 +84,7 @@ class Round:
 
 
 def round_flops(task: Task) -> int:
-    """Return the operations of one round for all characters (see `models.counting`)."""
+    """Return the operations of one round for all characters (see `networks.counting`)."""
     encode, evaluate = zoo.count_flops(task.config)
     return task.characters * (encode + evaluate * num_evaluations(task.sampler, task.steps))
 
@@ -130,9 +119,7 @@ def _compiled(task: Task, run, condition) -> Round:
     costs = compiled.cost_analysis() or {}
     accessed = costs.get("bytes accessed")
     return Round(
-        lambda: compiled(condition, key).block_until_ready(),
-        seconds,
-        None if accessed is None else int(accessed),
+        lambda: compiled(condition, key).block_until_ready(), seconds, None if accessed is None else int(accessed)
     )
 
 
@@ -171,8 +158,8 @@ def _iree(task: Task) -> Round:
     if device_name() != "CPU" or task.precision != "float32":
         raise NotPossible("IREE is timed on a CPU in float32 only")
     try:
-        from f3amd_lib.benchmarking.artefact import load_artefact
-        from f3amd_lib.benchmarking.export import export_round, save_artefact
+        from f3amd_lib.serving.artefact import load_artefact
+        from f3amd_lib.serving.export import export_round, save_artefact
 
         started = time.perf_counter()
         exported = export_round(_network(task), task.sigmas, task.characters, task.sampler)

@@ -23,21 +23,6 @@ from f3amd_lib.motion.rotations import (
 )
 from f3amd_lib.motion.skeleton import Motion, Skeleton, forward_kinematics
 
-__all__ = [
-    "Normaliser",
-    "num_channels",
-    "world_frames",
-    "motion_from_frames",
-    "split_frames",
-    "frame_positions",
-    "frame_yaw",
-    "center_window",
-    "turn_frames",
-    "orthonormalise",
-    "path_condition",
-    "bend_path",
-]
-
 
 def num_channels(skeleton: Skeleton) -> int:
     """Return C = 6 J + 3."""

@@ -24,19 +24,9 @@ from tqdm import tqdm
 
 from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Clip, Dataset
 from f3amd_lib.data.statistics import lowest_toe_height
-from f3amd_lib.files import whole_file
+from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-
-__all__ = [
-    "PackedMotion",
-    "pack",
-    "load_packed",
-    "save_packed",
-    "packed_dataset",
-    "cache_path",
-    "CACHE_DIR_VARIABLE",
-]
 
 CACHE_DIR_VARIABLE = "F3AMD_CACHE_DIR"
 
@@ -56,16 +46,7 @@ _ARRAYS = {
 
 # All that numpy and zipfile raise for files that are not what they should be; the TypeError stands
 # for a single array where an archive of them is wanted.
-_UNREADABLE = (
-    OSError,
-    EOFError,
-    KeyError,
-    TypeError,
-    ValueError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_UNREADABLE = (OSError, EOFError, KeyError, TypeError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +215,7 @@ def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> Packed
         kept.append((clip, root_position, rotation_6d, floor))
     if not kept:
         raise ValueError(
-            f"data set {dataset.name!r} has no clip of at least {MINIMUM_FRAMES} frames; "
-            f"{len(skipped)} are shorter"
+            f"data set {dataset.name!r} has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are shorter"
         )
     clips = [clip for clip, *_ in kept]
     lengths = [len(root_position) for _, root_position, *_ in kept]
@@ -338,17 +318,13 @@ def load_packed(path) -> PackedMotion:
         if strange:  # numpy hands out other members of a zip as bytes
             raise ValueError(f"{strange[0]} is not an array")
     except _UNREADABLE as error:
-        raise ValueError(
-            f"{path}: cannot be read as a packed data set ({error}); delete it and pack again"
-        ) from error
+        raise ValueError(f"{path}: cannot be read as a packed data set ({error}); delete it and pack again") from error
     text, checksum = arrays.pop("text").tobytes(), arrays.pop("checksum").tobytes()
     if _checksum(arrays, text).encode("ascii") != checksum:
         raise ValueError(f"{path}: checksum differs, the file was altered; delete it, pack again")
     about = json.loads(text)
     if about["format"] != _FORMAT:
-        raise ValueError(
-            f"{path}: is of format {about['format']}, this version reads {_FORMAT}; pack again"
-        )
+        raise ValueError(f"{path}: is of format {about['format']}, this version reads {_FORMAT}; pack again")
     offsets = arrays.pop("offsets")
     skeleton = Skeleton(
         names=tuple(about["joint_names"]),

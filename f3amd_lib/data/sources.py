@@ -32,21 +32,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pooch
 
+from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.skeleton import Motion, resample
-from f3amd_lib.profiles import SHOWN_STYLES
-
-__all__ = [
-    "NAMES",
-    "SPLITS",
-    "FPS",
-    "MINIMUM_FRAMES",
-    "DATA_DIR_VARIABLE",
-    "Clip",
-    "Dataset",
-    "open_dataset",
-    "assign_splits",
-]
 
 NAMES = ("synthetic", "bandai", "100style", "folder")
 SPLITS = ("train", "validation", "test")
@@ -190,9 +178,7 @@ def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise ValueError(
-            f"{path}: broken or truncated zip archive ({error}); fetch it again"
-        ) from error
+        raise ValueError(f"{path}: broken or truncated zip archive ({error}); fetch it again") from error
 
 
 @dataclass(frozen=True)
@@ -216,9 +202,7 @@ class _Archive:
         else:
             top = Path(self.path)
             names = [
-                (Path(folder) / file).relative_to(top).as_posix()
-                for folder, _, files in os.walk(top)
-                for file in files
+                (Path(folder) / file).relative_to(top).as_posix() for folder, _, files in os.walk(top) for file in files
             ]
         return sorted(name for name in names if not _is_companion(name))
 
@@ -237,9 +221,7 @@ class _Archive:
             RuntimeError,
             NotImplementedError,
         ) as error:
-            raise ValueError(
-                f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again"
-            ) from error
+            raise ValueError(f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again") from error
 
     def size_and_crc(self, name: str) -> tuple[int, int]:
         """Return a file's size and CRC-32: from a zip's directory, or by reading a plain file."""
@@ -289,9 +271,7 @@ def _find_archive(path, known: tuple[str, ...], word: str, download: Callable[[]
     zips = [
         item
         for item in sorted(folder.iterdir())
-        if item.suffix.lower() == ".zip"
-        and word in item.name.lower()
-        and not item.name.startswith("._")
+        if item.suffix.lower() == ".zip" and word in item.name.lower() and not item.name.startswith("._")
     ]
     if len(zips) > 1:
         raise ValueError(
@@ -305,9 +285,7 @@ def _download(url: str, known_hash: str | None, file_name: str, title: str) -> s
     """Fetch a file once into pooch's cache, with a progress bar; return where it lies."""
     pooch.get_logger().setLevel("WARNING")
     try:
-        return pooch.retrieve(
-            url, known_hash, fname=file_name, path=pooch.os_cache("f3amd"), progressbar=True
-        )
+        return pooch.retrieve(url, known_hash, fname=file_name, path=pooch.os_cache("f3amd"), progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         raise ValueError(
             f"{title} could not be downloaded from {url} ({type(error).__name__}: {error}); "
@@ -417,8 +395,7 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
     takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
     splits = assign_splits((name, style) for name, style, _ in takes)
     clips = tuple(
-        Clip(name, style, "mixed", splits[name], _SyntheticTake(style, seconds, seed))
-        for name, style, seed in takes
+        Clip(name, style, "mixed", splits[name], _SyntheticTake(style, seconds, seed)) for name, style, seed in takes
     )
     return Dataset(
         name="synthetic",
@@ -483,13 +460,7 @@ def _bandai_list() -> tuple[_ListedFile, ...]:
     source = resources.files("f3amd_lib.data").joinpath("bandai_files.csv")
     with source.open("r", encoding="utf-8", newline="") as file:
         return tuple(
-            _ListedFile(
-                row["name"],
-                int(row["frames"]),
-                int(row["size"]),
-                int(row["crc32"], 16),
-                row["sha256_prefix"],
-            )
+            _ListedFile(row["name"], int(row["frames"]), int(row["size"]), int(row["crc32"], 16), row["sha256_prefix"])
             for row in csv.DictReader(file)
         )
 
@@ -551,9 +522,7 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     # must not take a place in validation or test.
     splits = {item.name: "train" for item in listed}
     splits |= assign_splits(
-        (item.name, (item.style, item.is_locomotion))
-        for item in listed
-        if item.frames >= MINIMUM_FRAMES
+        (item.name, (item.style, item.is_locomotion)) for item in listed if item.frames >= MINIMUM_FRAMES
     )
     clips = tuple(
         Clip(
@@ -593,12 +562,7 @@ def _open_100style(path) -> Dataset:
         path,
         ("100STYLE.zip",),
         "100style",
-        lambda: _download(
-            f"doi:{_100STYLE_DOI}/100STYLE.zip",
-            f"md5:{_100STYLE_MD5}",
-            "100STYLE.zip",
-            "100STYLE",
-        ),
+        lambda: _download(f"doi:{_100STYLE_DOI}/100STYLE.zip", f"md5:{_100STYLE_MD5}", "100STYLE.zip", "100STYLE"),
     )
     names = archive.names()
     cuts = _read_frame_cuts(archive, _find_table(archive, names, "Frame_Cuts.csv"))
@@ -657,8 +621,7 @@ def _open_100style(path) -> Dataset:
         name="100style",
         licence="CC BY 4.0",
         credit=(
-            "Motion data: The 100STYLE Dataset - Ian Mason, CC BY 4.0; cut to the usable ranges, "
-            "resampled to 30 fps."
+            "Motion data: The 100STYLE Dataset - Ian Mason, CC BY 4.0; cut to the usable ranges, resampled to 30 fps."
         ),
         fingerprint=_fingerprint("100style", clips, sorted(content)),
         styles=styles,
@@ -747,10 +710,7 @@ def _open_folder(path) -> Dataset:
         relative = PurePosixPath(member)
         name = relative.with_suffix("").as_posix()
         if name in labelled:
-            raise ValueError(
-                f"{archive.label(member)}: two files differ only in the case of their suffix; "
-                "rename one"
-            )
+            raise ValueError(f"{archive.label(member)}: two files differ only in the case of their suffix; rename one")
         head, _, tail = relative.stem.partition("_")
         style = relative.parent.name or head
         content = relative.stem if relative.parent.name else tail
@@ -759,9 +719,7 @@ def _open_folder(path) -> Dataset:
     clips, content_ids = [], []
     for name, (member, style, content) in sorted(labelled.items()):
         size, crc32 = archive.size_and_crc(member)
-        clips.append(
-            Clip(name, style, content, splits[name], _BvhFile(archive, member, size, crc32))
-        )
+        clips.append(Clip(name, style, content, splits[name], _BvhFile(archive, member, size, crc32)))
         content_ids.append((name, size, crc32))
     styles = tuple(sorted({clip.style for clip in clips}))
     return Dataset(

@@ -6,8 +6,6 @@ import numpy as np
 
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Motion
 
-__all__ = ["clip_statistics", "lowest_toe_height"]
-
 
 def lowest_toe_height(motion: Motion) -> float:
     """Return the lowest height of either toe joint over a clip, metres."""

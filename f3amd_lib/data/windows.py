@@ -32,20 +32,6 @@ from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Skeleton, mirror
 
-__all__ = [
-    "WindowSet",
-    "Batch",
-    "build_windows",
-    "gather_windows",
-    "draw_windows",
-    "sample_windows",
-    "spread_windows",
-    "restart_from",
-    "mean_poses",
-    "fit_normaliser",
-    "seed_histories",
-]
-
 _SMOOTHING = (0.0, 5.0, 10.0)
 """Widths in frames of the Gaussians that smooth the path condition (0: as captured)."""
 
@@ -178,10 +164,7 @@ def build_windows(
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
             offset += len(world)
     if not sum(len(first) for first in starts):
-        raise ValueError(
-            f"data set {packed.dataset!r} has no {split} clip of at least "
-            f"{num_history + window} frames"
-        )
+        raise ValueError(f"data set {packed.dataset!r} has no {split} clip of at least {num_history + window} frames")
     return WindowSet(
         window=window,
         num_history=num_history,
@@ -190,21 +173,12 @@ def build_windows(
         starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
         room=jnp.asarray(np.concatenate(room).astype(np.int32)),
         styles=jnp.asarray(np.concatenate(labels).astype(np.int32)),
-        one_hot=jnp.eye(len(names), dtype=jnp.float32)[
-            jnp.array([names.index(style) for style in packed.styles])
-        ],
+        one_hot=jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])],
     )
 
 
 def gather_windows(
-    windows: WindowSet,
-    index,
-    yaw,
-    smoothing,
-    *,
-    window: int = 32,
-    num_history: int = 10,
-    earlier: int = 0,
+    windows: WindowSet, index, yaw, smoothing, *, window: int = 32, num_history: int = 10, earlier: int = 0
 ) -> Batch:
     """Cut chosen windows, turned and made relative.
 
@@ -238,11 +212,7 @@ def gather_windows(
     # (x, z) turned by yaw: x' = x cos + z sin, z' = z cos - x sin
     cosine, sine = jnp.cos(yaw)[:, None], jnp.sin(yaw)[:, None]
     position = jnp.stack(
-        [
-            shift[..., 0] * cosine + shift[..., 1] * sine,
-            shift[..., 1] * cosine - shift[..., 0] * sine,
-        ],
-        axis=-1,
+        [shift[..., 0] * cosine + shift[..., 1] * sine, shift[..., 1] * cosine - shift[..., 0] * sine], axis=-1
     )
     facing = wrap_angle(jnp.arctan2(track[..., 2], track[..., 3]) + yaw[:, None])
     path = path_condition(position, facing)[:, num_history:]
@@ -277,9 +247,7 @@ def draw_windows(windows: WindowSet, key, batch_size: int, captured_path_share: 
     return index, yaw, jnp.where(captured, 0, width)
 
 
-def sample_windows(
-    windows: WindowSet, key, batch_size: int, *, window: int = 32, num_history: int = 10
-) -> Batch:
+def sample_windows(windows: WindowSet, key, batch_size: int, *, window: int = 32, num_history: int = 10) -> Batch:
     """Draw random windows with random facing and random path smoothing (see `draw_windows`).
 
     Source: paper section 3.2 (facing); CAMDM's training recipe (smoothing).
@@ -377,9 +345,7 @@ def fit_normaliser(
     return measure(windows, key)
 
 
-def seed_histories(
-    packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 8, split: str = "train"
-) -> dict:
+def seed_histories(packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 8, split: str = "train") -> dict:
     """Cut a few starting poses per style out of a packed data set.
 
     Args:
@@ -395,8 +361,7 @@ def seed_histories(
     for style, name in enumerate(packed.styles):
         for where in (split, *SPLITS):
             chosen = np.flatnonzero(
-                (np.asarray(packed.clip_style) == style)
-                & (np.asarray(packed.clip_split) == SPLITS.index(where))
+                (np.asarray(packed.clip_style) == style) & (np.asarray(packed.clip_split) == SPLITS.index(where))
             )
             if len(chosen):
                 break

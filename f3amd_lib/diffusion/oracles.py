@@ -13,9 +13,7 @@ import jax
 import numpy as np
 from scipy.special import ndtr
 
-from f3amd_lib.motion.rotations import array_module
-
-__all__ = ["GaussianMixture"]
+from f3amd_lib.ground.arrays import array_module
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,27 +22,8 @@ import jax
 import jax.numpy as jnp
 
 from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma
-from f3amd_lib.motion.rotations import array_module
-from f3amd_lib.names import nearest_hint
-
-__all__ = [
-    "SAMPLERS",
-    "add_noise",
-    "ddim_step",
-    "ddim_step_literal",
-    "ddim_step_vp",
-    "ddpm_posterior",
-    "ddpm_step",
-    "num_evaluations",
-    "probability_flow_slope",
-    "sample",
-    "sample_ddim",
-    "sample_ddim_literal",
-    "sample_ddim_vp",
-    "sample_ddpm",
-    "sample_euler",
-    "sample_heun",
-]
+from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.names import nearest_hint
 
 Denoiser = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -259,7 +240,7 @@ def sample_ddim_literal(denoise: Denoiser, x_init, sigmas, *, unroll: bool = Fal
     """Walk with the printed update and never rescale: what Appendix F says if taken to the letter.
 
     No sampler to use: an exact denoiser's samples collapse onto its mean. It is here to find out
-    who would notice, see `evaluation.literal_update`.
+    who would notice, see `experiments.literal_update`.
 
     Args:
       denoise, x_init, sigmas, unroll: as in `sample_ddim`.
@@ -375,9 +356,7 @@ def _known(name: str) -> str:
     return name
 
 
-def sample(
-    name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bool = False
-) -> jax.Array:
+def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bool = False) -> jax.Array:
     """Walk a variance-exploding state down the noise levels with a sampler chosen by name.
 
     Args:

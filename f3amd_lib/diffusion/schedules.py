@@ -26,23 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.motion.rotations import array_module
-from f3amd_lib.names import nearest_hint, refuse_unknown
-
-__all__ = [
-    "SCHEDULES",
-    "NoiseSchedule",
-    "VarianceExploding",
-    "VariancePreservingCosine",
-    "VariancePreservingLinear",
-    "schedule_from_dict",
-    "alpha_bar_from_sigma",
-    "sigma_from_alpha_bar",
-    "log_snr_from_sigma",
-    "sigma_from_log_snr",
-    "log_snr_from_alpha_bar",
-    "alpha_bar_from_log_snr",
-]
+from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 
 
 def _check_grid(num_steps: int, spacing: str) -> None:
@@ -285,9 +270,7 @@ class VariancePreservingLinear(_VariancePreserving):
     beta_max: float = 20.0
 
     def __post_init__(self):
-        self._check(
-            ("0 < beta_min <= beta_max, finite", 0.0 < self.beta_min <= self.beta_max < np.inf)
-        )
+        self._check(("0 < beta_min <= beta_max, finite", 0.0 < self.beta_min <= self.beta_max < np.inf))
 
     @property
     def alpha_bars(self) -> np.ndarray:
@@ -300,8 +283,7 @@ NoiseSchedule = VarianceExploding | VariancePreservingCosine | VariancePreservin
 """Any noise schedule, for annotations."""
 
 SCHEDULES: dict[str, type] = {
-    schedule.kind: schedule
-    for schedule in (VarianceExploding, VariancePreservingCosine, VariancePreservingLinear)
+    schedule.kind: schedule for schedule in (VarianceExploding, VariancePreservingCosine, VariancePreservingLinear)
 }
 """Noise schedules by the name that they have in a file."""
 

@@ -17,9 +17,7 @@ from typing import Any
 
 from f3amd_lib.exercises import networks, one_step, printed_update, sampler_theory
 from f3amd_lib.exercises.judging import NotAnswered, is_missing
-from f3amd_lib.names import nearest_hint
-
-__all__ = ["CHECKS", "Verdict", "check"]
+from f3amd_lib.ground.names import nearest_hint
 
 CHECKS: dict[str, Callable[[Any], str | None]] = (
     sampler_theory.CHECKS | printed_update.CHECKS | one_step.CHECKS | networks.CHECKS

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["NotAnswered", "agree", "is_choice", "is_missing", "numbers"]
-
 
 class NotAnswered(ValueError):
     """There is no answer to judge yet; the message is the hint."""

@@ -7,11 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.evaluation import expressivity
 from f3amd_lib.exercises.judging import agree, numbers
-from f3amd_lib.models.spectral import spectral_convolution
-
-__all__ = ["CHECKS"]
+from f3amd_lib.experiments import expressivity
+from f3amd_lib.networks.spectral import spectral_convolution
 
 
 def _layer_matrix(weights, num_frames: int):
@@ -90,9 +88,7 @@ def _shared_kernels(answer) -> str | None:
     )
     for what, filters, allowed in families:
         expected = next(
-            count
-            for count in range(len(filters) + 1)
-            if expressivity.film_share(filters, count) <= allowed + 1e-12
+            count for count in range(len(filters) + 1) if expressivity.film_share(filters, count) <= allowed + 1e-12
         )
         if not agree(answer(filters, allowed), expected):
             return (
@@ -133,11 +129,5 @@ def _advance(answer) -> str | None:
     return None
 
 
-CHECKS = {
-    "12.a": _matrix,
-    "12.b": _ranks,
-    "12.c": _beside_a_line,
-    "12.d": _shared_kernels,
-    "12.e": _advance,
-}
+CHECKS = {"12.a": _matrix, "12.b": _ranks, "12.c": _beside_a_line, "12.d": _shared_kernels, "12.e": _advance}
 """By number, a function of the answer that returns None if it is right, else a hint."""

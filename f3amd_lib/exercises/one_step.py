@@ -13,8 +13,6 @@ from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.exercises.judging import agree
 from f3amd_lib.training.fork import Fork, crossing, outcome_shares
 
-__all__ = ["CHECKS"]
-
 
 def _unequal_ways(answer) -> str | None:
     walkers = GaussianMixture([-1, 1], width=0.1, weights=[0.3, 0.7])
@@ -29,13 +27,9 @@ def _errors_of_two(answer) -> str | None:
     if np.shape(answer) != (2,):
         return "two numbers are asked for, in centimetres"
     if not agree(answer[0], np.sqrt(5.0**2 - 3.0**2), rtol=0.01):
-        return (
-            "variances add, deviations do not: what is left open and what is answered make the data"
-        )
+        return "variances add, deviations do not: what is left open and what is answered make the data"
     if not agree(answer[1], 5.0, rtol=0.01):
-        return (
-            "a network that ignores its input has one answer; which is best, and how far off is it?"
-        )
+        return "a network that ignores its input has one answer; which is best, and how far off is it?"
     return None
 
 
@@ -82,9 +76,7 @@ def _how_right(answer) -> str | None:
     enough = 0.5 * (1.0 + fork.wall / left)
     if agree(answer, enough, atol=0.01):
         return None
-    return (
-        "the mean path crosses at q times one side plus 1 - q times the other; where ends the wall?"
-    )
+    return "the mean path crosses at q times one side plus 1 - q times the other; where ends the wall?"
 
 
 CHECKS = {

@@ -7,17 +7,9 @@ import numpy as np
 from scipy.stats import norm
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import (
-    ddim_step,
-    ddim_step_literal,
-    sample_ddim,
-    sample_ddim_literal,
-    sample_ddim_vp,
-)
+from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal, sample_ddim, sample_ddim_literal, sample_ddim_vp
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.exercises.judging import NotAnswered, agree, is_missing
-
-__all__ = ["CHECKS"]
 
 _SCHEDULE = VarianceExploding()
 
@@ -31,10 +23,7 @@ def _mended_step(answer) -> str | None:
         if not agree(found, expected, rtol=1e-9, atol=1e-9):
             if agree(found, ddim_step_literal(sigma * x, x0_hat, sigma, sigma_next), rtol=1e-9):
                 return "this is the printed line itself; which state does the network want to see?"
-            return (
-                f"from sigma = {sigma:g} to {sigma_next:g} this is not DDIM's step; write x_VE in "
-                "terms of x_VP"
-            )
+            return f"from sigma = {sigma:g} to {sigma_next:g} this is not DDIM's step; write x_VE in terms of x_VP"
     return None
 
 

@@ -11,8 +11,6 @@ from f3amd_lib.diffusion import samplers, schedules
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.exercises.judging import agree
 
-__all__ = ["CHECKS"]
-
 _WIDE = GaussianMixture([-1.0, 1.0], width=0.3)
 _NARROW_PAIR = GaussianMixture([-0.1, 0.1], width=0.1)
 _SIGMA_MAX = schedules.VarianceExploding().sigma_max

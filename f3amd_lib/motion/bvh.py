@@ -16,11 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.files import whole_file
+from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-
-__all__ = ["read_bvh", "parse_bvh", "write_bvh", "format_bvh", "RIGID_TOLERANCE"]
 
 RIGID_TOLERANCE = 1e-3
 """Metres by which a joint's position channels may wander before its bone counts as not rigid."""
@@ -29,9 +27,7 @@ _MOTION_LINE = re.compile(rb"^[ \t]*MOTION[ \t]*\r?$", re.IGNORECASE | re.MULTIL
 _FRAMES_LINE = re.compile(r"frames\s*:\s*(.*)", re.IGNORECASE)
 _FRAME_TIME_LINE = re.compile(r"frame\s*time\s*:\s*(.*)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_CHANNELS = {
-    f"{axis}{kind}".lower(): (axis, kind) for axis in "XYZ" for kind in ("position", "rotation")
-}
+_CHANNELS = {f"{axis}{kind}".lower(): (axis, kind) for axis in "XYZ" for kind in ("position", "rotation")}
 
 
 def read_bvh(path_or_file=None, *, text=None, name=None, scale: float = 0.01) -> Motion:
@@ -93,21 +89,16 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
         _fail(
             name,
             data.count(b"\n") + 1,
-            "the file ends without a MOTION line; it is cut off or not a BVH file: "
-            "export or copy it again",
+            "the file ends without a MOTION line; it is cut off or not a BVH file: export or copy it again",
         )
     joints, end_sites = _parse_hierarchy(data[: found.start()], name)
     first_line = data.count(b"\n", 0, found.start()) + 1
-    num_frames, frame_time, rows, rows_line = _parse_motion_head(
-        data[found.end() :], name, first_line
-    )
+    num_frames, frame_time, rows, rows_line = _parse_motion_head(data[found.end() :], name, first_line)
     values = _parse_rows(rows, name, rows_line, joints, num_frames)
     return _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows_line)
 
 
-def write_bvh(
-    path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY", overwrite: bool = False
-) -> Path:
+def write_bvh(path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY", overwrite: bool = False) -> Path:
     """Write a motion as a BVH file; see `format_bvh` for what is in it.
 
     Args:
@@ -211,9 +202,7 @@ class _Joint:
 
     @property
     def rotation_columns(self) -> list[int]:
-        return [
-            self.first_column + k for k, (_, kind) in enumerate(self.channels) if kind == "rotation"
-        ]
+        return [self.first_column + k for k, (_, kind) in enumerate(self.channels) if kind == "rotation"]
 
 
 def _fail(name: str, line: int, message: str):
@@ -296,11 +285,7 @@ class _Tokens:
             word, line = self.take(f"a number of {what}")
             value = _finite_number(word)
             if value is None:
-                _fail(
-                    self.name,
-                    line,
-                    f"{what} needs {count} finite numbers, found {word!r} among them",
-                )
+                _fail(self.name, line, f"{what} needs {count} finite numbers, found {word!r} among them")
             values.append(value)
         return tuple(values)
 
@@ -341,8 +326,7 @@ def _parse_hierarchy(data: bytes, name: str):
                 _fail(
                     name,
                     line,
-                    f"joint name {joint_name!r} is taken (line {lines_of[joint_name]}); "
-                    "rename one of the two",
+                    f"joint name {joint_name!r} is taken (line {lines_of[joint_name]}); rename one of the two",
                 )
             lines_of[joint_name] = line
             tokens.expect("{", f"after {keyword} {joint_name}")
@@ -354,18 +338,13 @@ def _parse_hierarchy(data: bytes, name: str):
                 _fail(name, line, f"a '}}' too many; {_BRACES}")
             for what, value in (("OFFSET", current.offset), ("CHANNELS", current.channels)):
                 if value is None:
-                    _fail(
-                        name,
-                        line,
-                        f"joint {current.name!r} ends without {what}; add the line",
-                    )
+                    _fail(name, line, f"joint {current.name!r} ends without {what}; add the line")
             open_blocks.pop()
         elif current is None:
             _fail(
                 name,
                 line,
-                f"unexpected {word!r}: "
-                + (f"the ROOT's braces are closed; {_BRACES}" if joints else "expected ROOT"),
+                f"unexpected {word!r}: " + (f"the ROOT's braces are closed; {_BRACES}" if joints else "expected ROOT"),
             )
         elif keyword == "OFFSET":
             if current.offset is not None:
@@ -377,9 +356,7 @@ def _parse_hierarchy(data: bytes, name: str):
             current.channels = _parse_channels(tokens, line, current.name)
             current.first_column = column
             current.position = {
-                axis: column + k
-                for k, (axis, kind) in enumerate(current.channels)
-                if kind == "position"
+                axis: column + k for k, (axis, kind) in enumerate(current.channels) if kind == "position"
             }
             column += len(current.channels)
         elif keyword == "END":
@@ -391,18 +368,13 @@ def _parse_hierarchy(data: bytes, name: str):
             end_sites.append((open_blocks[-1], tokens.numbers(3, "OFFSET")))
             tokens.expect("}", "after the OFFSET of End Site")
         else:
-            _fail(
-                name,
-                line,
-                f"unexpected {word!r}; known here are OFFSET, CHANNELS, JOINT, End Site and '}}'",
-            )
+            _fail(name, line, f"unexpected {word!r}; known here are OFFSET, CHANNELS, JOINT, End Site and '}}'")
     if open_blocks:
         unclosed = joints[open_blocks[-1]]
         _fail(
             name,
             tokens.last_line,
-            f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still "
-            f"open; {_BRACES}",
+            f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open; {_BRACES}",
         )
     if not joints:
         _fail(name, tokens.last_line, "MOTION starts, but there is no ROOT")
@@ -433,11 +405,7 @@ def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, s
         channels.append(channel)
     extra, extra_line = tokens.peek()
     if extra.lower() in _CHANNELS:
-        _fail(
-            name,
-            extra_line,
-            f"joint {joint!r} says it has {word} channels, but lists {extra!r} too: mend the count",
-        )
+        _fail(name, extra_line, f"joint {joint!r} says it has {word} channels, but lists {extra!r} too: mend the count")
     return channels
 
 
@@ -488,9 +456,7 @@ def _parse_rows(rows: bytes, name: str, rows_line: int, joints, num_frames) -> n
     values = None
     if rows.strip():
         try:
-            values = np.loadtxt(
-                io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii"
-            )
+            values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
         except ValueError:  # UnicodeDecodeError is one, too
             values = None
     if values is not None and values.shape == (count, columns) and np.isfinite(values).all():
@@ -560,9 +526,7 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows
     root, root_position = 0, channel_positions(0)
     if count > 1 and joints[0].position and joints[1].position and parents.count(0) == 1:
         root = 1
-        root_position = root_position + np.einsum(
-            "tab,tb->ta", rotations[:, 0], channel_positions(1)
-        )
+        root_position = root_position + np.einsum("tab,tb->ta", rotations[:, 0], channel_positions(1))
         rotations[:, 1] = rotations[:, 0] @ rotations[:, 1]
 
     offsets = np.zeros((count, 3))
@@ -587,15 +551,9 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows
         parents=tuple(max(parent - root, -1) for parent in parents[root:]),
         offsets=offsets[root:],
         end_sites=tuple(
-            (joint - root, tuple(scale * value for value in offset))
-            for joint, offset in end_sites
-            if joint >= root
+            (joint - root, tuple(scale * value for value in offset)) for joint, offset in end_sites if joint >= root
         ),
     )
     return Motion(
-        skeleton=skeleton,
-        root_position=root_position,
-        rotations=rotations[:, root:],
-        fps=1.0 / frame_time,
-        name=name,
+        skeleton=skeleton, root_position=root_position, rotations=rotations[:, root:], fps=1.0 / frame_time, name=name
     )

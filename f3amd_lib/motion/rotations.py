@@ -7,29 +7,10 @@ with yaw 0 faces +Z, a positive yaw is a turn to its left (towards +X).
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-__all__ = [
-    "array_module",
-    "matrix_from_euler",
-    "euler_from_matrix",
-    "matrix_from_rotation_6d",
-    "rotation_6d_from_matrix",
-    "matrix_from_yaw",
-    "rotation_6d_from_yaw",
-    "yaw_from_direction",
-    "yaw_from_rotation_6d",
-    "wrap_angle",
-    "slerp_matrices",
-]
-
-
-def array_module(*arrays):
-    """Return `jax.numpy` if any argument is a JAX array (or tracer), else `numpy`."""
-    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+from f3amd_lib.ground.arrays import array_module
 
 
 def rotation_6d_from_matrix(matrix):

@@ -13,25 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from f3amd_lib.motion.rotations import (
-    array_module,
-    matrix_from_yaw,
-    slerp_matrices,
-    yaw_from_direction,
-)
-
-__all__ = [
-    "Skeleton",
-    "Motion",
-    "forward_kinematics",
-    "global_rotations",
-    "facing_yaw",
-    "contact_labels",
-    "mirror",
-    "resample",
-    "turn",
-    "CONTACT_SPEED",
-]
+from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
 CONTACT_SPEED = 0.01
 """A toe that moves less than this, metres in a frame at 30 fps, is in contact (CAMDM's rule)."""
@@ -122,9 +105,7 @@ class Skeleton:
         try:
             return self.names.index(name)
         except ValueError:
-            raise ValueError(
-                f"skeleton has no joint {name!r}; it has {', '.join(self.names)}"
-            ) from None
+            raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}") from None
 
     def role(self, role: str) -> int:
         """Return the joint that plays a role: left_hip, right_hip, left_toe or right_toe."""
@@ -149,8 +130,7 @@ class Skeleton:
             if parent >= 0:
                 depth[joint] = depth[parent] + 1
         return tuple(
-            tuple(joint for joint in range(self.num_joints) if depth[joint] == level)
-            for level in range(max(depth) + 1)
+            tuple(joint for joint in range(self.num_joints) if depth[joint] == level) for level in range(max(depth) + 1)
         )
 
     @functools.cached_property
@@ -173,9 +153,7 @@ class Skeleton:
         child's twin, which fixes D_j up to ties along single bones; ties follow the parent, and
         else take -I, the convention of rigs whose right side points its bone axes backwards.
         """
-        candidates = np.array(
-            [[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, -1.0]]
-        )
+        candidates = np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, -1.0]])
         twin = self.mirror_permutation
         frames = np.zeros((self.num_joints, 3))
         for joint in range(self.num_joints):
@@ -190,9 +168,7 @@ class Skeleton:
                 )
             tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
             parent = self.parents[joint]
-            inherited = [
-                k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])
-            ]
+            inherited = [k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])]
             if inherited:
                 choice = inherited[0]
             else:
@@ -296,8 +272,7 @@ def _walk(skeleton: Skeleton, root_position, rotations):
         joints = np.array(level)
         above = level_rotations[-1][..., slot, :, :]
         level_positions.append(
-            level_positions[-1][..., slot, :]
-            + sum(above[..., k] * offsets[joints, k, None] for k in range(3))
+            level_positions[-1][..., slot, :] + sum(above[..., k] * offsets[joints, k, None] for k in range(3))
         )
         level_rotations.append(_compose(above, rotations[..., joints, :, :]))
     order = np.argsort(np.array([joint for level in skeleton.levels for joint in level]))
@@ -412,18 +387,14 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
     if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
         stride = int(round(ratio))
         return motion.replace(
-            root_position=motion.root_position[::stride],
-            rotations=motion.rotations[::stride],
-            fps=float(fps),
+            root_position=motion.root_position[::stride], rotations=motion.rotations[::stride], fps=float(fps)
         )
     duration = (motion.num_frames - 1) / motion.fps
     times = np.arange(int(np.floor(duration * fps + 1e-6)) + 1) / fps * motion.fps
     low = np.minimum(np.floor(times).astype(int), motion.num_frames - 1)
     high = np.minimum(low + 1, motion.num_frames - 1)
     weight = times - low
-    root = (1 - weight)[:, None] * motion.root_position[low] + weight[
-        :, None
-    ] * motion.root_position[high]
+    root = (1 - weight)[:, None] * motion.root_position[low] + weight[:, None] * motion.root_position[high]
     rotations = slerp_matrices(motion.rotations[low], motion.rotations[high], weight[:, None])
     return motion.replace(root_position=root, rotations=rotations, fps=float(fps))
 

@@ -27,20 +27,9 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
+from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.names import nearest_hint
-
-__all__ = [
-    "ArmPose",
-    "StyleParameters",
-    "STYLES",
-    "SYNTHETIC_SKELETON",
-    "style_parameters",
-    "synthesize",
-    "synthesize_with_contacts",
-    "walk_along",
-]
 
 # ------------------------------------------------------------------------------------ skeleton
 
@@ -300,9 +289,7 @@ def _wander(rng: np.random.Generator, count: int, sigma: float, channels: int) -
     width = sigma * _GRID_RATE
     noise = rng.standard_normal((count, channels))
     # A Gaussian blur of white noise has variance 1 / (2 sqrt(pi) width).
-    return gaussian_filter1d(noise, width, axis=0, mode="reflect") * np.sqrt(
-        2.0 * np.sqrt(np.pi) * width
-    )
+    return gaussian_filter1d(noise, width, axis=0, mode="reflect") * np.sqrt(2.0 * np.sqrt(np.pi) * width)
 
 
 def _ramp(x: np.ndarray) -> np.ndarray:
@@ -357,9 +344,7 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
     """String random stretches together and smooth speed, turning and heading."""
     count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
     time = np.arange(count) / _GRID_RATE - _LEAD
-    kinds = np.array(
-        ["straight", "curve", "tight", "slalom", "fast", "slow", "diagonal", "side", "back"]
-    )
+    kinds = np.array(["straight", "curve", "tight", "slalom", "fast", "slow", "diagonal", "side", "back"])
     weights = np.array([0.20, 0.26, 0.15, 0.08, 0.07, 0.07, 0.06, 0.06, 0.05])
     speed, turn, heading = np.zeros(count), np.zeros(count), np.zeros(count)
     start, forced, stood = 0, "straight", False
@@ -567,14 +552,7 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
     plants = []
     for foot in (0, 1):
         lift[foot].append(end + 10.0)
-        plants.append(
-            _Plants(
-                np.array(land[foot]),
-                np.array(lift[foot]),
-                np.array(place[foot]),
-                np.array(yaw[foot]),
-            )
-        )
+        plants.append(_Plants(np.array(land[foot]), np.array(lift[foot]), np.array(place[foot]), np.array(yaw[foot])))
     return plants, np.array(knots), np.array(strides)
 
 
@@ -610,9 +588,7 @@ def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: 
     arc = progress**2 * (1.0 - progress) ** 2.5 * 26.0
     height = style.foot_lift * scale * effort[index] * arc
     outwards = side * np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
-    flat = (
-        flat + (style.circumduction * 16.0 * (progress * (1.0 - progress)) ** 2)[:, None] * outwards
-    )
+    flat = flat + (style.circumduction * 16.0 * (progress * (1.0 - progress)) ** 2)[:, None] * outwards
 
     keys, values = [], []
     raised = style.heel_raise_deg
@@ -709,9 +685,7 @@ def walk_along(style: str, position, yaw, seed: int = 0, fps: float = 30.0) -> M
     """
     position, yaw = np.asarray(position, np.float64), np.asarray(yaw, np.float64)
     if position.ndim != 2 or position.shape != (len(yaw), 2) or yaw.ndim != 1 or len(yaw) < 4:
-        raise ValueError(
-            f"a path needs position [T, 2] and yaw [T], T >= 4; got {position.shape}, {yaw.shape}"
-        )
+        raise ValueError(f"a path needs position [T, 2] and yaw [T], T >= 4; got {position.shape}, {yaw.shape}")
     if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
         raise ValueError("a path must hold finite numbers alone")
     return _walk(style_parameters(style), style, seed, fps, len(yaw), (position, yaw))[0]
@@ -766,35 +740,22 @@ def _walk(
     root_flat, yaw, speed, turn = sampled[:, :2], sampled[:, 2], sampled[:, 3], sampled[:, 4]
     heading = sampled[:, 5]
     drift = sampled[:, 6:] * (0.4 + 2.0 * parameters.unsteadiness)
-    phase = _smooth(
-        PchipInterpolator(knots, strides, extrapolate=True)(np.clip(time, knots[0], knots[-1])),
-        0.05,
-        fps,
-    )
+    phase = _smooth(PchipInterpolator(knots, strides, extrapolate=True)(np.clip(time, knots[0], knots[-1])), 0.05, fps)
     cycle = 2.0 * np.pi * phase
     stepping = np.gradient(phase, time) * 2.0 * parameters.step_length / parameters.speed
-    effort = _smooth(
-        np.clip(1.3 * stepping, 0.0, 1.0) * np.clip(speed / parameters.speed, 0.25, 1.1), 0.16, fps
-    )
+    effort = _smooth(np.clip(1.3 * stepping, 0.0, 1.0) * np.clip(speed / parameters.speed, 0.25, 1.1), 0.16, fps)
 
-    feet = [
-        _move_foot(parameters, plants[foot], time, side, fps)
-        for foot, side in enumerate((1.0, -1.0))
-    ]
+    feet = [_move_foot(parameters, plants[foot], time, side, fps) for foot, side in enumerate((1.0, -1.0))]
 
     # Pelvis: sway, twist, roll and bounce ride on the gait phase (left footfall at whole strides).
     accelerate = np.gradient(speed, time)
     bank = np.degrees(np.arctan(speed * turn / 9.81))
-    spared = np.square(0.5 + 0.5 * np.sin(cycle) * np.sign(parameters.limp or 1.0)) * abs(
-        parameters.limp
-    )
+    spared = np.square(0.5 + 0.5 * np.sin(cycle) * np.sign(parameters.limp or 1.0)) * abs(parameters.limp)
     spared = spared * effort
     pelvis_yaw = np.degrees(yaw) - effort * parameters.hip_twist_deg * np.cos(cycle)
     pelvis_roll = effort * parameters.hip_roll_deg * np.sin(cycle) * -1.0 + 0.5 * bank
     pelvis_roll = pelvis_roll + 0.6 * drift[:, 0] * 0.5
-    pelvis_pitch = (
-        parameters.pelvis_pitch_deg + 1.5 * np.clip(accelerate, -2, 2) + 0.3 * drift[:, 1]
-    )
+    pelvis_pitch = parameters.pelvis_pitch_deg + 1.5 * np.clip(accelerate, -2, 2) + 0.3 * drift[:, 1]
     pelvis = _yaw_pitch_roll(pelvis_yaw, pelvis_pitch, pelvis_roll)
     left = np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
     ahead = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
@@ -829,9 +790,7 @@ def _walk(
     for foot, (name, side) in enumerate((("Left", 1.0), ("Right", -1.0))):
         hip = root + pelvis @ (_HIP_OFFSET * [side, 1.0, 1.0])
         foot_yaw = feet[foot][1]
-        bearing = 0.5 * (foot_yaw + np.radians(pelvis_yaw)) + side * np.radians(
-            parameters.knee_out_deg
-        )
+        bearing = 0.5 * (foot_yaw + np.radians(pelvis_yaw)) + side * np.radians(parameters.knee_out_deg)
         pole = np.stack([np.sin(bearing), np.zeros(count), np.cos(bearing)], axis=-1)
         thigh, shank = _bend_leg(hip, ankles[foot], pole)
         local[:, joint(f"{name}Hip")] = transpose @ thigh
@@ -857,9 +816,7 @@ def _walk(
     # Head: looks where the path goes next, and stays steadier than the trunk that carries it.
     look = np.degrees(_smooth(np.interp(time + 0.25, path.time, path.yaw), 0.12, fps))
     look = look + 0.3 * parameters.spine_twist_deg + parameters.head_yaw_deg + 2.5 * drift[:, 7]
-    nod = parameters.head_pitch_deg + 0.35 * (
-        parameters.pelvis_pitch_deg + parameters.spine_pitch_deg
-    )
+    nod = parameters.head_pitch_deg + 0.35 * (parameters.pelvis_pitch_deg + parameters.spine_pitch_deg)
     nod = nod + effort * parameters.head_bob_deg * np.cos(2.0 * cycle) + 1.2 * drift[:, 8]
     tilt = parameters.head_roll_deg + 0.4 * parameters.spine_roll_deg + 0.4 * bank
     head = np.swapaxes(chest, -1, -2) @ _yaw_pitch_roll(look, nod, tilt)
@@ -869,10 +826,7 @@ def _walk(
     # Arms swing against the legs; the trunk's lean is given back to gravity.
     lean = pelvis_pitch + spine_pitch
     roll = pelvis_roll + spine_roll
-    for name, side, pose in (
-        ("Left", 1.0, parameters.left_arm),
-        ("Right", -1.0, parameters.right_arm),
-    ):
+    for name, side, pose in (("Left", 1.0, parameters.left_arm), ("Right", -1.0, parameters.right_arm)):
         swing = -side * effort * np.cos(cycle - 0.25)
         turns = 2.0 * np.pi * pose.wave_hz * time + gesture_start + 0.25 * drift[:, 9]
         if parameters.opposed_waves and side < 0:

@@ -23,24 +23,10 @@ from safetensors.flax import save_file
 
 from f3amd_lib.data.features import Normaliser
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
-from f3amd_lib.files import whole_file
-from f3amd_lib.models.config import NetworkConfig
-from f3amd_lib.models.zoo import build_from_config, config_from_dict
+from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.skeleton import Skeleton
-
-__all__ = [
-    "OutdatedFile",
-    "save_tree",
-    "describe",
-    "load_tree",
-    "weights_digest",
-    "errors_name",
-    "describe_skeleton",
-    "described_skeleton",
-    "TrainedModel",
-    "save_model",
-    "load_model",
-]
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.zoo import build_from_config, config_from_dict
 
 FORMAT = "f3amd-1"
 
@@ -90,8 +76,7 @@ def _read(path: Path) -> tuple[dict, dict]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError) as error:
         raise ValueError(
-            f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, "
-            "delete it or restore a copy"
+            f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, delete it or restore a copy"
         ) from None
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: not written by this project (format {header.get('format')!r})")
@@ -128,9 +113,7 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
         raise ValueError(f"{path}: does not hold the expected arrays; first difference {odd[0]}")
     for name, leaf in wanted.items():
         if arrays[name].shape != leaf.shape:
-            raise ValueError(
-                f"{path}: {name} has shape {arrays[name].shape}, expected {leaf.shape}"
-            )
+            raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {leaf.shape}")
     leaves = [arrays[name].astype(leaf.dtype) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
 
@@ -317,9 +300,6 @@ def _model_template(metadata: dict) -> dict:
             "deviation": single((config.channels,), jnp.float32),
             "path_scale": single((), jnp.float32),
         },
-        "seeds": {
-            name: single(tuple(shape), jnp.float32)
-            for name, shape in metadata["seed_shapes"].items()
-        },
+        "seeds": {name: single(tuple(shape), jnp.float32) for name, shape in metadata["seed_shapes"].items()},
         "offsets": single((len(metadata["joints"]), 3), jnp.float32),
     }

@@ -4,7 +4,7 @@ A window of motion is here a path of a few points on the ground. Every path of t
 wall on one side, so that the mean of all paths runs into it: a sampler whose one step returns a
 mean must fail, unless the condition says which side is meant. The data are a Gaussian mixture over
 whole paths, whose denoiser is known exactly (`diffusion.oracles`), and the networks are F3AMD's own
-(`models.zoo`), only smaller, so that what is trained can be laid beside what is exact.
+(`networks.zoo`), only smaller, so that what is trained can be laid beside what is exact.
 
 Paths are [B, T, 2], sideways (positive to the walker's left, as +X is) and ahead, in metres from
 the middle of the wall; their coordinates have a deviation of about 1, so that metres are network
@@ -30,29 +30,11 @@ from f3amd_lib.data.features import path_condition
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import add_noise, ddim_step, ddpm_step
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.config import NetworkConfig, scaled_input
-from f3amd_lib.models.spectral import cosine_basis
-from f3amd_lib.models.zoo import build_config, build_from_config
-from f3amd_lib.training.loop import (
-    TrainingConfig,
-    draw_sigma,
-    learning_rate_schedule,
-    short_recipe,
-)
-
-__all__ = [
-    "TOLD",
-    "Fork",
-    "ForkNetwork",
-    "crossing",
-    "outcome_shares",
-    "fork_recipe",
-    "train_fork",
-    "sample_paths",
-    "outcome_table",
-    "error_table",
-]
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig, scaled_input
+from f3amd_lib.networks.spectral import cosine_basis
+from f3amd_lib.networks.zoo import build_config, build_from_config
+from f3amd_lib.training.loop import TrainingConfig, draw_sigma, learning_rate_schedule, short_recipe
 
 TOLD = ("nothing", "left", "right")
 """What the condition says of the side, by the number that stands for it."""
@@ -95,14 +77,10 @@ class Fork:
             if not 0 < getattr(self, item.name) < np.inf:
                 raise ValueError(f"{item.name} must be positive, got {getattr(self, item.name)!r}")
         if not 2 <= self.num_modes <= self.num_frames:
-            raise ValueError(
-                f"num_modes must be between 2 and num_frames = {self.num_frames}, "
-                f"got {self.num_modes}"
-            )
+            raise ValueError(f"num_modes must be between 2 and num_frames = {self.num_frames}, got {self.num_modes}")
         if self.wall >= self.side:
             raise ValueError(
-                f"the wall must leave room on both sides: wall = {self.wall!r} must be below "
-                f"side = {self.side!r}"
+                f"the wall must leave room on both sides: wall = {self.wall!r} must be below side = {self.side!r}"
             )
 
     @functools.cached_property
@@ -253,9 +231,7 @@ def outcome_shares(fork: Fork, paths) -> dict[str, float]:
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("params", "input_scaling"),
-    meta_fields=("fork", "graph"),
+    jax.tree_util.register_dataclass, data_fields=("params", "input_scaling"), meta_fields=("fork", "graph")
 )
 @dataclass(frozen=True, eq=False)
 class ForkNetwork:
@@ -297,12 +273,7 @@ def fork_recipe(diffusion: NoiseSchedule, num_steps: int = 1500, **settings) -> 
 
 
 def train_fork(
-    fork: Fork,
-    recipe: TrainingConfig,
-    *,
-    input_scaling: bool = True,
-    latent_width: int = 16,
-    depth: int = 2,
+    fork: Fork, recipe: TrainingConfig, *, input_scaling: bool = True, latent_width: int = 16, depth: int = 2
 ) -> tuple[ForkNetwork, np.ndarray]:
     """Train a small F3AMD on paths drawn afresh at every step, half of them with the side told.
 
@@ -345,8 +316,7 @@ def train_fork(
     if not np.isfinite(losses).all():
         step = int(np.argmin(np.isfinite(losses))) + 1
         raise ArithmeticError(
-            f"the loss stopped being a number at step {step}: lower the learning rate "
-            f"{recipe.learning_rate}"
+            f"the loss stopped being a number at step {step}: lower the learning rate {recipe.learning_rate}"
         )
     return network, losses
 
@@ -399,9 +369,7 @@ def _estimate(model: Fork | ForkNetwork, x_noisy, sigma, told):
     return model.denoise(x_noisy, sigma, told)
 
 
-def sample_paths(
-    model: Fork | ForkNetwork, diffusion: NoiseSchedule, num_steps: int, told, key
-) -> np.ndarray:
+def sample_paths(model: Fork | ForkNetwork, diffusion: NoiseSchedule, num_steps: int, told, key) -> np.ndarray:
     """Sample paths with the sampler that belongs to a noise schedule.
 
     The answer is that of `samplers.sample`, but only the denoiser is compiled, once for all numbers

@@ -35,28 +35,14 @@ from f3amd_lib.data.windows import (
 )
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.diffusion.schedules import NoiseSchedule, VarianceExploding, schedule_from_dict
-from f3amd_lib.models.conditioning import Condition
-from f3amd_lib.models.config import NetworkConfig
-from f3amd_lib.models.zoo import build_from_config, find_preset
+from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.names import nearest_hint, refuse_unknown
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.zoo import build_from_config, find_preset
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
-
-__all__ = [
-    "TrainingConfig",
-    "TrainingState",
-    "TrainingDiverged",
-    "Trainer",
-    "LOG_NORMAL_SIGMA",
-    "draw_sigma",
-    "noise_weights",
-    "learning_rate_schedule",
-    "network_inputs",
-    "paper_recipe",
-    "short_recipe",
-]
 
 
 class TrainingDiverged(ArithmeticError):
@@ -153,16 +139,9 @@ class TrainingConfig:
             isinstance(self.diffusion, VarianceExploding) and self.diffusion.sigma_min < 1.0
         ):
             raise ValueError(
-                f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, "
-                f"got {self.diffusion!r}"
+                f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, got {self.diffusion!r}"
             )
-        shares = (
-            "history_dropout",
-            "condition_dropout",
-            "captured_path_share",
-            "own_history_share",
-            "history_damping",
-        )
+        shares = ("history_dropout", "condition_dropout", "captured_path_share", "own_history_share", "history_damping")
         for name in shares:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)!r}")
@@ -252,9 +231,7 @@ class TrainingState(NamedTuple):
 def network_inputs(batch: Batch, normaliser: Normaliser) -> tuple[jax.Array, Condition]:
     """Return (x0, condition) of a batch in network units."""
     condition = Condition(
-        history=normaliser.normalise(batch.history),
-        path=normaliser.normalise_path(batch.path),
-        style=batch.style,
+        history=normaliser.normalise(batch.history), path=normaliser.normalise_path(batch.path), style=batch.style
     )
     return normaliser.normalise(batch.future), condition
 
@@ -264,9 +241,7 @@ def draw_sigma(key, batch_size: int, config: TrainingConfig):
     key_time, key_low, key_choice = jax.random.split(key, 3)
     sigma = config.diffusion.draw(key_time, (batch_size,))
     if config.noise == "mixed":
-        log_low = jax.random.uniform(
-            key_low, (batch_size,), minval=np.log(config.diffusion.sigma_min), maxval=0.0
-        )
+        log_low = jax.random.uniform(key_low, (batch_size,), minval=np.log(config.diffusion.sigma_min), maxval=0.0)
         low = jax.random.bernoulli(key_choice, 0.5, (batch_size,))
         sigma = jnp.where(low, jnp.exp(log_low), sigma)
     if config.noise == "log_normal":
@@ -330,9 +305,7 @@ class Trainer:
             steps.insert(0, optax.clip_by_global_norm(config.gradient_clip))
         self.optimiser = optax.chain(*steps)
         everywhere = None if mesh is None else NamedSharding(mesh, PartitionSpec())
-        self._chunk = jax.jit(
-            self._run_chunk, static_argnames="length", donate_argnums=0, out_shardings=everywhere
-        )
+        self._chunk = jax.jit(self._run_chunk, static_argnames="length", donate_argnums=0, out_shardings=everywhere)
         self._evaluate = jax.jit(self._held_out_terms, static_argnames="num_samples")
 
     def initial_state(self) -> TrainingState:
@@ -392,8 +365,7 @@ class Trainer:
             share = 1.0 - config.condition_dropout
             kept = jax.random.bernoulli(jax.random.fold_in(key, 1), share, history.shape[:1])
             condition = jax.tree.map(
-                lambda part: jnp.where(kept.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0),
-                condition,
+                lambda part: jnp.where(kept.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), condition
             )
         return condition
 
@@ -450,15 +422,11 @@ class Trainer:
         base = jax.random.fold_in(jax.random.key(config.seed), 1)
 
         def one_step(state, _):
-            key_batch, key_sigma, key_loss = jax.random.split(
-                jax.random.fold_in(base, state.step), 3
-            )
+            key_batch, key_sigma, key_loss = jax.random.split(jax.random.fold_in(base, state.step), 3)
             batch = self._training_batch(windows, state, key_batch)
             sigma = draw_sigma(key_sigma, config.batch_size, config)
             batch, sigma = parallel.spread((batch, sigma), self.mesh)
-            gradient, terms = jax.grad(self._loss, has_aux=True)(
-                state.params, batch, sigma, key_loss, training=True
-            )
+            gradient, terms = jax.grad(self._loss, has_aux=True)(state.params, batch, sigma, key_loss, training=True)
             updates, optimiser = self.optimiser.update(gradient, state.optimiser, state.params)
             params = optax.apply_updates(state.params, updates)
             ema = optax.incremental_update(params, state.ema, 1.0 - config.ema_decay)
@@ -533,9 +501,7 @@ class Trainer:
             mine = self._identity()
             for part in ("model", "training"):
                 theirs = metadata.get(part, {})
-                changed = sorted(
-                    name for name, value in mine[part].items() if value != theirs.get(name)
-                )
+                changed = sorted(name for name, value in mine[part].items() if value != theirs.get(name))
                 if changed:
                     raise ValueError(
                         f"{path}: checkpoint was made with other {part} settings "
@@ -636,6 +602,4 @@ class Trainer:
             what = f"weights are not finite after step {done + len(bad)}"
         kept = checkpoint is not None and Path(checkpoint).exists()
         advice = f"; the last good state is in {checkpoint}" if kept else ""
-        raise TrainingDiverged(
-            f"{what}: lower the learning rate or check the data for broken frames{advice}"
-        )
+        raise TrainingDiverged(f"{what}: lower the learning rate or check the data for broken frames{advice}")

@@ -14,8 +14,6 @@ import jax.numpy as jnp
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
 
-__all__ = ["LossWeights", "LOSS_TERMS", "loss_terms", "total_loss"]
-
 LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "floor", "ird")
 
 
@@ -50,9 +48,7 @@ class LossWeights:
     def __post_init__(self):
         for term in LOSS_TERMS:
             if not 0.0 <= getattr(self, term) < math.inf:
-                raise ValueError(
-                    f"loss weight {term} must be >= 0 and finite, got {getattr(self, term)!r}"
-                )
+                raise ValueError(f"loss weight {term} must be >= 0 and finite, got {getattr(self, term)!r}")
         _check_ird_form(self.ird_form)
 
 
@@ -74,14 +70,7 @@ def _norm(difference):
 
 
 def loss_terms(
-    skeleton: Skeleton,
-    x0_hat,
-    x0,
-    future_hat,
-    future,
-    last_history,
-    ird_form: str = "literal",
-    weights=None,
+    skeleton: Skeleton, x0_hat, x0, future_hat, future, last_history, ird_form: str = "literal", weights=None
 ) -> dict:
     """Return each term of the loss, unweighted.
 
@@ -128,9 +117,7 @@ def loss_terms(
     return {
         "sample": mean_square(x0_hat - x0),
         "position": mean_square(positions_hat - positions),
-        "feature_velocity": mean_square(
-            (x0_hat[:, 1:] - x0_hat[:, :-1]) - (x0[:, 1:] - x0[:, :-1])
-        ),
+        "feature_velocity": mean_square((x0_hat[:, 1:] - x0_hat[:, :-1]) - (x0[:, 1:] - x0[:, :-1])),
         "joint_velocity": mean_square(step_hat - step),
         "foot": mean_square(step_hat[:, :, toes] * contact[..., None]),
         "floor": _mean(below * below, weights),

@@ -13,26 +13,11 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-__all__ = [
-    "AXIS",
-    "join_processes",
-    "all_devices",
-    "check_batch",
-    "replicate",
-    "spread",
-    "is_first_process",
-    "first_says",
-    "same_everywhere",
-    "wait_for_all",
-]
-
 AXIS = "batch"
 """Name of the mesh axis that a batch is spread over."""
 
 
-def join_processes(
-    coordinator: str | None = None, count: int | None = None, number: int | None = None
-) -> None:
+def join_processes(coordinator: str | None = None, count: int | None = None, number: int | None = None) -> None:
     """Make this process one of several that train together; before anything else touches JAX.
 
     Args:

@@ -27,37 +27,14 @@ from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
-from f3amd_lib.files import set_aside
-from f3amd_lib.models import zoo
-from f3amd_lib.models.config import NetworkConfig
-from f3amd_lib.profiles import Profile, load_profile, runs_dir
-from f3amd_lib.report.records import read_table, run_record, write_table
+from f3amd_lib.ground.files import set_aside
+from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
+from f3amd_lib.ground.records import read_table, run_record, write_table
+from f3amd_lib.networks import zoo
+from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training import parallel
-from f3amd_lib.training.checkpoints import (
-    OutdatedFile,
-    TrainedModel,
-    describe,
-    load_model,
-    save_model,
-)
+from f3amd_lib.training.checkpoints import OutdatedFile, TrainedModel, describe, load_model, save_model
 from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
-
-__all__ = [
-    "PreparedData",
-    "prepare",
-    "ModelFiles",
-    "model_files",
-    "profile_recipe",
-    "train",
-    "finished_model",
-    "obtain_model",
-    "shipped_weights",
-    "shown_model",
-    "shipped_history",
-    "available_models",
-    "find_model",
-    "set_aside_unlike",
-]
 
 log = logging.getLogger("f3amd")
 
@@ -98,10 +75,7 @@ class PreparedData:
     def normaliser(self) -> Normaliser:
         """Mean and deviation of the training windows, from a fixed key."""
         return fit_normaliser(
-            self.windows("train"),
-            jax.random.key(0),
-            window=self.window,
-            num_history=self.num_history,
+            self.windows("train"), jax.random.key(0), window=self.window, num_history=self.num_history
         )
 
     @functools.cached_property
@@ -122,9 +96,7 @@ class PreparedData:
             **settings,
         )
 
-    def trainer(
-        self, preset: str, config: TrainingConfig, *, network=None, mesh: Mesh | None = None
-    ) -> Trainer:
+    def trainer(self, preset: str, config: TrainingConfig, *, network=None, mesh: Mesh | None = None) -> Trainer:
         """Return what trains a preset on this data set's training windows.
 
         Args:
@@ -151,10 +123,7 @@ def prepare(profile: Profile, *, path=None) -> PreparedData:
       path: folder or archive, where the data set needs one.
     """
     dataset = open_dataset(
-        profile.dataset,
-        path=path,
-        seconds_per_style=profile.seconds_per_style,
-        num_styles=profile.num_styles,
+        profile.dataset, path=path, seconds_per_style=profile.seconds_per_style, num_styles=profile.num_styles
     )
     return PreparedData(packed_dataset(dataset), profile.window, profile.num_history)
 
@@ -193,9 +162,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
         folder = runs_dir(profile.dataset, profile.name) / "models"
     folder = Path(folder)
     return ModelFiles(
-        folder / f"{name}.safetensors",
-        folder / f"{name}.state.safetensors",
-        folder / f"{name}.history.csv",
+        folder / f"{name}.safetensors", folder / f"{name}.state.safetensors", folder / f"{name}.history.csv"
     )
 
 
@@ -285,9 +252,7 @@ def train(
             earlier, _ = read_table(files.history)
             rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
         else:  # it is written after the state: a run may be killed between the two
-            log.warning(
-                "%s is missing: losses of the first %d steps are lost", files.history, state.step
-            )
+            log.warning("%s is missing: losses of the first %d steps are lost", files.history, state.step)
 
     def keep(row: dict) -> None:
         rows.append(row)
@@ -381,9 +346,7 @@ def shipped_weights(dataset: str) -> Path | None:
     return weights if weights.is_file() else None
 
 
-def shown_model(
-    prepared: PreparedData, profile: Profile, *, progress: bool = True
-) -> tuple[TrainedModel, str]:
+def shown_model(prepared: PreparedData, profile: Profile, *, progress: bool = True) -> tuple[TrainedModel, str]:
     """Return the model whose motion a reader sees: what ships for the data set, in any profile.
 
     Args:
@@ -417,9 +380,7 @@ def shipped_history(profile: Profile, preset: str) -> pd.DataFrame:
     raise ValueError(f"no losses of {preset} on {profile.dataset!r} are kept: train it first")
 
 
-def finished_model(
-    prepared: PreparedData, profile: Profile, preset: str, files: ModelFiles
-) -> TrainedModel | None:
+def finished_model(prepared: PreparedData, profile: Profile, preset: str, files: ModelFiles) -> TrainedModel | None:
     """Return the model that a run by the profile's recipe left, None if it left none yet.
 
     Args:
@@ -451,9 +412,7 @@ def _unlike(trained: TrainedModel, mine: dict) -> list[str]:
     return [name for name, value in mine.items() if theirs[name] != value]
 
 
-def set_aside_unlike(
-    prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig
-) -> None:
+def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig) -> None:
     """Keep a training state under another name if it is of other data or settings.
 
     Args:
@@ -487,11 +446,7 @@ def available_models(profile: Profile) -> list[str]:
 
 def _identity(prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> dict:
     """Return all that decides a model's weights, as a state or record tells it."""
-    return {
-        "model": model.to_dict(),
-        "training": config.to_dict(),
-        "dataset_fingerprint": prepared.packed.fingerprint,
-    }
+    return {"model": model.to_dict(), "training": config.to_dict(), "dataset_fingerprint": prepared.packed.fingerprint}
 
 
 def find_model(dataset: str) -> Path:

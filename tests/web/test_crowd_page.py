@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from conftest import DESKTOP, PHONE
 
-from f3amd_lib.evaluation.crowd import plan_crowd
+from f3amd_lib.drawing.plots_crowd import crowd_colors
+from f3amd_lib.generation.crowd import plan_crowd
 from f3amd_lib.motion.skeleton import turn
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.report.player import Character, Scene, write_player
-from f3amd_lib.report.plots_crowd import crowd_colors
+from f3amd_lib.serving.player import Character, Scene, write_player
 
 COUNT, FRAMES = 100, 60
 STYLES = ("Neutral", "Old", "March", "Zombie", "ArmsWide")
@@ -32,9 +32,7 @@ def motions():
 @pytest.fixture(scope="module")
 def crowd_page(motions, tmp_path_factory):
     colors = crowd_colors([motion.name for motion in motions])
-    characters = [
-        Character(motion, color=color) for motion, color in zip(motions, colors, strict=True)
-    ]
+    characters = [Character(motion, color=color) for motion, color in zip(motions, colors, strict=True)]
     path = tmp_path_factory.mktemp("pages") / "crowd.html"
     return write_player(path, Scene(characters, title="A hundred"), strip=False)
 

@@ -9,9 +9,9 @@ from builders import wandering_motion
 from conftest import DESKTOP, PHONE
 from PIL import Image
 
-from f3amd_lib.evaluation.paths import path_from_motion
+from f3amd_lib.motion.root_paths import path_from_motion
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.report.player import Character, Scene, player_page, show_player, write_player
+from f3amd_lib.serving.player import Character, Scene, player_page, show_player, write_player
 
 FRAMES = 90
 TITLES = ["Real", "CAMDM, 8 steps", "F3AMD, 8 steps", "F3AMD, 1 step"]
@@ -67,9 +67,7 @@ def settled(browser) -> dict:
 
 def pixels(browser, panel: int = 0) -> np.ndarray:
     """What a panel's canvas shows, [H, W, 3]."""
-    picture = browser.script(
-        "return document.querySelectorAll('canvas')[arguments[0]].toDataURL()", panel
-    )
+    picture = browser.script("return document.querySelectorAll('canvas')[arguments[0]].toDataURL()", panel)
     image = Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1])))
     return np.asarray(image.convert("RGB"))
 
@@ -127,9 +125,7 @@ def test_titles_stand_over_their_panels_and_text_is_text(browser, side_by_side):
     assert [title for title, _, _ in captions] == TITLES
     lefts = [left for _, left, _ in captions]
     assert lefts == sorted(lefts) and len(set(lefts)) == 4  # side by side on a desktop
-    assert all(
-        label == f"{title}: 1 character of 23 joints, 3.0 seconds" for title, _, label in captions
-    )
+    assert all(label == f"{title}: 1 character of 23 joints, 3.0 seconds" for title, _, label in captions)
     assert browser.find("h1").text == "One path & four ways"
     assert browser.find("figcaption span").text == "a note <b>below</b>"
     assert browser.find(".credit").text == "Nobody's"
@@ -138,17 +134,14 @@ def test_titles_stand_over_their_panels_and_text_is_text(browser, side_by_side):
 def test_the_browser_reads_the_positions_that_python_wrote(browser, side_by_side, walks):
     opened(browser, side_by_side)
     for scene, frame in ((0, 0), (3, FRAMES - 1), (2, 47)):
-        read = [
-            browser.script("return player.position(...arguments)", scene, 0, frame, place)
-            for place in (0, 5)
-        ]
+        read = [browser.script("return player.position(...arguments)", scene, 0, frame, place) for place in (0, 5)]
         # The first points are joints in their order; heads' tips come last.
         expected = walks[scene].positions[frame, [0, 5]] * 1000
         np.testing.assert_allclose(read, expected, atol=0.5001)
 
 
 def test_every_panel_shows_a_figure_in_the_colours_of_the_pictures(browser, side_by_side):
-    from f3amd_lib.report.stick_figures import LIMB_COLORS
+    from f3amd_lib.drawing.stick_figures import LIMB_COLORS
 
     opened(browser, side_by_side)
     for panel in range(4):
@@ -206,14 +199,7 @@ def test_scrubbing_seeks(browser, side_by_side):
     # The middle of the thumb's road is the middle frame.
     middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     for kind in ("mousePressed", "mouseReleased"):
-        browser.command(
-            "Input.dispatchMouseEvent",
-            type=kind,
-            x=middle[0],
-            y=middle[1],
-            button="left",
-            clickCount=1,
-        )
+        browser.command("Input.dispatchMouseEvent", type=kind, x=middle[0], y=middle[1], button="left", clickCount=1)
     now = settled(browser)
     assert abs(now["frame"] - (FRAMES - 1) / 2) <= 1.5
     assert now["window"] == 2
@@ -299,9 +285,7 @@ def test_a_focused_button_or_slider_obeys_once(browser, alone):
 def test_every_control_has_a_name(browser, alone):
     opened(browser, alone)
     browser.find("#turn").click()
-    controls = browser.driver.find_elements(
-        "css selector", "button, input, select, canvas, summary"
-    )
+    controls = browser.driver.find_elements("css selector", "button, input, select, canvas, summary")
     names = [control.accessible_name for control in controls]
     assert len(names) >= 20 and all(names)
     assert len(set(names)) == len(names)
@@ -311,22 +295,14 @@ def test_dragging_orbits_and_the_wheel_zooms(browser, alone):
     opened(browser, alone)
     before = browser.script("return {...player.view}")
     picture = pixels(browser)
-    for kind, x, y in (
-        ("mousePressed", 600, 300),
-        ("mouseMoved", 700, 250),
-        ("mouseReleased", 700, 250),
-    ):
-        browser.command(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
-        )
+    for kind, x, y in (("mousePressed", 600, 300), ("mouseMoved", 700, 250), ("mouseReleased", 700, 250)):
+        browser.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
     settled(browser)
     after = browser.script("return {...player.view}")
     assert after["around"] == pytest.approx(before["around"] - 0.8)
     assert after["elevation"] < before["elevation"]
     assert (pixels(browser) != picture).any()
-    browser.command(
-        "Input.dispatchMouseEvent", type="mouseWheel", x=600, y=300, deltaX=0, deltaY=-200
-    )
+    browser.command("Input.dispatchMouseEvent", type="mouseWheel", x=600, y=300, deltaX=0, deltaY=-200)
     browser.wait("return player.view.zoom > 1.2")
     browser.find("#reset").click()
     again = browser.script("return {...player.view}")
@@ -338,11 +314,7 @@ def press(browser, letter: str, shift: bool = False) -> dict:
     key = letter.upper() if shift else letter
     for kind in ("keyDown", "keyUp"):
         browser.command(
-            "Input.dispatchKeyEvent",
-            type=kind,
-            key=key,
-            code=f"Key{letter.upper()}",
-            modifiers=8 if shift else 0,
+            "Input.dispatchKeyEvent", type=kind, key=key, code=f"Key{letter.upper()}", modifiers=8 if shift else 0
         )
     return browser.script("return {...player.view}")
 
@@ -357,10 +329,7 @@ def test_keys_orbit_and_with_shift_move_the_view(browser, alone):
     assert moved["around"] == pytest.approx(before["around"])
     # To the reader's right, and ahead, away from the eye: each is square to the other.
     around = moved["around"]
-    right, ahead = (
-        np.array(way)
-        for way in ((np.cos(around), -np.sin(around)), (-np.sin(around), -np.cos(around)))
-    )
+    right, ahead = (np.array(way) for way in ((np.cos(around), -np.sin(around)), (-np.sin(around), -np.cos(around))))
     step = np.array([moved["panX"], moved["panZ"]])
     assert step @ right > 0.1 and step @ ahead == pytest.approx(0, abs=1e-9)
     settled(browser)
@@ -473,8 +442,7 @@ def test_the_list_of_keys_is_scrolled_by_its_own_keys(browser, alone):
     browser.find("summary").click()
     scrolled = "return document.querySelector('.sheet').scrollTop"
     assert browser.script(
-        "const sheet = document.querySelector('.sheet');"
-        "return sheet.scrollHeight > sheet.clientHeight + 20"
+        "const sheet = document.querySelector('.sheet');return sheet.scrollHeight > sheet.clientHeight + 20"
     )
     browser.keys("Tab")
     assert browser.script("return document.activeElement.className") == "sheet"
@@ -529,9 +497,10 @@ def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
     picture = pixels(browser)
     assert share_of(picture, "#EF9A26") > 300
     # On its own: neither the notebook around it nor its storage is within reach.
-    assert browser.script(
-        "try { return String(window.parent.document); } catch (error) { return error.name; }"
-    ) in ("SecurityError", "null")
+    assert browser.script("try { return String(window.parent.document); } catch (error) { return error.name; }") in (
+        "SecurityError",
+        "null",
+    )
     browser.driver.switch_to.default_content()
     assert browser.errors() == [] and browser.requests() == []
 
@@ -566,8 +535,7 @@ def test_a_crowd_is_all_there(browser, tmp_path, screenshots, capsys):
         side = int(np.ceil(np.sqrt(count)))
         crowd = [
             base[k % 4].replace(
-                root_position=base[k % 4].root_position
-                + np.array([1.5 * (k % side), 0.0, 1.5 * (k // side)])
+                root_position=base[k % 4].root_position + np.array([1.5 * (k % side), 0.0, 1.5 * (k // side)])
             )
             for k in range(count)
         ]

@@ -35,16 +35,12 @@ return `${extra} px: ${wide ? wide.outerHTML.slice(0, 120) : "?"}`;
 # What MathJax leaves where it does not understand: a message, or the unknown command in red.
 NOT_UNDERSTOOD = '[data-mml-node="merror"], mjx-merror, [fill="red"]'
 
-PAGE_BACKGROUND = (
-    "return getComputedStyle(document.body).backgroundColor.match(/[0-9.]+/g).map(Number)"
-)
+PAGE_BACKGROUND = "return getComputedStyle(document.body).backgroundColor.match(/[0-9.]+/g).map(Number)"
 
 
 def notebooks() -> list[str]:
     """Addresses of the notebooks that the built site has."""
-    return sorted(
-        path.relative_to(SITE).as_posix() for path in (SITE / "notebooks").rglob("*.html")
-    )
+    return sorted(path.relative_to(SITE).as_posix() for path in (SITE / "notebooks").rglob("*.html"))
 
 
 def open_with_equations(browser, name: str):
@@ -101,9 +97,7 @@ def test_every_notebook_is_whole_on_a_phone(browser):
         drawn = page.script("return document.querySelectorAll('.math mjx-container svg').length")
         equations += asked
         assert drawn >= asked, name
-        assert page.script(f"return document.querySelectorAll('{NOT_UNDERSTOOD}').length") == 0, (
-            name
-        )
+        assert page.script(f"return document.querySelectorAll('{NOT_UNDERSTOOD}').length") == 0, name
         assert page.script(SIDEWAYS) == "", name
         assert page.errors() == [] and page.outside() == [], name
     assert equations > 100
@@ -111,10 +105,7 @@ def test_every_notebook_is_whole_on_a_phone(browser):
 
 def test_what_equations_are_written_with_is_understood(browser):
     page = open_with_equations(browser, "notebooks/02_sampler_theory.html")
-    faults = (
-        "return MathJax.tex2svg(arguments[0], {display: true})"
-        f".querySelectorAll('{NOT_UNDERSTOOD}').length"
-    )
+    faults = f"return MathJax.tex2svg(arguments[0], {{display: true}}).querySelectorAll('{NOT_UNDERSTOOD}').length"
     for text in (
         r"\bar\alpha = \frac{1}{1 + \sigma^2} \tag{9}",
         r"\begin{aligned} z &= \sqrt{\bar\alpha}\,x \\ x &= z / \sqrt{\bar\alpha} \end{aligned}",
@@ -128,9 +119,7 @@ def test_what_equations_are_written_with_is_understood(browser):
 def test_a_word_is_found_and_leads_to_its_notebook(browser):
     page = browser.open(f"{(SITE / 'search.html').as_uri()}?q=alpha_bar")
     page.wait("return /found \\d+ pages?/.test(document.querySelector('main').textContent)", 60)
-    found = page.script(
-        "return [...document.querySelectorAll('#search-results li a')].map((a) => a.pathname)"
-    )
+    found = page.script("return [...document.querySelectorAll('#search-results li a')].map((a) => a.pathname)")
     assert any("02_sampler_theory" in address for address in found)
     assert any("docs/api/diffusion" in address for address in found)
     assert page.errors() == [] and page.outside() == []

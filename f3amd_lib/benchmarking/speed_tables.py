@@ -1,0 +1,213 @@
+"""Speed tables from records: ours beside the paper's, and what the library asks of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.ground.papers import load_paper_table
+
+_FAST = ("jit", "jit, all devices", "IREE")
+_TORCH = ("PyTorch", "PyTorch, oneDNN", "PyTorch, compiled")
+
+
+def _best(table: pd.DataFrame, model: str, steps: int, characters: int, ways) -> pd.Series | None:
+    """Return the fastest row of a model among some ways, 32 frames and float32; None if none."""
+    mine = table[
+        (table["model"] == model)
+        & (table["steps"] == steps)
+        & (table["characters"] == characters)
+        & (table["window_frames"] == 32)
+        & (table["precision"] == "float32")
+        & table["way"].isin(ways)
+    ]
+    return None if mine.empty else mine.loc[mine["value"].idxmin()]
+
+
+def speed_bars(ways: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
+    """Compare what was measured on a CPU with what the library asks of itself.
+
+    Shares are of the machine's own matrix product, timed by turns with the rounds. Each system has
+    its fastest way, in float32.
+
+    Args:
+      ways: the table `synthesis_ways`.
+      suite: "main" or "bars", one of both, so that all comes from the same turns.
+
+    Returns:
+      Columns what, characters, asked, measured, way, met ("yes", "no" or "not measured").
+    """
+    ways = ways[ways["suite"] == suite]
+    one, eight, camdm = ("F3AMD-FNO-96", 1), ("F3AMD-FNO-96", 8), ("CAMDM", 8)
+    rows = []
+
+    def add(what, characters, asked, measured, way, met):
+        met = "not measured" if measured is None else "yes" if met(measured) else "no"
+        rows.append(
+            {"what": what, "characters": characters, "asked": asked, "measured": measured,
+             "way": way, "met": met}
+        )  # fmt: skip
+
+    def share(system, label, ways_taken, least):
+        row = _best(ways, *system, 32, ways_taken)
+        found, way = (None, "") if row is None else (row["share_of_peak"], row["way"])
+        add(f"{label}: share of the matrix product's speed", 32, f">= {least}", found, way,
+            lambda value: value >= least)  # fmt: skip
+
+    def quotient(slow, fast, characters, what, asked, slow_ways, fast_ways, met):
+        first, second = (
+            _best(ways, *system, characters, chosen) for system, chosen in ((slow, slow_ways), (fast, fast_ways))
+        )
+        if first is None or second is None:
+            add(what, characters, asked, None, "", met)
+            return
+        way = f"{first['way']} / {second['way']}"
+        add(what, characters, asked, first["value"] / second["value"], way, met)
+
+    share(one, "FNO-96, 1 step", _FAST, 0.65)
+    share(eight, "FNO-96, 8 steps", _FAST, 0.65)
+    share(camdm, "CAMDM, 8 steps", _FAST, 0.65)
+    share(camdm, "CAMDM, 8 steps, PyTorch", _TORCH, 0.6)
+    for fast, label, least in ((one, "1 step", 55), (eight, "8 steps", 7)):
+        quotient(camdm, fast, 32, f"time of CAMDM, 8 steps, over FNO-96, {label}", f">= {least}",
+                 _FAST, _FAST, lambda value, least=least: value >= least)  # fmt: skip
+    quotient(camdm, one, 32, "time of CAMDM in PyTorch, 8 steps, over FNO-96, 1 step", "reported",
+             _TORCH, _FAST, lambda value: True)  # fmt: skip
+    quotient(one, one, 1, "time of FNO-96, 1 step, over its plain form under jit", "<= 0.35",
+             _FAST, ("jit, FFT",), lambda value: value <= 0.35)  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def fastest_ways(table: pd.DataFrame, precision: Mapping[str, str] | None = None) -> pd.DataFrame:
+    """Keep the fastest way of each framework, for tables that have one number a cell.
+
+    The plain form is left out: it is there to be compared with, not to be used.
+
+    Args:
+      table: `synthesis_ways`. What several suites have timed counts as it is in the first of them,
+        "main" before the others and "bars" last, so that neighbours in a table come from the same
+        turns where that can be.
+      precision: device -> the precision to keep; by default float32 on a CPU, and on a GPU tf32,
+        which JAX takes by itself.
+
+    Returns:
+      The rows, one for each model, window, steps, framework, device and number of characters.
+    """
+    precision = precision or {"CPU": "float32", "GPU": "tf32"}
+    wanted = table["device"].map(precision).fillna("float32")
+    kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
+    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
+    turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
+    kept = kept.assign(turn=turn).reset_index(drop=True)
+    kept = kept[kept["turn"] == kept.groupby(keys)["turn"].transform("min")].drop(columns="turn")
+    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
+    models = {model: place for place, model in enumerate(dict.fromkeys(table["model"]))}
+    place = fastest["model"].map(models).to_numpy()
+    sorting = np.lexsort((fastest["characters"], -fastest["steps"], fastest["window_frames"], place))
+    return fastest.iloc[sorting].reset_index(drop=True)
+
+
+def speedups_by_turns(ways: pd.DataFrame) -> pd.DataFrame:
+    """Return the speedups over CAMDM of our own rounds, both from the same turns.
+
+    Args:
+      ways: `synthesis_ways`; JAX's rows count.
+
+    Returns:
+      As `speedups`; what two suites have timed counts once, as in `fastest_ways`.
+    """
+    suites = sorted(set(ways["suite"]), key=lambda name: (name == "bars", name != "main"))
+    mine = ways[ways["framework"] == "jax"]
+    tables = [speedups(fastest_ways(mine[mine["suite"] == suite])) for suite in suites]
+    keys = ["model", "window_frames", "steps", "device", "characters"]
+    return pd.concat(tables).drop_duplicates(keys).reset_index(drop=True)
+
+
+def times_beside_paper(table: pd.DataFrame, number: int, device: str) -> pd.DataFrame:
+    """Lay our synthesis times beside a table of the paper.
+
+    Args:
+      table: `synthesis_time`, the fastest way of each framework.
+      number: of the paper's table: 1, 4 or 7.
+      device: "CPU" or "GPU", for both sides. The paper's machines are others than ours.
+
+    Returns:
+      Columns model, window_frames, steps, characters, paper (ms), ours (ms), low, high, framework
+      and way; a row for each cell of the paper's table, ours NaN where nothing was measured.
+
+    Raises:
+      ValueError: for another table.
+    """
+    if number not in (1, 4, 7):
+        raise ValueError(f"table {number} holds no synthesis times by characters: use 1, 4 or 7")
+    paper = load_paper_table(number)
+    paper = paper[paper["device"] == device].rename(columns={"value": "paper"})
+    torch = paper["model"].str.contains("PyTorch")
+    paper = paper.assign(
+        asked_framework=torch.map({True: "torch", False: "jax"}),
+        preset=paper["model"].str.replace(r" \((JAX|PyTorch)\)", "", regex=True),
+    )
+    ours = table[table["device"] == device]
+    keys = ["window_frames", "steps", "characters"]
+    joined = paper.merge(
+        ours[["model", "framework", "way", *keys, "value", "low", "high"]],
+        how="left",
+        left_on=["preset", "asked_framework", *keys],
+        right_on=["model", "framework", *keys],
+        suffixes=("", "_ours"),
+    ).rename(columns={"value": "ours"})
+    columns = ["model", *keys, "paper", "ours", "low", "high", "framework", "way"]
+    return joined[columns].reset_index(drop=True)
+
+
+def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
+    """Lay our training times beside the paper's Table 2.
+
+    Epochs differ in length (other data), so that what can be compared is the quotient over CAMDM.
+
+    Args:
+      table: `training_time`.
+
+    Returns:
+      Columns model, window_frames, paper_minutes, paper_over_camdm, our_minutes, our_over_camdm,
+      seconds_per_step, batch_size, device.
+    """
+    paper = load_paper_table(2)[["model", "window_frames", "value"]]
+    paper = paper.rename(columns={"value": "paper_minutes"})
+    ours = table[["model", "window_frames", "epoch_minutes", "value", "batch_size", "device"]]
+    ours = ours.rename(columns={"epoch_minutes": "our_minutes", "value": "seconds_per_step"})
+    joined = paper.merge(ours, how="left", on=["model", "window_frames"])
+    for name in ("paper", "our"):
+        minutes = f"{name}_minutes"
+        camdm = joined[joined["model"] == "CAMDM"].set_index("window_frames")[minutes]
+        quotient = joined[minutes] / joined["window_frames"].map(camdm)
+        joined.insert(joined.columns.get_loc(minutes) + 1, f"{name}_over_camdm", quotient)
+    return joined
+
+
+def speedups(times: pd.DataFrame, *, window: int = 32) -> pd.DataFrame:
+    """Return how many times faster than CAMDM with 8 steps each row is (Figures 3 and 4).
+
+    Args:
+      times: columns model, window_frames, steps, device, characters and value (ms), one framework;
+        a table of the paper, or rows of `synthesis_time`.
+      window: frames; both sides have it.
+
+    Returns:
+      The rows of that window but CAMDM's with 8 steps, with the column speedup; rows without a
+      CAMDM at as many characters are left out.
+
+    Raises:
+      ValueError: if CAMDM is timed twice for one device and number of characters.
+    """
+    mine = times[times["window_frames"] == window]
+    is_camdm = (mine["model"] == "CAMDM") & (mine["steps"] == 8)
+    camdm = mine[is_camdm].set_index(["device", "characters"])["value"]
+    if not camdm.index.is_unique:
+        raise ValueError("CAMDM is timed twice for one number of characters: keep one framework")
+    others = mine[~is_camdm]
+    keys = pd.MultiIndex.from_frame(others[["device", "characters"]])
+    slow = camdm.reindex(keys).to_numpy()
+    return others.assign(speedup=slow / others["value"]).dropna(subset=["speedup"])

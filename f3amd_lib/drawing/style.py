@@ -1,0 +1,201 @@
+"""One look for all figures: style sheet, colours by model name, saving.
+
+Colours keep apart for colour-blind readers and, by lightness and marker, in grey print too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+DPI = 150
+
+PALETTE = {
+    "black": "#1A1A1A",
+    "purple": "#542788",
+    "blue": "#2166AC",
+    "green": "#35978F",
+    "vermilion": "#D6604D",
+    "orange": "#F1A340",
+    "sky": "#92C5DE",
+    "grey": "#8A8A8A",
+}
+"""Colours from dark to light; neighbours in this order differ in lightness as well as in hue."""
+
+STYLE = {
+    "figure.dpi": 100,
+    "figure.facecolor": "white",
+    "figure.constrained_layout.use": True,
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same text on every machine
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.prop_cycle": matplotlib.cycler(
+        color=[PALETTE[c] for c in ("purple", "orange", "green", "vermilion", "blue", "sky")]
+    ),
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5.5,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "savefig.dpi": DPI,
+}
+"""matplotlib settings of every figure; use them through `plot_style`."""
+
+
+@dataclass(frozen=True)
+class ModelStyle:
+    """How one model is drawn everywhere: colour, marker and line style."""
+
+    color: str
+    marker: str
+    linestyle: str
+
+    @property
+    def line(self) -> dict:
+        """Keyword arguments for `Axes.plot`."""
+        return {"color": self.color, "marker": self.marker, "linestyle": self.linestyle}
+
+
+# Purple for FNO and green for CAMDM, as in the paper; within a family, width sets the shade.
+_FNO_SHADES = {32: "#B9A3D6", 48: "#9E7FC7", 64: "#8159B0", 96: "#542788", 128: "#2D0B55"}
+_TRANSFORMER_SHADES = {32: "#FBD29A", 48: "#F8BE6D", 64: "#F1A340", 96: "#D3831C", 128: "#A35F0C"}
+# Our own recipes stand beside the paper's models and are never to be taken for one of them.
+_OUR_COLORS = {"-plus": PALETTE["vermilion"], "-steady": PALETTE["blue"]}
+_WIDTH_MARKERS = {32: "v", 48: "^", 64: "s", 96: "o", 128: "D"}
+
+
+def model_style(name: str) -> ModelStyle:
+    """Return colour, marker and line style of a model by its name.
+
+    Args:
+      name: a preset's name ("F3AMD-FNO-96", "CAMDM", ...), "real" for real motion, "paper" for
+        a printed number; suffixes such as "(FiLM)" keep the family's colour, our own recipes
+        ("-plus", "-steady") have one of their own.
+
+    Returns:
+      The style. A name of no known family is drawn in grey.
+    """
+    lowered = name.lower()
+    number = re.search(r"-(32|48|64|96|128)(?!\d)", lowered)
+    width = int(number.group(1)) if number else 96
+    if lowered.startswith("real"):
+        return ModelStyle(PALETTE["black"], "", "--")
+    if lowered.startswith("paper"):
+        return ModelStyle(PALETTE["grey"], "x", ":")
+    if lowered.startswith("camdm"):
+        line = ":" if "pytorch" in lowered else "--" if "code" in lowered or number else "-"
+        return ModelStyle(PALETTE["green"], "P", line)
+    if "transformer" in lowered:
+        return ModelStyle(_TRANSFORMER_SHADES[width], _WIDTH_MARKERS[width], "-")
+    if lowered.startswith("f3amd"):
+        for suffix, color in _OUR_COLORS.items():
+            if lowered.split(",")[0].endswith(suffix):
+                return ModelStyle(color, _WIDTH_MARKERS[width], "-")
+        line = ":" if "raw" in lowered else "--" if "dct" in lowered else "-"
+        return ModelStyle(_FNO_SHADES[width], _WIDTH_MARKERS[width], line)
+    return ModelStyle(PALETTE["grey"], ".", "-")
+
+
+def system_line(label: str) -> dict:
+    """Return keyword arguments for `Axes.plot` of a model at some steps, "F3AMD-FNO-96, 8 steps".
+
+    One step is dotted, with open markers.
+    """
+    name, _, steps = label.partition(", ")
+    line = model_style(name).line
+    if steps.strip() == "1 step":
+        line |= {"linestyle": ":", "markerfacecolor": "white"}
+    return line
+
+
+def use_style() -> None:
+    """Use the project's style sheet from here on: for a notebook's first cell.
+
+    matplotlib looks titles, legends and labels up when they are made, so the style must be in
+    force then, and not only when the figure is started. Library code uses `plot_style` instead.
+    """
+    matplotlib.rcParams.update(STYLE)
+
+
+@contextlib.contextmanager
+def plot_style():
+    """Use the project's style sheet inside a `with` block, and the user's own outside."""
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: int = 1, **grid):
+    """Start a figure in the project's style, without touching pyplot's state.
+
+    Args:
+      width, height: inches.
+      nrows, ncols: grid of axes.
+      grid: passed to `Figure.subplots`.
+
+    Returns:
+      (figure, axes), axes as from `Figure.subplots`.
+    """
+    with plot_style():
+        figure = Figure(figsize=(width, height))
+        FigureCanvasAgg(figure)
+        return figure, figure.subplots(nrows, ncols, **grid)
+
+
+def save_figure(figure: Figure, path, *, dpi: int = DPI) -> Path:
+    """Write a figure as PNG whose bytes depend on the drawing alone.
+
+    No date and no software version is written, so that an unchanged figure is an unchanged file.
+    A figure drawn before is replaced.
+
+    Args:
+      figure: what to write.
+      path: ends in .png; folders are made.
+      dpi: dots an inch.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: if the name does not end in .png.
+    """
+    path = Path(path)
+    if path.suffix != ".png":
+        raise ValueError(f"{path}: figures are written as .png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(_png(figure, dpi))
+    return path
+
+
+def show_figure(figure: Figure, *, dpi: int = 100):
+    """Return the figure as an image that Jupyter shows when it is a cell's last value."""
+    from IPython.display import Image
+
+    return Image(data=_png(figure, dpi))
+
+
+def _png(figure: Figure, dpi: int) -> bytes:
+    buffer = io.BytesIO()
+    with plot_style():
+        # Axes of a fixed aspect have their final size only after a first layout, and titles and
+        # labels are kept inside the picture only by a second one.
+        if any(axis.get_aspect() != "auto" for axis in figure.axes):
+            figure.draw_without_rendering()
+        figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()

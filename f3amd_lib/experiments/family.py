@@ -1,0 +1,141 @@
+"""The family on one data set, one preset after the other: trained within a time budget, or only
+asked, in short runs all alike, whether each of them learns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+
+import pandas as pd
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.training import parallel
+from f3amd_lib.training.loop import short_recipe
+from f3amd_lib.training.pipeline import PreparedData, finished_model, model_files, train
+
+SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
+"""What all runs have in common; enough to see a loss fall, far from enough to walk."""
+
+
+def train_family(
+    prepared: PreparedData,
+    profile: Profile,
+    presets: Iterable[str],
+    *,
+    folder=None,
+    budget_s: float | None = None,
+    mesh: Mesh | None = None,
+    progress: bool = True,
+) -> Iterator[tuple[str, str]]:
+    """Train presets one after the other, all with the profile's steps and batch.
+
+    Each leaves its model, state and history in one folder, and a later call goes on from them: a
+    finished model is left as it is, an unfinished one resumed. So a long job can be done in legs.
+
+    Args:
+      prepared: the data.
+      profile: how much.
+      presets: names, in the order to train them.
+      folder: where files go instead of `runs/`.
+      budget_s: seconds for all together; the run under way stops with a checkpoint when they are
+        over. By default as long as it takes.
+      mesh: see `pipeline.train`.
+      progress: show progress bars.
+
+    Yields:
+      (preset, state) as each is done with; the state is "finished before", "finished" or
+      "unfinished", and the budget is over with the first "unfinished".
+
+    Raises:
+      ValueError: for an unknown preset, before anything is trained.
+      TrainingDiverged: if a loss stops being a number.
+    """
+    stop_at = None if budget_s is None else time.monotonic() + budget_s
+    files = {preset: model_files(profile, preset, folder=folder) for preset in presets}
+    for preset, its in files.items():
+        if finished_model(prepared, profile, preset, its) is not None:
+            yield preset, "finished before"
+            continue
+        if stop_at is not None and parallel.first_says(time.monotonic() >= stop_at):
+            yield preset, "unfinished"
+            return
+        trained, _ = train(
+            prepared, profile, preset=preset, folder=folder, mesh=mesh, stop_at=stop_at,
+            progress=progress,
+        )  # fmt: skip
+        yield preset, "unfinished" if trained is None else "finished"
+        if trained is None:
+            return
+
+
+def learning_curve(
+    prepared: PreparedData, preset: str, *, seed: int = 0, progress: bool = False, **settings
+) -> pd.DataFrame:
+    """Train a preset for a short while and watch its loss.
+
+    Args:
+      prepared: the data.
+      preset: see `zoo.find_preset`.
+      seed: of weights and batches.
+      progress: show a bar of the steps.
+      **settings: fields of `TrainingConfig` in place of `SHORT_RUN`'s.
+
+    Returns:
+      Columns model, step, loss (mean over a tenth of the run) and held_out_loss (moving average of
+      the weights on held-out windows, every row from step 0 on; before the first step no training
+      loss is known, NaN).
+
+    Raises:
+      TrainingDiverged: if the loss stops being a number.
+    """
+    recipe = short_recipe(preset, seed=seed, **{**SHORT_RUN, **settings})
+    trainer = prepared.trainer(preset, recipe)
+    held_out = prepared.windows(prepared.held_out_split)
+    chunk = max(1, recipe.num_steps // 10)
+    state = trainer.initial_state()
+    before = trainer.held_out_terms(state.params, held_out)["loss"]
+    rows = [{"model": preset, "step": 0, "loss": float("nan"), "held_out_loss": before}]
+    _, history = trainer.run(state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=progress)
+    rows += [{"model": preset, **{name: row[name] for name in ("step", "loss", "held_out_loss")}} for row in history]
+    return pd.DataFrame(rows)
+
+
+def learning_curves(
+    prepared: PreparedData, presets: Iterable[str], *, seed: int = 0, progress: bool = True
+) -> Iterator[pd.DataFrame]:
+    """Yield the learning curve of one preset after the other, so that each can be kept at once."""
+    presets = list(presets)
+    with tqdm(presets, unit="model", disable=not progress) as bar:
+        for preset in bar:
+            bar.set_postfix_str(preset)
+            yield learning_curve(prepared, preset, seed=seed)
+
+
+def learning_table(curves: pd.DataFrame) -> pd.DataFrame:
+    """Sum up learning curves, one row a model.
+
+    Args:
+      curves: from `learning_curve`, of one or many models.
+
+    Returns:
+      Columns model, steps, first_loss and last_loss (mean training loss of the first and the last
+      tenth of the run), held_out_before, held_out_after, and falls: whether both fell.
+    """
+    rows = []
+    for model, curve in curves.groupby("model", sort=False):
+        curve = curve.sort_values("step")
+        losses, held_out = curve["loss"].dropna(), curve["held_out_loss"]
+        row = {
+            "model": model,
+            "steps": int(curve["step"].iloc[-1]),
+            "first_loss": losses.iloc[0],
+            "last_loss": losses.iloc[-1],
+            "held_out_before": held_out.iloc[0],
+            "held_out_after": held_out.iloc[-1],
+        }
+        fell = row["last_loss"] < row["first_loss"]
+        rows.append({**row, "falls": bool(fell and row["held_out_after"] < held_out.iloc[0])})
+    return pd.DataFrame(rows)

@@ -1,0 +1,204 @@
+"""Two readings of the printed update, walked side by side by trained networks.
+
+Appendix F prints a DDIM step that takes a variance-exploding state and returns a preserving one. To
+rescale it before the next step gives plain DDIM ("rescaled"); to leave it as it is gives another
+walk ("literal", see `samplers.ddim_step_literal`). Which of the two a table was measured with can
+only show where a network uses its noise. These functions look at single windows, all from the same
+noise: after held-out motion, or after the openings that weights carry with them, for which no data
+are needed. Long rollouts choose the update by the name of its sampler, `UPDATES[...]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.data.features import frame_positions, path_condition
+from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
+from f3amd_lib.experiments.denoising import held_out_batch
+from f3amd_lib.generation.rollout import pose_speed
+from f3amd_lib.measures.distributions import diversity
+from f3amd_lib.measures.metrics import joint_acceleration
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.loop import network_inputs
+
+UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
+"""Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""
+
+WINDOW_METRICS = {
+    "joint_error": "cm",
+    "joint_acceleration": "cm/frame^2",
+    "seed_spread": "cm",
+    "from_rescaled": "cm",
+    "from_half_the_steps": "cm",
+}
+"""Metric of `window_figures` -> unit."""
+
+CM = 100.0
+
+_STEP = {"rescaled": ddim_step, "literal": ddim_step_literal}
+
+
+@dataclass(frozen=True, eq=False)
+class WindowWalks:
+    """Windows that one network made from the same noise in several ways.
+
+    Attributes:
+      real: joints as captured, [B, T, J, 3], metres; None where nothing was.
+      made: (update, steps) -> joints, [S, B, T, J, 3]; seed s has the same noise in all of them.
+    """
+
+    real: np.ndarray | None
+    made: dict[tuple[str, int], np.ndarray]
+
+
+def walk_windows(
+    trained: TrainedModel,
+    windows: WindowSet,
+    steps: Sequence[int] = (8, 4, 2, 1),
+    *,
+    spacing: str = "endpoints",
+    num_windows: int = 64,
+    num_seeds: int = 8,
+    seed: int = 0,
+) -> WindowWalks:
+    """Sample held-out windows with both updates and several numbers of steps.
+
+    Args:
+      trained: the model; its own schedule gives the noise levels.
+      windows: held-out windows.
+      steps: numbers of steps.
+      spacing: where the steps lie, see the schedule's `grid`.
+      num_windows: conditions, spread evenly over the windows.
+      num_seeds: draws of noise for each.
+      seed: of the noise.
+
+    Returns:
+      The walks.
+
+    Raises:
+      ValueError: for windows of another length, or fewer than 2 seeds, which have no spread.
+    """
+    batch = held_out_batch(windows, trained, num_windows)
+    _, condition = network_inputs(batch, trained.normaliser)
+    real = np.asarray(frame_positions(trained.skeleton, batch.future))
+    return WindowWalks(real, _walk(trained, condition, steps, spacing, num_seeds, seed))
+
+
+def opening_condition(trained: TrainedModel) -> Condition:
+    """Return one condition for each style: its first stored opening, and straight on at its pace.
+
+    Weights carry a few captured openings of each style, so that this needs no motion data.
+
+    Args:
+      trained: the model.
+
+    Returns:
+      Condition of as many rows as there are styles, in the order of `trained.styles`, in network
+      units.
+    """
+    history = np.stack([trained.seeds[style][0] for style in trained.styles])
+    # Openings end at the origin and face +Z.
+    ahead = pose_speed(history)[:, None] * np.arange(1, trained.config.window + 1)
+    position = np.stack([0.0 * ahead, ahead], axis=-1)
+    path = path_condition(position, 0.0 * ahead).astype(np.float32)
+    return Condition(
+        history=trained.normaliser.normalise(jnp.asarray(history)),
+        path=trained.normaliser.normalise_path(jnp.asarray(path)),
+        style=jnp.eye(len(trained.styles), dtype=jnp.float32),
+    )
+
+
+def walk_openings(
+    trained: TrainedModel,
+    steps: Sequence[int] = (8, 4, 2, 1),
+    *,
+    spacing: str = "endpoints",
+    num_seeds: int = 8,
+    seed: int = 0,
+) -> WindowWalks:
+    """Sample the window after a stored opening of each style, as `walk_windows` does.
+
+    Args:
+      trained, steps, spacing, num_seeds, seed: as for `walk_windows`.
+
+    Returns:
+      The walks; nothing real stands beside them.
+
+    Raises:
+      ValueError: for fewer than 2 seeds.
+    """
+    condition = opening_condition(trained)
+    return WindowWalks(None, _walk(trained, condition, steps, spacing, num_seeds, seed))
+
+
+def _walk(
+    trained: TrainedModel, condition: Condition, steps: Sequence[int], spacing: str, num_seeds: int, seed: int
+) -> dict[tuple[str, int], np.ndarray]:
+    """Walk both updates from the same noise; returns `WindowWalks.made`."""
+    if num_seeds < 2:
+        raise ValueError(f"num_seeds must be at least 2 for a spread over seeds, got {num_seeds}")
+    network = trained.network()
+    context = jax.jit(network.encode)(condition)
+    # One compiled evaluation serves every update and number of steps.
+    denoise = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, context))
+    joints = jax.jit(lambda x: frame_positions(trained.skeleton, trained.normaliser.denormalise(x)))
+    grids = {number: trained.diffusion.grid(number, spacing).astype(np.float32) for number in steps}
+    made = {(update, number): [] for number in steps for update in UPDATES}
+    shape = (len(condition.style), trained.config.window, trained.config.channels)
+    for key in jax.random.split(jax.random.key(seed), num_seeds):
+        noise = jax.random.normal(key, shape)
+        for (update, number), draws in made.items():
+            x_noisy = grids[number][0] * noise
+            for sigma, sigma_next in zip(grids[number][:-1], grids[number][1:], strict=True):
+                x_noisy = _STEP[update](x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
+            draws.append(np.asarray(joints(x_noisy)))
+    return {way: np.stack(draws) for way, draws in made.items()}
+
+
+def _distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the mean distance of joints, cm."""
+    return float(CM * np.mean(np.linalg.norm(first - second, axis=-1)))
+
+
+def window_figures(walks: WindowWalks) -> pd.DataFrame:
+    """Measure what walks from the same noise made.
+
+    Args:
+      walks: from `walk_windows` or `walk_openings`.
+
+    Returns:
+      Columns update, steps, metric, unit, value, means over windows and seeds; update "real" with
+      0 steps is what was captured, where something was. Metrics:
+        joint_error: distance of joints from what was captured;
+        joint_acceleration: see `metrics.joint_acceleration`;
+        seed_spread: `diversity` over the seeds of one condition;
+        from_rescaled: distance of joints from the rescaled walk of as many steps;
+        from_half_the_steps: distance of joints from the same update with half the steps, where
+          that was walked.
+    """
+    rows = []
+    if walks.real is not None:
+        lively = float(np.mean(joint_acceleration(walks.real)))
+        rows.append(("real", 0, "joint_acceleration", lively))
+    for (update, number), joints in walks.made.items():
+        figures = {} if walks.real is None else {"joint_error": _distance(joints, walks.real)}
+        figures |= {
+            "joint_acceleration": float(np.mean(joint_acceleration(joints))),
+            "seed_spread": diversity(np.swapaxes(joints, 0, 1)),
+            "from_rescaled": _distance(joints, walks.made["rescaled", number]),
+        }
+        half = walks.made.get((update, number // 2)) if number % 2 == 0 else None
+        if half is not None:
+            figures["from_half_the_steps"] = _distance(joints, half)
+        rows += [(update, number, name, value) for name, value in figures.items()]
+    table = pd.DataFrame(rows, columns=["update", "steps", "metric", "value"])
+    table.insert(3, "unit", table["metric"].map(WINDOW_METRICS))
+    return table

@@ -1,0 +1,538 @@
+"""The evaluation protocol: long rollouts of every style, repeated, beside real and broken motion.
+
+Paper section 4.4: each model makes 2,560 frames (80 rounds of 32, or 40 of 64) on a complex path
+with varied speeds, turns and directions, in every style. Here that is repeated over seeds, each
+with a path, noise and starting poses of its own; held-out real clips and three deliberately bad
+generators are scored by the same code.
+
+Rows are tidy: model, window_frames, steps, varies, seed, metric, unit, better, value. A row's value
+is a mean over styles. `varies` says what the repeats differ in: "seed" for models, "clips" for real
+motion, where every repeat takes another half of the clips. `summarise` turns repeats into means
+with 95 % intervals. One training of each model is behind its rows: what another training would have
+given is not in the interval.
+
+FID, EMD and coverage see posture and style through one classifier. They say little of whether
+somebody walks or glides: read them beside foot alternation, acceleration and contact.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.experiments.denoising import noise_use
+from f3amd_lib.experiments.quality import (
+    WALKING,
+    by_round,
+    facing_ahead,
+    own_path,
+    reference_clips,
+    sideways_share,
+    style_floor,
+    style_pace,
+    training_clips,
+    walking_measures,
+)
+from f3amd_lib.generation.rollout import MotionGenerator, Rollout
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.measures import distributions
+from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
+from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
+from f3amd_lib.measures.metrics import CAMDM_METRICS, METRICS, camdm_metrics, first_metrics
+from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
+from f3amd_lib.motion.skeleton import Motion
+
+REFERENCE_MODELS = ("real", *CORRUPTIONS)
+"""Rows that no network made: held-out clips, and the three bad generators."""
+
+_DISTRIBUTION = {
+    "FID": ("", "down"),
+    "FID_per_dimension": ("", "down"),
+    "CAMDM_FID": ("", "down"),
+    "EMD": ("", "down"),
+    "style_coverage": ("%", "up"),
+    "style_accuracy": ("%", "up"),
+}
+
+_NOISE = {
+    "diversity": ("cm", "up"),
+    "rollout_diversity": ("cm", "up"),
+    "x0_error_ratio": ("", "down"),
+    "seed_spread": ("cm", "up"),
+}
+
+_DIVERSITY_ROUNDS = 4
+"""Rounds after which samples of one start are compared once more (`rollout_diversity`)."""
+
+_GROWS_WITH_LENGTH = ("path_drift", "CAMDM_trajectory_error", "CAMDM_orientation_error")
+"""Figures whose size hangs on the length of a motion: no yardstick between clips and rollouts."""
+
+PROTOCOL_METRICS = (
+    {name: (unit, better) for name, unit, better in (METRICS | CAMDM_METRICS).values()}
+    | {name.replace(" ", "_"): (unit, "near real") for name, unit, _ in WALKING.values()}
+    | _DISTRIBUTION
+    | _NOISE
+)
+"""Metric -> (unit, which way is better). The paper's nine bear the names of `ground.papers`."""
+
+_KEYS = {key: name for key, (name, _, _) in (METRICS | CAMDM_METRICS).items()} | {
+    key: name.replace(" ", "_") for key, (name, _, _) in WALKING.items()
+}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How much is measured.
+
+    Attributes:
+      styles: labels that are walked and scored; the classes of the classifier.
+      num_frames: length of each rollout (paper: 2,560).
+      num_seeds: rollouts of each style, each with noise and starting pose of its own.
+      num_diversity_seeds: samples of one fixed condition.
+      windows_per_style: windows of 60 frames of each style on either side of FID and EMD; the same
+        for all rows, since both fall as windows are added (see `windows_that_fit`).
+      path_seed: seed k walks the complex path of seed path_seed + k.
+
+    Raises:
+      ValueError: for no style or numbers that are too small.
+    """
+
+    styles: tuple[str, ...]
+    num_frames: int = 2560
+    num_seeds: int = 5
+    num_diversity_seeds: int = 10
+    windows_per_style: int = 12
+    path_seed: int = 0
+
+    def __post_init__(self):
+        if not self.styles:
+            raise ValueError("a protocol needs at least one style")
+        limits = {"num_frames": 66, "num_seeds": 1, "num_diversity_seeds": 2}
+        limits["windows_per_style"] = 1 if len(self.styles) > 1 else 2
+        for name, least in limits.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
+
+def evaluation_paths(packed: PackedMotion, styles: Sequence[str], num_frames: int, *, seed: int = 0) -> list[RootPath]:
+    """Make the path that each style walks: one complex path, at the usual pace of the style.
+
+    All get the same turns at the same times. Where the training clips hold (almost) no sideways or
+    backward steps, everybody faces where the path goes: anything else would test the data.
+
+    Args:
+      packed: the data set.
+      styles: labels of it.
+      num_frames: length.
+      seed: of the path.
+
+    Returns:
+      One path a style, each of `num_frames`.
+
+    Raises:
+      ValueError: for an unknown style.
+
+    Source: paper section 4.4, which describes the trajectory but does not print it; ours.
+    """
+    paths = [named_path("complex", num_frames, speed=style_pace(packed, style), seed=seed) for style in styles]
+    known = _sideways_in_training(packed, tuple(styles))
+    asked = np.mean([sideways_share(path) for path in paths])
+    return [facing_ahead(path) for path in paths] if known < 0.02 < asked else paths
+
+
+@functools.lru_cache(maxsize=8)
+def _sideways_in_training(packed: PackedMotion, styles: tuple[str, ...]) -> float:
+    """Return the share of sideways steps in the training clips; every seed's paths ask for it."""
+    clips = [clip for style in styles for clip in training_clips(packed, style)]
+    return float(np.mean([sideways_share(path_from_motion(packed.motion(clip))) for clip in clips]))
+
+
+def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
+    """Describe paths, or the tracks of real clips, by how they move and turn.
+
+    Args:
+      paths: any number of them.
+      seconds: span over which a turn is counted, so that the sway of a stride is not.
+
+    Returns:
+      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel)
+      and its 95th percentile, sideways_share, standing_share; over all moving frames of all paths.
+    """
+    speeds, turns, sideways = [], [], []
+    for path in paths:
+        step = np.diff(path.position, axis=0) * path.fps
+        speed = np.linalg.norm(step, axis=-1)
+        speeds.append(speed)
+        sideways.append((sideways_share(path), len(speed)))
+        span = max(1, round(seconds * path.fps))
+        if path.num_frames > 2 * span:
+            legs = path.position[span:] - path.position[:-span]
+            moved = np.linalg.norm(legs, axis=-1) > 0.1 * seconds
+            heading = np.unwrap(np.arctan2(legs[:, 0], legs[:, 1]))
+            turn = np.abs(heading[span:] - heading[:-span]) / seconds
+            turns.append(np.rad2deg(turn[moved[span:] & moved[:-span]]))
+    speeds = np.concatenate(speeds)
+    turns = np.concatenate(turns) if turns else np.array([np.nan])
+    moving = speeds[speeds > 0.1]
+    weights = np.array([frames for _, frames in sideways], float)
+    return {
+        "speed_m_s": float(moving.mean()),
+        "speed_p5": float(np.percentile(moving, 5)),
+        "speed_p95": float(np.percentile(moving, 95)),
+        "turn_deg_s": float(np.mean(turns)),
+        "turn_p95": float(np.percentile(turns, 95)),
+        "sideways_share": float(np.average([share for share, _ in sideways], weights=weights)),
+        "standing_share": float(1.0 - len(moving) / len(speeds)),
+    }
+
+
+def _motion_figures(motion: Motion, path: RootPath, window: int, floor: float) -> dict:
+    """Measure one motion against a path with everything that needs no classifier."""
+    positions, skeleton = np.asarray(motion.positions), motion.skeleton
+    values = first_metrics(positions, None, path, window, skeleton, floor_shift=floor)
+    values |= camdm_metrics(positions, None, path, skeleton)
+    values |= walking_measures(positions, skeleton, floor_shift=floor)
+    return {_KEYS[key]: float(value) for key, value in values.items()}
+
+
+def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
+    """Average figures over the motions of each style, then over styles; undefined ones left out."""
+    table = pd.DataFrame(figures)
+    return table.groupby(np.asarray(styles)).mean().mean().to_dict()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the classifier says of the windows of some motions.
+
+    Attributes:
+      features: [N, D].
+      predicted: class of each window, [N].
+      style: class that was asked for, [N].
+      source: number of the motion that a window was cut from, [N].
+    """
+
+    features: np.ndarray
+    predicted: np.ndarray
+    style: np.ndarray
+    source: np.ndarray
+
+    def of(self, sources: Iterable[int]) -> Seen:
+        """Return the windows of some of the motions, motion by motion in that order."""
+        order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
+        parts = (self.features, self.predicted, self.style, self.source)
+        return Seen(*(part[order] for part in parts))
+
+
+def see_windows(classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]) -> Seen:
+    """Show motions to the classifier; those shorter than its window hold no window.
+
+    Args:
+      classifier: whose features and classes are wanted.
+      motions: of the classifier's skeleton.
+      styles: what each was asked to look like.
+
+    Raises:
+      ValueError: if no motion is long enough, or for an unknown style.
+    """
+    windows, asked, source = [], [], []
+    for number, (motion, style) in enumerate(zip(motions, styles, strict=True)):
+        if motion.num_frames >= classifier.config.window:
+            cut = classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
+            windows.append(cut)
+            asked += [classifier.style_index(style)] * len(cut)
+            source += [number] * len(cut)
+    if not windows:
+        raise ValueError(
+            f"no motion of {', '.join(dict.fromkeys(styles))} has the {classifier.config.window} "
+            "frames that the style classifier looks at"
+        )
+    features, predicted = classifier.features_and_classes(np.concatenate(windows))
+    return Seen(features, predicted, np.array(asked), np.array(source))
+
+
+def real_features(
+    packed: PackedMotion, classifier: StyleClassifier, styles: Sequence[str], window: int
+) -> dict[int, np.ndarray]:
+    """Return features of real training windows by class, at the speeds that are asked for.
+
+    Args:
+      packed: the data set.
+      classifier: holds the features.
+      styles: labels of it.
+      window: see `quality.reference_clips`.
+
+    Returns:
+      Class number -> [N, D], in the order of `styles`.
+    """
+    clips = reference_clips(packed, styles, window=window, split="train")
+    known = classifier.references["train"]
+    kept = np.isin(known.clips, clips)
+    return {number: known.features[kept & (known.styles == number)] for number in map(classifier.style_index, styles)}
+
+
+def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol, *, window: int) -> int:
+    """Return how many windows of each style every row of a table can have in FID and EMD.
+
+    Args:
+      packed: the data set.
+      classifier: cuts windows and holds those of the training clips.
+      protocol: its styles and length; at most its `windows_per_style` is returned.
+      window: frames of a round.
+
+    Returns:
+      The smallest number, over styles, of windows in the training clips, in half of the held-out
+      clips and in one rollout.
+
+    Raises:
+      ValueError: if some style has none.
+    """
+    span = classifier.config.window
+    counts = [protocol.windows_per_style, protocol.num_frames // span]
+    real = real_features(packed, classifier, protocol.styles, window)
+    counts += [len(features) for features in real.values()]
+    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    lengths = np.diff(packed.clip_start)[clips] // span
+    counts += [int(lengths[labels == style].sum()) // 2 for style in protocol.styles]
+    if min(counts) < 1:
+        raise ValueError(
+            f"some style of {', '.join(protocol.styles)} has no window of {span} frames for FID "
+            "and EMD: make longer rollouts, or take more data"
+        )
+    return min(counts)
+
+
+def _held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return clips of both held-out splits at the speeds that are asked for, and their styles."""
+    present = set(np.asarray(packed.clip_split).tolist())
+    clips = [
+        clip
+        for split in ("test", "validation")
+        if SPLITS.index(split) in present
+        for clip in reference_clips(packed, styles, window=window, split=split)
+    ]
+    return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
+
+
+def _distribution_figures(seen: Seen, real: dict[int, np.ndarray], count: int, rng: np.random.Generator) -> dict:
+    """Score windows against real ones of the same styles, `count` of each style on either side."""
+    drawn, wanted, by_style = [], [], []
+    for number, reference in real.items():
+        mine = seen.features[seen.style == number]
+        for cloud, part in ((mine, drawn), (reference, wanted)):
+            if len(cloud) < count:
+                raise ValueError(f"FID and EMD want {count} windows of a style, got {len(cloud)}")
+            part.append(cloud[rng.choice(len(cloud), count, replace=False)])
+        if len(mine) > 1 and len(reference) > 1:
+            by_style.append(distributions.frechet_distance_per_dimension(mine, reference))
+    features, reference = np.concatenate(drawn), np.concatenate(wanted)
+    distance = distributions.frechet_distance(features, reference)
+    return {
+        "FID": distance,
+        "FID_per_dimension": distance / features.shape[1],
+        # The mean over styles of CAMDM's code, with all windows of the motion.
+        "CAMDM_FID": float(np.mean(by_style)) if len(by_style) == len(real) else float("nan"),
+        "EMD": distributions.earth_movers_distance(features, reference),
+        "style_coverage": distributions.style_coverage(
+            np.bincount(seen.predicted, minlength=max(real) + 1)[list(real)],
+            np.bincount(seen.style, minlength=max(real) + 1)[list(real)],
+        ),
+        "style_accuracy": distributions.style_accuracy(seen.predicted, seen.style),
+    }
+
+
+def _rows(figures: dict, **columns) -> list[dict]:
+    rows = []
+    for name, value in figures.items():
+        unit, better = PROTOCOL_METRICS[name]
+        row = {"metric": name, "unit": unit, "better": better, "value": float(value)}
+        rows.append({**columns, **row})
+    return rows
+
+
+def measure_model(
+    generator: MotionGenerator,
+    packed: PackedMotion,
+    classifier: StyleClassifier,
+    protocol: Protocol,
+    held_out: WindowSet,
+    *,
+    name: str | None = None,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Run the whole protocol for one model and number of steps.
+
+    All styles and seeds are walked in one batch. Seeds differ in path, noise and, as far as there
+    are enough stored ones, starting pose.
+
+    Args:
+      generator: the model and its sampler.
+      packed: the data set it was trained on.
+      classifier: for FID, EMD and coverage; its classes must hold the protocol's styles.
+      protocol: how much.
+      held_out: windows on which the use of noise is measured.
+      name: of the model in the rows; by default the trained model's.
+
+    Returns:
+      (rows, rounds). Rows: model, window_frames, steps, varies, seed, metric, unit, better, value.
+      Rounds: model, window_frames, steps, metric, round, value, means over styles and seeds.
+
+    Raises:
+      ValueError: if the classifier cannot tell styles apart, or does not know one of them.
+    """
+    require_telling_styles(classifier)
+    trained, seeds = generator.trained, range(protocol.num_seeds)
+    columns = {"model": name or trained.name, "window_frames": trained.config.window, "steps": generator.num_steps}
+    styles = list(protocol.styles)
+    real = real_features(packed, classifier, styles, trained.config.window)
+    paths = [evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed) for seed in seeds]
+    floors = {style: style_floor(packed, style) for style in styles}
+    rollout = generator.rollout(
+        [path for walk in paths for path in walk], styles * protocol.num_seeds, seed=protocol.path_seed
+    )
+    rows = []
+    for seed in seeds:
+        motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
+        figures = _style_means(
+            [
+                _motion_figures(motion, path, rollout.window, floors[style])
+                for motion, path, style in zip(motions, paths[seed], styles, strict=True)
+            ],
+            styles,
+        )
+        rng = np.random.default_rng([protocol.path_seed, seed])
+        seen = see_windows(classifier, motions, styles)
+        figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
+        figures |= _diversities(generator, paths[seed], styles, protocol, seed)
+        use = noise_use(generator, held_out, seed=seed)
+        figures["x0_error_ratio"] = use["x0_error_ratio"]
+        figures["seed_spread"] = use["seed_spread_cm"]
+        rows += _rows(figures, **columns, varies="seed", seed=seed)
+    return pd.DataFrame(rows), _rounds(rollout, columns)
+
+
+def _diversities(
+    generator: MotionGenerator, paths: Sequence[RootPath], styles: Sequence[str], protocol: Protocol, seed: int
+) -> dict:
+    """Diversity of Appendix C under one fixed condition a style: first round, and some rounds on.
+
+    `diversity` compares samples of the first round. `rollout_diversity` lets them walk on, each
+    from its own history, and compares all frames of some rounds: it holds differences of phase.
+    """
+    window, repeats = generator.trained.config.window, protocol.num_diversity_seeds
+    frames = min(_DIVERSITY_ROUNDS * window, protocol.num_frames)
+    short = [path.slice(0, frames) for path in paths]
+    poses = generator.rollout(short, styles, seed=protocol.path_seed + seed).history
+    made = generator.rollout(
+        [path for path in short for _ in range(repeats)],
+        [style for style in styles for _ in range(repeats)],
+        seed=protocol.path_seed + seed + protocol.num_seeds,
+        history=np.repeat(poses, repeats, axis=0),
+    )
+    samples = np.stack([made.motion(k).positions for k in range(len(made.styles))])
+    samples = samples.reshape(len(styles), repeats, *samples.shape[1:])
+    return {
+        "diversity": distributions.diversity(samples[:, :, :window]),
+        "rollout_diversity": distributions.diversity(samples),
+    }
+
+
+def _rounds(rollout: Rollout, columns: dict) -> pd.DataFrame:
+    """Follow a rollout round by round (claim Q16: long rollouts drift)."""
+    table = by_round(rollout).melt(id_vars="round", var_name="metric")
+    return table.assign(**columns)[[*columns, "metric", "round", "value"]]
+
+
+def measure_real(
+    packed: PackedMotion,
+    classifier: StyleClassifier,
+    protocol: Protocol,
+    *,
+    window: int,
+    model: str = "real",
+    repeats: int = 20,
+) -> pd.DataFrame:
+    """Score held-out clips, as they are or broken by a recipe, as if they were rollouts.
+
+    A clip follows the smoothed path of the motion that it came from. Every repeat takes another
+    half of each style's clips, drawn without replacement: figures of halves scatter about as much
+    as figures of all clips would between one recording and another (half-sampling), and no window
+    counts twice.
+
+    Args:
+      packed: the data set.
+      classifier: as for `measure_model`.
+      protocol: its styles and windows.
+      window: where the seams of a rollout would lie, frames.
+      model: one of `REFERENCE_MODELS`.
+      repeats: halves to draw.
+
+    Returns:
+      Rows as from `measure_model`, with steps 0 and varies "clips"; without diversity and use of
+      noise, which real motion does not have, and without figures whose size hangs on length.
+
+    Raises:
+      ValueError: for an unknown model, or as `measure_model`.
+    """
+    if model not in REFERENCE_MODELS:
+        raise ValueError(f"unknown reference {model!r}{nearest_hint(model, REFERENCE_MODELS)}")
+    require_telling_styles(classifier)
+    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    motions, figures = [], []
+    for clip in clips:
+        whole = packed.motion(int(clip))
+        seen = whole if model == "real" else corrupt(model, whole, seed=int(clip))
+        motions.append(seen)
+        floor = float(packed.floor_shift[clip])
+        found = _motion_figures(seen, own_path(whole), window, floor)
+        figures.append({k: v for k, v in found.items() if k not in _GROWS_WITH_LENGTH})
+    seen = see_windows(classifier, motions, labels)
+    real = real_features(packed, classifier, protocol.styles, window)
+    columns = {"model": model, "window_frames": window, "steps": 0, "varies": "clips"}
+    rows = []
+    for repeat in range(repeats):
+        rng = np.random.default_rng([protocol.path_seed, repeat])
+        half, shown = [], []
+        for style in protocol.styles:
+            mine = rng.permutation(np.flatnonzero(labels == style))
+            half += mine[: max(1, len(mine) // 2)].tolist()
+            # Halves of few clips may hold too few windows: then one clip more is looked at.
+            held = np.cumsum([np.count_nonzero(seen.source == clip) for clip in mine])
+            enough = 1 + int(np.searchsorted(held, protocol.windows_per_style))
+            shown += mine[: max(len(mine) // 2, enough)].tolist()
+        means = _style_means([figures[place] for place in half], labels[half])
+        means |= _distribution_figures(seen.of(shown), real, protocol.windows_per_style, rng)
+        rows += _rows(means, **columns, seed=repeat)
+    return pd.DataFrame(rows)
+
+
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+    """Turn the figures of single repeats into means with 95 % intervals.
+
+    Repeats over seeds are draws of their own: the interval is that of their mean. Repeats over
+    halves of the clips scatter as the figure itself does: the interval is that of one of them.
+
+    Args:
+      rows: from `measure_model` and `measure_real`.
+
+    Returns:
+      Columns model, window_frames, steps, metric, unit, better, varies, value, low, high, repeats,
+      in the order of the rows; a figure without repeats has NaN for bounds.
+    """
+    keys = ["model", "window_frames", "steps", "metric", "unit", "better", "varies"]
+    out = []
+    for key, group in rows.groupby(keys, sort=False):
+        row = dict(zip(keys, key, strict=True))
+        interval = distributions.mean_and_interval(group["value"].to_numpy())
+        if row["varies"] == "clips":
+            wider = np.sqrt(interval["repeats"])
+            for bound in ("low", "high"):
+                interval[bound] = interval["value"] + wider * (interval[bound] - interval["value"])
+        out.append(row | interval)
+    return pd.DataFrame(out)

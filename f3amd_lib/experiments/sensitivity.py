@@ -1,0 +1,290 @@
+"""Measuring the measures: do distances order motion that is broken more and more, how many windows
+do they need, and what do they not see of the feet?
+
+FID and EMD look at motion through a classifier (`measures.classifier`). Nothing here says what
+people would prefer; it says whether a distance knows the order in which we broke the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.signal import welch
+from scipy.stats import spearmanr
+from tqdm import tqdm
+
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.experiments.protocol import Protocol, real_features, see_windows
+from f3amd_lib.experiments.quality import reference_clips
+from f3amd_lib.measures import distributions
+from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
+from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
+from f3amd_lib.motion.skeleton import Motion
+
+STRENGTHS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Shares of each recipe of `corruptions`: 0 is real motion, 1 the bad generator of our tables."""
+
+_DISTANCES = {"FID": distributions.frechet_distance, "EMD": distributions.earth_movers_distance}
+
+FOOT_BANDS = {"0.5-2 Hz": (0.5, 2.0), "2-5 Hz": (2.0, 5.0), "5-15 Hz": (5.0, 15.0)}
+"""Bands of toe motion, Hz: strides; lift, swing and strike; what is finer, up to half of 30 fps."""
+
+_SEGMENT = 64
+"""Frames of a spectrum's segment: bins of 0.47 Hz, and clips of 2.1 s are long enough."""
+
+
+# ------------------------------------------------------------------------------ graded corruptions
+
+
+def _draw_alike(clouds: Mapping[str, np.ndarray], count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw as many windows of each style, without replacement."""
+    for style, cloud in clouds.items():
+        if len(cloud) < count:
+            raise ValueError(f"{count} windows of style {style!r} are wanted, of {len(cloud)}")
+    return np.concatenate([cloud[rng.choice(len(cloud), count, replace=False)] for cloud in clouds.values()])
+
+
+def graded_corruptions(
+    packed: PackedMotion,
+    classifier: StyleClassifier,
+    protocol: Protocol,
+    strengths: Sequence[float] = STRENGTHS,
+    *,
+    corruptions: Sequence[str] = tuple(CORRUPTIONS),
+    splits: Sequence[str] = ("validation", "test"),
+    progress: bool = False,
+) -> pd.DataFrame:
+    """Break held-out clips more and more and measure the distance to real training windows.
+
+    Each strength and seed draws windows of its own, so that the order is that of independent
+    measurements, as of two models. Both sides hold as many windows of each style, at the speeds
+    of the protocol's paths.
+
+    Args:
+      packed: the data set.
+      classifier: whose features are compared.
+      protocol: its styles, num_seeds, windows_per_style and path_seed.
+      strengths: shares of each recipe, 0 to 1.
+      corruptions: names of `corruptions.CORRUPTIONS`.
+      splits: of the clips that are broken.
+      progress: show a progress bar.
+
+    Returns:
+      Columns corruption, strength, seed, metric ("FID", "EMD", "style_accuracy" in %), value.
+
+    Raises:
+      ValueError: for a classifier that cannot tell styles apart, a strength out of range, an
+        unknown corruption, style or split, or a style with too few windows.
+
+    Source: ours, for claim Q18 (paper section 4.4: "EMD values showed better consistency with
+    perceived motion quality than FID in our experiments").
+    """
+    require_telling_styles(classifier)
+
+    def clips_of(split: str) -> list[int]:
+        return reference_clips(packed, protocol.styles, window=classifier.config.window, split=split)
+
+    clips = [clip for split in splits for clip in clips_of(split)]
+    motions = [packed.motion(clip) for clip in clips]
+    names = [packed.styles[packed.clip_style[clip]] for clip in clips]
+    by_class = real_features(packed, classifier, protocol.styles, classifier.config.window)
+    real = {classifier.styles[number]: cloud for number, cloud in by_class.items()}
+    todo = [
+        (name, strength, seed) for name in corruptions for strength in strengths for seed in range(protocol.num_seeds)
+    ]
+    rows = []
+    for name, strength, seed in tqdm(todo, unit="set", disable=not progress):
+        rng = np.random.default_rng([protocol.path_seed, seed, round(1e6 * strength)])
+        broken = [corrupt(name, motion, strength=strength, seed=int(rng.integers(2**31))) for motion in motions]
+        seen = see_windows(classifier, broken, names)
+        made = {style: seen.features[seen.style == classifier.style_index(style)] for style in real}
+        drawn = [_draw_alike(side, protocol.windows_per_style, rng) for side in (made, real)]
+        figures = {metric: distance(*drawn) for metric, distance in _DISTANCES.items()}
+        figures["style_accuracy"] = distributions.style_accuracy(seen.predicted, seen.style)
+        named = {"corruption": name, "strength": float(strength), "seed": seed}
+        rows += [{**named, "metric": metric, "value": value} for metric, value in figures.items()]
+    return pd.DataFrame(rows)
+
+
+def _over_repeats(rows: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
+    """Turn the values of repeats into means with intervals, in the order of the rows."""
+    out = []
+    for key, group in rows.groupby(list(keys), sort=False):
+        interval = distributions.mean_and_interval(group["value"].to_numpy())
+        out.append(dict(zip(keys, key, strict=True)) | interval)
+    return pd.DataFrame(out)
+
+
+def summarise_corruptions(rows: pd.DataFrame) -> pd.DataFrame:
+    """Turn figures of single seeds into means with 95 % intervals.
+
+    Args:
+      rows: from `graded_corruptions`.
+
+    Returns:
+      Columns corruption, strength, metric, value, low, high, repeats. The intervals are over draws
+      of windows and noise, not over people or clips.
+    """
+    return _over_repeats(rows, ("corruption", "strength", "metric"))
+
+
+def rank_agreement(rows: pd.DataFrame) -> pd.DataFrame:
+    """Say how well each distance orders the strengths of a corruption (claim Q18).
+
+    Spearman's rank correlation between strength and distance within a seed; its mean over seeds.
+    1 is the right order throughout, 0 none.
+
+    Args:
+      rows: from `graded_corruptions`, at least two strengths.
+
+    Returns:
+      Columns corruption, metric, value, low, high (95 %, cut to [-1, 1]; for the difference to
+      [-2, 2]), repeats. Metrics are "FID", "EMD" and "EMD minus FID", the paired difference, which
+      lies above 0 where EMD knows the order better.
+
+    Raises:
+      ValueError: for a single strength.
+
+    Source: ours.
+    """
+    if rows["strength"].nunique() < 2:
+        raise ValueError("one strength has no order; give `graded_corruptions` at least two")
+    found = []
+    for (name, seed), group in rows.groupby(["corruption", "seed"], sort=False):
+        ranks = {}
+        for metric in _DISTANCES:
+            mine = group[group["metric"] == metric]
+            ranks[metric] = float(spearmanr(mine["strength"], mine["value"]).statistic)
+        ranks["EMD minus FID"] = ranks["EMD"] - ranks["FID"]
+        found += [
+            {"corruption": name, "seed": seed, "metric": metric, "value": value} for metric, value in ranks.items()
+        ]
+    table = _over_repeats(pd.DataFrame(found), ("corruption", "metric"))
+    most = np.where(table["metric"] == "EMD minus FID", 2.0, 1.0)
+    return table.assign(low=np.maximum(table["low"], -most), high=np.minimum(table["high"], most))
+
+
+# ---------------------------------------------------------------------------------------- settling
+
+
+def settling(
+    classifier: StyleClassifier, sizes: Sequence[int] | None = None, *, repeats: int = 5, seed: int = 0
+) -> pd.DataFrame:
+    """Follow FID and EMD of real held-out motion against real training motion over the windows.
+
+    Both sides are real, so what is measured is other clips of the same people, and the number of
+    windows. (`distributions.settling_curve` does it for any two clouds, styles unknown.)
+
+    Args:
+      classifier: its reference features are the two clouds.
+      sizes: windows of each style on either side, at most half of what the poorest style has, lest
+        draws share too many windows for their interval; by default halvings of that.
+      repeats: draws a size.
+      seed: of the draws.
+
+    Returns:
+      Columns metric, windows (of all styles together), value, low, high (95 % over draws), repeats.
+
+    Raises:
+      ValueError: for a classifier that cannot tell styles apart, or a size out of range.
+
+    Source: ours.
+    """
+    require_telling_styles(classifier)
+    sides = [
+        {style: classifier.reference(split, style) for style in classifier.styles} for split in ("held_out", "train")
+    ]
+    most = min(len(cloud) for side in sides for cloud in side.values()) // 2
+    if sizes is None:
+        sizes = [most >> k for k in range(10, -1, -1) if most >> k]
+    if not len(sizes) or not 1 <= min(sizes) <= max(sizes) <= most:
+        raise ValueError(
+            f"sizes must lie between 1 and {most} windows of a style, half of what the poorest "
+            f"style has; got {list(sizes)}"
+        )
+    rows = []
+    for size in sizes:
+        for repeat in range(repeats):
+            rng = np.random.default_rng([seed, size, repeat])
+            drawn = [_draw_alike(side, size, rng) for side in sides]
+            rows += [
+                {"metric": metric, "windows": len(drawn[0]), "value": distance(*drawn)}
+                for metric, distance in _DISTANCES.items()
+            ]
+    return _over_repeats(pd.DataFrame(rows), ("metric", "windows"))
+
+
+# ------------------------------------------------------------------------------------ foot spectra
+
+
+def _toe_power(motion: Motion, bands: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return the power of toe velocity in each band, (m/s)^2: mean over toes, sum over x, y, z."""
+    toes = motion.positions[:, list(motion.skeleton.toes)]
+    velocity = motion.fps * np.diff(toes, axis=0)
+    frequency, density = welch(velocity, motion.fps, nperseg=_SEGMENT, axis=0, detrend="constant")
+    density = density.sum(axis=-1).mean(axis=-1)
+    width = frequency[1] - frequency[0]
+    return {
+        band: float(density[(frequency >= low) & (frequency < high)].sum() * width)
+        for band, (low, high) in bands.items()
+    }
+
+
+def foot_spectrum(
+    systems: Mapping[tuple[str, int, int], Sequence[tuple[str, Motion]]],
+    *,
+    bands: Mapping[str, tuple[float, float]] = FOOT_BANDS,
+) -> pd.DataFrame:
+    """Compare the power of toe motion by frequency with that of real feet (claim Q15).
+
+    Power is that of the toes' velocity in the world, where a resting foot reads 0. Fine foot motion
+    that is lost lowers the upper bands; trembling raises them. The lowest band follows the pace:
+    on a path with stops it is low for that alone.
+
+    Args:
+      systems: (model, window_frames, steps) -> (style, motion) pairs, such as
+        `zip(rollout.styles, map(rollout.motion, range(len(rollout.styles))))`. Real clips stand
+        under a key whose model is "real". Motions under 65 frames are left out.
+      bands: name -> (lowest, first beyond) frequency, Hz.
+
+    Returns:
+      Columns model, window_frames, steps, band, metric, value, low, high, repeats. Metric
+      "toe_power" in (m/s)^2 is the mean over styles; "toe_power_over_real" the geometric mean over
+      styles of the quotient with real clips of the same style, 1 where feet are as lively as real
+      ones. Intervals (95 %) are over styles.
+
+    Raises:
+      ValueError: without real clips, for a system none of whose motions is long enough, or a style
+        without a real clip that is.
+
+    Source: paper section 6 ("may lose fine foot motion" of FNO variants); the measure is ours.
+    """
+    if not any(model == "real" for model, _, _ in systems):
+        raise ValueError("toe motion is compared with real clips: add a system named 'real'")
+    power = {}
+    for key, pairs in systems.items():
+        found = [
+            {"style": style, **_toe_power(motion, bands)} for style, motion in pairs if motion.num_frames > _SEGMENT
+        ]
+        if not found:
+            raise ValueError(f"{key[0]}: no motion of more than {_SEGMENT} frames")
+        power[key] = pd.DataFrame(found).groupby("style", sort=False).mean()
+    real = next(table for key, table in power.items() if key[0] == "real")
+    rows = []
+    for key, table in power.items():
+        lacking = [style for style in table.index if style not in real.index]
+        if lacking:
+            raise ValueError(f"no real clip of style {lacking[0]!r} is long enough to compare with")
+        named = dict(zip(("model", "window_frames", "steps"), key, strict=True))
+        quotient = np.log(table / real.loc[table.index])
+        for band in bands:
+            plain = distributions.mean_and_interval(table[band].to_numpy())
+            ratio = distributions.mean_and_interval(quotient[band].to_numpy())
+            ratio |= {bound: float(np.exp(ratio[bound])) for bound in ("value", "low", "high")}
+            rows += [
+                {**named, "band": band, "metric": "toe_power", **plain},
+                {**named, "band": band, "metric": "toe_power_over_real", **ratio},
+            ]
+    return pd.DataFrame(rows)

@@ -1,0 +1,175 @@
+"""Blending at window boundaries, a post-process that one may ask for (paper section 6).
+
+The paper leaves its rollouts as they come, and so does every figure of this project unless it says
+"blended": what is seen at a seam is what the network made of it. Products blend. We do it by
+inertialisation: both sides of a seam are extended to the moment half way between the last frame of
+the one window and the first of the next. There they differ by an offset in value and in velocity.
+The later side gets this offset added, and lets it die away over the next frames by a polynomial:
+
+    x(u) = offset (1 - 10 u^3 + 15 u^4 - 6 u^5) + N velocity (u - 6 u^3 + 8 u^4 - 3 u^5),
+
+u = tau / N, tau frames after the seam, 0 <= u <= 1; x has the offset and its velocity at the seam,
+and value, velocity and acceleration 0 after N frames. Frames before the seam are not touched, so
+that nothing has to be known ahead and a running character could be blended as well. What is blended
+is not given back to the network as history.
+
+Source: ours, after D. Bollo, "Inertialization: High-Performance Animation Transitions in Gears of
+War", GDC 2018 (offsets instead of cross-fades, a quintic in time), without its clamps, so that the
+result is linear in the offset.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.data.features import split_frames
+from f3amd_lib.generation.generated import Rollout
+from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+
+
+def dying_offset(offset, velocity, num_frames: int) -> np.ndarray:
+    """Let an offset die away: the quintic of this module's text at tau = 1/2, 3/2, ..., N - 1/2.
+
+    Args:
+      offset: at the seam, [...].
+      velocity: of the offset at the seam, per frame, [...].
+      num_frames: N, at least 1.
+
+    Returns:
+      [N, ...], float64.
+    """
+    offset, velocity = np.asarray(offset, np.float64), np.asarray(velocity, np.float64)
+    u = (np.arange(num_frames) + 0.5) / num_frames
+    u = u.reshape(-1, *[1] * offset.ndim)
+    value = 1.0 + u**3 * (-10.0 + u * (15.0 - 6.0 * u))
+    slope = u + u**3 * (-6.0 + u * (8.0 - 3.0 * u))
+    return value * offset + num_frames * slope * velocity
+
+
+def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.ndarray:
+    """Blend world frames at the boundaries between windows.
+
+    Root positions are blended as vectors, rotations as rotation vectors of the turn from the later
+    side to the earlier one, applied from the left: what comes out is a rotation whatever happens.
+    Value at the seam is continuous; velocity too, for rotations up to second order in the offset.
+
+    Args:
+      frames: [..., F, C], metres and 6D; window k starts at frame k * window.
+      window: T.
+      blend_frames: N, frames after a seam that are changed, 0 to T; 0 changes nothing.
+      history: the frames before window 0, [..., H, C]; with them the step into window 0 is a seam
+        as well.
+
+    Returns:
+      [..., F, C], float64.
+
+    Raises:
+      ValueError: for a window or blend_frames out of range, frames that are none, or a history that
+        does not fit.
+    """
+    frames = np.asarray(frames, np.float64)
+    if frames.ndim < 2 or frames.shape[-1] < 9 or (frames.shape[-1] - 3) % 6:
+        raise ValueError(f"frames must be [..., F, 3 + 6 J], got {frames.shape}")
+    if not np.isfinite(frames).all():
+        frame = int(np.argwhere(~np.isfinite(frames))[0][-2])
+        raise ValueError(f"frames hold a number that is not finite at frame {frame}")
+    if int(window) != window or window < 1:
+        raise ValueError(f"window must be a whole number of frames, 1 or more, got {window}")
+    if int(blend_frames) != blend_frames or not 0 <= blend_frames <= window:
+        raise ValueError(
+            f"blend_frames must be a whole number from 0 to the window's {window} frames, got {blend_frames}"
+        )
+    before = np.zeros((*frames.shape[:-2], 0, frames.shape[-1]))
+    if history is not None:
+        before = np.asarray(history, np.float64)
+        expected = (*frames.shape[:-2], frames.shape[-1])
+        if before.ndim != frames.ndim or (*before.shape[:-2], before.shape[-1]) != expected:
+            raise ValueError(f"history of shape {before.shape} does not fit frames of shape {frames.shape}")
+    if blend_frames == 0:
+        return frames.copy()
+    # Time first: seams are walked one after the other, as a blended window is the next one's past.
+    whole = np.moveaxis(np.concatenate([before, frames], axis=-2), -2, 0)
+    root, rotation_6d = split_frames(whole)
+    root, turns = root.copy(), matrix_from_rotation_6d(rotation_6d)
+    start = before.shape[-2]
+    for seam in range(start or window, len(whole), int(window)):
+        stop = min(seam + int(blend_frames), len(whole))
+        added = _offsets(_Positions, root, seam, int(blend_frames))[: stop - seam]
+        root[seam:stop] = _Positions.add(added, root[seam:stop])
+        added = _offsets(_Rotations, turns, seam, int(blend_frames))[: stop - seam]
+        turns[seam:stop] = _Rotations.add(added, turns[seam:stop])
+    flat = rotation_6d_from_matrix(turns).reshape(*whole.shape[:-1], -1)
+    blended = np.concatenate([root, flat], axis=-1)[start:]
+    return np.moveaxis(blended, 0, -2)
+
+
+class _Positions:
+    """Differences and sums of positions [..., 3]."""
+
+    @staticmethod
+    def between(first, second):
+        return second - first
+
+    @staticmethod
+    def add(step, value):
+        return value + step
+
+
+class _Rotations:
+    """The same for rotation matrices [..., 3, 3], with rotation vectors [..., 3] as steps."""
+
+    @staticmethod
+    def between(first, second):
+        turn = second @ np.swapaxes(first, -1, -2)
+        vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec()
+        return vectors.reshape(turn.shape[:-1])
+
+    @staticmethod
+    def add(step, value):
+        step = np.array(np.broadcast_to(step, value.shape[:-1]))
+        turn = Rotation.from_rotvec(step.reshape(-1, 3)).as_matrix()
+        return turn.reshape(value.shape) @ value
+
+
+def _offsets(space, values, seam: int, num_frames: int) -> np.ndarray:
+    """Return what has to be added to the frames after a seam, [N, ..., 3]."""
+    earlier = values[max(0, seam - 3) : seam][::-1]
+    later = values[seam : seam + 3]
+    steps = [[space.between(side[k + 1], side[k]) for k in range(len(side) - 1)] for side in (earlier, later)]
+    # A side of one frame goes on as the other does; one of two frames keeps its step.
+    still = np.zeros_like(space.between(values[seam], values[seam]))
+    toward = [mine or [-other[0] if other else still] for mine, other in (steps, steps[::-1])]
+    toward = [(mine[0], mine[-1]) for mine in toward]
+    (left, left_before), (right, right_before) = toward
+    # Towards the seam: linear in value (equal accelerations of both sides cancel), and with its own
+    # acceleration in velocity. The later side runs backwards in time.
+    offset = space.between(space.add(0.5 * right, later[0]), space.add(0.5 * left, earlier[0]))
+    velocity = (2.0 * left - left_before) + (2.0 * right - right_before)
+    return dying_offset(offset, velocity, num_frames)
+
+
+def blend_rollout(rollout: Rollout, blend_frames: int) -> Rollout:
+    """Blend all characters of a rollout, the step from their history included.
+
+    Args:
+      rollout: as the network made it.
+      blend_frames: N, 0 to the rollout's window.
+
+    Returns:
+      The rollout with blended frames; its `blend_frames` says so.
+
+    Raises:
+      ValueError: for a rollout that is blended already, or N out of range.
+    """
+    if rollout.blend_frames:
+        raise ValueError(
+            f"this rollout is blended already (over {rollout.blend_frames} frames); blend the one that the network made"
+        )
+    frames = blend_seams(rollout.frames, rollout.window, blend_frames, history=rollout.history)
+    if blend_frames == 0:
+        return rollout
+    frames = frames.astype(rollout.frames.dtype)
+    return dataclasses.replace(rollout, frames=frames, blend_frames=int(blend_frames))

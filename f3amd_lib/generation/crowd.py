@@ -1,0 +1,642 @@
+"""Crowds of any size: characters in chunks, written to disk as they are made.
+
+A crowd is a folder. Its arrays are plain `.npy` files, which NumPy opens without this library:
+
+| file | what |
+|---|---|
+| `root.npy` | float32 [B, F, 3]: root x, y, z in metres, +Y up |
+| `rotations.npy` | float16 [B, F, J, 6]: first two columns of each joint's local rotation matrix |
+| `path.npy` | float32 [B, F, 3]: what was asked for: root x and z in metres, facing in radians |
+| `styles.npy` | int32 [B]: place in the list `styles` of `crowd.json` |
+| `crowd.json` | skeleton, styles, model and its terms, seed, frame rate, how many are finished |
+
+Rotations bear half precision, root positions do not: float16 steps 0.25 m at 300 m.
+
+A character is made from the seed and its own number alone: neither the chunk it comes in, nor the
+size of the crowd, nor a run that stopped and went on makes a difference beyond rounding. Characters
+do not see each other; they may walk through one another, unless their paths are planned to keep
+apart (`min_distance`). Then everybody's path depends on who else is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from f3amd_lib.data.features import center_window, motion_from_frames, turn_frames
+from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
+from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
+from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
+
+PATHS = tuple(name for name in NAMES if name != "complex")
+"""Names that the paths of a crowd are drawn from unless told: those that face where they go."""
+
+FORMAT = "f3amd-crowd-1"
+
+_ARRAYS = {
+    "root": ("<f4", lambda frames, joints: (frames, 3)),
+    "rotations": ("<f2", lambda frames, joints: (frames, joints, 6)),
+    "path": ("<f4", lambda frames, joints: (frames, 3)),
+    "styles": ("<i4", lambda frames, joints: ()),
+}
+"""File stem -> type and shape of one character."""
+
+_FPS = 30.0
+_HEADER_BYTES = 128  # of a .npy file of so few dimensions
+# CPU time a character on two cores with 2 MiB of L2 (F3AMD-FNO-96, one step, 32 frames): least at
+# 128; 64 costs 8 % more, 512 15 %, 4096 38 %.
+_CHUNK = 128
+_CHUNK_BYTES = 1 << 28  # of generated frames; a rollout holds a few copies of them
+_SLOWEST = 0.3  # m/s; a path has to be walked, even by one who stood in the starting pose
+_TEMPLATE_SPEED = 1.2  # m/s, the speed that the sizes of the named paths are made for
+_TEMPLATE_SECONDS = 60.0  # within which a character may enter a path: three laps of the longest
+_SPACING = 1.0  # metres; neighbours start about 1.7 times as far apart
+
+PathMaker = Callable[[range, np.ndarray, int, int], tuple[np.ndarray, np.ndarray]]
+
+
+def _draws(characters: range, count: int, seed: int, purpose: int) -> np.ndarray:
+    """Draw numbers in [0, 1), [n, count], that depend on seed, purpose and character alone.
+
+    Philox counts: every character owns a stretch of the counter, to which we jump.
+    """
+    bits = np.random.Philox(np.random.SeedSequence([seed, purpose]))
+    counters = -(-count // 4)  # each gives four doubles
+    bits.advance(characters.start * counters)
+    return np.random.Generator(bits).random((len(characters), 4 * counters))[:, :count]
+
+
+_POSES, _WAYS = range(2)  # purposes of draws
+
+
+@functools.lru_cache(maxsize=4)
+def _templates(names: tuple[str, ...], num_frames: int, seed: int):
+    """Return named paths long enough to enter late: positions [N, L, 2] and yaw [N, L]."""
+    length = num_frames + round(_TEMPLATE_SECONDS * _FPS)
+    made = [named_path(name, length, speed=_TEMPLATE_SPEED, seed=seed, fps=_FPS) for name in names]
+    return np.stack([path.position for path in made]), np.stack([path.yaw for path in made])
+
+
+def crowd_paths(
+    characters: range, pace: np.ndarray, num_frames: int, seed: int, *, names: Sequence[str] = PATHS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give each character a path of its own, for many characters at once.
+
+    Each walks a stretch of a named path, entered at a random time of its first minute, to the left
+    or mirrored to the right, turned to a random side. The path is scaled so that it is walked at
+    the character's pace with the turns of a walk: a runner's circle is wider. Starting places lie
+    on a sunflower's spiral, about 1.7 m apart, however many there are.
+
+    Args:
+      characters: their numbers.
+      pace: of each, [n], m/s; the mean one where a path stops and goes ("complex").
+      num_frames: F.
+      seed: of all choices.
+      names: of `paths.NAMES`; each character draws one.
+
+    Returns:
+      (position [n, F, 2] in metres, yaw [n, F] in radians), both float64.
+
+    Source: ours.
+    """
+    positions, yaws = _templates(tuple(names), num_frames, seed)
+    which, enter, side, facing = _draws(characters, 4, seed, _WAYS).T
+    which = (which * len(positions)).astype(int)[:, None]
+    late = (enter * (positions.shape[1] - num_frames + 1)).astype(int)
+    frame = late[:, None] + np.arange(num_frames)
+    position, yaw = positions[which, frame], yaws[which, frame]
+
+    side = np.where(side < 0.5, 1.0, -1.0)[:, None]
+    scale = (np.asarray(pace) / _TEMPLATE_SPEED)[:, None]
+    angle = 2.0 * np.pi * facing[:, None] - np.pi - side * yaw[:, :1]
+    x = scale * side * (position[..., 0] - position[:, :1, 0])
+    z = scale * (position[..., 1] - position[:, :1, 1])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    moved = np.stack([cosine * x + sine * z, cosine * z - sine * x], axis=-1)
+    return moved + _sunflower(characters)[:, None, :], side * yaw + angle
+
+
+def _sunflower(characters: range) -> np.ndarray:
+    """Return places of equal density around the origin, [n, 2], metres (Vogel 1979)."""
+    number = np.arange(characters.start, characters.stop)
+    angle = number * np.pi * (3.0 - math.sqrt(5.0))
+    radius = _SPACING * np.sqrt(number + 0.5)
+    return radius[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def plan_crowd(
+    num_characters: int,
+    num_frames: int,
+    *,
+    pace=_TEMPLATE_SPEED,
+    seed: int = 0,
+    min_distance: float = MIN_DISTANCE,
+    radius: float | None = None,
+    names: Sequence[str] = PATHS,
+) -> tuple[RootPath, ...]:
+    """Plan paths for a crowd that keeps apart, ready for `MotionGenerator.rollout`.
+
+    Args:
+      num_characters: B.
+      num_frames: F, at 30 fps.
+      pace: of all, or of each, [B], m/s.
+      seed: of all choices.
+      min_distance: metres between any two characters at every frame.
+      radius: of the disc that holds the starting places, metres; they fill it only if they have
+        to. By default it is as large as it has to be.
+      names: of `paths.NAMES` to draw from.
+
+    Returns:
+      A path each; the same for the same arguments.
+
+    Raises:
+      ValueError: for counts or paces out of range, an unknown path, or what `keep_apart` refuses.
+    """
+    num_characters = _whole("num_characters", num_characters, 1)
+    num_frames, seed = _whole("num_frames", num_frames, 2), _whole("seed", seed, 0)
+    pace = np.asarray(pace, np.float64)
+    if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
+        raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
+    make_paths, _ = _path_maker(names)
+    pace = np.broadcast_to(pace, (num_characters,))
+    position, yaw = keep_apart(
+        *make_paths(range(num_characters), pace, num_frames, seed), min_distance=min_distance, radius=radius, fps=_FPS
+    )
+    return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
+
+
+def default_chunk(num_frames: int, channels: int) -> int:
+    """Return how many characters to generate at once.
+
+    At most 128, which was fastest on a CPU; fewer where their frames would take over 256 MiB.
+
+    Args:
+      num_frames: F.
+      channels: C.
+    """
+    return max(1, min(_CHUNK, _CHUNK_BYTES // (4 * num_frames * channels)))
+
+
+@dataclass(frozen=True, eq=False)
+class Crowd:
+    """A finished crowd on disk; arrays are read as they are asked for.
+
+    Attributes:
+      settings: what `crowd.json` says.
+      skeleton: of all characters.
+      root: [B, F, 3], metres.
+      rotations: [B, F, J, 6], float16.
+      path: [B, F, 3], x, z in metres and facing in radians that were asked for.
+      style_index: [B], into `settings["styles"]`.
+    """
+
+    settings: dict
+    skeleton: Skeleton
+    root: np.ndarray
+    rotations: np.ndarray
+    path: np.ndarray
+    style_index: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.root)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of every character, F."""
+        return self.root.shape[1]
+
+    def style(self, character: int) -> str:
+        """Return a character's style."""
+        return self.settings["styles"][self.style_index[character]]
+
+    def target(self, character: int) -> RootPath:
+        """Return the path that a character was asked to follow."""
+        path = np.asarray(self.path[character], np.float64)
+        return RootPath(path[:, :2], path[:, 2], self.settings["fps"])
+
+    def motion(self, character: int) -> Motion:
+        """Return a character's motion."""
+        root = np.asarray(self.root[character], np.float64)
+        rotations = np.asarray(self.rotations[character], np.float64)
+        frames = np.concatenate([root, rotations.reshape(len(root), -1)], axis=-1)
+        return motion_from_frames(self.skeleton, frames, self.settings["fps"], name=self.style(character))
+
+
+def generate_crowd(
+    generator: MotionGenerator,
+    num_characters: int,
+    num_frames: int,
+    out,
+    *,
+    styles: str | Sequence[str] | None = None,
+    paths: str | Sequence[str] | PathMaker = PATHS,
+    min_distance: float | None = None,
+    seed: int = 0,
+    chunk: int | None = None,
+    overwrite: bool = False,
+    progress: bool = False,
+) -> Crowd:
+    """Animate any number of characters, and write them to a folder chunk by chunk.
+
+    Memory depends on the chunk, not on the number of characters. A call that was stopped goes on
+    where it was when it is made again; every finished chunk is on disk before it counts.
+
+    Args:
+      generator: of the motion; says model, steps and sampler.
+      num_characters: B.
+      num_frames: F, at 30 fps.
+      out: folder to write to (see the module's table); new, empty, or of this call when stopped.
+      styles: names, taken in turn; by default all that the model knows and has starting poses for.
+      paths: name or names of paths to draw from (see `crowd_paths`), or a function of its first
+        four arguments and with its result. A call that goes on must give the first character the
+        path that it had.
+      min_distance: metres that paths keep from each other at every frame, all planned before the
+        first chunk is made (see `crowd_planning`); None lets characters walk through one another.
+      seed: of paths, starting poses and noise, 0 or more.
+      chunk: characters generated at once; by default `default_chunk`.
+      overwrite: write over a crowd that lies there, finished or not.
+      progress: show a progress bar.
+
+    Returns:
+      The crowd, as from `read_crowd`.
+
+    Raises:
+      ValueError: for counts below 1 (2 frames), an unknown style or path, paths of a wrong shape, a
+        folder with anything else in it (a crowd of another call, for one), or too little room on
+        the disk.
+      ArithmeticError: if the model generates a number that is not finite.
+    """
+    trained, skeleton = generator.trained, generator.trained.skeleton
+    num_characters = _whole("num_characters", num_characters, 1)
+    num_frames, seed = _whole("num_frames", num_frames, 2), _whole("seed", seed, 0)
+    if chunk is None:
+        chunk = default_chunk(num_frames, trained.config.channels)
+    chunk = min(_whole("chunk", chunk, 1), num_characters)
+    styles = [styles] if isinstance(styles, str) else styles
+    if styles is None:
+        styles = [style for style in trained.styles if style in trained.seeds]
+    in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
+    if not len(in_turn):
+        raise ValueError("a crowd needs at least one style")
+    for style in styles:
+        if style not in trained.seeds:
+            raise ValueError(f"no starting pose is stored for style {style!r}; leave it out")
+    make_paths, path_names = _path_maker(paths)
+
+    settings = {
+        "format": FORMAT,
+        "num_characters": num_characters,
+        "num_frames": num_frames,
+        "fps": _FPS,
+        "seed": seed,
+        "chunk": chunk,
+        "paths": path_names,
+        "min_distance": min_distance,
+        "styles": list(trained.styles),
+        "styles_in_turn": hashlib.sha256(in_turn.tobytes()).hexdigest()[:12],
+        **describe_skeleton(skeleton),
+        "offsets": np.asarray(skeleton.offsets).tolist(),
+        "model": {
+            "name": trained.name,
+            "weights": weights_digest(trained.params),
+            "dtype": generator.dtype.name,
+            "sampler": generator.sampler,
+            "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
+            "dataset": trained.record.get("dataset"),
+            "dataset_licence": trained.record.get("dataset_licence"),
+            "dataset_credit": trained.record.get("dataset_credit"),
+        },
+    }
+    settings = json.loads(json.dumps(settings))
+    out = Path(out)
+    finished, first_path = _look_into(out, settings, overwrite)
+    _check_room(out, settings)
+
+    def asked_of(part: range):
+        style_index = in_turn[np.arange(part.start, part.stop) % len(in_turn)]
+        pace, pose = _paces(generator, part, style_index, seed)
+        made = make_paths(part, pace, num_frames, seed)
+        return style_index, pose, *_checked(made, (len(part), num_frames))
+
+    if min_distance is not None:
+        _, _, *wanted = asked_of(range(num_characters))
+        planned = keep_apart(*wanted, min_distance=min_distance, fps=_FPS)
+        make_paths = lambda part, *_: tuple(array[part.start : part.stop] for array in planned)
+    beginning = asked_of(range(chunk))
+    settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
+    if first_path not in (None, settings[_FIRST_PATH]):
+        raise ValueError(
+            f"{out}: holds a crowd whose first character walks another path than this call's; "
+            "give the paths that it was begun with, pass overwrite=True, or choose another folder"
+        )
+    if finished == 0:
+        _write_settings(out, settings, 0)
+    noise = jax.random.key(seed)
+    with contextlib.ExitStack() as files:
+        writers = {name: files.enter_context(_open_rows(out, name, settings, finished)) for name in _ARRAYS}
+        bar = files.enter_context(
+            tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress)
+        )
+        for first in range(finished, num_characters, chunk):
+            characters = range(first, min(first + chunk, num_characters))
+            asked = asked_of(characters) if first else beginning
+            style_index, pose, position, yaw = asked
+            history = _starting_poses(generator, style_index, position, yaw, pose)
+            # The last chunk is filled up with its last character, so that nothing compiles twice.
+            number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
+            row = number - first
+            frames = generator.generate(
+                position[row],
+                yaw[row],
+                style_index[row],
+                history[row],
+                jax.vmap(jax.random.fold_in, (None, 0))(noise, number),
+            )[: len(characters)]
+            if not np.isfinite(frames).all():
+                worst = first + int(np.argwhere(~np.isfinite(frames))[0][0])
+                raise ArithmeticError(
+                    f"{trained.name} generated a number that is not finite for character {worst}; "
+                    "its weights or its noise levels are broken"
+                )
+            rows = {
+                "root": frames[..., :3],
+                "rotations": frames[..., 3:].reshape(*frames.shape[:2], -1, 6),
+                "path": np.concatenate([position, yaw[..., None]], axis=-1),
+                "styles": style_index,
+            }
+            for name, writer in writers.items():
+                _append(writer, rows[name].astype(_ARRAYS[name][0]))
+            _write_settings(out, settings, characters.stop)
+            bar.update(len(characters))
+    return read_crowd(out)
+
+
+def read_crowd(folder) -> Crowd:
+    """Open a crowd that `generate_crowd` finished.
+
+    Args:
+      folder: where it lies.
+
+    Returns:
+      The crowd; its arrays stay on disk until they are indexed.
+
+    Raises:
+      ValueError: naming the file, if it is missing, cut short, of another kind, or the crowd is not
+        finished.
+    """
+    folder = Path(folder)
+    settings = _read_settings(folder)
+    total, finished = settings["num_characters"], settings["num_finished"]
+    if finished != total:
+        raise ValueError(
+            f"{folder}: only {finished} of {total} characters are finished; make the same call again and it goes on"
+        )
+    with errors_name(folder / _SETTINGS):
+        skeleton = described_skeleton(settings, settings["offsets"])
+    arrays = {name: _open_array(folder, name, settings) for name in _ARRAYS}
+    return Crowd(
+        settings=settings,
+        skeleton=skeleton,
+        root=arrays["root"],
+        rotations=arrays["rotations"],
+        path=arrays["path"],
+        style_index=arrays["styles"],
+    )
+
+
+def _whole(name: str, value, least: int) -> int:
+    """Return a whole number; ValueError if it is none, or below the least."""
+    if int(value) != value or value < least:
+        raise ValueError(f"{name} must be a whole number of {least} or more, got {value}")
+    return int(value)
+
+
+def _path_maker(paths) -> tuple[PathMaker, list[str] | str]:
+    """Return what makes the paths, and how to call it in the settings."""
+    if callable(paths):
+        kind = paths if hasattr(paths, "__qualname__") else type(paths)
+        return paths, f"{kind.__module__}.{kind.__qualname__}"
+    names = [paths] if isinstance(paths, str) else list(paths)
+    if not names:
+        raise ValueError("a crowd needs at least one path to draw from")
+    for name in names:
+        if name not in NAMES:
+            raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
+    return functools.partial(crowd_paths, names=names), names
+
+
+def _checked(made, expected: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [n, F, 2] and yaw [n, F] as float64; ValueError for anything else."""
+    position, yaw = (np.asarray(array, np.float64) for array in made)
+    if position.shape != (*expected, 2) or yaw.shape != expected:
+        raise ValueError(
+            f"paths must be position {(*expected, 2)} and yaw {expected}, got {position.shape} and {yaw.shape}"
+        )
+    if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
+        raise ValueError("paths hold a number that is not finite")
+    return position, yaw
+
+
+def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
+    """Return a digest of one path, [F, 2] and [F], in tenths of a millimetre and milliradian.
+
+    The same path worked out on another machine may differ in its last bits.
+    """
+    tenths = np.rint(1e4 * np.column_stack([position, yaw])).astype("<i8")
+    return hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
+
+
+def _paces(generator: MotionGenerator, characters: range, style_index, seed: int):
+    """Draw each character's pace from the starting poses of its style.
+
+    Returns:
+      (pace [n] in m/s, a number in [0, 1) for the choice of the pose [n]).
+    """
+    trained = generator.trained
+    which, pose = _draws(characters, 2, seed, _POSES).T
+    pace = np.empty(len(characters))
+    for style in np.unique(style_index):
+        mine = style_index == style
+        speeds = _FPS * pose_speed(trained.seeds[trained.styles[style]])
+        pace[mine] = speeds[(which[mine] * len(speeds)).astype(int)]
+    return np.maximum(pace, _SLOWEST), pose
+
+
+def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw) -> np.ndarray:
+    """Return histories [n, H, C]: poses about as fast as the paths, moved to where those start."""
+    trained, config = generator.trained, generator.trained.config
+    start = path_start(position)
+    speed = np.linalg.norm(position[:, 0] - start, axis=-1)
+    poses = np.empty((len(start), config.num_history, config.channels))
+    for style in np.unique(style_index):
+        mine = style_index == style
+        choices = trained.seeds[trained.styles[style]]
+        fitting = as_fast_as(choices, speed[mine])
+        number = (draw[mine] * fitting.sum(axis=1)).astype(int)
+        # The first place where more than `number` fitting poses have been passed.
+        poses[mine] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
+    return center_window(turn_frames(poses, yaw[:, 0]), -start).astype(np.float32)
+
+
+_SETTINGS = "crowd.json"
+_FIRST_PATH = "first_path"  # digest; crowds of earlier versions lack it
+_NEEDED = ("num_characters", "num_frames", "num_finished", "fps", "styles", "joints", "offsets")
+
+
+def _read_settings(folder: Path) -> dict:
+    """Return what `crowd.json` says; ValueError if it is missing or not ours."""
+    path = folder / _SETTINGS
+    if not path.is_file():
+        raise ValueError(f"{folder}: holds no crowd ({_SETTINGS} is missing)")
+    with errors_name(path):
+        settings = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+            raise ValueError("not written by this project; choose another folder")
+        for name in _NEEDED:
+            if name not in settings:
+                raise ValueError(f"{name} is missing; restore a whole copy")
+        finished, total = settings["num_finished"], settings["num_characters"]
+        if not 0 <= finished <= total:
+            raise ValueError(f"says that {finished} of {total} characters are finished")
+        return settings
+
+
+def _write_settings(folder: Path, settings: dict, finished: int) -> None:
+    text = json.dumps(settings | {"num_finished": finished}, indent=1, ensure_ascii=False)
+    with whole_file(folder / _SETTINGS, overwrite=True) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | None]:
+    """Return how far this very crowd has come; ValueError for anything else.
+
+    Returns:
+      (number of finished characters, digest of the first one's path if it is known).
+    """
+    if not out.exists():
+        return 0, None
+    if not out.is_dir():
+        raise ValueError(f"{out}: not a folder; a crowd needs one to itself")
+    if not (out / _SETTINGS).exists():
+        other = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
+        if other:
+            raise ValueError(f"{out}: holds other files ({other[0]}); choose a folder of its own")
+        return 0, None
+    there = _read_settings(out)  # also before overwriting: what is not ours stays
+    if overwrite:
+        return 0, None
+    finished = there.pop("num_finished")
+    for name in settings:
+        if there.get(name) != settings[name]:
+            short = [json.dumps(value)[:60] for value in (there.get(name), settings[name])]
+            raise ValueError(
+                f"{out}: holds a crowd made with {name} {short[0]}, not {short[1]}; pass "
+                "overwrite=True or choose another folder"
+            )
+    if finished == settings["num_characters"]:
+        raise ValueError(
+            f"{out}: holds this crowd already, finished; read it with read_crowd, pass "
+            "overwrite=True, or choose another folder"
+        )
+    return finished, there.get(_FIRST_PATH)
+
+
+def _row(name: str, settings: dict) -> tuple[np.dtype, tuple[int, ...]]:
+    """Return type and shape of one character in an array."""
+    dtype, shape = _ARRAYS[name]
+    return np.dtype(dtype), shape(settings["num_frames"], len(settings["joints"]))
+
+
+def _row_bytes(name: str, settings: dict) -> int:
+    dtype, shape = _row(name, settings)
+    return dtype.itemsize * math.prod(shape)
+
+
+def _check_room(out: Path, settings: dict) -> None:
+    """Raise ValueError if the disk lacks room for what is still to be written."""
+    needed = settings["num_characters"] * sum(_row_bytes(name, settings) for name in _ARRAYS)
+    needed += len(_ARRAYS) * _HEADER_BYTES
+    there = [out / f"{name}.npy" for name in _ARRAYS]
+    needed -= sum(path.stat().st_size for path in there if path.exists())
+    place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    free = shutil.disk_usage(place).free
+    if needed > free:
+        raise ValueError(
+            f"{out}: this crowd takes {needed / 1e9:.3g} GB more, and the disk has "
+            f"{free / 1e9:.3g} GB free; make fewer characters or frames, or choose another disk"
+        )
+
+
+def _first_row(path: Path, name: str, settings: dict) -> int:
+    """Return where a file's first character begins, in bytes; ValueError for a foreign header."""
+    dtype, shape = _row(name, settings)
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; the crowd has to be made anew")
+    with path.open("rb") as file, errors_name(path):
+        np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0(file)
+        if header != ((settings["num_characters"], *shape), False, dtype):
+            raise ValueError(f"holds {header[2]} {header[0]}, which is not what {_SETTINGS} says")
+        return file.tell()
+
+
+def _open_rows(out: Path, name: str, settings: dict, finished: int):
+    """Open an array's file behind the finished characters; what lies beyond is written over."""
+    path = out / f"{name}.npy"
+    if finished == 0:
+        file = path.open("wb")
+        dtype, shape = _row(name, settings)
+        np.lib.format.write_array_header_1_0(
+            file,
+            {
+                "descr": np.lib.format.dtype_to_descr(dtype),
+                "fortran_order": False,
+                "shape": (settings["num_characters"], *shape),
+            },
+        )
+        return file
+    end = _first_row(path, name, settings) + finished * _row_bytes(name, settings)
+    if path.stat().st_size < end:
+        raise ValueError(
+            f"{path}: cut short, it does not hold the {finished} characters that {_SETTINGS} "
+            "counts; pass overwrite=True to begin anew"
+        )
+    file = path.open("r+b")
+    file.seek(end)
+    return file
+
+
+def _append(file, rows: np.ndarray) -> None:
+    """Write rows behind the others, down to the disk.
+
+    Plain writes, as pages of a writable memory map would count as this process's memory.
+    """
+    file.write(np.ascontiguousarray(rows))
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _open_array(folder: Path, name: str, settings: dict) -> np.ndarray:
+    """Map a finished array; ValueError if the file is not exactly as long as it should be."""
+    path = folder / f"{name}.npy"
+    end = _first_row(path, name, settings)
+    end += settings["num_characters"] * _row_bytes(name, settings)
+    if path.stat().st_size != end:
+        raise ValueError(f"{path}: has {path.stat().st_size} bytes, should have {end}; cut short?")
+    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,0 +1,246 @@
+"""Paths for a crowd whose characters keep apart.
+
+Everybody brings a path that knows nothing of the others, such as those of `crowd.crowd_paths`. Two
+who would come too close at time t* step aside: each path is bent away from the other by a smooth
+bump around t*, along the line that joins them at their closest, which is square to their relative
+motion. That is repeated until no two are too close at any frame. Bumps change how fast somebody
+walks. Who would have to hurry or dawdle out of bounds gets the old path back, and from then on is
+moved aside as a whole. Starting places of a crowd that has to be untangled are moved apart before
+that, by 1.44, and again as long as it is too dense even so. So it ends: places that lie farther
+apart than two paths are long need no bump at all. Within a given radius they are moved apart only
+if they cannot stay where they are, and no farther than it allows.
+
+Nothing is left to chance or to a proof: `keep_apart` measures every frame of what it returns.
+Networks follow paths to a few centimetres, so that generated characters keep a little less distance
+than their paths; `closest_approach` measures that as well.
+
+Source: ours. The paper does not say how the characters of its Figure 1 keep apart.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.ndimage import convolve1d, gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from f3amd_lib.motion.root_paths import tangent_yaw
+from f3amd_lib.motion.rotations import wrap_angle
+
+MIN_DISTANCE = 0.8
+"""Metres between two roots by default: shoulders of 0.45 m and a swinging arm."""
+
+SPEED_BOUNDS = (0.5, 1.5)
+"""A bent path is walked at this share of its own greatest speed and its own speed at that frame."""
+
+_MARGIN = 0.03  # metres more than asked for, so that rounds of bumps end
+_PASSING = 0.01  # metres a frame; who moves faster relative to another passes by
+_HALF_WIDTH = 2.5  # seconds from the middle of a bump to its end
+_ROUNDS = 60
+_EVERY = 5  # frames looked at until the last rounds; two pass each other more slowly than that
+_SPREADS = 1.2 ** np.arange(2, 40)  # ends at a factor of 1000
+_LARGE = 256  # characters; larger crowds begin farther apart, as a round takes them seconds
+_TIGHTER = (1.0, 0.97, 0.94, 0.9, 0.85)  # shares of a given radius that are tried
+_DENSEST = math.pi / math.sqrt(12.0)  # share of a plane that discs can cover
+_SMOOTH_TURN = 0.15  # seconds; what is turned by a bump is smoothed so far
+
+
+def closest_approach(position) -> np.ndarray:
+    """Return the smallest distance between any two characters at each frame.
+
+    Args:
+      position: of all roots on the ground, [B, F, 2], metres.
+
+    Returns:
+      Metres, [F]; infinite for one character.
+
+    Raises:
+      ValueError: for another shape, or a number that is not finite.
+    """
+    position = _checked(position)
+    if len(position) == 1:
+        return np.full(position.shape[1], np.inf)
+    frames = np.moveaxis(position, 1, 0)
+    return np.array([cKDTree(frame).query(frame, k=2)[0][:, 1].min() for frame in frames])
+
+
+def keep_apart(
+    position, yaw, *, min_distance: float = MIN_DISTANCE, radius: float | None = None, fps: float = 30.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bend and spread paths until all characters keep a distance at every frame.
+
+    Args:
+      position: paths that know nothing of each other, [B, F, 2], metres.
+      yaw: their facing, [B, F], radians; turned with the line.
+      min_distance: metres between any two roots at any frame.
+      radius: all starting places stay within this distance of their middle, metres; they are
+        spread no wider than they have to be. By default they take the room they need.
+      fps: frames per second.
+
+    Returns:
+      (position [B, F, 2], yaw [B, F]), float64; the same for the same input. Every character's
+      speed lies within `SPEED_BOUNDS` of its own. Paths that keep apart already come back
+      unchanged, unless they start outside the radius.
+
+    Raises:
+      ValueError: for arrays that do not fit, a distance that is not above 0, or a radius within
+        which so many characters cannot keep apart.
+    """
+    position, yaw = _checked(position), np.asarray(yaw, np.float64)
+    if yaw.shape != position.shape[:2] or not np.isfinite(yaw).all():
+        raise ValueError(f"yaw must be finite and {position.shape[:2]}, got {yaw.shape}")
+    if not (np.isfinite(min_distance) and min_distance > 0):
+        raise ValueError(f"min_distance must be above 0 metres, got {min_distance}")
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps must be above 0, got {fps}")
+    if radius is not None:
+        _check_room(len(position), min_distance, radius)
+    start = position[:, 0]
+    middle = 0.5 * (start.min(axis=0) + start.max(axis=0))
+    places, walked = start - middle, position - position[:, :1]
+    reach = float(np.linalg.norm(places, axis=-1).max())
+    if (radius is None or reach <= radius) and closest_approach(position).min() >= min_distance:
+        return position.copy(), yaw.copy()
+    spreads = _SPREADS[2 if len(position) > _LARGE else 0 :]
+    if radius is not None:
+        widest = radius / reach if reach > 0 else 1.0
+        wider = np.concatenate([[1.0], spreads])
+        # In the end nearly as wide as it may be, for stepping aside moves starting places, too.
+        spreads = np.concatenate([wider[wider < widest], widest * np.array(_TIGHTER)])
+    for spread in spreads:
+        wanted = middle + spread * places[:, None] + walked
+        bent = _untangle(wanted, min_distance, fps)
+        if bent is None:
+            continue
+        if radius is None or np.linalg.norm(bent[:, 0] - middle, axis=-1).max() <= radius:
+            return bent, _turned(wanted, bent, yaw, fps)
+    if radius is not None:
+        raise ValueError(
+            f"{len(position)} characters found no paths {min_distance:g} m apart from starting "
+            f"places within {radius:g} m; give them more room, fewer frames or a smaller distance"
+        )
+    raise ValueError(
+        f"{len(position)} characters found no paths {min_distance:g} m apart however far they were "
+        "spread; do some of them start in the same place?"
+    )
+
+
+def _checked(position) -> np.ndarray:
+    position = np.asarray(position, np.float64)
+    if position.ndim != 3 or position.shape[-1] != 2 or 0 in position.shape:
+        raise ValueError(f"position must be [B, F, 2] with B and F above 0, got {position.shape}")
+    if not np.isfinite(position).all():
+        character, frame = np.argwhere(~np.isfinite(position))[0][:2]
+        raise ValueError(f"position is not finite for character {character} at frame {frame}")
+    return position
+
+
+def _check_room(count: int, min_distance: float, radius: float) -> None:
+    """Refuse what no arrangement can do: discs of the distance cover a share of the plane."""
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius must be above 0 metres, got {radius}")
+    room = (radius + 0.5 * min_distance) ** 2  # discs may stick out by half
+    most = math.floor(_DENSEST * room / (0.5 * min_distance) ** 2)
+    if count > most:
+        raise ValueError(
+            f"{count} characters cannot stand {min_distance:g} m apart within {radius:g} m: at "
+            f"most {most} can; give them more room or a smaller distance"
+        )
+
+
+def _untangle(wanted: np.ndarray, min_distance: float, fps: float) -> np.ndarray | None:
+    """Bend paths until they keep apart at every frame and speeds fit; None if that does not end."""
+    bent = wanted.copy()
+    as_a_whole = np.zeros(len(wanted), bool)
+    half = max(2, round(_HALF_WIDTH * fps))
+    bump = np.cos(0.5 * np.pi * np.arange(-half, half + 1) / (half + 1)) ** 2
+    for _ in range(_ROUNDS):
+        pairs, frames = _conflicts(bent, min_distance, _EVERY)
+        if not len(pairs):
+            pairs, frames = _conflicts(bent, min_distance)
+        if not len(pairs):
+            outside = ~_speeds_fit(wanted, bent, fps) & ~as_a_whole
+            if not outside.any():
+                return bent
+            bent[outside] = wanted[outside]
+            as_a_whole |= outside
+            continue
+        one, other = pairs.T
+        push = 0.6 * _ways_aside(bent, one, other, frames, min_distance + _MARGIN)
+        pushes = np.zeros_like(bent)
+        np.add.at(pushes, (one, frames), push)
+        np.add.at(pushes, (other, frames), -push)
+        smooth = convolve1d(pushes, bump, axis=1, mode="constant")
+        whole = np.broadcast_to(pushes.sum(axis=1, keepdims=True), pushes.shape)
+        bent = bent + np.where(as_a_whole[:, None, None], whole, smooth)
+    return None
+
+
+def _ways_aside(position: np.ndarray, one, other, frames, distance: float) -> np.ndarray:
+    """Return what the first of each pair should move, relative to the second, [K, 2].
+
+    Those who pass each other move square to their relative motion, to the side on which they are
+    already, and to the left if they would meet head on. Those who stand, walk side by side, or are
+    closest at the first or last frame move straight apart.
+    """
+    last = position.shape[1] - 1
+    before, after = np.maximum(frames - 1, 0), np.minimum(frames + 1, last)
+    gap = position[one] - position[other]
+    pair = np.arange(len(one))
+    apart = gap[pair, frames]
+    motion = gap[pair, after] - gap[pair, before]
+    speed = np.linalg.norm(motion, axis=-1)
+    left = np.stack([motion[:, 1], -motion[:, 0]], axis=-1) / np.maximum(speed, 1e-12)[:, None]
+    aside = np.sum(apart * left, axis=-1)
+    passing = (speed > _PASSING * (after - before)) & (frames > 0) & (frames < last)
+    side = np.where(passing, np.abs(aside), np.linalg.norm(apart, axis=-1))
+    length = np.maximum(np.linalg.norm(apart, axis=-1, keepdims=True), 1e-12)
+    straight = np.where(length > 1e-6, apart / length, np.where(speed[:, None] > 0, left, [1.0, 0.0]))
+    way = np.where(passing[:, None], np.where(aside < 0, -1.0, 1.0)[:, None] * left, straight)
+    return np.maximum(distance - side, 0.0)[:, None] * way
+
+
+def _conflicts(position: np.ndarray, min_distance: float, every: int = 1):
+    """List pairs that come too close, each at its own closest frame.
+
+    Returns:
+      (pairs [K, 2], frames [K]).
+    """
+    count, num_frames = position.shape[:2]
+    looked_at = np.arange(0, num_frames, every)
+    # One tree for all frames: a third coordinate holds them too far apart to meet.
+    height = np.broadcast_to(2.0 * min_distance * looked_at[None, :], (count, len(looked_at)))
+    points = np.concatenate([position[:, looked_at], height[..., None]], axis=-1)
+    tree = cKDTree(points.reshape(-1, 3), balanced_tree=False, compact_nodes=False)
+    found = tree.query_pairs(min_distance, output_type="ndarray")
+    one, other = np.sort(found // len(looked_at), axis=1).T
+    frames = looked_at[found[:, 0] % len(looked_at)]
+    distances = np.linalg.norm(position[one, frames] - position[other, frames], axis=-1)
+    # The closest frame of each pair: sort by pair, then distance, then keep the first.
+    order = np.lexsort((frames, distances, other, one))
+    key = (one * count + other)[order]
+    first = order[np.diff(key, prepend=-1) > 0]
+    return np.column_stack([one, other])[first], frames[first]
+
+
+def _speeds_fit(wanted: np.ndarray, bent: np.ndarray, fps: float) -> np.ndarray:
+    """Tell whose bent path is walked within `SPEED_BOUNDS` of the speeds that were wanted, [B]."""
+    asked = fps * np.linalg.norm(np.diff(wanted, axis=1), axis=-1)
+    walked = fps * np.linalg.norm(np.diff(bent, axis=1), axis=-1)
+    slowest, fastest = SPEED_BOUNDS
+    greatest = asked.max(axis=1, keepdims=True, initial=0.0)
+    tolerance = 1e-9
+    slow = (walked < slowest * asked - tolerance).any(axis=1)
+    fast = (walked > fastest * greatest + tolerance).any(axis=1)
+    return ~(slow | fast)
+
+
+def _turned(wanted: np.ndarray, bent: np.ndarray, yaw: np.ndarray, fps: float) -> np.ndarray:
+    """Turn the facing as the line was turned; paths that were not bent keep theirs."""
+    turned = yaw.copy()
+    for character in np.flatnonzero((wanted != bent).any(axis=(1, 2))):
+        change = tangent_yaw(bent[character]) - tangent_yaw(wanted[character])
+        change = np.unwrap(wrap_angle(change))
+        turned[character] += gaussian_filter1d(change, _SMOOTH_TURN * fps, mode="nearest")
+    return turned

@@ -1,0 +1,101 @@
+"""One round of synthesis: what a user waits for, what is timed, and what is exported.
+
+A round draws noise, encodes the condition once and walks down all noise levels. Kinematics and the
+way back to metres come after it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh, PartitionSpec
+
+from f3amd_lib.diffusion.samplers import sample
+
+
+def sample_round(
+    network, condition, sigmas, key=None, *, noise=None, sampler: str = "ddim", unroll: bool = False
+) -> jax.Array:
+    """Sample one window for every character.
+
+    Args:
+      network: has `config`, `encode(condition)` and is called as `network(x_noisy, sigma, context)`
+        (`networks.config.Denoiser`).
+      condition: in the network's normalised units, history [B, H, C] first.
+      sigmas: [N + 1], falling, from a noise schedule's `grid`.
+      key: JAX random key of the noise; not needed if `noise` is given and the sampler draws none.
+      noise: standard normal numbers to start from, [B, T, C], instead of drawn ones.
+      sampler: a name of `samplers.SAMPLERS`.
+      unroll: write the steps out one by one instead of a `lax.scan` (for exports).
+
+    Returns:
+      Clean features, [B, T, C], in network units.
+
+    Raises:
+      ValueError: for neither key nor noise, noise of a wrong shape, an unknown sampler, or one that
+        draws noise at every step without a key.
+    """
+    config = network.config
+    shape = (condition.history.shape[0], config.window, config.channels)
+    key_steps = None
+    if key is not None:
+        key_init, key_steps = jax.random.split(key)
+    if noise is None:
+        if key is None:
+            raise ValueError("a round starts from noise: give it a key, or the noise itself")
+        # Drawn with all digits and then cut: one seed, one noise, whatever the precision.
+        dtype = condition.history.dtype
+        drawn = jax.random.normal(key_init, shape, jnp.promote_types(dtype, jnp.float32))
+        noise = drawn.astype(dtype)
+    elif noise.shape != shape:
+        raise ValueError(f"noise must have shape {shape}, got {noise.shape}")
+    context = network.encode(condition)
+    return sample(
+        sampler,
+        lambda x_noisy, sigma: network(x_noisy, sigma, context),
+        jnp.asarray(sigmas[0], noise.dtype) * noise,
+        sigmas,
+        key=key_steps,
+        unroll=unroll,
+    )
+
+
+def sample_round_on_devices(
+    network, condition, sigmas, key=None, *, mesh: Mesh, noise=None, sampler: str = "ddim"
+) -> jax.Array:
+    """Sample one window for every character, an equal share of the characters on each device.
+
+    Characters have nothing to do with each other within a round, so that devices never wait for one
+    another. Processor cores count as devices once XLA is told so
+    (`--xla_force_host_platform_device_count`).
+
+    Args:
+      network, condition, sigmas, key, noise, sampler: as in `sample_round`.
+      mesh: of one axis, all devices to use; their number must divide the number of characters.
+
+    Returns:
+      Clean features, [B, T, C], spread over the devices. With `noise` given and a sampler that
+      draws none, the numbers of `sample_round`; with a key, others: each device draws its own.
+
+    Raises:
+      ValueError: for a mesh of several axes or a number of characters that does not divide; and as
+        `sample_round`.
+    """
+    if len(mesh.axis_names) != 1:
+        raise ValueError(f"the mesh must have one axis, got {mesh.axis_names}")
+    (axis,) = mesh.axis_names
+    characters = condition.history.shape[0]
+    if characters % mesh.size:
+        raise ValueError(
+            f"{characters} characters cannot be shared equally by {mesh.size} devices: pad them to "
+            f"{-(-characters // mesh.size) * mesh.size}"
+        )
+
+    def share(condition, key, noise):
+        if key is not None:
+            key = jax.random.fold_in(key, jax.lax.axis_index(axis))
+        return sample_round(network, condition, sigmas, key, noise=noise, sampler=sampler)
+
+    rows, whole = PartitionSpec(axis), PartitionSpec()
+    spread = jax.shard_map(share, mesh=mesh, in_specs=(rows, whole, rows), out_specs=rows, check_vma=False)
+    return spread(condition, key, noise)

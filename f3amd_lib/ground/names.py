@@ -1,0 +1,45 @@
+"""Names that people type: refuse an unknown one, and say which known one is nearest."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+
+
+def nearest_names(name, known: Iterable[str], count: int = 3) -> list[str]:
+    """Return up to `count` known names that look like `name`, the likest first; case is ignored."""
+    by_lower = {item.lower(): item for item in known}
+    near = difflib.get_close_matches(str(name).lower(), by_lower, n=count, cutoff=0.5)
+    return [by_lower[item] for item in near]
+
+
+def nearest_hint(name, known: Iterable[str], *, most: int = 25) -> str:
+    """Return the end of an error message about an unknown name: the nearest one, and all of them.
+
+    Args:
+      name: what was given, of any type.
+      known: the names that exist.
+      most: with more names than this, only the three nearest are listed (or the first ones).
+
+    Returns:
+      "; did you mean 'laptop'? (one of smoke, laptop, gpu)", without the question where nothing is
+      near.
+    """
+    known = list(known)
+    if not known:
+        return "; there is none to choose from"
+    near = nearest_names(name, known)
+    question = f"; did you mean {near[0]!r}?" if near else ""
+    if len(known) <= most:
+        return f"{question} (one of {', '.join(known)})"
+    listed = ", ".join(near or known[:3])
+    return f"{question} ({len(known)} are known, {'nearest' if near else 'such as'} {listed})"
+
+
+def refuse_unknown(values: Mapping, config_class: type, what: str) -> None:
+    """Raise ValueError, with the nearest name, for a key that is no field of a config class."""
+    known = [field.name for field in dataclasses.fields(config_class) if field.init]
+    for key in values:
+        if key not in known:
+            raise ValueError(f"unknown {what} {key!r}{nearest_hint(key, known)}")

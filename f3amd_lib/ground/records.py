@@ -1,0 +1,347 @@
+"""Run records: what a number was measured on, and tables that never travel without one.
+
+A table is a CSV file with a JSON record of the same name beside it. The record says which profile,
+data set, seed, code and machine made it, and holds a checksum of the CSV, so that a table edited
+or swapped by hand is noticed. What draws figures reads tables only through `read_table`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import importlib.metadata
+import io
+import json
+import logging
+import os
+import platform
+import subprocess
+import tempfile
+from pathlib import Path, PurePath
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.ground.files import set_aside, whole_file
+
+log = logging.getLogger("f3amd")
+
+_LIBRARY = Path(__file__).resolve().parents[1]
+_REPOSITORY = _LIBRARY.parent
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
+# Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
+_EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
+_CIRCUMSTANCES = (
+    "git_commit",
+    "git_dirty",
+    "library_version",
+    "versions",
+    "device_platform",
+    "device_kind",
+    "num_devices",
+    "cores",
+    "date_utc",
+    "not_possible",
+    "table",
+)
+
+
+def run_record(*, profile, dataset, seed: int, **extra) -> dict:
+    """Describe a run: what was asked for, on which data, code and machine.
+
+    Args:
+      profile: a profile's name, or an object with a `name`.
+      dataset: a data set's name, or an object with `name` and, where it has them, `fingerprint`,
+        `licence` and `credit`.
+      seed: the run's seed.
+      extra: anything else worth keeping, such as steps=8; numbers, strings, lists, dicts.
+
+    Returns:
+      A dict ready for JSON: profile, dataset, dataset_fingerprint, dataset_licence,
+      dataset_credit, seed, git_commit and git_dirty (None where the library is not in a git
+      checkout), library_version, versions, device_platform, device_kind, num_devices, cores,
+      date_utc, and the extras. Paths in it are shortened, so that no home or temporary folder
+      of the machine is told.
+
+    Raises:
+      ValueError: for an extra whose name is taken, or a value that JSON cannot hold.
+    """
+    import jax  # here, so that reading a table does not wait for JAX
+
+    devices = jax.devices()
+    commit, dirty = _git_state()
+    record = {
+        "profile": _name(profile, "profile"),
+        "dataset": _name(dataset, "dataset"),
+        "dataset_fingerprint": getattr(dataset, "fingerprint", None),
+        "dataset_licence": getattr(dataset, "licence", None),
+        "dataset_credit": getattr(dataset, "credit", None),
+        "seed": seed,
+        "git_commit": commit,
+        "git_dirty": dirty,
+        "library_version": _library_version(),
+        "versions": {"python": platform.python_version()} | {package: _version(package) for package in _PACKAGES},
+        "device_platform": devices[0].platform,
+        "device_kind": devices[0].device_kind,
+        "num_devices": len(devices),
+        "cores": _num_cores(),
+        "date_utc": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+    }
+    taken = sorted(set(extra) & (set(record) | {"table"}))
+    if taken:
+        raise ValueError(f"a run record already has {taken[0]!r}; name the extra value otherwise")
+    return _plain(record | extra)
+
+
+def record_hash(record: dict) -> str:
+    """Hash what was asked for, leaving out machine, versions, code state and date.
+
+    Args:
+      record: from `run_record`.
+
+    Returns:
+      64 hex digits, equal for runs that should give the same numbers up to rounding.
+    """
+    asked = {key: value for key, value in record.items() if key not in _CIRCUMSTANCES}
+    return hashlib.sha256(json.dumps(_plain(asked), sort_keys=True).encode()).hexdigest()
+
+
+def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
+    """Write a table as CSV with its run record as JSON beside it.
+
+    Args:
+      path: where to, ending in .csv; folders are made.
+      frame: the table; its index is not written.
+      record: from `run_record`.
+
+    Returns:
+      The path of the CSV.
+
+    Raises:
+      ValueError: if the name does not end in .csv, the table is empty or repeats a column, the
+        record lacks data set, profile or seed, or there is already a table (or a file without a
+        record) that is not of the same data set and profile.
+    """
+    path = Path(path)
+    if path.suffix != ".csv":
+        raise ValueError(f"{path}: a table's name must end in .csv")
+    if not isinstance(frame, pd.DataFrame) or frame.empty:
+        raise ValueError(f"{path}: there is nothing to write, the table has no rows")
+    if not frame.columns.is_unique:
+        raise ValueError(f"{path}: a column is named twice in {', '.join(map(str, frame.columns))}")
+    for key in ("dataset", "profile", "seed"):
+        if key not in record:
+            raise ValueError(f"{path}: the record has no {key!r}; make it with run_record")
+    record_path = path.with_suffix(".json")
+    if path.exists() or record_path.exists():
+        _refuse_foreign(path, record_path, record)
+
+    buffer = io.StringIO()
+    frame.to_csv(buffer, index=False, lineterminator="\n")
+    text = buffer.getvalue()
+    described = _plain(record) | {
+        "table": {
+            "file": path.name,
+            "rows": len(frame),
+            "columns": [str(column) for column in frame.columns],
+            "sha256": _text_hash(text),
+        }
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Each file appears whole. Should the run die between the two, the checksum tells.
+    _replace(path, text)
+    _replace(record_path, json.dumps(described, indent=2, ensure_ascii=False) + "\n")
+    return path
+
+
+def read_table(path) -> tuple[pd.DataFrame, dict]:
+    """Read a table together with its run record.
+
+    Args:
+      path: the CSV file.
+
+    Returns:
+      (table, record).
+
+    Raises:
+      FileNotFoundError: if there is no such table.
+      ValueError: if the record is missing or broken, or the CSV is not the one it describes.
+    """
+    path = Path(path)
+    record_path = path.with_suffix(".json")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such table")
+    record = _read_record(path, record_path)
+    text = path.read_text(encoding="utf-8")
+    if _text_hash(text) != record.get("table", {}).get("sha256"):
+        raise ValueError(
+            f"{path}: not the table that {record_path.name} describes (it was changed, or a run "
+            "died while writing); measure it again"
+        )
+    return pd.read_csv(io.StringIO(text), **_EXACT_FLOATS), record
+
+
+def _read_record(path: Path, record_path: Path) -> dict:
+    if not record_path.exists():
+        raise ValueError(
+            f"{path}: has no run record {record_path.name} beside it, so nothing says what its numbers were measured on"
+        )
+    try:
+        record = json.loads(record_path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{record_path}: not a readable run record ({error})") from None
+    if not isinstance(record, dict):
+        raise ValueError(f"{record_path}: not a run record (a JSON object is needed)")
+    return record
+
+
+def _refuse_foreign(path: Path, record_path: Path, record: dict) -> None:
+    """Let a table be written again only by a run on the same data set in the same profile."""
+    if not record_path.exists():
+        raise ValueError(f"{path}: there is a file without a run record; move it away first")
+    there = _read_record(path, record_path)
+    for key in ("dataset", "profile"):
+        if there.get(key) != record[key]:
+            raise ValueError(
+                f"{path}: holds results of {key} {there.get(key)!r} and is not overwritten with "
+                f"those of {record[key]!r}; write to another folder"
+            )
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a whole file or none."""
+    with whole_file(path, overwrite=True) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _text_hash(text: str) -> str:
+    # Line ends are not content: a checkout on another system may have changed them.
+    return hashlib.sha256(text.replace("\r\n", "\n").encode("utf-8")).hexdigest()
+
+
+def _name(thing, what: str) -> str:
+    name = thing if isinstance(thing, str) else getattr(thing, "name", None)
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} must be a name or have one, got {thing!r}")
+    return name
+
+
+def _plain(value):
+    """Turn a value into what JSON holds, with the machine's folders shortened."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, PurePath):
+        text = _shorten(value.as_posix())
+        # A folder that is none of ours says nothing to others: keep the file's name.
+        return f".../{value.name}" if text.startswith("/") or value.drive else text
+    if isinstance(value, str):
+        return _shorten(value)
+    if isinstance(value, np.ndarray) and value.ndim:
+        return _plain(value.tolist())
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float)):
+        # JSON has no NaN; a figure that is undefined is null.
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+    raise ValueError(f"a run record cannot hold {value!r} of type {type(value).__name__}")
+
+
+def _shorten(text: str) -> str:
+    """Replace the folders of this machine: repository, temporary, working and home folder."""
+    folders = [
+        (str(_REPOSITORY), "."),
+        (str(Path.cwd()), "."),
+        (tempfile.gettempdir(), "<tmp>"),
+        (os.path.expanduser("~"), "~"),
+    ]
+    for folder, short in sorted(folders, key=lambda pair: -len(pair[0])):
+        if len(folder) > 1:
+            text = text.replace(f"{folder}{os.sep}", f"{short}/")
+            if text.endswith(folder):
+                text = text[: -len(folder)] + short
+    return text
+
+
+def _git_state() -> tuple[str | None, bool | None]:
+    """Return the commit of the library's checkout and whether its code differs from it."""
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(_REPOSITORY), *arguments], capture_output=True, text=True, timeout=20, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    # The library may be installed inside somebody else's checkout, whose commit says nothing.
+    if not git("ls-files", "--", str(Path(__file__).resolve())):
+        return None, None
+    commit = git("rev-parse", "HEAD")
+    # Only code counts: results written by the run itself do not make it dirty.
+    status = git("status", "--porcelain", "--", str(_LIBRARY), str(_REPOSITORY / "notebooks"))
+    return commit, None if commit is None or status is None else bool(status)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _library_version() -> str | None:
+    import f3amd_lib
+
+    return getattr(f3amd_lib, "__version__", None) or _version("f3amd-lib") or _version("f3amd")
+
+
+def _num_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def set_aside_table(path) -> Path:
+    """Rename a table and its record to the first free number, so that it can still be read.
+
+    Args:
+      path: of the CSV.
+
+    Returns:
+      Where it lies now, such as `quality.old1.csv`.
+    """
+    path = Path(path)
+    kept = set_aside((path, path.with_suffix(".json")), path.stem)
+    return path.with_name(f"{kept}.csv") if kept else path
+
+
+def kept_rows(path, record: dict) -> pd.DataFrame | None:
+    """Return the rows of an earlier run that asked for the same, so that a stopped run goes on.
+
+    A table that asked for something else is kept under another name.
+
+    Args:
+      path: of the CSV.
+      record: of the run that wants to go on.
+
+    Returns:
+      The rows; None if there are none.
+
+    Raises:
+      ValueError: if the table there is broken.
+    """
+    path = Path(path)
+    if not path.exists():
+        return None
+    rows, earlier = read_table(path)
+    if record_hash(earlier) != record_hash(record):
+        kept = set_aside_table(path)
+        log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
+        return None
+    if "unit" in rows:
+        rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
+    return rows

@@ -1,0 +1,898 @@
+"""The style classifier: the eyes through which FID, EMD and style coverage look at motion.
+
+The network of CAMDM's evaluation code, trained by this project on the data at hand. It sees two
+seconds of one body at a time, turned so that every frame faces the same way and standing on the
+spot: posture and gait, but no path. What it makes of them just before the answer, 512 numbers, are
+the features whose distributions FID and EMD compare; its answer is what style coverage counts.
+
+A distance between features says something about style only if the features do. Every classifier
+therefore carries its accuracy on clips that it was not trained on, and `require_telling_styles`
+refuses one that guesses. What it goes by may still be something else than style: in the Bandai
+Namco data style and recording session go together. And posture alone gives most styles away, so
+that coverage says little about how somebody moves.
+
+Source: CAMDM's released evaluation code (its paper and F3AMD's section 4.4 and Appendix C name the
+metrics and leave the network out).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from tqdm import tqdm
+
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.profiles import Profile, runs_dir
+from f3amd_lib.ground.records import record_hash, run_record
+from f3amd_lib.motion.rotations import matrix_from_yaw, yaw_from_direction
+from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.networks.spectral import TemporalConvolution
+from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, load_tree, save_tree
+from f3amd_lib.training.loop import TrainingDiverged
+
+_SIDE = ("clavicle", "shoulder", "elbow", "hip", "knee", "ankle")
+
+CLASSIFIER_JOINTS = ("hips", "neck", "head", *(f"left {part}" for part in _SIDE), *(f"right {part}" for part in _SIDE))
+"""The 15 joints that the classifier sees; wrists and toes, the noisiest, are left out."""
+
+NUM_CHANNELS = 3 * len(CLASSIFIER_JOINTS)
+"""Numbers a frame: x, y, z of each of `CLASSIFIER_JOINTS`."""
+
+ACCURACY_BAR = 0.8
+"""Least held-out accuracy of a classifier whose features may be used for FID, EMD and coverage."""
+
+# Conventions are matched as a whole: "LeftShoulder" is the upper arm in one and the collar bone in
+# another.
+_CONVENTIONS = {
+    "100STYLE": (
+        *("Hips", "Neck", "Head"),
+        *("LeftCollar", "LeftShoulder", "LeftElbow", "LeftHip", "LeftKnee", "LeftAnkle"),
+        *("RightCollar", "RightShoulder", "RightElbow", "RightHip", "RightKnee", "RightAnkle"),
+    ),
+    "Bandai Namco": (
+        *("Hips", "Neck", "Head"),
+        *("Shoulder_L", "UpperArm_L", "LowerArm_L", "UpperLeg_L", "LowerLeg_L", "Foot_L"),
+        *("Shoulder_R", "UpperArm_R", "LowerArm_R", "UpperLeg_R", "LowerLeg_R", "Foot_R"),
+    ),
+    "Mixamo": (
+        *("Hips", "Neck", "Head"),
+        *("LeftShoulder", "LeftArm", "LeftForeArm", "LeftUpLeg", "LeftLeg", "LeftFoot"),
+        *("RightShoulder", "RightArm", "RightForeArm", "RightUpLeg", "RightLeg", "RightFoot"),
+    ),
+}
+
+_STRIDE = 10
+"""Frames between the windows trained on (CAMDM's code)."""
+
+_LEARNING_RATE = 1e-3
+_HELD_OUT = ("validation", "test")
+_BATCH = 256
+"""Windows that are evaluated at once; fixed, so that a window's features depend on it alone."""
+
+
+# ------------------------------------------------------------------------------ what it looks at
+
+
+def classifier_joints(skeleton: Skeleton) -> tuple[int, ...]:
+    """Find the joints of `CLASSIFIER_JOINTS` in a skeleton.
+
+    Args:
+      skeleton: with the joint names of 100STYLE (and our synthetic walker), Bandai Namco or Mixamo.
+
+    Returns:
+      15 joint indices, in the order of `CLASSIFIER_JOINTS`.
+
+    Raises:
+      ValueError: naming the joints that are missing.
+    """
+    names = [name.removeprefix("mixamorig:") for name in skeleton.names]
+    missing = {
+        convention: [
+            f"{wanted!r} ({joint})"
+            for joint, wanted in zip(CLASSIFIER_JOINTS, wanted_names, strict=True)
+            if wanted not in names
+        ]
+        for convention, wanted_names in _CONVENTIONS.items()
+    }
+    nearest = min(missing, key=lambda convention: len(missing[convention]))
+    if missing[nearest]:
+        raise ValueError(
+            f"the style classifier finds no {', '.join(missing[nearest])} in this skeleton; by "
+            f"the names of {nearest}, the nearest convention, it has {', '.join(skeleton.names)}"
+        )
+    return tuple(names.index(name) for name in _CONVENTIONS[nearest])
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-8)
+
+
+def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
+    """Reduce joint positions to what the classifier sees: posture, without place and direction.
+
+    Each frame is moved so that its hips are the origin and turned about the vertical so that its
+    own facing is +Z. Facing here is cross(a, +Y) with a = unit(left - right clavicle) + unit(left -
+    right hip): it takes in the shoulders, unlike `facing_yaw`, which serves paths and sees the hips
+    only. (CAMDM's code turns to +X, which is the same up to the order and sign of channels.)
+
+    Args:
+      positions: global joint positions, [..., T, J, 3], metres.
+      skeleton: J joints.
+
+    Returns:
+      [..., T, 45], metres, float64: x, y, z of each of `CLASSIFIER_JOINTS`.
+
+    Raises:
+      ValueError: for shapes that do not fit the skeleton, numbers that are not finite, or a
+        skeleton without one of the joints.
+
+    Source: CAMDM's evaluation code (its feature extraction).
+    """
+    positions = np.asarray(positions, np.float64)
+    if positions.ndim < 3 or positions.shape[-2:] != (skeleton.num_joints, 3):
+        raise ValueError(
+            f"positions must be [..., T, {skeleton.num_joints}, 3] in metres for this skeleton, got {positions.shape}"
+        )
+    if not np.all(np.isfinite(positions)):
+        place = [int(index) for index in np.argwhere(~np.isfinite(positions))[0]]
+        raise ValueError(
+            f"positions are not finite at frame {place[-3]}, joint {skeleton.names[place[-2]]!r}"
+            + (f" of motion {place[:-3]}" if len(place) > 3 else "")
+        )
+    body = positions[..., list(classifier_joints(skeleton)), :]
+    body = body - body[..., :1, :]
+    at = {joint: body[..., index, :] for index, joint in enumerate(CLASSIFIER_JOINTS)}
+    across = _unit(at["left clavicle"] - at["right clavicle"])
+    across = across + _unit(at["left hip"] - at["right hip"])
+    # cross(a, +Y) = (-a_z, 0, a_x)
+    forward = np.stack([-across[..., 2], np.zeros(across.shape[:-1]), across[..., 0]], axis=-1)
+    turned = body @ np.swapaxes(matrix_from_yaw(-yaw_from_direction(forward)), -1, -2)
+    return turned.reshape(*body.shape[:-2], NUM_CHANNELS)
+
+
+def classifier_windows(positions, skeleton: Skeleton, *, window: int = 60) -> np.ndarray:
+    """Cut motion into windows side by side; what is left at the end is not used.
+
+    Args:
+      positions: global joint positions, [..., T, J, 3], metres, at 30 fps.
+      skeleton: J joints.
+      window: frames of each.
+
+    Returns:
+      [..., T // window, window, 45], metres, float32.
+
+    Raises:
+      ValueError: as `classifier_frames`, or if the motion is shorter than a window.
+    """
+    frames = classifier_frames(positions, skeleton)
+    count = frames.shape[-2] // window
+    if count == 0:
+        raise ValueError(
+            f"{frames.shape[-2]} frames do not fill a window of the style classifier; it needs "
+            f"{window} ({window / 30:g} s)"
+        )
+    whole = frames[..., : count * window, :]
+    return whole.reshape(*whole.shape[:-2], count, window, NUM_CHANNELS).astype(np.float32)
+
+
+def _mirror_channels() -> tuple[np.ndarray, np.ndarray]:
+    """Return (which channel to take, its sign), each [45], that show a frame in the mirror."""
+    twins = [
+        CLASSIFIER_JOINTS.index(joint.replace("left", "right") if "left" in joint else joint.replace("right", "left"))
+        for joint in CLASSIFIER_JOINTS
+    ]
+    order = 3 * np.repeat(twins, 3) + np.tile(np.arange(3), len(twins))
+    return order, np.tile(np.array([-1.0, 1.0, 1.0], np.float32), len(twins))
+
+
+# ------------------------------------------------------------------------------------ the network
+
+
+@dataclass(frozen=True)
+class ClassifierConfig:
+    """Sizes of the network; the defaults are CAMDM's.
+
+    Attributes:
+      num_styles: classes, S.
+      window: frames it sees, at 30 fps.
+      widths: channels of the two convolution blocks.
+      hidden_width: of the first layer after them.
+      feature_width: of the second, whose output is the feature.
+      dropout: share of block outputs that is blanked in training.
+    """
+
+    num_styles: int
+    window: int = 60
+    widths: tuple[int, ...] = (64, 128)
+    hidden_width: int = 1024
+    feature_width: int = 512
+    dropout: float = 0.5
+
+    def __post_init__(self):
+        object.__setattr__(self, "widths", tuple(self.widths))
+        sizes = (self.num_styles, self.window, *self.widths, self.hidden_width, self.feature_width)
+        if not self.widths or min(sizes) < 1:
+            raise ValueError(f"a style classifier's sizes must be 1 or more, got {self}")
+        if not 0.0 <= self.dropout < 1.0:
+            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
+
+    def to_dict(self) -> dict:
+        """Return the sizes as JSON values."""
+        return dataclasses.asdict(self) | {"widths": list(self.widths)}
+
+    @classmethod
+    def from_dict(cls, values: dict) -> ClassifierConfig:
+        """Return the config of `to_dict`; ValueError for a name that is no size."""
+        refuse_unknown(values, cls, "size of a style classifier")
+        return cls(**values)
+
+
+def _batch_norm(width: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
+    # Short trainings need statistics that follow; 0.9 is PyTorch's default, thus CAMDM's.
+    return nnx.BatchNorm(width, momentum=0.9, epsilon=1e-5, rngs=rngs)
+
+
+class _ConvolutionBlock(nnx.Module):
+    """Convolution over three frames, batch norm and leaky ReLU; plus a shortcut frame by frame."""
+
+    def __init__(self, width_in: int, width_out: int, *, rngs: nnx.Rngs):
+        self.convolution = TemporalConvolution(width_in, width_out, 3, rngs=rngs)
+        self.norm = _batch_norm(width_out, rngs)
+        self.shortcut = nnx.Linear(width_in, width_out, rngs=rngs)
+
+    def __call__(self, z, training: bool):
+        """Map [B, T, D0] to [B, T, D1]."""
+        main = self.norm(self.convolution(z), use_running_average=not training)
+        return nnx.leaky_relu(main) + self.shortcut(z)
+
+
+class StyleNetwork(nnx.Module):
+    """Two convolution blocks, two wide layers and a class layer; 8,489,572 weights at 100 styles.
+
+    Source: CAMDM's evaluation code (its classifier).
+    """
+
+    def __init__(self, config: ClassifierConfig, *, rngs: nnx.Rngs):
+        self.dropout = config.dropout
+        widths = (NUM_CHANNELS, *config.widths)
+        self.blocks = nnx.List(
+            [
+                _ConvolutionBlock(width_in, width_out, rngs=rngs)
+                for width_in, width_out in zip(widths[:-1], widths[1:], strict=True)
+            ]
+        )
+        self.hidden = nnx.Linear(config.window * widths[-1], config.hidden_width, rngs=rngs)
+        self.hidden_norm = _batch_norm(config.hidden_width, rngs)
+        self.feature = nnx.Linear(config.hidden_width, config.feature_width, rngs=rngs)
+        self.feature_norm = _batch_norm(config.feature_width, rngs)
+        self.classes = nnx.Linear(config.feature_width, config.num_styles, rngs=rngs)
+
+    def __call__(self, windows, key=None):
+        """Return features and class scores.
+
+        Args:
+          windows: [B, window, 45], metres.
+          key: JAX random key of the dropout. With it the network trains: batch norm goes by this
+            batch and updates its running statistics. Without it, it goes by those.
+
+        Returns:
+          (features [B, feature_width], scores [B, S]).
+        """
+        training = key is not None
+        z = windows
+        for block in self.blocks:
+            z = block(z, training)
+        if training and self.dropout > 0:
+            kept = jax.random.bernoulli(key, 1.0 - self.dropout, z.shape)
+            z = jnp.where(kept, z / (1.0 - self.dropout), 0.0)
+        z = self.hidden(z.reshape(z.shape[0], -1))
+        z = nnx.leaky_relu(self.hidden_norm(z, use_running_average=not training))
+        z = self.feature_norm(self.feature(z), use_running_average=not training)
+        features = nnx.leaky_relu(z)
+        return features, self.classes(features)
+
+
+@functools.lru_cache(maxsize=8)
+def _blank(config: ClassifierConfig):
+    """Return a network's structure and the shapes of its weights and batch statistics."""
+    network = nnx.eval_shape(lambda: StyleNetwork(config, rngs=nnx.Rngs(0)))
+    return nnx.split(network, nnx.Param, nnx.BatchStat)
+
+
+def _network(config: ClassifierConfig, params, statistics) -> StyleNetwork:
+    # A fresh tree, so that the network may update its statistics inside a gradient.
+    return nnx.merge(_blank(config)[0], params, jax.tree.map(lambda leaf: leaf, statistics))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _evaluate(config: ClassifierConfig, params, statistics, windows):
+    return _network(config, params, statistics)(windows)
+
+
+def _answers(config, params, statistics, windows) -> tuple[np.ndarray, np.ndarray]:
+    """Return (features, scores) of windows [N, window, 45], a fixed number at a time."""
+    features, scores = [], []
+    for start in range(0, len(windows), _BATCH):
+        part = windows[start : start + _BATCH]
+        padded = np.pad(part, ((0, _BATCH - len(part)), (0, 0), (0, 0)))
+        answer = _evaluate(config, params, statistics, padded)
+        features.append(np.asarray(answer[0])[: len(part)])
+        scores.append(np.asarray(answer[1])[: len(part)])
+    return np.concatenate(features), np.concatenate(scores)
+
+
+# ----------------------------------------------------------------------------------- the classifier
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFeatures:
+    """Features of real windows, cut side by side from the clips of a split.
+
+    Attributes:
+      features: [N, feature_width], rounded to float16.
+      styles: [N], index of each window's own style.
+      clips: [N], number of the clip in the packed data set that it was cut from. Windows of one
+        clip are alike: an interval from resampling must draw clips, not windows.
+    """
+
+    features: np.ndarray
+    styles: np.ndarray
+    clips: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StyleClassifier:
+    """A trained style classifier with what it knows of real motion.
+
+    Attributes:
+      config: sizes of the network.
+      params, statistics: weights and running batch statistics; weights are rounded to bfloat16, so
+        that a file holds exactly what was measured.
+      skeleton: of the data it was trained on; no other is accepted.
+      styles: the classes, in the order of the scores.
+      held_out_accuracy: per style, the share of held-out windows that it recognises.
+      references: "train" and "held_out" (validation and test clips), the features of real motion.
+      record: how it was trained, on what, under what terms.
+    """
+
+    config: ClassifierConfig
+    params: Any
+    statistics: Any
+    skeleton: Skeleton
+    styles: tuple[str, ...]
+    held_out_accuracy: dict[str, float]
+    references: dict[str, ReferenceFeatures]
+    record: dict
+
+    @property
+    def accuracy(self) -> float:
+        """Held-out accuracy, each style counting alike; guessing gives 1 / S."""
+        return float(np.mean(list(self.held_out_accuracy.values())))
+
+    def style_index(self, style: str) -> int:
+        """Return a style's class number; ValueError names the nearest one known."""
+        if style not in self.styles:
+            raise ValueError(
+                f"the style classifier was not trained on style {style!r}{nearest_hint(style, self.styles)}"
+            )
+        return self.styles.index(style)
+
+    def windows_of(self, positions, skeleton: Skeleton) -> np.ndarray:
+        """Cut motion into the windows that the classifier sees (see `classifier_windows`).
+
+        Args:
+          positions: global joint positions, [..., T, J, 3], metres, at 30 fps.
+          skeleton: of the motion; must be the classifier's own.
+
+        Returns:
+          [..., T // window, window, 45], metres.
+
+        Raises:
+          ValueError: for another skeleton, motion that is too short, or numbers not finite.
+        """
+        if skeleton != self.skeleton:
+            raise ValueError(
+                f"this style classifier was trained on the {self.skeleton.num_joints} joints of "
+                f"{self.record.get('dataset', 'its data')!r}; features of another skeleton "
+                f"(here {skeleton.num_joints} joints: other names, parents or bone lengths) do not "
+                "compare. Train one on that data with `obtain_classifier`"
+            )
+        return classifier_windows(positions, skeleton, window=self.config.window)
+
+    def _run(self, windows) -> tuple[np.ndarray, np.ndarray]:
+        """Return (features, scores) of windows [..., window, 45], or say what is wrong."""
+        windows = np.asarray(windows, np.float32)
+        expected = (self.config.window, NUM_CHANNELS)
+        if windows.shape[-2:] != expected or windows.size == 0:
+            raise ValueError(
+                f"windows must be [..., {expected[0]}, {expected[1]}] and at least one, got "
+                f"{windows.shape}; cut them with `windows_of`"
+            )
+        flat = windows.reshape(-1, *expected)
+        bad = ~np.isfinite(flat).all(axis=(1, 2))
+        if bad.any():
+            raise ValueError(f"window {int(np.argmax(bad))} is not finite")
+        answers = _answers(self.config, self.params, self.statistics, flat)
+        return tuple(answer.reshape(*windows.shape[:-2], -1) for answer in answers)
+
+    def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
+        """Return what `features` and `predict` return, with one run of the network for both."""
+        features, scores = self._run(windows)
+        return features, np.argmax(scores, axis=-1)
+
+    def features(self, windows) -> np.ndarray:
+        """Return the features of windows, for FID and EMD.
+
+        Args:
+          windows: from `windows_of`, [..., window, 45], metres.
+
+        Returns:
+          [..., feature_width], float32, without unit.
+
+        Raises:
+          ValueError: for another shape, no windows, or numbers not finite.
+        """
+        return self._run(windows)[0]
+
+    def predict(self, windows) -> np.ndarray:
+        """Return the class that each window is taken for, for style coverage.
+
+        Args:
+          windows: from `windows_of`, [..., window, 45], metres.
+
+        Returns:
+          Indices into `styles`, [...].
+
+        Raises:
+          ValueError: for another shape, no windows, or numbers not finite.
+        """
+        return self.features_and_classes(windows)[1]
+
+    def reference(self, split: str, style: str | None = None) -> np.ndarray:
+        """Return the features of real windows, [N, feature_width], float32.
+
+        Args:
+          split: "train" or "held_out".
+          style: one of `styles`; by default all of them pooled.
+
+        Raises:
+          ValueError: for an unknown split or style.
+        """
+        if split not in self.references:
+            raise ValueError(f"unknown reference {split!r}{nearest_hint(split, self.references)}")
+        known = self.references[split]
+        if style is None:
+            return known.features
+        return known.features[known.styles == self.style_index(style)]
+
+
+def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BAR) -> None:
+    """Refuse a classifier that cannot tell styles apart on clips it was not trained on.
+
+    With as much real motion of each style, coverage is at least the accuracy a, so that up to 1 - a
+    of a coverage figure is the classifier's own error; and features that mix styles up let FID and
+    EMD take one style for another. The bar of 0.8 keeps that error within a fifth, and lies far
+    from guessing (1 / S) and from what a whole training reaches (0.98 and more on our data sets).
+
+    Args:
+      classifier: a trained one.
+      bar: least accuracy, each style counting alike.
+
+    Raises:
+      ValueError: naming the accuracy, the bar and the styles that are confused most.
+    """
+    # Written so that an accuracy which is not a number is refused too.
+    if not classifier.accuracy >= bar:
+        worst = sorted(classifier.held_out_accuracy.items(), key=lambda item: item[1])[:3]
+        listed = ", ".join(f"{style} {100 * share:.0f} %" for style, share in worst)
+        raise ValueError(
+            f"the style classifier recognises {100 * classifier.accuracy:.1f} % of held-out real "
+            f"motion, under the bar of {100 * bar:.1f} % (worst: {listed}): FID, EMD and coverage "
+            "on its features would mean nothing. Train it longer or on more data"
+        )
+
+
+# --------------------------------------------------------------------------------------- training
+
+
+@dataclass(frozen=True, eq=False)
+class _Takes:
+    """The clips of some styles and splits, as frames put end to end; K clips, sorted by style.
+
+    Attributes:
+      window: frames of a window.
+      frames: [N, 45], metres, float32.
+      first, length, styles, clips: [K], first frame, number of frames, style index and clip number.
+    """
+
+    window: int
+    frames: np.ndarray
+    first: np.ndarray
+    length: np.ndarray
+    styles: np.ndarray
+    clips: np.ndarray
+
+    def starts(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return (first frame, take) of each window, [W]; sorted by style."""
+        count = (self.length - self.window) // stride + 1
+        take = np.repeat(np.arange(len(count)), count)
+        place = np.arange(len(take)) - np.repeat(np.cumsum(count) - count, count)
+        return self.first[take] + stride * place, take
+
+    def side_by_side(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return windows that do not overlap, [W, window, 45], with style and clip of each."""
+        starts, take = self.starts(self.window)
+        windows = self.frames[starts[:, None] + np.arange(self.window)]
+        return windows, self.styles[take], self.clips[take]
+
+
+def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, ...], window: int) -> _Takes:
+    """Collect the clips of styles and splits; one shorter than a window holds none to give."""
+    frames, labels, clips = [], [], []
+    for number, style in enumerate(styles):
+        mine = np.asarray(packed.clip_style) == packed.styles.index(style)
+        mine &= np.isin(packed.clip_split, [SPLITS.index(split) for split in splits])
+        mine &= np.diff(packed.clip_start) >= window
+        if not mine.any():
+            raise ValueError(
+                f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip "
+                f"of at least {window} frames; add clips, or leave the style out with `styles`"
+            )
+        for clip in np.flatnonzero(mine):
+            positions = packed.motion(int(clip)).positions
+            frames.append(classifier_frames(positions, packed.skeleton).astype(np.float32))
+            labels.append(number)
+            clips.append(clip)
+    length = np.array([len(part) for part in frames])
+    return _Takes(
+        window=window,
+        frames=np.concatenate(frames),
+        first=np.cumsum(length) - length,
+        length=length,
+        styles=np.array(labels, np.int32),
+        clips=np.array(clips, np.int32),
+    )
+
+
+class _TrainingData(NamedTuple):
+    """What batches are drawn from, on the device.
+
+    Attributes:
+      frames: [N, 45], metres.
+      starts: first frame of each window, sorted by style, [W].
+      first, count: each style's first window and number of windows, [S].
+      mirrored: whether a style's windows may be mirrored, [S].
+    """
+
+    frames: jax.Array
+    starts: jax.Array
+    first: jax.Array
+    count: jax.Array
+    mirrored: jax.Array
+
+
+def _training_data(takes: _Takes, stride: int, mirrored: np.ndarray) -> _TrainingData:
+    starts, take = takes.starts(stride)
+    count = np.bincount(takes.styles[take], minlength=len(mirrored))
+    return _TrainingData(
+        frames=jnp.asarray(takes.frames),
+        starts=jnp.asarray(starts, jnp.int32),
+        first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
+        count=jnp.asarray(count, jnp.int32),
+        mirrored=jnp.asarray(mirrored),
+    )
+
+
+def _draw(data: _TrainingData, key, batch_size: int, window: int):
+    """Return (windows [B, window, 45], styles [B]) of a batch."""
+    key_style, key_place, key_mirror = jax.random.split(key, 3)
+    # The style first, so that each is seen alike however much motion it has.
+    style = jax.random.randint(key_style, (batch_size,), 0, len(data.count))
+    place = jax.random.randint(key_place, (batch_size,), 0, data.count[style])
+    start = data.starts[data.first[style] + place]
+    windows = data.frames[start[:, None] + jnp.arange(window)]
+    channel, sign = _mirror_channels()
+    swapped = data.mirrored[style] & jax.random.bernoulli(key_mirror, 0.5, (batch_size,))
+    return jnp.where(swapped[:, None, None], sign * windows[..., channel], windows), style
+
+
+def _optimiser(num_steps: int):
+    # Falling to zero lets the weights settle and the batch statistics catch up with them.
+    return optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps))
+
+
+@functools.partial(jax.jit, static_argnames=("config", "num_steps"))
+def _initial_state(key, config: ClassifierConfig, num_steps: int):
+    network = StyleNetwork(config, rngs=nnx.Rngs(key))
+    _, params, statistics = nnx.split(network, nnx.Param, nnx.BatchStat)
+    return params, statistics, _optimiser(num_steps).init(params)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "num_steps", "batch_size"), donate_argnames="state")
+def _advance(state, data: _TrainingData, key, steps, config, num_steps: int, batch_size: int):
+    """Take the steps of the given numbers; return (state, loss of each)."""
+
+    def loss_of(params, statistics, windows, style, key):
+        network = _network(config, params, statistics)
+        _, scores = network(windows, key)
+        loss = optax.softmax_cross_entropy_with_integer_labels(scores, style).mean()
+        return loss, nnx.state(network, nnx.BatchStat)
+
+    def one_step(state, step):
+        params, statistics, moments = state
+        key_draw, key_dropout = jax.random.split(jax.random.fold_in(key, step))
+        windows, style = _draw(data, key_draw, batch_size, config.window)
+        (loss, statistics), gradient = jax.value_and_grad(loss_of, has_aux=True)(
+            params, statistics, windows, style, key_dropout
+        )
+        updates, moments = _optimiser(num_steps).update(gradient, moments, params)
+        return (optax.apply_updates(params, updates), statistics, moments), loss
+
+    return jax.lax.scan(one_step, state, steps)
+
+
+def _fit(config: ClassifierConfig, training: dict, data: _TrainingData, progress: bool):
+    """Train a network from scratch; return its weights and batch statistics."""
+    num_steps = training["num_steps"]
+    key_weights, key_steps = jax.random.split(jax.random.key(training["seed"]))
+    state = _initial_state(key_weights, config, num_steps)
+    chunk = max(1, min(20, num_steps // 10))
+    with tqdm(total=num_steps, unit="step", desc="style classifier", disable=not progress) as bar:
+        for done in range(0, num_steps, chunk):
+            steps = jnp.arange(done, min(done + chunk, num_steps))
+            state, losses = _advance(state, data, key_steps, steps, config, num_steps, training["batch_size"])
+            loss = float(losses.mean())
+            if not np.isfinite(loss):
+                raise TrainingDiverged(
+                    f"the style classifier's loss is not finite by step {done + len(steps)}: "
+                    "check the data for broken frames"
+                )
+            bar.update(len(steps))
+            bar.set_postfix(loss=f"{loss:.4f}")
+    return state[:2]
+
+
+def _recipe(num_steps: int, batch_size: int, seed: int) -> dict:
+    """Return all that decides how a network of given size is trained on given data."""
+    if num_steps < 1 or batch_size < 2:
+        raise ValueError(f"a style classifier needs at least 1 step and batches of 2, got {num_steps} and {batch_size}")
+    return {
+        "num_steps": num_steps,
+        "batch_size": batch_size,
+        "seed": seed,
+        "learning_rate": _LEARNING_RATE,
+        "schedule": "cosine to 0",
+        "stride": _STRIDE,
+    }
+
+
+def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
+    """Return the classes: those asked for, or the primary ones."""
+    chosen = tuple(packed.primary_styles if styles is None else styles)
+    for style in chosen:
+        if style not in packed.styles:
+            raise ValueError(f"data set {packed.dataset!r} has no style {style!r}{nearest_hint(style, packed.styles)}")
+    if len(set(chosen)) != len(chosen) or len(chosen) < 2:
+        raise ValueError(
+            f"a style classifier needs at least two styles, each named once; got {len(chosen)} "
+            f"({', '.join(chosen[:5])})"
+        )
+    return chosen
+
+
+def train_classifier(
+    packed: PackedMotion,
+    *,
+    num_steps: int = 600,
+    batch_size: int = 128,
+    seed: int = 0,
+    styles=None,
+    profile: Profile | str = "none",
+    progress: bool = True,
+    **sizes,
+) -> StyleClassifier:
+    """Train a style classifier on a data set's training clips and try it on the held-out ones.
+
+    Cross entropy, Adam from 1e-3, windows every 10 frames and dropout 0.5 are CAMDM's. Ours: the
+    learning rate falls to 0 on a cosine (at a constant rate the accuracy of a short training swings
+    by several points from seed to seed), each style is drawn alike however much motion it has, half
+    the windows of styles that may be mirrored are, as in the training of the generators, and clips
+    are held out.
+
+    By default the classes are the primary styles, so that every answer is a style that is
+    evaluated, and each style has held-out clips enough to say how well it is recognised. A clip
+    shorter than a window (60 frames) holds none and is left out; Bandai's primary styles have none
+    so short, and a window padded by still or repeated frames would be no real motion.
+
+    Args:
+      packed: the data.
+      num_steps, batch_size: optimiser steps, and windows in each.
+      seed: of weights, batches and dropout.
+      styles: labels to tell apart, instead of the primary ones.
+      profile: what the run record names.
+      progress: show a progress bar.
+      **sizes: fields of `ClassifierConfig` to change.
+
+    Returns:
+      The classifier, weights rounded to bfloat16 and then measured.
+
+    Raises:
+      ValueError: for an unknown style or size, fewer than two styles, a style without a training
+        or a held-out clip of 60 frames, or a skeleton without one of `CLASSIFIER_JOINTS`.
+      TrainingDiverged: if the loss stops being a number.
+
+    Source: CAMDM's evaluation code (its classifier).
+    """
+    training = _recipe(num_steps, batch_size, seed)
+    styles = _chosen_styles(packed, styles)
+    config = ClassifierConfig.from_dict({"num_styles": len(styles), **sizes})
+    takes = {
+        "train": _collect(packed, styles, ("train",), config.window),
+        "held_out": _collect(packed, styles, _HELD_OUT, config.window),
+    }
+    mirrored = np.array([style in packed.mirror_styles for style in styles])
+    data = _training_data(takes["train"], _STRIDE, mirrored)
+    params, statistics = _fit(config, training, data, progress)
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(leaf.dtype), params)
+    references = {}
+    for split, part in takes.items():
+        windows, labels, clips = part.side_by_side()
+        features, scores = _answers(config, params, statistics, windows)
+        rounded = features.astype(np.float16).astype(np.float32)
+        references[split] = ReferenceFeatures(rounded, labels, clips)
+    right = np.argmax(scores, axis=-1) == labels  # of the last split, held out
+    return StyleClassifier(
+        config=config,
+        params=params,
+        statistics=statistics,
+        skeleton=packed.skeleton,
+        styles=styles,
+        held_out_accuracy={style: float(right[labels == number].mean()) for number, style in enumerate(styles)},
+        references=references,
+        record=run_record(
+            profile=profile,
+            dataset=packed,
+            seed=seed,
+            classifier=config.to_dict(),
+            classifier_training=training,
+            classifier_styles=styles,
+            num_train_windows=len(data.starts),
+            num_held_out_windows=len(labels),
+        ),
+    )
+
+
+_PROFILE_TRAINING = {
+    "smoke": {"num_steps": 60, "batch_size": 32},
+    "laptop": {"num_steps": 600, "batch_size": 128},
+    "gpu": {"num_steps": 10_000, "batch_size": 1024},
+}
+"""How long a profile trains; `gpu` is CAMDM's 50 epochs of 100STYLE (201,000 windows)."""
+
+
+def obtain_classifier(
+    packed: PackedMotion, profile: Profile, *, progress: bool = True, **changes
+) -> tuple[StyleClassifier, str]:
+    """Return the style classifier of a data set: of an earlier run, or trained now and kept.
+
+    It is not shipped: its 8.5 million weights would take as much room as all models together, and a
+    laptop trains it in under a minute. The seed is always the same, since features of two trainings
+    do not compare. It is kept in `runs/<data set>/<profile>/classifier/` under a name that depends
+    on data, styles and recipe.
+
+    Args:
+      packed: the data.
+      profile: says how long, and where the file goes.
+      progress: show a progress bar if training is needed.
+      **changes: settings of `train_classifier` to change.
+
+    Returns:
+      (classifier, origin), origin being "earlier run" or "trained now".
+
+    Raises:
+      ValueError: as `train_classifier`, or naming a file that is broken.
+    """
+    settings = {"seed": 0, "styles": None} | _PROFILE_TRAINING[profile.name] | changes
+    training = _recipe(*(settings[name] for name in ("num_steps", "batch_size", "seed")))
+    styles = _chosen_styles(packed, settings["styles"])
+    sizes = {name: value for name, value in settings.items() if name not in (*training, "styles")}
+    identity = {
+        "dataset_fingerprint": packed.fingerprint,
+        "classifier": ClassifierConfig.from_dict({"num_styles": len(styles), **sizes}).to_dict(),
+        "classifier_training": training,
+        "classifier_styles": styles,
+    }
+    folder = runs_dir(profile.dataset, profile.name) / "classifier"
+    path = folder / f"style-classifier-{record_hash(identity)[:12]}.safetensors"
+    if path.exists():
+        return load_classifier(path), "earlier run"
+    classifier = train_classifier(packed, profile=profile, progress=progress, **settings)
+    save_classifier(path, classifier)
+    return classifier, "trained now"
+
+
+# ------------------------------------------------------------------------------------------- files
+
+
+def save_classifier(path: Path, classifier: StyleClassifier) -> None:
+    """Write a classifier; `load_classifier` gives back exactly the same."""
+    skeleton = classifier.skeleton
+    tree = {
+        "params": jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), classifier.params),
+        "statistics": classifier.statistics,
+        "references": {
+            split: {
+                "features": jnp.asarray(reference.features, jnp.float16),
+                "styles": jnp.asarray(reference.styles, jnp.int32),
+                "clips": jnp.asarray(reference.clips, jnp.int32),
+            }
+            for split, reference in classifier.references.items()
+        },
+        "offsets": jnp.asarray(skeleton.offsets, jnp.float32),
+    }
+    metadata = {
+        "kind": "style classifier",
+        "classifier": classifier.config.to_dict(),
+        "styles": list(classifier.styles),
+        **describe_skeleton(skeleton),
+        "held_out_accuracy": classifier.held_out_accuracy,
+        "reference_windows": {split: len(reference.features) for split, reference in classifier.references.items()},
+        "record": classifier.record,
+    }
+    save_tree(path, tree, metadata)
+
+
+def load_classifier(path: Path) -> StyleClassifier:
+    """Read a classifier written by `save_classifier`.
+
+    Raises:
+      ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
+    """
+    with errors_name(path):
+        tree, metadata = load_tree(path, _template)
+        return StyleClassifier(
+            config=ClassifierConfig.from_dict(metadata["classifier"]),
+            params=tree["params"],
+            statistics=tree["statistics"],
+            skeleton=described_skeleton(metadata, tree["offsets"]),
+            styles=tuple(metadata["styles"]),
+            held_out_accuracy=metadata["held_out_accuracy"],
+            references={
+                split: ReferenceFeatures(**{name: np.asarray(part[name]) for name in part})
+                for split, part in tree["references"].items()
+            },
+            record=metadata["record"],
+        )
+
+
+def _template(metadata: dict) -> dict:
+    """Return the shapes that a classifier's description speaks of."""
+    if metadata.get("kind") != "style classifier":
+        raise ValueError(f"holds a {metadata.get('kind')}, not a style classifier")
+    config = ClassifierConfig.from_dict(metadata["classifier"])
+    _, params, statistics = _blank(config)
+    shape = jax.ShapeDtypeStruct
+    return {
+        "params": params,
+        "statistics": statistics,
+        "references": {
+            split: {
+                "features": shape((count, config.feature_width), jnp.float32),
+                "styles": shape((count,), jnp.int32),
+                "clips": shape((count,), jnp.int32),
+            }
+            for split, count in metadata["reference_windows"].items()
+        },
+        "offsets": shape((len(metadata["joints"]), 3), jnp.float32),
+    }

@@ -1,0 +1,356 @@
+"""Root paths: where a character shall walk, and which way it shall face.
+
+A path is one ground position and one facing angle a frame. It comes from a name (`named_path`), a
+CSV file (`read_path_csv`) or a real motion (`path_from_motion`), and it is what the models are
+conditioned on (paper section 3.3) and judged against (section 4.4).
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import jn_zeros
+
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.skeleton import Motion
+
+NAMES = ("straight", "circle", "figure-eight", "slalom", "square", "spiral", "complex")
+"""The paths that `named_path` knows."""
+
+MAX_STEP = 0.5
+"""Longest step between two rows of a path file, metres (15 m/s at 30 fps: nobody runs so fast)."""
+
+_SUBSTEPS = 8  # integration steps a frame; leaves about 1e-6 of a path's length in error
+
+
+@dataclass(frozen=True, eq=False)
+class RootPath:
+    """A target for the root: one ground position and one facing angle a frame.
+
+    Attributes:
+      position: [T, 2], x and z in metres.
+      yaw: [T], radians, unwrapped (no jumps of 2 pi); 0 faces +Z, positive turns left.
+      fps: frames per second.
+
+    Raises:
+      ValueError: for shapes that do not agree, no frames, a bad fps, or numbers not finite.
+    """
+
+    position: np.ndarray
+    yaw: np.ndarray
+    fps: float = 30.0
+
+    def __post_init__(self):
+        position = np.array(self.position, dtype=np.float64)
+        yaw = np.array(self.yaw, dtype=np.float64)
+        if position.ndim != 2 or position.shape[1] != 2 or yaw.shape != position.shape[:1]:
+            raise ValueError(f"a path needs position [T, 2] and yaw [T]; got {position.shape} and {yaw.shape}")
+        if len(position) == 0:
+            raise ValueError("a path needs at least one frame")
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise ValueError(f"a path's fps must be positive, got {self.fps}")
+        for what, array in (("position", position), ("yaw", yaw)):
+            if not np.all(np.isfinite(array)):
+                frame = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise ValueError(f"path {what} is not finite at frame {frame}")
+        yaw = np.unwrap(yaw)
+        position.setflags(write=False)
+        yaw.setflags(write=False)
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "yaw", yaw)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.position)
+
+    @property
+    def length(self) -> float:
+        """Length of the walked line, metres."""
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=-1).sum())
+
+    def slice(self, start: int, stop: int) -> RootPath:
+        """Return frames start (included) to stop (excluded)."""
+        return dataclasses.replace(self, position=self.position[start:stop], yaw=self.yaw[start:stop])
+
+    def placed(self, position, yaw: float = 0.0) -> RootPath:
+        """Move the path so that its first frame lies at `position` (x, z) and faces `yaw`."""
+        angle = float(yaw) - self.yaw[0]
+        cosine, sine = np.cos(angle), np.sin(angle)
+        x, z = (self.position - self.position[0]).T
+        turned = np.stack([cosine * x + sine * z, cosine * z - sine * x], axis=-1)
+        return dataclasses.replace(self, position=turned + np.asarray(position, dtype=np.float64), yaw=self.yaw + angle)
+
+
+def named_path(
+    name: str, num_frames: int, *, speed: float = 1.2, seed: int = 0, fps: float = 30.0, ramp_seconds: float = 0.0
+) -> RootPath:
+    """Build one of the named paths.
+
+    Every path starts at the origin, moves and faces along +Z there, and has a continuous heading.
+    All but "complex" keep a constant speed and face where they go. A longer path of the same name
+    and seed begins with the shorter one.
+
+    | name | shape |
+    |---|---|
+    | straight | along +Z |
+    | circle | to the left, radius 2.5 m |
+    | figure-eight | closed, 22.7 m a lap, starts in its crossing; tightest radius 1.5 m |
+    | slalom | swings 50 degrees to each side of +Z, a period every 8 m |
+    | square | to the left, 6 m sides with rounded corners, starts in the middle of a side |
+    | spiral | to the left and outwards, from radius 1 m, arms 1 m apart |
+    | complex | by seed: straights, turns, stops, speed changes, sideways and backward stretches |
+
+    "complex" is made in the spirit of section 4.4's "varied speeds, turns, and directions".
+
+    Args:
+      name: one of `NAMES`.
+      num_frames: number of frames, at least 2.
+      speed: metres per second along the path; for "complex" the pace around which speeds vary
+        (0.4 to 1.6 times this, and 0 in stops).
+      seed: chooses the "complex" path; the others ignore it.
+      fps: frames per second.
+      ramp_seconds: time in which the speed rises smoothly from 0; 0 starts at full speed.
+
+    Returns:
+      The path, [T = num_frames].
+
+    Raises:
+      ValueError: for an unknown name (with the nearest ones), fewer than 2 frames, or a speed, fps
+        or ramp out of range.
+
+    Source: ours; the paper does not give its test trajectory.
+    """
+    if name not in NAMES:
+        raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
+    if int(num_frames) != num_frames or num_frames < 2:
+        raise ValueError(f"a path needs at least 2 whole frames, got num_frames={num_frames}")
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps must be positive, got {fps}")
+    if not (np.isfinite(speed) and 0 < speed < MAX_STEP * 30.0):
+        raise ValueError(f"speed must lie between 0 and {MAX_STEP * 30.0:g} m/s, got {speed}")
+    if not (np.isfinite(ramp_seconds) and ramp_seconds >= 0):
+        raise ValueError(f"ramp_seconds must be 0 or more, got {ramp_seconds}")
+    num_frames = int(num_frames)
+
+    fine_time = np.arange((num_frames - 1) * _SUBSTEPS + 1) / (_SUBSTEPS * fps)
+    if name == "complex":
+        pace, turn_rate, offset = _complex_profile(fine_time[-1], speed, seed)
+        fine_speed = np.interp(fine_time, *pace)
+        heading = _integrate(np.interp(fine_time, *turn_rate), fine_time)
+        facing_offset = np.interp(fine_time, *offset)
+    else:
+        fine_speed = np.full_like(fine_time, speed)
+        heading, facing_offset = None, 0.0
+    if ramp_seconds > 0:
+        fine_speed = fine_speed * _smoothstep(fine_time / ramp_seconds)
+    distance = _integrate(fine_speed, fine_time)
+    if heading is None:
+        heading = _HEADINGS[name](distance)
+
+    # Midpoint rule: each small step goes along the mean of the headings at its two ends.
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    step = np.diff(distance)[:, None] * np.stack([np.sin(middle), np.cos(middle)], axis=-1)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    yaw = heading + facing_offset
+    return RootPath(position[::_SUBSTEPS], yaw[::_SUBSTEPS], float(fps))
+
+
+def _integrate(rate: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Integrate a rate over time by the trapezium rule, starting at 0."""
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
+    return np.concatenate([np.zeros(1), np.cumsum(steps)])
+
+
+def _smoothstep(u: np.ndarray) -> np.ndarray:
+    """Rise from 0 to 1 over [0, 1] with level ends."""
+    u = np.clip(u, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+def _heading_figure_eight(distance: np.ndarray) -> np.ndarray:
+    # A heading of amplitude A that swings like a sine closes on itself where the Bessel function
+    # J0(A) = 0; the first zero is the figure eight. Shifted by a quarter lap it starts in the
+    # crossing, with no curvature there.
+    amplitude = jn_zeros(0, 1)[0]
+    lap = 2.0 * np.pi * amplitude * 1.5
+    return amplitude * (1.0 - np.cos(2.0 * np.pi * distance / lap))
+
+
+def _heading_slalom(distance: np.ndarray) -> np.ndarray:
+    return np.deg2rad(50.0) * np.sin(2.0 * np.pi * distance / 8.0)
+
+
+def _heading_square(distance: np.ndarray) -> np.ndarray:
+    straight, corner = 3.0, 3.0  # a corner of 3 m of arc turns with a tightest radius of 1.3 m
+    along = (distance + straight / 2.0) / (straight + corner)
+    side = np.floor(along)
+    within = (along - side) * (straight + corner) - straight
+    return 0.5 * np.pi * (side + _smoothstep(within / corner))
+
+
+def _heading_spiral(distance: np.ndarray) -> np.ndarray:
+    # Radius r grows with r dr = (c / 2) ds, so each turn adds pi c metres to it.
+    start, growth = 1.0, 1.0 / np.pi
+    return (2.0 / growth) * (np.sqrt(start**2 + growth * distance) - start)
+
+
+_HEADINGS = {
+    "straight": np.zeros_like,
+    "circle": lambda distance: distance / 2.5,
+    "figure-eight": _heading_figure_eight,
+    "slalom": _heading_slalom,
+    "square": _heading_square,
+    "spiral": _heading_spiral,
+}
+
+
+def _complex_profile(seconds: float, speed: float, seed: int):
+    """Draw speed, turn rate and facing offset as smooth functions of time.
+
+    Segments of a few seconds each hold constant targets; Gaussians round them off. Segments are
+    drawn one after the other, so that a longer path begins with the shorter one.
+
+    Returns:
+      Three (time, value) pairs for `numpy.interp`: m/s, rad/s, rad.
+    """
+    rng = np.random.default_rng(seed)
+    rate = 30.0
+    needed = int(np.ceil((seconds + 4.0) * rate)) + 1  # beyond the reach of the widest Gaussian
+    kinds = ("walk", "turn", "stop", "sideways", "backwards")
+    weights = (0.42, 0.30, 0.08, 0.12, 0.08)
+    segments = [(2.5, 1.0, 0.0, 0.0)]  # long enough to start exactly along +Z
+    while sum(int(segment[0] * rate) for segment in segments) < needed:
+        kind = kinds[rng.choice(len(kinds), p=weights)]
+        duration, side = rng.uniform(2.0, 4.5), rng.choice([-1.0, 1.0])
+        pace, turning, offset = rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0), 0.0
+        if kind == "walk":
+            pace, turning = 0.6 + 1.0 * pace, 0.25 * turning
+        elif kind == "turn":
+            # 30 to 140 degrees in all, so that a turn is a turn and not a tight loop.
+            duration *= 0.7
+            pace, turning = 0.5 + 0.6 * pace, np.deg2rad(30.0 + 110.0 * turning) / duration
+        elif kind == "stop":
+            duration, pace, turning = rng.uniform(1.2, 2.0), 0.0, 0.0
+        elif kind == "sideways":
+            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, 0.5 * np.pi
+        else:
+            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, np.pi
+        facing_side = rng.choice([-1.0, 1.0])
+        segments.append((duration, pace, side * turning, facing_side * offset))
+    frames = [int(segment[0] * rate) for segment in segments]
+    time = np.arange(sum(frames)) / rate
+
+    def smooth(column: int, sigma_seconds: float) -> np.ndarray:
+        values = np.repeat([segment[column] for segment in segments], frames)
+        return gaussian_filter1d(values, sigma_seconds * rate, mode="nearest", truncate=4.0)
+
+    return ((time, speed * smooth(1, 0.4)), (time, smooth(2, 0.4)), (time, smooth(3, 0.5)))
+
+
+def read_path_csv(path) -> RootPath:
+    """Read a path from a CSV file with one row a frame at 30 fps.
+
+    The header names the columns `x` and `z` (metres) and, if wanted, `yaw_deg` (degrees, 0 faces
+    +Z, positive turns left). Without `yaw_deg` the path faces where it goes; while it stands still
+    it keeps the last direction.
+
+    Args:
+      path: the file.
+
+    Returns:
+      The path, one frame a row, neither moved nor resampled.
+
+    Raises:
+      ValueError: naming file and line, for a missing, repeated or unknown column, a row of the
+        wrong length, a cell that is not a finite number, a step over 0.5 m, or fewer than 2 rows.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+    reader = csv.reader(text.splitlines())
+    header = [cell.strip() for cell in next(reader, [])]
+    if len(set(header)) != len(header):
+        raise ValueError(f"{path}: line 1: a column is named twice in {', '.join(header)}")
+    for column in ("x", "z"):
+        if column not in header:
+            raise ValueError(
+                f"{path}: line 1: column {column!r} is missing; the header must be x,z or "
+                f"x,z,yaw_deg, it is {','.join(header) or 'empty'}"
+            )
+    unknown = set(header) - {"x", "z", "yaw_deg"}
+    if unknown:
+        raise ValueError(
+            f"{path}: line 1: unknown column {min(unknown)!r}; the header must be x,z or "
+            "x,z,yaw_deg (facing in degrees)"
+        )
+
+    rows: list[list[float]] = []
+    for cells in reader:
+        line = reader.line_num
+        if not "".join(cells).strip():
+            continue
+        if len(cells) != len(header):
+            raise ValueError(f"{path}: line {line}: {len(cells)} cells where the header has {len(header)}")
+        row = []
+        for column, cell in zip(header, cells, strict=True):
+            try:
+                number = float(cell)
+            except ValueError:
+                raise ValueError(f"{path}: line {line}: {column} is {cell.strip()!r}, not a number") from None
+            if not np.isfinite(number):
+                raise ValueError(f"{path}: line {line}: {column} is {cell.strip()}, not finite")
+            row.append(number)
+        if rows:
+            jump = float(np.hypot(*(row[header.index(c)] - rows[-1][header.index(c)] for c in ("x", "z"))))
+            if jump > MAX_STEP:
+                raise ValueError(
+                    f"{path}: line {line}: jumps {jump:.2f} m in one frame (at most {MAX_STEP} m "
+                    "at 30 fps); units are metres and one row is one frame"
+                )
+        rows.append(row)
+    if len(rows) < 2:
+        raise ValueError(f"{path}: a path needs at least 2 rows below its header, has {len(rows)}")
+    table = np.array(rows)
+    position = table[:, [header.index("x"), header.index("z")]]
+    if "yaw_deg" in header:
+        return RootPath(position, np.deg2rad(table[:, header.index("yaw_deg")]))
+    return RootPath(position, tangent_yaw(position))
+
+
+def tangent_yaw(position: np.ndarray) -> np.ndarray:
+    """Return the yaw of the direction of travel; frames that stand keep the last direction.
+
+    Args:
+      position: [T, 2], x and z in metres.
+
+    Returns:
+      [T], radians.
+    """
+    velocity = np.gradient(position, axis=0)
+    moving = np.linalg.norm(velocity, axis=-1) > 1e-4  # 3 mm/s at 30 fps
+    if not moving.any():
+        return np.zeros(len(position))
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(position)), -1))
+    last = np.where(last < 0, np.argmax(moving), last)
+    return np.arctan2(velocity[last, 0], velocity[last, 1])
+
+
+def path_from_motion(motion: Motion) -> RootPath:
+    """Take a motion's own root path: ground position and facing of the hips.
+
+    Args:
+      motion: any motion.
+
+    Returns:
+      The path, [T], at the motion's frame rate, where the motion has it (not moved to the origin).
+    """
+    root = np.asarray(motion.root_position, dtype=np.float64)
+    return RootPath(root[:, [0, 2]], np.asarray(motion.yaw, dtype=np.float64), float(motion.fps))

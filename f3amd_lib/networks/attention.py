@@ -1,0 +1,206 @@
+"""Attention and the Transformer encoder block (paper section 3.4.1; Vaswani et al. 2017)."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from f3amd_lib.ground.names import nearest_hint
+
+# PyTorch's GELU is the exact one; JAX's default is an approximation by tanh.
+_ACTIVATIONS = {"gelu": functools.partial(jax.nn.gelu, approximate=False), "relu": jax.nn.relu}
+
+
+@functools.lru_cache(maxsize=64)
+def position_code(first: int, last: int, width: int, base: float = 1000.0) -> np.ndarray:
+    """Return sinusoidal codes of frames first .. last - 1.
+
+    Future frames count from 0, history frames are negative, so that a query of frame t and the path
+    token of frame t carry the same code.
+
+    Args:
+      first, last: range of frames, last excluded.
+      width: length of a code.
+      base: the slowest sinusoid turns about `base` times slower than the fastest. Vaswani et al.
+        2017 have 10,000; windows are short.
+
+    Returns:
+      [last - first, width], float64, read-only (it is cached).
+    """
+    frame = np.arange(first, last)[:, None]
+    rate = np.exp(-np.log(base) * np.arange(0, width, 2) / width)[None, :]
+    code = np.zeros((last - first, width))
+    code[:, 0::2] = np.sin(frame * rate)
+    code[:, 1::2] = np.cos(frame * rate)[:, : width // 2]
+    code.setflags(write=False)
+    return code
+
+
+def dropout(x, rate: float, key):
+    """Set a random share of numbers to zero and enlarge the others, so that the mean stays.
+
+    Args:
+      x: any shape.
+      rate: the share, 0 <= rate < 1.
+      key: random key.
+
+    Returns:
+      Like x.
+
+    Raises:
+      ValueError: if the rate is out of range.
+    """
+    if not 0.0 <= rate < 1.0:
+        raise ValueError(f"dropout rate must be at least 0 and below 1, got {rate}")
+    if rate == 0.0:
+        return x
+    kept = jax.random.bernoulli(key, 1.0 - rate, x.shape)
+    return jnp.where(kept, x / (1.0 - rate), 0.0)
+
+
+def check_num_heads(width: int, num_heads: int) -> None:
+    """Raise ValueError unless the number of heads divides the width."""
+    if num_heads < 1 or width % num_heads:
+        raise ValueError(f"num_heads must divide the width {width}, got {num_heads}")
+
+
+def split_heads(z, num_heads: int):
+    """Return [B, T, D] as [B, T, heads, D / heads]."""
+    return z.reshape(*z.shape[:-1], num_heads, z.shape[-1] // num_heads)
+
+
+def attention_weights(query, key):
+    """Return how much each query takes from each key, softmax(Q K^T / sqrt(width per head)).
+
+    Args:
+      query: [B, T, heads, width per head].
+      key: [B, S, heads, width per head].
+
+    Returns:
+      [B, heads, T, S]; the last axis sums to 1.
+    """
+    scores = jnp.einsum("bthd,bshd->bhts", query, key) / np.sqrt(query.shape[-1])
+    return jax.nn.softmax(scores, axis=-1)
+
+
+def attention(query, key, value, *, dropout_rate: float = 0.0, dropout_key=None):
+    """Return the values, averaged by the attention weights of each query.
+
+    Args:
+      query: [B, T, heads, width per head].
+      key, value: [B, S, heads, width per head].
+      dropout_rate: share of the weights that is dropped, if there is a `dropout_key`.
+      dropout_key: random key, in training; without one nothing is dropped.
+
+    Returns:
+      [B, T, heads, width per head].
+
+    Source: Vaswani et al. 2017, section 3.2.1.
+    """
+    if dropout_key is None:
+        return jax.nn.dot_product_attention(query, key, value)
+    weights = dropout(attention_weights(query, key), dropout_rate, dropout_key)
+    return jnp.einsum("bhts,bshd->bthd", weights, value)
+
+
+class MultiHeadAttention(nnx.Module):
+    """Attention between linear layers, several heads side by side (Vaswani et al. 2017, 3.2.2).
+
+    Args:
+      width: D, of the asking sequence and the result.
+      num_heads: must divide D.
+      answering_width: of the answering sequence; D by default.
+
+    Raises:
+      ValueError: if the number of heads does not divide D.
+    """
+
+    def __init__(self, width: int, num_heads: int, answering_width: int | None = None, *, rngs: nnx.Rngs):
+        check_num_heads(width, num_heads)
+        answering_width = width if answering_width is None else answering_width
+        self.num_heads = num_heads
+        self.query = nnx.Linear(width, width, rngs=rngs)
+        self.key = nnx.Linear(answering_width, width, rngs=rngs)
+        self.value = nnx.Linear(answering_width, width, rngs=rngs)
+        self.output = nnx.Linear(width, width, rngs=rngs)
+
+    def __call__(self, asking, answering=None, *, dropout_rate: float = 0.0, dropout_key=None):
+        """Let every frame of one sequence ask all frames of another, or of its own.
+
+        Args:
+          asking: [B, T, D].
+          answering: [B, S, answering_width]; `asking` itself by default.
+          dropout_rate, dropout_key: of `attention`.
+
+        Returns:
+          [B, T, D].
+        """
+        answering = asking if answering is None else answering
+        answer = attention(
+            split_heads(self.query(asking), self.num_heads),
+            split_heads(self.key(answering), self.num_heads),
+            split_heads(self.value(answering), self.num_heads),
+            dropout_rate=dropout_rate,
+            dropout_key=dropout_key,
+        )
+        return self.output(answer.reshape(asking.shape))
+
+
+class TransformerBlock(nnx.Module):
+    """Encoder block: self-attention, then two layers, each added to its input and normalised.
+
+    Layer normalisation comes last (post-norm), and its epsilon is PyTorch's. Attention has no sense
+    of order of its own: add a `position_code` before the first block.
+
+    Args:
+      width: D.
+      num_heads: must divide D (Appendix A).
+      hidden_width: between the two layers.
+      dropout: rate after attention, inside and after the two layers, and of the attention weights.
+      activation: "gelu" (exact) or "relu" (Vaswani et al. 2017).
+
+    Raises:
+      ValueError: if the number of heads does not divide D, or for an unknown activation.
+
+    Source: section 3.4.1; Vaswani et al. 2017, section 3.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        num_heads: int,
+        hidden_width: int,
+        dropout: float = 0.0,
+        activation: str = "gelu",
+        *,
+        rngs: nnx.Rngs,
+    ):
+        if activation not in _ACTIVATIONS:
+            raise ValueError(f"unknown activation {activation!r}{nearest_hint(activation, _ACTIVATIONS)}")
+        self.dropout, self.activation = dropout, activation
+        self.attention = MultiHeadAttention(width, num_heads, rngs=rngs)
+        self.attention_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
+        self.hidden = nnx.Linear(width, hidden_width, rngs=rngs)
+        self.output = nnx.Linear(hidden_width, width, rngs=rngs)
+        self.output_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
+
+    def __call__(self, z, key=None):
+        """Map [B, T, D] to [B, T, D].
+
+        Args:
+          z: [B, T, D].
+          key: random key for dropout, in training; without one nothing is dropped.
+        """
+        keys = [None] * 4 if key is None else jax.random.split(key, 4)
+
+        def drop(x, place: int):
+            return x if key is None else dropout(x, self.dropout, keys[place])
+
+        answer = self.attention(z, dropout_rate=self.dropout, dropout_key=keys[0])
+        z = self.attention_norm(z + drop(answer, 1))
+        hidden = drop(_ACTIVATIONS[self.activation](self.hidden(z)), 2)
+        return self.output_norm(z + drop(self.output(hidden), 3))

@@ -1,0 +1,260 @@
+"""Conditions (sections 3.3, 3.4.3, Table 11).
+
+Context tokens and noise embedding become the conditioning signal c by cross-attention; then c
+enters every backbone block, by FiLM or by one of the three ways that the paper compares with it.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.networks.attention import MultiHeadAttention, attention, check_num_heads, position_code, split_heads
+
+CONDITIONINGS = ("film", "concatenation", "adaln_zero", "cross_attention")
+"""The ways of Table 11 for c to enter a backbone block."""
+
+PATH_CHANNELS = 8
+"""2D displacement (x, z) and yaw in 6D, per future frame (section 3.3)."""
+
+
+class Condition(NamedTuple):
+    """What guides one window (section 3.3), all in normalised units.
+
+    Attributes:
+      history: past motion features, [B, H, C].
+      path: future root path, [B, T, 8]: displacement x, z and yaw in 6D.
+      style: one-hot (or a blend), [B, S].
+    """
+
+    history: jax.Array
+    path: jax.Array
+    style: jax.Array
+
+
+class Context(NamedTuple):
+    """An encoded condition: keys and values of the context tokens, [B, H + T + 1, D] each.
+
+    It does not depend on the noise level, so that a round encodes it once for all its steps.
+    """
+
+    keys: jax.Array
+    values: jax.Array
+
+
+@functools.lru_cache(maxsize=32)
+def _noise_frequencies(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fixed random frequencies and phases of Karras et al. 2024, from a fixed seed."""
+    generator = np.random.default_rng(2024)
+    return generator.standard_normal(width), generator.uniform(size=width)
+
+
+def noise_features(sigma, width: int):
+    """Embed noise levels as random Fourier features of log(sigma) / 4.
+
+    Args:
+      sigma: noise levels, [...], > 0.
+      width: number of features.
+
+    Returns:
+      [..., width], variance about 1.
+
+    Source: phi of Eq. 1; Karras et al. 2024 (EDM2), section B.3.
+    """
+    frequency, phase = _noise_frequencies(width)
+    position = 0.25 * jnp.log(sigma)[..., None]
+    angle = 2.0 * jnp.pi * (position * jnp.asarray(frequency, position.dtype) + phase)
+    return (jnp.sqrt(2.0) * jnp.cos(angle)).astype(position.dtype)
+
+
+class ConditionEncoder(nnx.Module):
+    """Condition -> context tokens -> cross-attention -> c (section 3.3).
+
+    History, path and style go through one linear layer each into tokens of one width; noise
+    embeddings, broadcast over the window, ask them by cross-attention (one head unless told). The
+    paper does not mention a position code; without one every frame would ask the same question,
+    and c would be constant over the window.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        num_styles: int,
+        width: int,
+        window: int,
+        num_history: int,
+        num_heads: int = 1,
+        frames_before: int = 0,
+        *,
+        rngs: nnx.Rngs,
+    ):
+        check_num_heads(width, num_heads)
+        self.width, self.window, self.num_history = width, window, num_history
+        self.frames_before = frames_before
+        self.num_heads = num_heads
+        self.history = nnx.Linear(channels, width, rngs=rngs)
+        self.path = nnx.Linear(PATH_CHANNELS, width, rngs=rngs)
+        self.style = nnx.Linear(num_styles, width, rngs=rngs)
+        self.noise_first = nnx.Linear(width, width, rngs=rngs)
+        self.noise_second = nnx.Linear(width, width, rngs=rngs)
+        self.query = nnx.Linear(width, width, rngs=rngs)
+        self.key = nnx.Linear(width, width, rngs=rngs)
+        self.value = nnx.Linear(width, width, rngs=rngs)
+        self.output = nnx.Linear(width, width, rngs=rngs)
+
+    def encode(self, condition: Condition) -> Context:
+        """Turn a condition into keys and values; once a round."""
+        dtype = condition.history.dtype
+        past = jnp.asarray(position_code(-self.num_history, 0, self.width), dtype)
+        future = jnp.asarray(position_code(0, self.window, self.width), dtype)
+        tokens = jnp.concatenate(
+            [
+                self.history(condition.history) + past,
+                self.path(condition.path) + future,
+                self.style(condition.style)[:, None, :],
+            ],
+            axis=1,
+        )
+        return Context(self.key(tokens), self.value(tokens))
+
+    def __call__(self, context: Context, sigma):
+        """Return the conditioning signal c, [B, T, D], or [B, frames_before + T, D].
+
+        Args:
+          context: from `encode`.
+          sigma: noise levels, [B] or scalar.
+        """
+        dtype = context.keys.dtype
+        noise = noise_features(jnp.asarray(sigma, dtype), self.width)
+        noise = self.noise_second(nnx.silu(self.noise_first(noise)))
+        code = jnp.asarray(position_code(-self.frames_before, self.window, self.width), dtype)
+        # One noise level for all characters asks one question for all of them.
+        asked = noise[..., None, :] + code
+        shape = (context.keys.shape[0], self.frames_before + self.window, self.width)
+        answer = attention(
+            split_heads(jnp.broadcast_to(self.query(asked), shape), self.num_heads),
+            split_heads(context.keys, self.num_heads),
+            split_heads(context.values, self.num_heads),
+        )
+        return asked + self.output(answer.reshape(shape))
+
+
+def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
+    """Return the linear layer of Eq. 7 (a convolution of kernel 1 is a linear layer per frame)."""
+    # Zero at the start makes a residual block the identity, so that depth costs nothing.
+    initial = {"kernel_init": nnx.initializers.zeros_init()} if zero_output else {}
+    return nnx.Linear(width, width, rngs=rngs, **initial)
+
+
+class FiLM(nnx.Module):
+    """Feature-wise linear modulation with a bounded gate (Eqs 5-7)."""
+
+    def __init__(self, width: int, condition_width: int, *, zero_output: bool = False, rngs: nnx.Rngs):
+        self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs)
+        self.output = _output_layer(width, zero_output, rngs)
+
+    def modulate(self, z_base, c):
+        """Modulate [B, T, D] by c [B, T, C_cond] (Eqs 5-7)."""
+        gamma, beta = jnp.split(self.modulation(c), 2, axis=-1)  # Eq. 5
+        z_tilde = z_base * (1.0 + jnp.tanh(gamma)) + beta  # Eq. 6
+        return nnx.silu(self.output(z_tilde))  # Eq. 7
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, T, D] and modulate the result by c [B, T, C_cond]."""
+        return self.modulate(base(z), c)
+
+
+class Concatenation(nnx.Module):
+    """Condition and features in one sequence, as CAMDM concatenates its conditions in time.
+
+    The network lays c before the features once, ahead of the first block, and drops its frames
+    after the last: blocks run on 2 T frames, which agrees with the 2.05 times as long of Table 11.
+    The base block brings both together, so that only the output layer of Eq. 7 is left here.
+    """
+
+    def __init__(self, width: int, *, zero_output: bool = False, rngs: nnx.Rngs):
+        self.output = _output_layer(width, zero_output, rngs)
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, 2 T, D], whose first T frames came from c; c is not read."""
+        return nnx.silu(self.output(base(z)))
+
+
+class AdaLNZero(nnx.Module):
+    """Adaptive layer normalisation, which starts as the identity (Peebles and Xie 2023, DiT).
+
+    The condition scales and shifts what the base block reads, and gates what it adds to its input.
+    One modulation goes around the whole base block. DiT's SiLU before the linear layer is left out,
+    as c enters by a linear layer alone in FiLM too (Eq. 5).
+    """
+
+    def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):
+        zeros = nnx.initializers.zeros_init()
+        self.modulation = nnx.Linear(condition_width, 3 * width, kernel_init=zeros, rngs=rngs)
+
+    def __call__(self, base, z, c):
+        """Add to z [B, T, D] what the base block makes of it under c [B, T, C_cond]."""
+        shift, scale, gate = jnp.split(self.modulation(c), 3, axis=-1)
+        normalised = jax.nn.standardize(z, axis=-1, epsilon=1e-6)
+        return z + gate * base(normalised * (1.0 + scale) + shift)
+
+
+class CrossAttention(nnx.Module):
+    """Every frame asks the frames of c; the answer is added, and the output layer of Eq. 7 follows.
+
+    Questions carry a position code, as those of `ConditionEncoder` do: without one, a frame could
+    not prefer its own part of c.
+    """
+
+    def __init__(
+        self, width: int, condition_width: int, num_heads: int = 1, *, zero_output: bool = False, rngs: nnx.Rngs
+    ):
+        self.attention = MultiHeadAttention(width, num_heads, condition_width, rngs=rngs)
+        self.output = _output_layer(width, zero_output, rngs)
+
+    def __call__(self, base, z, c):
+        """Run the base block on z [B, T, D], and let the result ask c [B, T, C_cond]."""
+        z_base = base(z)
+        code = jnp.asarray(position_code(0, *z_base.shape[1:]), z_base.dtype)
+        z_tilde = z_base + self.attention(z_base + code, c)
+        return nnx.silu(self.output(z_tilde))
+
+
+def conditioning_layer(
+    name: str, width: int, condition_width: int, *, num_heads: int = 1, zero_output: bool = False, rngs: nnx.Rngs
+):
+    """Return a layer that brings c into a backbone block, called as layer(base, z, c).
+
+    There `base` is the base block (a callable z -> z_base), z is [B, T, D] and c [B, T, C_cond].
+    Except for AdaLN-zero all end with the output layer of Eq. 7, so that only the way in differs.
+
+    Args:
+      name: one of `CONDITIONINGS`.
+      width: D.
+      condition_width: C_cond.
+      num_heads: of "cross_attention".
+      zero_output: start as zero, for a block whose input is added to its output.
+
+    Raises:
+      ValueError: for an unknown name (with the nearest); for "concatenation" of features and a
+        condition of other width; for "adaln_zero" with `zero_output`, as it adds its input itself.
+    """
+    if name not in CONDITIONINGS:
+        raise ValueError(f"unknown conditioning {name!r}{nearest_hint(name, CONDITIONINGS)}")
+    if name == "concatenation":
+        if condition_width != width:
+            raise ValueError(f"concatenation needs a condition as wide as the features, {width}, got {condition_width}")
+        return Concatenation(width, zero_output=zero_output, rngs=rngs)
+    if name == "adaln_zero":
+        if zero_output:
+            raise ValueError("adaln_zero adds its input itself and has no output layer to zero")
+        return AdaLNZero(width, condition_width, rngs=rngs)
+    if name == "cross_attention":
+        return CrossAttention(width, condition_width, num_heads, zero_output=zero_output, rngs=rngs)
+    return FiLM(width, condition_width, zero_output=zero_output, rngs=rngs)

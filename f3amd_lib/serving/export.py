@@ -1,0 +1,480 @@
+"""Ahead-of-time export: a whole round of synthesis as a program without Python.
+
+    network -> jax.export -> StableHLO -> IREE -> CPU, CUDA or Vulkan
+
+The paper measures its models this way (section 4.5). The program takes history, path, style and
+noise and returns clean features; weights and noise levels are constants in it, so that compilers
+may fold and repack them. Noise comes from outside: a program then gives the same numbers on every
+device, and has no loop of random bits. What is written here is loaded by `artefact`, which needs
+nothing of this library.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import export
+from jax.extend.mlir import ir, passmanager
+from jax.extend.mlir.dialects import stablehlo
+
+from f3amd_lib.diffusion.samplers import ddpm_step
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.serving.artefact import (
+    FEATURES,
+    FORMAT,
+    JAX_EXPORT,
+    MANIFEST,
+    STABLEHLO,
+    cpu_features,
+    iree_version,
+    manifest_digest,
+    read_manifest,
+)
+from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+
+_ENTRY = "main"
+"""What JAX calls the program's one public function."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What IREE compiles for, and how.
+
+    Attributes:
+      backend: IREE's name of the code generator.
+      driver: IREE's name of what runs it.
+      flags: of the compiler.
+    """
+
+    backend: str
+    driver: str
+    flags: tuple[str, ...] = ()
+
+
+# Matrices in tiles of the CPU's own size, weights packed so at compile time.
+_DATA_TILING = ("--iree-opt-data-tiling", "--iree-dispatch-creation-data-tiling")
+
+TARGETS: dict[str, Target] = {
+    "llvm-cpu": Target(
+        "llvm-cpu", "local-task", ("--iree-llvmcpu-target-cpu=host", "--iree-opt-level=O3", *_DATA_TILING)
+    ),
+    "vmvx": Target("vmvx", "local-task"),
+    "vulkan-spirv": Target("vulkan-spirv", "vulkan", ("--iree-opt-level=O3",)),
+    **{
+        f"cuda-sm_{number}": Target("cuda", "cuda", (f"--iree-cuda-target=sm_{number}", "--iree-opt-level=O3"))
+        for number in (80, 86, 89)
+    },
+}
+"""Targets by name: the CPU of this machine, IREE's portable bytecode, Vulkan, and NVIDIA GPUs."""
+
+
+@dataclass(frozen=True)
+class ExportedRound:
+    """One round of synthesis as a program.
+
+    Attributes:
+      config: of the network.
+      sigmas: noise levels that the sampler visits, [N + 1].
+      sampler: a name of `samplers.SAMPLERS`.
+      batch: B, characters.
+      inputs: shapes by name, in the order of a call.
+      weights_digest: tells one set of weights from another.
+      exported: the program, for JAX; without the places of its operations in source files.
+    """
+
+    config: NetworkConfig
+    sigmas: tuple[float, ...]
+    sampler: str
+    batch: int
+    inputs: dict[str, tuple[int, ...]]
+    weights_digest: str
+    exported: export.Exported
+
+    @property
+    def stablehlo(self) -> bytes:
+        """The program as a portable StableHLO artefact (MLIR bytecode)."""
+        return self.exported.mlir_module_serialized
+
+    @property
+    def num_steps(self) -> int:
+        """N, steps of the sampler."""
+        return len(self.sigmas) - 1
+
+
+def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: bool = True) -> ExportedRound:
+    """Export a whole round of synthesis with the weights inside.
+
+    The program is `rounds.sample_round` with history, path, style and noise as inputs. DDPM draws
+    fresh noise at every step; its program takes that as a fifth input, `step_noise` [N, B, T, C],
+    of which the step to sigma = 0 uses nothing.
+
+    Args:
+      network: a denoiser of `models`, with its weights.
+      sigmas: [N + 1], falling, from a noise schedule's `grid`.
+      batch: B, characters of one call.
+      sampler: a name of `samplers.SAMPLERS`.
+      unroll: write the steps out one by one. A program with a loop is smaller, and only the JAX
+        runtime is safe with it (see `compile_iree`).
+
+    Returns:
+      The program, in float32, lowered for the CPU without anything that only a CPU has.
+
+    Raises:
+      ValueError: for less than one character, sigmas that make no step, or an unknown sampler.
+    """
+    if type(batch) is not int or batch < 1:
+        raise ValueError(f"batch must be a whole number of characters, at least 1, got {batch!r}")
+    sigmas = np.asarray(sigmas, np.float64)
+    if sigmas.ndim != 1 or len(sigmas) < 2 or not np.isfinite(sigmas).all():
+        raise ValueError(
+            f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}; "
+            "take them from a noise schedule's grid"
+        )
+    config = network.config
+    shape = (batch, config.window, config.channels)
+    inputs = {
+        "history": (batch, config.num_history, config.channels),
+        "path": (batch, config.window, 8),
+        "style": (batch, config.num_styles),
+        "noise": shape,
+    }
+    if sampler == "ddpm":
+        inputs["step_noise"] = (len(sigmas) - 1, *shape)
+    # Split here and merged inside: the weights then are constants of the program.
+    graph, state = nnx.split(network)
+
+    def one_round(history, path, style, noise, step_noise=None):
+        denoiser, condition = nnx.merge(graph, state), Condition(history, path, style)
+        if step_noise is not None:
+            return _sample_ddpm(denoiser, condition, sigmas, noise, step_noise)
+        return sample_round(denoiser, condition, sigmas, noise=noise, sampler=sampler, unroll=unroll)
+
+    program = export.export(
+        jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
+    )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
+    return ExportedRound(
+        config=config,
+        sigmas=tuple(sigmas.tolist()),
+        sampler=sampler,
+        batch=batch,
+        inputs=inputs,
+        weights_digest=weights_digest(state),
+        exported=dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized)),
+    )
+
+
+def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
+    """Walk as `samplers.sample_ddpm` does, with its noise [N, B, T, C] given."""
+    context = network.encode(condition)
+    levels = jnp.asarray(sigmas, noise.dtype)
+    x_noisy = levels[0] * noise
+    for sigma, sigma_next, fresh in zip(levels[:-1], levels[1:], step_noise, strict=True):
+        x0_hat = network(x_noisy, sigma, context)
+        x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
+    return x_noisy
+
+
+@contextlib.contextmanager
+def _parsed(program: bytes) -> Iterator[ir.Module]:
+    with ir.Context() as context:
+        try:
+            module = stablehlo.deserialize_portable_artifact(context, program)
+        except Exception as error:  # the bindings promise no type
+            raise ValueError(f"not a portable StableHLO program: {error}") from None
+        yield module
+
+
+def _without_places(program: bytes) -> bytes:
+    """Return a program that no longer says which lines of which files made it."""
+    with _parsed(program) as module:
+        passmanager.PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
+        # As `jax.export` does: readers of the last four weeks and later ones.
+        version = stablehlo.get_version_from_compatibility_requirement(
+            stablehlo.StablehloCompatibilityRequirement.WEEK_4
+        )
+        return stablehlo.serialize_portable_artifact(module, version)
+
+
+def _operations(program: bytes) -> set[str]:
+    """Return the names of all operations in a program."""
+    names = set()
+
+    def visit(operation):
+        names.add(operation.name)
+        return ir.WalkResult.ADVANCE
+
+    with _parsed(program) as module:
+        module.operation.walk(visit)
+    return names
+
+
+def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
+    """Compile a program with IREE.
+
+    Args:
+      program: a portable StableHLO artefact, such as `ExportedRound.stablehlo`.
+      target: a name of `TARGETS`, or "cuda-sm_NN" for another generation of NVIDIA GPUs, which this
+        release of IREE may or may not know. None needs the device to be there, except that
+        "llvm-cpu" compiles for the CPU that it runs on.
+
+    Returns:
+      The compiled module (IREE's "vmfb").
+
+    Raises:
+      ImportError: if IREE's compiler is not installed, saying how to install it.
+      ValueError: for an unknown target, one that this release of IREE cannot compile for, or a
+        program with a loop for a target that runs on the CPU: IREE's local-task driver was seen to
+        return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
+    """
+    return _compile(program, target)[0]
+
+
+def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
+    """Do the work of `compile_iree`; also return the flags that it compiled with."""
+    settings = _find_target(target)
+    if settings.driver == "local-task" and "stablehlo.while" in _operations(program):
+        raise ValueError(
+            f"the program has a loop (stablehlo.while), and on {target} IREE's local-task driver "
+            "returns NaN or garbage from such programs now and then: export it with unroll=True, "
+            "and give it its noise instead of a random key"
+        )
+    if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
+        raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
+    with tempfile.TemporaryDirectory() as folder:
+        source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
+        source.write_bytes(program)
+        for flags in _attempts(settings.flags):
+            # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
+            # process that holds both dies when it ends.
+            command = [
+                *(sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile"),
+                *(str(source), "-o", str(compiled)),
+                "--iree-input-type=stablehlo",
+                f"--iree-hal-target-backends={settings.backend}",
+                "--iree-vm-bytecode-module-strip-source-map",
+                *flags,
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode == 0:
+                return compiled.read_bytes(), flags
+    found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
+    raise ValueError(
+        f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}. "
+        f"Targets known to work are {', '.join(TARGETS)}"
+    )
+
+
+def _attempts(flags: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return flags to try in turn: tiles are faster, but some programs do not compile in them."""
+    plain = tuple(flag for flag in flags if flag not in _DATA_TILING)
+    return [flags] if plain == flags else [flags, plain]
+
+
+def _find_target(name: str) -> Target:
+    if name in TARGETS:
+        return TARGETS[name]
+    if re.fullmatch(r"cuda-sm_\d+a?", name):
+        like = TARGETS["cuda-sm_80"]
+        flags = tuple(flag.replace("sm_80", name.removeprefix("cuda-")) for flag in like.flags)
+        return dataclasses.replace(like, flags=flags)
+    raise ValueError(f"unknown target {name!r}{nearest_hint(name, TARGETS)}")
+
+
+def save_artefact(
+    folder,
+    exported: ExportedRound,
+    *,
+    name: str,
+    targets: Iterable[str] = ("llvm-cpu",),
+    trained: TrainedModel | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a round as a folder that `artefact.load_artefact` runs, whole or not at all.
+
+    The folder holds the program as StableHLO and for JAX, a compiled module per target, the scales
+    of the features and the style names of a trained model, and a manifest with checksums.
+
+    Args:
+      folder: to make; missing ones above it are made, too.
+      exported: from `export_round`.
+      name: of the model.
+      targets: to compile for, see `compile_iree`; none leaves the program to JAX.
+      trained: the model whose network was exported, so that real motion can be fed in; without it
+        the artefact takes and returns network units only.
+      overwrite: replace an earlier artefact of that name; anything else is never replaced.
+
+    Returns:
+      The folder.
+
+    Raises:
+      ImportError, ValueError: as `compile_iree`; if the folder exists and `overwrite` is false, or
+        is not an artefact; or if the trained model is not the one that was exported.
+    """
+    folder = Path(folder)
+    _check_free(folder, overwrite)
+    if trained is not None and weights_digest(trained.params) != exported.weights_digest:
+        raise ValueError(f"the exported round does not hold the weights of the trained model {trained.name}")
+    files = {STABLEHLO: exported.stablehlo, JAX_EXPORT: bytes(exported.exported.serialize())}
+    compiled = {}
+    for target in dict.fromkeys(targets):
+        file = f"round.{target}.vmfb"
+        start = time.perf_counter()
+        files[file], flags = _compile(exported.stablehlo, target)
+        compiled[target] = _describe_target(target, file, flags, time.perf_counter() - start)
+    if trained is not None:
+        features = {
+            "normaliser": {
+                part: np.asarray(values, np.float32).tolist() for part, values in trained.normaliser._asdict().items()
+            },
+            "styles": list(trained.styles),
+        }
+        files[FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
+    manifest = _manifest(exported, name, files, compiled, trained)
+    files[MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
+    with _whole_folder(folder) as temporary:
+        for file, content in files.items():
+            (temporary / file).write_bytes(content)
+    return folder
+
+
+def _describe_target(target: str, file: str, flags: tuple[str, ...], seconds: float) -> dict:
+    settings = _find_target(target)
+    host = {"machine": platform.machine(), "features": list(cpu_features())}
+    return {
+        "file": file,
+        "entry": _ENTRY,
+        "driver": settings.driver,
+        "iree_version": iree_version(),
+        "flags": list(flags),
+        "compile_seconds": round(seconds, 1),
+        "cpu": host if settings.backend == "llvm-cpu" else None,
+    }
+
+
+def _manifest(
+    exported: ExportedRound, name: str, files: dict[str, bytes], targets: dict[str, dict], trained: TrainedModel | None
+) -> dict:
+    training, config = trained.record if trained else {}, exported.config
+    dataset = SimpleNamespace(
+        name=training.get("dataset", "none"),
+        **{key: training.get(f"dataset_{key}") for key in ("fingerprint", "licence", "credit")},
+    )
+    manifest = {
+        "format": FORMAT,
+        "model": name,
+        "config": config.to_dict(),
+        "num_steps": exported.num_steps,
+        "sampler": exported.sampler,
+        "sigmas": list(exported.sigmas),
+        "batch": exported.batch,
+        "inputs": [{"name": item, "shape": list(shape), "dtype": "float32"} for item, shape in exported.inputs.items()],
+        "output": {"name": "x0_hat", "shape": [exported.batch, config.window, config.channels], "dtype": "float32"},
+        "weights": exported.weights_digest,
+        "targets": targets,
+        "files": {
+            file: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            for file, content in files.items()
+        },
+        "record": run_record(profile="export", dataset=dataset, seed=training.get("seed", 0), training=training),
+    }
+    return manifest | {"sha256": manifest_digest(manifest)}
+
+
+def _check_free(folder: Path, overwrite: bool) -> None:
+    """Raise ValueError if something lies there that may not be replaced."""
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
+    ours = {MANIFEST, *read_manifest(folder)["files"]}
+    others = sorted({item.name for item in folder.iterdir()} - ours)
+    if others:
+        raise ValueError(
+            f"{folder}: holds {others[0]}, which is no part of the artefact, and is not "
+            "overwritten; move it away or choose another name"
+        )
+
+
+@contextlib.contextmanager
+def _whole_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder that takes the place of `folder` at the end, if the block ends well.
+
+    What was there before is deleted only once the new one has its name.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    earlier = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    try:
+        temporary.mkdir()
+        yield temporary
+        if folder.exists():
+            folder.rename(earlier)
+        try:
+            temporary.rename(folder)
+        except OSError:
+            earlier.rename(folder)
+            raise
+        shutil.rmtree(earlier, ignore_errors=True)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def export_model(
+    trained: TrainedModel,
+    folder,
+    *,
+    num_steps: int = 8,
+    batch: int = 1,
+    sampler: str | None = None,
+    schedule: NoiseSchedule | None = None,
+    targets: Iterable[str] = ("llvm-cpu",),
+    overwrite: bool = False,
+) -> Path:
+    """Export a trained model: what `python -m f3amd_lib export` does.
+
+    Args:
+      trained: the model.
+      folder, targets, overwrite: as for `save_artefact`.
+      num_steps: N, steps of the sampler.
+      batch: B, characters of one call.
+      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule.
+      schedule: noise levels; by default those that the model was trained with.
+
+    Returns:
+      The folder.
+
+    Raises:
+      ImportError, ValueError: as `export_round`, `compile_iree` and `save_artefact`.
+    """
+    schedule, targets = schedule or trained.diffusion, tuple(targets)
+    # Before the minutes of compiling.
+    _check_free(Path(folder), overwrite)
+    for target in targets:
+        _find_target(target)
+    exported = export_round(trained.network(), schedule.grid(num_steps), batch, sampler or schedule.sampler)
+    return save_artefact(folder, exported, name=trained.name, targets=targets, trained=trained, overwrite=overwrite)
