@@ -12,7 +12,7 @@ import pytest
 from builders import CHANNELS, WINDOW, make_condition, network_of, tiny_config
 from jax.sharding import Mesh
 
-from f3amd_lib.diffusion.samplers import sample_ddim, sample_ddpm
+from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
 
@@ -31,9 +31,9 @@ def test_round_is_encoding_noise_and_walk(network):
     denoise = lambda x_noisy, sigma: network(x_noisy, sigma, context)
     key_init, key_steps = jax.random.split(key)
     noise = jax.random.normal(key_init, (BATCH, WINDOW, CHANNELS))
-    by_hand = sample_ddim(denoise, SIGMAS[0] * noise, SIGMAS)
+    by_hand = sample("ddim", denoise, SIGMAS[0] * noise, SIGMAS)
     np.testing.assert_allclose(sample_round(network, given, SIGMAS, key), by_hand, atol=1e-5)
-    by_hand = sample_ddpm(denoise, SIGMAS[0] * noise, SIGMAS, key_steps)
+    by_hand = sample("ddpm", denoise, SIGMAS[0] * noise, SIGMAS, key=key_steps)
     drawn = sample_round(network, given, SIGMAS, key, sampler="ddpm")
     np.testing.assert_allclose(drawn, by_hand, atol=1e-5)
 

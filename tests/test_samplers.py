@@ -17,12 +17,7 @@ from f3amd_lib.diffusion.samplers import (
     num_evaluations,
     probability_flow_slope,
     sample,
-    sample_ddim,
-    sample_ddim_literal,
-    sample_ddim_vp,
-    sample_ddpm,
-    sample_euler,
-    sample_heun,
+    walk,
 )
 from f3amd_lib.diffusion.schedules import (
     SCHEDULES,
@@ -33,7 +28,7 @@ from f3amd_lib.diffusion.schedules import (
 )
 
 SCHEDULE = VarianceExploding()
-DETERMINISTIC = [sample_ddim, sample_ddim_vp, sample_euler, sample_heun]
+DETERMINISTIC = ["ddim", "ddim_vp", "euler", "heun"]
 
 
 def two_modes(width=0.1):
@@ -91,8 +86,8 @@ def test_a_step_to_zero_returns_the_estimate_exactly():
 @pytest.mark.parametrize("num_steps", [1, 2, 4, 8, 64])
 def test_appendix_f_vp_equals_ve_in_float32(num_steps):
     sigmas, x_init = SCHEDULE.grid(num_steps), jnp.asarray(start(), jnp.float32)
-    ve = sample_ddim(two_modes(), x_init, sigmas)
-    vp = sample_ddim_vp(two_modes(), x_init, sigmas)
+    ve = sample("ddim", two_modes(), x_init, sigmas)
+    vp = sample("ddim_vp", two_modes(), x_init, sigmas)
     assert ve.dtype == vp.dtype == jnp.float32
     np.testing.assert_allclose(vp, ve, atol=2e-4)
     assert float(jnp.std(ve)) > 1e-4  # not equal merely because all is zero
@@ -103,16 +98,16 @@ def test_appendix_f_vp_equals_ve_in_float64(num_steps):
     sigmas = SCHEDULE.grid(num_steps)
     with jax.enable_x64(True):
         x_init = jnp.asarray(start(), jnp.float64)
-        ve = np.asarray(sample_ddim(two_modes(), x_init, sigmas))
-        vp = np.asarray(sample_ddim_vp(two_modes(), x_init, sigmas))
+        ve = np.asarray(sample("ddim", two_modes(), x_init, sigmas))
+        vp = np.asarray(sample("ddim_vp", two_modes(), x_init, sigmas))
     assert ve.dtype == np.float64
     np.testing.assert_allclose(vp, ve, atol=1e-12)
 
 
 def test_appendix_f_vp_equals_ve_on_variance_preserving_levels():
     sigmas, x_init = VariancePreservingCosine().grid(4), jnp.asarray(start(), jnp.float32)
-    ve = sample_ddim(two_modes(), x_init, sigmas, unroll=True)
-    vp = sample_ddim_vp(two_modes(), x_init, sigmas, unroll=True)
+    ve = sample("ddim", two_modes(), x_init, sigmas, unroll=True)
+    vp = sample("ddim_vp", two_modes(), x_init, sigmas, unroll=True)
     np.testing.assert_allclose(vp, ve, atol=2e-4)
     assert float(jnp.std(ve)) > 0.1
 
@@ -121,7 +116,7 @@ def test_appendix_f_vp_equals_ve_on_variance_preserving_levels():
 def test_scan_equals_a_python_loop(unroll):
     sigmas, x = SCHEDULE.grid(8), start(64)
     with jax.enable_x64(True):
-        sampled = np.asarray(sample_ddim(two_modes(), jnp.asarray(x), sigmas, unroll=unroll))
+        sampled = np.asarray(sample("ddim", two_modes(), jnp.asarray(x), sigmas, unroll=unroll))
     for sigma, sigma_next in zip(sigmas[:-1], sigmas[1:], strict=True):
         x0_hat = np.asarray(two_modes()(x, sigma))
         x = x0_hat + sigma_next * (x - x0_hat) / sigma
@@ -134,22 +129,24 @@ def test_unrolled_program_has_no_loop(name):
 
     def lowered(num_steps, unroll):
         sigmas = SCHEDULE.grid(num_steps)
-        walk = lambda x, key: sample(name, two_modes(), x, sigmas, key=key, unroll=unroll)
-        return jax.jit(walk).lower(jnp.zeros((1, 2, 3)), key).as_text()
+        walked = lambda x, key: sample(name, two_modes(), x, sigmas, key=key, unroll=unroll)
+        return jax.jit(walked).lower(jnp.zeros((1, 2, 3)), key).as_text()
 
     assert "while" in lowered(4, False)
     assert all("while" not in lowered(num_steps, True) for num_steps in (1, 2, 4))
 
 
-@pytest.mark.parametrize("sample", DETERMINISTIC)
-def test_one_step_returns_the_denoiser_at_sigma_max(sample):
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_one_step_returns_the_denoiser_at_sigma_max(name):
     x_init = jnp.asarray(start(16), jnp.float32)
     seen = two_modes(width=100.0)(x_init, 128.0)
-    np.testing.assert_allclose(sample(two_modes(width=100.0), x_init, SCHEDULE.grid(1)), seen, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        sample(name, two_modes(width=100.0), x_init, SCHEDULE.grid(1)), seen, rtol=1e-5, atol=1e-5
+    )
 
 
-@pytest.mark.parametrize("sample", DETERMINISTIC)
-def test_the_denoiser_always_sees_the_variance_exploding_state(sample):
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_the_denoiser_always_sees_the_variance_exploding_state(name):
     # A denoiser that knows x0 keeps the state on the line x0 + sigma * noise, which it can check.
     rng = np.random.default_rng(0)
     x0, noise = rng.standard_normal((2, 4, 3, 2))
@@ -160,14 +157,14 @@ def test_the_denoiser_always_sees_the_variance_exploding_state(sample):
             off_line = jnp.max(jnp.abs(x_noisy - add_noise(x0, sigma, noise)))
             return jnp.where(off_line < 1e-9, x0, jnp.nan)
 
-        x = sample(denoise, jnp.asarray(add_noise(x0, sigmas[0], noise)), sigmas)
+        x = sample(name, denoise, jnp.asarray(add_noise(x0, sigmas[0], noise)), sigmas)
     np.testing.assert_allclose(x, x0, atol=1e-12)
 
 
 def test_grids_that_do_not_end_at_zero_leave_the_rest_of_the_noise():
     with jax.enable_x64(True):
-        x = sample_ddim(lambda x, sigma: 0.0 * x, jnp.full((1, 1, 1), 8.0), [8.0, 4.0, 2.0])
-        z = sample_ddim_vp(lambda x, sigma: 0.0 * x, jnp.full((1, 1, 1), 8.0), [8.0, 4.0, 2.0])
+        x = sample("ddim", lambda x, sigma: 0.0 * x, jnp.full((1, 1, 1), 8.0), [8.0, 4.0, 2.0])
+        z = sample("ddim_vp", lambda x, sigma: 0.0 * x, jnp.full((1, 1, 1), 8.0), [8.0, 4.0, 2.0])
     assert float(x[0, 0, 0]) == pytest.approx(2.0) and float(z[0, 0, 0]) == pytest.approx(2.0)
 
 
@@ -176,7 +173,7 @@ def test_appendix_f_without_rescaling_collapses():
     for num_steps in (8, 16, 256):
         sigmas = SCHEDULE.grid(num_steps)
         literal = literal_appendix_f(two_modes(), start(), sigmas)
-        rescaled = sample_ddim_vp(two_modes(), jnp.asarray(start(), jnp.float32), sigmas)
+        rescaled = sample("ddim_vp", two_modes(), jnp.asarray(start(), jnp.float32), sigmas)
         spread[num_steps] = np.abs(literal).mean(), float(jnp.abs(rescaled).mean())
     # Truth is 1: both modes lie there. Figures measured once with another implementation.
     assert all(literal < 0.01 for literal, _ in spread.values())
@@ -204,8 +201,8 @@ def test_appendix_f_literal_step_is_the_right_one_made_smaller():
 def test_appendix_f_literal_walk_feeds_the_state_back_as_it_is(num_steps):
     sigmas = SCHEDULE.grid(num_steps)
     with jax.enable_x64(True):
-        x = np.asarray(sample_ddim_literal(two_modes(), jnp.asarray(start(64)), sigmas))
-        right = np.asarray(sample_ddim(two_modes(), jnp.asarray(start(64)), sigmas))
+        x = np.asarray(sample("ddim_literal", two_modes(), jnp.asarray(start(64)), sigmas))
+        right = np.asarray(sample("ddim", two_modes(), jnp.asarray(start(64)), sigmas))
         by_hand = literal_appendix_f(two_modes(), start(64), sigmas)
     np.testing.assert_allclose(x, by_hand, atol=1e-10)
     # Nothing is fed back in a single step. Two end at sigma_min, where little is lost.
@@ -220,7 +217,7 @@ def test_appendix_f_literal_walk_loses_its_noise_factor_by_factor(num_steps):
     sigmas = SCHEDULE.grid(num_steps)[:-1]
     with jax.enable_x64(True):
         low, high = (
-            sample_ddim_literal(lambda x, sigma: 0.0 * x + 0.3, jnp.full((1, 1), start), sigmas)
+            sample("ddim_literal", lambda x, sigma: 0.0 * x + 0.3, jnp.full((1, 1), start), sigmas)
             for start in (0.0, 128.0)
         )
     left = float((high - low)[0, 0]) / sigmas[-1]
@@ -229,7 +226,7 @@ def test_appendix_f_literal_walk_loses_its_noise_factor_by_factor(num_steps):
 
 def test_both_modes_are_reached_and_keep_their_width():
     with jax.enable_x64(True):
-        x = np.asarray(sample_ddim(two_modes(), jnp.asarray(start(2000)), SCHEDULE.grid(512)))
+        x = np.asarray(sample("ddim", two_modes(), jnp.asarray(start(2000)), SCHEDULE.grid(512)))
     right = x[x > 0]
     assert 0.45 < len(right) / x.size < 0.55
     assert right.mean() == pytest.approx(1.0, abs=0.01)
@@ -241,13 +238,13 @@ def exact_end(mean, width, x_init):
     return mean + (x_init - mean) * width / np.sqrt(width**2 + 128.0**2)
 
 
-@pytest.mark.parametrize("sample", [sample_ddim, sample_ddim_vp])
-def test_error_falls_at_first_order_on_the_gaussian_oracle(sample):
+@pytest.mark.parametrize("name", ["ddim", "ddim_vp"])
+def test_error_falls_at_first_order_on_the_gaussian_oracle(name):
     mean, width, x_init = 0.7, 0.3, start(32)
     errors = []
     with jax.enable_x64(True):
         for num_steps in (64, 128, 256, 512):
-            x = sample(one_mode(mean, width), jnp.asarray(x_init), SCHEDULE.grid(num_steps))
+            x = sample(name, one_mode(mean, width), jnp.asarray(x_init), SCHEDULE.grid(num_steps))
             errors.append(np.abs(np.asarray(x) - exact_end(mean, width, x_init)).mean())
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     np.testing.assert_allclose(orders, 1.0, atol=0.15)
@@ -255,16 +252,16 @@ def test_error_falls_at_first_order_on_the_gaussian_oracle(sample):
 
 def test_gaussian_oracle_reaches_known_mean_and_deviation():
     x_init = jnp.asarray(start(4000), jnp.float32)
-    x = np.asarray(sample_ddim(one_mode(0.7, 0.3), x_init, SCHEDULE.grid(1024)))
+    x = np.asarray(sample("ddim", one_mode(0.7, 0.3), x_init, SCHEDULE.grid(1024)))
     assert x.mean() == pytest.approx(0.7, abs=0.02)
     assert x.std() == pytest.approx(0.3, rel=0.05)
 
 
-@pytest.mark.parametrize("sample", DETERMINISTIC)
+@pytest.mark.parametrize("name", DETERMINISTIC)
 @pytest.mark.parametrize("sigmas", [[1.0], [], [[1.0, 0.0]]])
-def test_grids_without_a_step_are_refused(sample, sigmas):
+def test_grids_without_a_step_are_refused(name, sigmas):
     with pytest.raises(ValueError, match="sigmas"):
-        sample(two_modes(), jnp.zeros((1, 1, 1)), sigmas)
+        sample(name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
 
 
 def test_ddpm_posterior_is_camdms():
@@ -324,7 +321,7 @@ def test_ddpm_equals_camdms_loop_over_its_own_levels():
     with jax.enable_x64(True):
         z = start(32) / 128.0
         x_init = jnp.asarray(z / np.sqrt(alpha_bars[-1]))
-        found = np.asarray(sample_ddpm(two_modes(), x_init, schedule.grid(4), key))
+        found = np.asarray(sample("ddpm", two_modes(), x_init, schedule.grid(4), key=key))
         for level, key_step in zip((3, 2, 1, 0), jax.random.split(key, 4), strict=True):
             noise = np.asarray(jax.random.normal(key_step, z.shape, z.dtype))
             x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.sigmas[level]))
@@ -362,7 +359,7 @@ def test_ddpm_on_the_gaussian_oracle_has_the_variance_worked_out(name):
     one = GaussianMixture([mean], width)
     key_init, key = jax.random.split(jax.random.key(11))
     x_init = np.float32(sigmas[0]) * jax.random.normal(key_init, (4000, 1))
-    x = np.asarray(sample_ddpm(one.denoise, x_init, sigmas, key))
+    x = np.asarray(sample("ddpm", one.denoise, x_init, sigmas, key=key))
     assert x.mean() == pytest.approx(mean, abs=0.015)
     assert x.var() == pytest.approx(ddpm_variance(width, sigmas, sigmas[0] ** 2), rel=0.06)
     if len(sigmas) > 1000:  # then it is nearly that of the data, too
@@ -389,7 +386,7 @@ def test_ddpm_keeps_the_noise_level_when_the_clean_signal_is_known():
     # Then every state is x0 + sigma * noise, fresh and old noise together, whatever the steps.
     key_init, key = jax.random.split(jax.random.key(8))
     x_init = 0.5 + 8.0 * jax.random.normal(key_init, (20_000, 1))
-    x = np.asarray(sample_ddpm(lambda x, sigma: 0.0 * x + 0.5, x_init, [8.0, 6.0, 4.0, 3.0], key))
+    x = np.asarray(sample("ddpm", lambda x, sigma: 0.0 * x + 0.5, x_init, [8.0, 6.0, 4.0, 3.0], key=key))
     assert x.mean() == pytest.approx(0.5, abs=0.07)
     assert x.std() == pytest.approx(3.0, rel=0.02)
 
@@ -419,19 +416,19 @@ def test_euler_is_ddim(num_steps):
     sigmas = SCHEDULE.grid(num_steps)
     with jax.enable_x64(True):
         x_init = jnp.asarray(start())
-        euler = np.asarray(sample_euler(two_modes(), x_init, sigmas))
-        ddim = np.asarray(sample_ddim(two_modes(), x_init, sigmas))
+        euler = np.asarray(sample("euler", two_modes(), x_init, sigmas))
+        ddim = np.asarray(sample("ddim", two_modes(), x_init, sigmas))
     np.testing.assert_allclose(euler, ddim, atol=1e-11)
 
 
 def test_heun_step_by_hand():
     # x0_hat = x / 2, so the slope is x / (2 sigma): 1 at (8, 4), 1.5 at the guess (6, 2).
     half = lambda x, sigma: 0.5 * x
-    x = sample_heun(half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 0.0])
+    x = sample("heun", half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 0.0])
     # 8 - 2 * 1.25 = 5.5, of which the Euler step to 0 keeps the estimate.
     assert float(x[0, 0, 0]) == pytest.approx(2.75, rel=1e-6)
     # The Euler step, from where the same grid is cut: 8 - 2 * 1.25 = 5.5, then 5.5 - 1 * 1.375.
-    x = sample_heun(half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 1.0])
+    x = sample("heun", half, jnp.full((1, 1, 1), 8.0), [4.0, 2.0, 1.0])
     assert float(x[0, 0, 0]) == pytest.approx(4.125, rel=1e-6)
 
 
@@ -479,13 +476,12 @@ def test_evaluations_are_as_many_as_promised(name, num_steps, unroll):
 def test_samplers_go_by_name_and_take_traced_levels(name):
     # One compiled program then serves every list of as many levels.
     grid, x_init, key = SCHEDULE.grid(4), jnp.asarray(start(16), jnp.float32), jax.random.key(1)
-    arguments = (key,) if name == "ddpm" else ()
-    direct = SAMPLERS[name](two_modes(), x_init, grid, *arguments)
-    walk = jax.jit(lambda x, sigmas: sample(name, two_modes(), x, sigmas, key=key))
-    np.testing.assert_allclose(walk(x_init, jnp.asarray(grid)), direct, atol=1e-4)
+    direct = sample(name, two_modes(), x_init, grid, key=key)
+    walked = jax.jit(lambda x, sigmas: sample(name, two_modes(), x, sigmas, key=key))
+    np.testing.assert_allclose(walked(x_init, jnp.asarray(grid)), direct, atol=1e-4)
     # The literal walk ends near 0 whatever the levels, but not in the same place.
     least = 1e-4 if name == "ddim_literal" else 0.01
-    assert float(jnp.abs(walk(x_init, 0.5 * grid) - direct).max()) > least
+    assert float(jnp.abs(walked(x_init, 0.5 * grid) - direct).max()) > least
 
 
 def test_every_schedule_asks_for_a_sampler_that_is_there():
@@ -511,3 +507,42 @@ def test_unknown_samplers_and_missing_keys_are_refused():
         sample("ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
     with pytest.raises(ValueError, match="num_steps=0"):
         num_evaluations("ddim", 0)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("num_steps", [1, 2, 5])
+def test_the_walk_in_python_visits_what_the_scan_goes_through(name, num_steps):
+    sigmas, x_init, key = SCHEDULE.grid(num_steps), jnp.asarray(start(16), jnp.float32), jax.random.key(4)
+    visited = list(walk(name, two_modes(), x_init, sigmas, key=key))
+    assert len(visited) == num_steps + 1 and visited[-1].x0_hat is None
+    np.testing.assert_array_equal(visited[0].x_noisy, x_init)
+    np.testing.assert_allclose([float(v.sigma) for v in visited], sigmas, rtol=1e-6)
+    for here in visited[:-1]:
+        np.testing.assert_array_equal(here.x0_hat, two_modes()(here.x_noisy, here.sigma))
+    np.testing.assert_allclose(
+        visited[-1].x_noisy, sample(name, two_modes(), x_init, sigmas, key=key), rtol=2e-5, atol=2e-5
+    )
+
+
+def test_a_recording_denoiser_may_be_walked_with():
+    """Plain Python all the way: what the denoiser is shown are numbers, not tracers."""
+    shown = []
+
+    def denoise(x_noisy, sigma):
+        shown.append(float(sigma))
+        return 0.0 * x_noisy
+
+    list(walk("heun", denoise, jnp.ones((1, 1, 1)), SCHEDULE.grid(3)))
+    assert len(shown) == num_evaluations("heun", 3)
+
+
+def test_one_ddim_step_serves_rectified_flow():
+    """On the straight path x = (1 - t) x0 + t noise, an exact estimate is carried along that line."""
+    x0, noise = np.float64([0.3, -2.0]), np.float64([1.5, 0.2])
+    at = lambda t: (1.0 - t) * x0 + t * noise
+    moved = ddim_step(at(0.8), x0, 0.8, 0.3, alpha=0.2, alpha_next=0.7)
+    np.testing.assert_allclose(moved, at(0.3), rtol=1e-12)
+    # The Euler step of dx/dt = v with the velocity v = noise - x0.
+    np.testing.assert_allclose(moved, at(0.8) + (0.3 - 0.8) * (noise - x0), rtol=1e-12)
+    # At t = 1 nothing of the signal is left, and the step still has a value.
+    np.testing.assert_allclose(ddim_step(at(1.0), x0, 1.0, 0.5, 0.0, 0.5), at(0.5), rtol=1e-12)

@@ -13,9 +13,7 @@ from f3amd_lib.diffusion.schedules import (
     VarianceExploding,
     VariancePreservingCosine,
     VariancePreservingLinear,
-    alpha_bar_from_log_snr,
     alpha_bar_from_sigma,
-    log_snr_from_alpha_bar,
     log_snr_from_sigma,
     schedule_from_dict,
     sigma_from_alpha_bar,
@@ -340,31 +338,8 @@ def test_round_trips_between_the_three_names():
     np.testing.assert_allclose(log_snr_from_sigma(sigma), np.log(alpha_bar / (1.0 - alpha_bar)), atol=1e-11)
 
 
-def test_log_snr_and_alpha_bar_by_hand():
-    # Four parts signal to one of noise; as much of each; one part signal to nine.
-    alpha_bar = np.array([0.8, 0.5, 0.1])
-    log_snr = np.array([np.log(4.0), 0.0, -np.log(9.0)])
-    np.testing.assert_allclose(log_snr_from_alpha_bar(alpha_bar), log_snr, atol=1e-15)
-    np.testing.assert_allclose(alpha_bar_from_log_snr(log_snr), alpha_bar, rtol=1e-15)
-
-
-def test_every_way_round_the_three_names_comes_back():
-    sigma = VarianceExploding().grid(50)[:-1]
-    round_one_way = sigma_from_alpha_bar(alpha_bar_from_log_snr(log_snr_from_sigma(sigma)))
-    round_the_other = sigma_from_log_snr(log_snr_from_alpha_bar(alpha_bar_from_sigma(sigma)))
-    np.testing.assert_allclose(round_one_way, sigma, rtol=1e-11)
-    np.testing.assert_allclose(round_the_other, sigma, rtol=1e-11)
-
-
 def test_the_three_names_answer_in_kind():
-    for function in (
-        alpha_bar_from_sigma,
-        sigma_from_alpha_bar,
-        log_snr_from_sigma,
-        sigma_from_log_snr,
-        log_snr_from_alpha_bar,
-        alpha_bar_from_log_snr,
-    ):
+    for function in (alpha_bar_from_sigma, sigma_from_alpha_bar, log_snr_from_sigma, sigma_from_log_snr):
         assert isinstance(function(np.array([0.5])), np.ndarray)
         assert isinstance(function(jnp.array([0.5])), jax.Array)
         assert float(jax.jit(function)(0.5)) == pytest.approx(float(function(0.5)), rel=1e-6)

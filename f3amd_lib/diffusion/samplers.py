@@ -4,19 +4,22 @@ A denoiser is a callable `denoise(x_noisy, sigma) -> x0_hat` that takes the vari
 of Eq. 8. What it wraps (a network with an encoded condition, or an exact mixture of Gaussians) is
 no concern of this module.
 
+There is one walk down a falling list of noise levels, and a sampler is how it takes a step. `sample`
+walks in one compiled scan; `walk` is the same in plain Python and yields every state on the way, so
+that it can be printed, drawn and recorded.
+
 The paper prints the DDIM update in variance-preserving form (Appendix F). Its state is
 `z = sqrt(alpha_bar) x`, and a network trained on `x` must be shown `z / sqrt(alpha_bar)`. Both
 forms are here and walk the same path; taking `z` for `x`, in the network and in the estimate of the
-noise, does not. That third walk is here as well, to be studied (`ddim_step_literal`).
-
-The same rescaling lets one denoiser serve both kinds of schedule: DDPM, too, is written for the
-variance-exploding state, in which its update has no alpha_bar at all. Every sampler takes any
-falling list of noise levels, so that a schedule and a sampler are chosen apart.
+noise, does not. That third walk is here as well, to be studied (`ddim_step_literal`). DDPM, too, is
+written for the variance-exploding state, in which its update has no alpha_bar at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,23 +36,26 @@ def add_noise(x0, sigma, noise):
     return x0 + sigma * noise
 
 
-def ddim_step(x_noisy, x0_hat, sigma, sigma_next):
-    """Move a variance-exploding state from `sigma` to `sigma_next` without fresh noise.
+def ddim_step(x_noisy, x0_hat, sigma, sigma_next, alpha=1.0, alpha_next=1.0):
+    """Move a state `alpha x0 + sigma noise` from one noise level to the next without fresh noise.
 
-    With eps_hat = (x_noisy - x0_hat) / sigma the update is x0_hat + sigma_next * eps_hat: a
-    straight line towards the prediction, one Euler step of dx/dsigma = (x - x0_hat) / sigma.
+    With eps_hat = (x_noisy - alpha x0_hat) / sigma the update is alpha_next x0_hat + sigma_next eps_hat.
+    In the variance-exploding state alpha is 1, and this is one Euler step of dx/dsigma = (x - x0_hat) / sigma:
+    a straight line towards the prediction. With alpha = 1 - t and sigma = t it is the Euler step of
+    rectified flow.
 
     Args:
       x_noisy, x0_hat: state and clean estimate, any equal shape.
       sigma: current noise level, > 0, broadcasting.
-      sigma_next: next level, 0 <= sigma_next < sigma; at 0 the answer is exactly `x0_hat`.
+      sigma_next: next level, 0 <= sigma_next < sigma; at 0 the answer is exactly alpha_next x0_hat.
+      alpha, alpha_next: how much of the signal is left at each.
 
     Returns:
-      State at `sigma_next`.
+      State at the next level.
 
-    Source: paper Appendix F, carried back from the VP to the VE state.
+    Source: paper Appendix F, which prints it for the VP state; here for any.
     """
-    return x0_hat + (sigma_next / sigma) * (x_noisy - x0_hat)
+    return alpha_next * x0_hat + (sigma_next / sigma) * (x_noisy - alpha * x0_hat)
 
 
 def ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next):
@@ -64,8 +70,8 @@ def ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next):
       VP state at `alpha_bar_next`: sqrt(ab') x0_hat + sqrt(1 - ab') eps_hat.
     """
     xp = array_module(z, x0_hat, alpha_bar, alpha_bar_next)
-    eps_hat = (z - xp.sqrt(alpha_bar) * x0_hat) / xp.sqrt(1.0 - alpha_bar)
-    return xp.sqrt(alpha_bar_next) * x0_hat + xp.sqrt(1.0 - alpha_bar_next) * eps_hat
+    sigma, sigma_next = xp.sqrt(1.0 - alpha_bar), xp.sqrt(1.0 - alpha_bar_next)
+    return ddim_step(z, x0_hat, sigma, sigma_next, xp.sqrt(alpha_bar), xp.sqrt(alpha_bar_next))
 
 
 def ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next):
@@ -154,210 +160,125 @@ def probability_flow_slope(x_noisy, x0_hat, sigma):
     return (x_noisy - x0_hat) / sigma
 
 
-def _noise_levels(sigmas, x_init):
-    """Return the levels in the state's type; ValueError if they make no step."""
+@dataclass(frozen=True)
+class Sampler:
+    """How to go from one noise level to the next.
+
+    Attributes:
+      step: `step(x_noisy, x0_hat, sigma, sigma_next, denoise, noise)` returns the state at `sigma_next`; it may ask
+        the denoiser again, and has standard normal `noise` if it draws any (else None).
+      last: instead of `step` in the last interval, which may end at 0; by default `step`.
+      draws_noise: whether it needs a random key.
+      evaluations: of the network in a step, but one in the last.
+    """
+
+    step: Callable
+    last: Callable | None = None
+    draws_noise: bool = False
+    evaluations: int = 1
+
+
+def _ddim(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    return ddim_step(x_noisy, x0_hat, sigma, sigma_next)
+
+
+def _ddim_vp(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    """Step in the VP state, with the rescaling before the network that Appendix F leaves unsaid."""
+    alpha_bar, alpha_bar_next = alpha_bar_from_sigma(sigma), alpha_bar_from_sigma(sigma_next)
+    z = jnp.sqrt(alpha_bar) * x_noisy
+    return ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next) / jnp.sqrt(alpha_bar_next)
+
+
+def _ddim_literal(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    return ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next)
+
+
+def _ddpm(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    return ddpm_step(x_noisy, x0_hat, sigma, sigma_next, noise)
+
+
+def _euler(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    return x_noisy + (sigma_next - sigma) * probability_flow_slope(x_noisy, x0_hat, sigma)
+
+
+def _heun(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+    """Go along the mean of the slopes at both ends (Karras et al. 2022, Algorithm 1)."""
+    slope = probability_flow_slope(x_noisy, x0_hat, sigma)
+    guess = x_noisy + (sigma_next - sigma) * slope
+    slope_next = probability_flow_slope(guess, denoise(guess, sigma_next), sigma_next)
+    return x_noisy + (sigma_next - sigma) * 0.5 * (slope + slope_next)
+
+
+SAMPLERS: dict[str, Sampler] = {
+    "ddim": Sampler(_ddim),
+    "ddim_vp": Sampler(_ddim_vp),
+    "ddpm": Sampler(_ddpm, draws_noise=True),
+    "euler": Sampler(_euler),
+    # At sigma = 0 the slope has no value, so that the last step is DDIM's. It is on grids that end
+    # higher, too: the number of evaluations then does not depend on the levels.
+    "heun": Sampler(_heun, last=_ddim, evaluations=2),
+    "ddim_literal": Sampler(_ddim_literal),
+}
+"""Samplers by name; a noise schedule's `sampler` is one of these. The last is there to be studied
+(an exact denoiser's samples collapse onto its mean), under a name because rollouts choose their
+sampler by name; no schedule asks for it."""
+
+
+def _sampler(name: str) -> Sampler:
+    """Return a sampler by name; ValueError names the nearest one if there is none."""
+    if name not in SAMPLERS:
+        raise ValueError(f"unknown sampler {name!r}{nearest_hint(name, SAMPLERS)}")
+    return SAMPLERS[name]
+
+
+class _Leg(NamedTuple):
+    """One interval of the walk: its two levels, and the key of its noise."""
+
+    sigma: jax.Array
+    sigma_next: jax.Array
+    key: jax.Array | None
+
+
+def _legs(name: str, x_init, sigmas, key) -> _Leg:
+    """Return all intervals at once, each field [N, ...]; ValueError as `sample` says."""
+    sampler = _sampler(name)
     sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(
             f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}; "
             "take them from a noise schedule's grid"
         )
-    return sigmas
+    if sampler.draws_noise and key is None:
+        raise ValueError(f"sampler {name!r} draws fresh noise at every step: give it a key")
+    keys = jax.random.split(key, len(sigmas) - 1) if sampler.draws_noise else None
+    return _Leg(sigmas[:-1], sigmas[1:], keys)
 
 
-def _walk(step, x, levels, unroll: bool, *more):
-    """Fold `step(x, level, level_next, *more)` over neighbouring levels, in one scan.
+def _take(step: Callable, denoise: Denoiser, x_noisy, leg: _Leg):
+    """Go over one interval; return the state at its end and the clean estimate at its start."""
+    x0_hat = denoise(x_noisy, leg.sigma)
+    noise = None if leg.key is None else jax.random.normal(leg.key, x_noisy.shape, x_noisy.dtype)
+    return step(x_noisy, x0_hat, leg.sigma, leg.sigma_next, denoise, noise), x0_hat
 
-    Args:
-      step: returns the state at `level_next`.
-      x: first state.
-      levels: [N + 1]; with N = 0 the state stays as it is.
-      unroll: write the steps out one by one.
-      *more: arrays of which each step takes its own entry, [N, ...].
-    """
-    num_steps, x = len(levels) - 1, jnp.asarray(x)
-    entries = (levels[:-1], levels[1:], *more)
+
+def _pick(legs: _Leg, which) -> _Leg:
+    return jax.tree.map(lambda field: field[which], legs)
+
+
+def _fold(step: Callable, denoise: Denoiser, x_init, legs: _Leg, unroll: bool):
+    """Go over all intervals in one scan."""
+    num_steps, x_noisy = len(legs.sigma), jnp.asarray(x_init)
+    over = lambda x_noisy, leg: (_take(step, denoise, x_noisy, leg)[0], None)
     # A scan keeps its loop around a single step, unrolled or not, and also around none.
     if num_steps == 0:
-        return x
+        return x_noisy
     if num_steps == 1:
-        return step(x, *(entry[0] for entry in entries))
-    unroll = num_steps if unroll else 1
-    return jax.lax.scan(lambda x, entry: (step(x, *entry), None), x, entries, unroll=unroll)[0]
-
-
-def sample_ddim(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
-    """Walk a variance-exploding state down the noise levels with DDIM.
-
-    Args:
-      denoise: `denoise(x_noisy, sigma) -> x0_hat`; sigma comes as a scalar.
-      x_init: state at sigmas[0], usually sigmas[0] * normal noise, [B, T, C].
-      sigmas: [N + 1], falling, the last may be 0 (see `VarianceExploding.grid`).
-      unroll: write the steps out one by one instead of a `lax.scan` (for exports).
-
-    Returns:
-      State at sigmas[-1], [B, T, C].
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-    """
-
-    def step(x_noisy, sigma, sigma_next):
-        return ddim_step(x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
-
-    return _walk(step, x_init, _noise_levels(sigmas, x_init), unroll)
-
-
-def sample_ddim_vp(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
-    """Walk the same path as `sample_ddim` in the VP state, rescaling before every network call.
-
-    Args:
-      denoise: takes the VE state, as everywhere.
-      x_init: VE state at sigmas[0], [B, T, C].
-      sigmas: [N + 1], falling, the last may be 0.
-      unroll: as in `sample_ddim`.
-
-    Returns:
-      VE state at sigmas[-1]; equal to `sample_ddim` to rounding.
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-
-    Source: paper Appendix F, with the rescaling that it leaves unsaid.
-    """
-    sigmas = _noise_levels(sigmas, x_init)
-    alpha_bars = alpha_bar_from_sigma(sigmas)
-
-    def step(z, alpha_bar, alpha_bar_next, sigma):
-        x0_hat = denoise(z / jnp.sqrt(alpha_bar), sigma)
-        return ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next)
-
-    z = _walk(step, jnp.sqrt(alpha_bars[0]) * x_init, alpha_bars, unroll, sigmas[:-1])
-    return z / jnp.sqrt(alpha_bars[-1])
-
-
-def sample_ddim_literal(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
-    """Walk with the printed update and never rescale: what Appendix F says if taken to the letter.
-
-    No sampler to use: an exact denoiser's samples collapse onto its mean. It is here to find out
-    who would notice, see `experiments.literal_update`.
-
-    Args:
-      denoise, x_init, sigmas, unroll: as in `sample_ddim`.
-
-    Returns:
-      State after the last step, [B, T, C]; one step alone is `sample_ddim`'s.
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-    """
-
-    def step(x_noisy, sigma, sigma_next):
-        return ddim_step_literal(x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
-
-    return _walk(step, x_init, _noise_levels(sigmas, x_init), unroll)
-
-
-def sample_ddpm(denoise: Denoiser, x_init, sigmas, key, *, unroll: bool = False):
-    """Walk a variance-exploding state down the noise levels with DDPM's ancestral sampling.
-
-    Args:
-      denoise, x_init, sigmas, unroll: as in `sample_ddim`. Unrolled, the walk is free of loops, but
-        JAX's default random numbers bring one of their own; those of
-        `jax.random.key(seed, impl="unsafe_rbg")` do not.
-      key: JAX random key of the noise added in between; the step to sigma = 0 adds none.
-
-    Returns:
-      State at sigmas[-1], [B, T, C].
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-
-    Source: Ho et al. 2020, Algorithm 2; what CAMDM samples with (section 6).
-    """
-    sigmas = _noise_levels(sigmas, x_init)
-
-    def step(x_noisy, sigma, sigma_next, key):
-        noise = jax.random.normal(key, x_noisy.shape, x_noisy.dtype)
-        return ddpm_step(x_noisy, denoise(x_noisy, sigma), sigma, sigma_next, noise)
-
-    return _walk(step, x_init, sigmas, unroll, jax.random.split(key, len(sigmas) - 1))
-
-
-def sample_euler(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
-    """Walk down the probability-flow ODE with Euler's method: DDIM, found in another way.
-
-    Args:
-      denoise, x_init, sigmas, unroll: as in `sample_ddim`.
-
-    Returns:
-      State at sigmas[-1], [B, T, C]; equal to `sample_ddim` to rounding.
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-    """
-
-    def step(x_noisy, sigma, sigma_next):
-        slope = probability_flow_slope(x_noisy, denoise(x_noisy, sigma), sigma)
-        return x_noisy + (sigma_next - sigma) * slope
-
-    return _walk(step, x_init, _noise_levels(sigmas, x_init), unroll)
-
-
-def sample_heun(denoise: Denoiser, x_init, sigmas, *, unroll: bool = False):
-    """Walk down the probability-flow ODE with Heun's method: second order, 2N - 1 evaluations.
-
-    Each step goes along the mean of the slopes at both of its ends. The last one is an Euler step,
-    because at sigma = 0 the slope has no value; it is one on grids that end higher, too, so that
-    the number of evaluations does not depend on the levels. One step of many is no loss of order.
-
-    Args:
-      denoise, x_init, sigmas, unroll: as in `sample_ddim`.
-
-    Returns:
-      State at sigmas[-1], [B, T, C].
-
-    Raises:
-      ValueError: if `sigmas` is not a list of at least two levels.
-
-    Source: Karras et al. 2022, Algorithm 1.
-    """
-    sigmas = _noise_levels(sigmas, x_init)
-
-    def step(x_noisy, sigma, sigma_next):
-        slope = probability_flow_slope(x_noisy, denoise(x_noisy, sigma), sigma)
-        guess = x_noisy + (sigma_next - sigma) * slope
-        slope_next = probability_flow_slope(guess, denoise(guess, sigma_next), sigma_next)
-        return x_noisy + (sigma_next - sigma) * 0.5 * (slope + slope_next)
-
-    x_noisy = _walk(step, x_init, sigmas[:-1], unroll)
-    # Outside the scan: masked inside, it would cost an evaluation that nobody uses.
-    return sample_ddim(denoise, x_noisy, sigmas[-2:])
-
-
-SAMPLERS: dict[str, Callable] = {
-    "ddim": sample_ddim,
-    "ddim_vp": sample_ddim_vp,
-    "ddpm": sample_ddpm,
-    "euler": sample_euler,
-    "heun": sample_heun,
-    "ddim_literal": sample_ddim_literal,
-}
-"""Samplers by name; a noise schedule's `sampler` is one of these. The last is there to be studied,
-under a name because rollouts choose their sampler by name; no schedule asks for it."""
-
-_STOCHASTIC = ("ddpm",)
-
-
-def _known(name: str) -> str:
-    """Return the name of a sampler; ValueError names the nearest one if there is none."""
-    if name not in SAMPLERS:
-        raise ValueError(f"unknown sampler {name!r}{nearest_hint(name, SAMPLERS)}")
-    return name
+        return over(x_noisy, _pick(legs, 0))[0]
+    return jax.lax.scan(over, x_noisy, legs, unroll=num_steps if unroll else 1)[0]
 
 
 def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bool = False) -> jax.Array:
-    """Walk a variance-exploding state down the noise levels with a sampler chosen by name.
+    """Walk a variance-exploding state down the noise levels, in one scan.
 
     Args:
       name: of `SAMPLERS`.
@@ -365,7 +286,9 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bo
       x_init: state at sigmas[0], usually sigmas[0] * normal noise, [B, T, C].
       sigmas: [N + 1], falling, the last may be 0 (a schedule's `grid`).
       key: JAX random key, needed by "ddpm"; the others draw nothing and leave it alone.
-      unroll: write the steps out one by one instead of a `lax.scan` (for exports).
+      unroll: write the steps out one by one instead of a `lax.scan` (for exports). The walk is then
+        free of loops, but JAX's default random numbers bring one of their own; those of
+        `jax.random.key(seed, impl="unsafe_rbg")` do not.
 
     Returns:
       State at sigmas[-1], [B, T, C].
@@ -374,12 +297,43 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bo
       ValueError: for an unknown name, a sampler that draws noise without a key, or `sigmas` that
         are not a list of at least two levels.
     """
-    sampler = SAMPLERS[_known(name)]
-    if name not in _STOCHASTIC:
-        return sampler(denoise, x_init, sigmas, unroll=unroll)
-    if key is None:
-        raise ValueError(f"sampler {name!r} draws fresh noise at every step: give it a key")
-    return sampler(denoise, x_init, sigmas, key, unroll=unroll)
+    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, key)
+    if sampler.last is None:
+        return _fold(sampler.step, denoise, x_init, legs, unroll)
+    # Apart from the scan: masked inside, it would cost an evaluation that nobody uses.
+    x_noisy = _fold(sampler.step, denoise, x_init, _pick(legs, slice(-1)), unroll)
+    return _take(sampler.last, denoise, x_noisy, _pick(legs, -1))[0]
+
+
+class Visited(NamedTuple):
+    """One state of a walk: the state, its noise level, and the clean estimate that was made there."""
+
+    x_noisy: jax.Array
+    sigma: jax.Array
+    x0_hat: jax.Array | None
+
+
+def walk(name: str, denoise: Denoiser, x_init, sigmas, *, key=None) -> Iterator[Visited]:
+    """Walk as `sample` does, step by step in plain Python, and yield every state.
+
+    Args:
+      name, denoise, x_init, sigmas, key: as for `sample`.
+
+    Yields:
+      N + 1 states, the first `x_init`; the last is the sample, where no estimate is made.
+
+    Raises:
+      ValueError: as `sample`.
+    """
+    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, key)
+    x_noisy, num_steps = jnp.asarray(x_init), len(legs.sigma)
+    for number in range(num_steps):
+        leg = _pick(legs, number)
+        step = sampler.last if sampler.last and number == num_steps - 1 else sampler.step
+        x_next, x0_hat = _take(step, denoise, x_noisy, leg)
+        yield Visited(x_noisy, leg.sigma, x0_hat)
+        x_noisy = x_next
+    yield Visited(x_noisy, legs.sigma_next[-1], None)
 
 
 def num_evaluations(name: str, num_steps: int) -> int:
@@ -394,4 +348,4 @@ def num_evaluations(name: str, num_steps: int) -> int:
     """
     if num_steps < 1:
         raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
-    return 2 * num_steps - 1 if _known(name) == "heun" else num_steps
+    return _sampler(name).evaluations * (num_steps - 1) + 1

@@ -333,15 +333,3 @@ def sigma_from_log_snr(log_snr):
     """Return sigma = exp(-log_snr / 2), any shape."""
     xp = array_module(log_snr)
     return xp.exp(-0.5 * log_snr)
-
-
-def log_snr_from_alpha_bar(alpha_bar):
-    """Return the log signal-to-noise ratio, log(alpha_bar / (1 - alpha_bar)), any shape."""
-    xp = array_module(alpha_bar)
-    return xp.log(alpha_bar) - xp.log1p(-alpha_bar)
-
-
-def alpha_bar_from_log_snr(log_snr):
-    """Return alpha_bar = 1 / (1 + exp(-log_snr)), any shape."""
-    xp = array_module(log_snr)
-    return 1.0 / (1.0 + xp.exp(-log_snr))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal, sample_ddim, sample_ddim_literal, sample_ddim_vp
+from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal, sample
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.exercises.judging import NotAnswered, agree, is_missing
 
@@ -74,9 +76,9 @@ def _sample_in_preserving_state(denoise, x_init, sigmas, forget: bool):
 
 
 _STRANGERS = (
-    (sample_ddim, True),
-    (sample_ddim_literal, False),
-    (sample_ddim_vp, True),
+    (functools.partial(sample, "ddim"), True),
+    (functools.partial(sample, "ddim_literal"), False),
+    (functools.partial(sample, "ddim_vp"), True),
     (lambda *given: _sample_in_preserving_state(*given, forget=False), True),
     (lambda *given: _sample_in_preserving_state(*given, forget=True), False),
 )
