@@ -113,7 +113,7 @@ def same_way(characters, pace, num_frames, seed):
 
 def test_noise_differs_between_characters_and_seeds(tmp_path):
     # Style, starting pose and path are the same: what differs is the noise.
-    trained = tiny_trained_with({"calm": tiny_trained().seeds["calm"][:1]})
+    trained = tiny_trained_with({"calm": tiny_trained().start_poses["calm"][:1]})
     generator = MotionGenerator(trained, num_steps=1)
     made = [generate_crowd(generator, 4, WINDOW, tmp_path / str(seed), paths=same_way, seed=seed) for seed in (0, 1)]
     rotations = np.concatenate([crowd.rotations for crowd in made]).astype(float)
@@ -124,8 +124,8 @@ def test_noise_differs_between_characters_and_seeds(tmp_path):
 
 def tiny_trained_with(seeds):
     trained = tiny_trained()
-    trained.seeds.clear()
-    trained.seeds.update(seeds)
+    trained.start_poses.clear()
+    trained.start_poses.update(seeds)
     return trained
 
 
@@ -138,16 +138,15 @@ def test_styles_go_in_turn(still, tmp_path):
     assert styles("one", styles="proud") == ["proud"] * 5
     three = ["proud", "proud", "calm"]
     assert styles("three", styles=three) == [*three, "proud", "proud"]
-    still.trained = tiny_trained_with({"proud": still.trained.seeds["proud"]})
+    still.trained = tiny_trained_with({"proud": still.trained.start_poses["proud"]})
     assert styles("with poses") == ["proud"] * 5
 
 
 def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
     # Of each pose there is a second one that moves three times as fast.
     fast = np.where(np.isin(np.arange(CHANNELS), [0, 2]), 3.0, 1.0)
-    seeds = {
-        style: np.concatenate([poses, poses * fast]).astype(np.float32) for style, poses in still.trained.seeds.items()
-    }
+    starts = still.trained.start_poses
+    seeds = {style: np.concatenate([poses, poses * fast]).astype(np.float32) for style, poses in starts.items()}
     still.trained = tiny_trained_with(seeds)
     histories, generate = [], still.generate
     still.generate = lambda *given: histories.append(given) or generate(*given)
@@ -163,14 +162,14 @@ def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
             back[:, [0, 2]] -= start
             back = turn_frames(back, -yaw[k, 0])
             style = still.trained.styles[style_index[k]]
-            poses = still.trained.seeds[style]
+            poses = still.trained.start_poses[style]
             gap = np.abs(poses - back).max(axis=(1, 2))
             assert gap.min() < 1e-4
             speeds = np.linalg.norm(np.diff(poses[:, [0, -1]][..., [0, 2]], axis=1), axis=-1)[:, 0]
             off = np.abs(speeds / (HISTORY - 1) - np.linalg.norm(position[k, 1] - position[k, 0]))
             assert off[gap.argmin()] <= off.min() + 0.1 / 30 + 1e-9
             used[style].add(int(gap.argmin()))
-    assert used == {style: set(range(len(still.trained.seeds[style]))) for style in used}
+    assert used == {style: set(range(len(still.trained.start_poses[style]))) for style in used}
 
 
 # --- paths -------------------------------------------------------------------------------------
@@ -597,7 +596,7 @@ def test_bad_input_is_refused(still, tmp_path, changed, message):
 
 
 def test_styles_without_a_starting_pose_are_refused(still, tmp_path):
-    still.trained = tiny_trained_with({"proud": still.trained.seeds["proud"]})
+    still.trained = tiny_trained_with({"proud": still.trained.start_poses["proud"]})
     with pytest.raises(ValueError, match="starting pose is stored for style 'calm'"):
         generate_crowd(still, 3, 5, tmp_path, styles=["proud", "calm"])
 

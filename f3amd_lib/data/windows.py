@@ -345,19 +345,19 @@ def fit_normaliser(
     return measure(windows, key)
 
 
-def seed_histories(packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 8, split: str = "train") -> dict:
+def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8, split: str = "train") -> dict:
     """Cut a few starting poses per style out of a packed data set.
 
     Args:
       packed: the data.
       num_history: frames H of each.
-      num_seeds: most seeds per style; each comes from the middle of another clip.
+      num_poses: most per style; each comes from the middle of another clip.
       split: where to look first; a style without a clip there is looked up in the others.
 
     Returns:
       Style name -> [K, H, C] world frames, the last one at x = z = 0 and facing +Z.
     """
-    seeds = {}
+    starts = {}
     for style, name in enumerate(packed.styles):
         for where in (split, *SPLITS):
             chosen = np.flatnonzero(
@@ -368,12 +368,12 @@ def seed_histories(packed: PackedMotion, *, num_history: int = 10, num_seeds: in
         else:
             continue
         cuts = []
-        spread = np.linspace(0, len(chosen) - 1, min(num_seeds, len(chosen))).astype(int)
+        spread = np.linspace(0, len(chosen) - 1, min(num_poses, len(chosen))).astype(int)
         for clip in chosen[spread]:
             motion = packed.motion(int(clip))
             start = max(0, motion.num_frames // 2 - num_history)
             frames = world_frames(motion.slice(start, start + num_history))
             frames = center_window(frames, frames[-1, [0, 2]])
             cuts.append(turn_frames(frames, -frame_yaw(motion.skeleton, frames[-1])))
-        seeds[name] = np.stack(cuts).astype(np.float32)
-    return seeds
+        starts[name] = np.stack(cuts).astype(np.float32)
+    return starts

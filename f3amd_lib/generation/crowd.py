@@ -290,12 +290,12 @@ def generate_crowd(
     chunk = min(_whole("chunk", chunk, 1), num_characters)
     styles = [styles] if isinstance(styles, str) else styles
     if styles is None:
-        styles = [style for style in trained.styles if style in trained.seeds]
+        styles = [style for style in trained.styles if style in trained.start_poses]
     in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
     if not len(in_turn):
         raise ValueError("a crowd needs at least one style")
     for style in styles:
-        if style not in trained.seeds:
+        if style not in trained.start_poses:
             raise ValueError(f"no starting pose is stored for style {style!r}; leave it out")
     make_paths, path_names = _path_maker(paths)
 
@@ -472,9 +472,9 @@ def _paces(generator: MotionGenerator, characters: range, style_index, seed: int
     which, pose = _draws(characters, 2, seed, _POSES).T
     pace = np.empty(len(characters))
     for style in np.unique(style_index):
-        mine = style_index == style
-        speeds = _FPS * pose_speed(trained.seeds[trained.styles[style]])
-        pace[mine] = speeds[(which[mine] * len(speeds)).astype(int)]
+        members = style_index == style
+        speeds = _FPS * pose_speed(trained.start_poses[trained.styles[style]])
+        pace[members] = speeds[(which[members] * len(speeds)).astype(int)]
     return np.maximum(pace, _SLOWEST), pose
 
 
@@ -485,12 +485,12 @@ def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw
     speed = np.linalg.norm(position[:, 0] - start, axis=-1)
     poses = np.empty((len(start), config.num_history, config.channels))
     for style in np.unique(style_index):
-        mine = style_index == style
-        choices = trained.seeds[trained.styles[style]]
-        fitting = as_fast_as(choices, speed[mine])
-        number = (draw[mine] * fitting.sum(axis=1)).astype(int)
+        members = style_index == style
+        choices = trained.start_poses[trained.styles[style]]
+        fitting = as_fast_as(choices, speed[members])
+        number = (draw[members] * fitting.sum(axis=1)).astype(int)
         # The first place where more than `number` fitting poses have been passed.
-        poses[mine] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
+        poses[members] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
     return center_window(turn_frames(poses, yaw[:, 0]), -start).astype(np.float32)
 
 

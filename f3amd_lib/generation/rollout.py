@@ -238,9 +238,9 @@ class MotionGenerator:
         taken = dict.fromkeys(styles, 0)
         poses = []
         for character, style in enumerate(styles):
-            if style not in self.trained.seeds:
+            if style not in self.trained.start_poses:
                 raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
-            choices = self.trained.seeds[style]
+            choices = self.trained.start_poses[style]
             choices = choices[as_fast_as(choices, speed[character])]
             order = np.random.default_rng([seed, self.trained.style_index(style)])
             number = order.permutation(len(choices))[taken[style] % len(choices)]
