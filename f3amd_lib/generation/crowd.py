@@ -20,7 +20,6 @@ apart (`min_distance`). Then everybody's path depends on who else is there.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import json
@@ -49,16 +48,10 @@ PATHS = tuple(name for name in NAMES if name != "complex")
 
 FORMAT = "f3amd-crowd-1"
 
-_ARRAYS = {
-    "root": ("<f4", lambda frames, joints: (frames, 3)),
-    "rotations": ("<f2", lambda frames, joints: (frames, joints, 6)),
-    "path": ("<f4", lambda frames, joints: (frames, 3)),
-    "styles": ("<i4", lambda frames, joints: ()),
-}
-"""File stem -> type and shape of one character."""
+_ARRAYS = {"root": "<f4", "rotations": "<f2", "path": "<f4", "styles": "<i4"}
+"""File stem -> type of its numbers."""
 
 _FPS = 30.0
-_HEADER_BYTES = 128  # of a .npy file of so few dimensions
 # CPU time a character on two cores with 2 MiB of L2 (F3AMD-FNO-96, one step, 32 frames): least at
 # 128; 64 costs 8 % more, 512 15 %, 4096 38 %.
 _CHUNK = 128
@@ -318,9 +311,7 @@ def generate_crowd(
             "dtype": generator.dtype.name,
             "sampler": generator.sampler,
             "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
-            "dataset": trained.record.get("dataset"),
-            "dataset_licence": trained.record.get("dataset_licence"),
-            "dataset_credit": trained.record.get("dataset_credit"),
+            **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
         },
     }
     settings = json.loads(json.dumps(settings))
@@ -347,27 +338,21 @@ def generate_crowd(
         )
     if finished == 0:
         _write_settings(out, settings, 0)
+        _lay_out(out, settings)
+    for name in _ARRAYS:
+        _open_array(out, name, settings)
     noise = jax.random.key(seed)
-    with contextlib.ExitStack() as files:
-        writers = {name: files.enter_context(_open_rows(out, name, settings, finished)) for name in _ARRAYS}
-        bar = files.enter_context(
-            tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress)
-        )
+    with tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress) as bar:
         for first in range(finished, num_characters, chunk):
             characters = range(first, min(first + chunk, num_characters))
-            asked = asked_of(characters) if first else beginning
-            style_index, pose, position, yaw = asked
+            style_index, pose, position, yaw = asked_of(characters) if first else beginning
             history = _starting_poses(generator, style_index, position, yaw, pose)
             # The last chunk is filled up with its last character, so that nothing compiles twice.
             number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
             row = number - first
-            frames = generator.generate(
-                position[row],
-                yaw[row],
-                style_index[row],
-                history[row],
-                jax.vmap(jax.random.fold_in, (None, 0))(noise, number),
-            )[: len(characters)]
+            keys = jax.vmap(jax.random.fold_in, (None, 0))(noise, number)
+            frames = generator.generate(position[row], yaw[row], style_index[row], history[row], keys)
+            frames = frames[: len(characters)]
             if not np.isfinite(frames).all():
                 worst = first + int(np.argwhere(~np.isfinite(frames))[0][0])
                 raise ArithmeticError(
@@ -380,8 +365,8 @@ def generate_crowd(
                 "path": np.concatenate([position, yaw[..., None]], axis=-1),
                 "styles": style_index,
             }
-            for name, writer in writers.items():
-                _append(writer, rows[name].astype(_ARRAYS[name][0]))
+            for name, values in rows.items():
+                _write_rows(out, name, settings, first, values)
             _write_settings(out, settings, characters.stop)
             bar.update(len(characters))
     return read_crowd(out)
@@ -409,15 +394,7 @@ def read_crowd(folder) -> Crowd:
         )
     with errors_name(folder / _SETTINGS):
         skeleton = described_skeleton(settings, settings["offsets"])
-    arrays = {name: _open_array(folder, name, settings) for name in _ARRAYS}
-    return Crowd(
-        settings=settings,
-        skeleton=skeleton,
-        root=arrays["root"],
-        rotations=arrays["rotations"],
-        path=arrays["path"],
-        style_index=arrays["styles"],
-    )
+    return Crowd(settings, skeleton, *(_open_array(folder, name, settings) for name in _ARRAYS))
 
 
 def _whole(name: str, value, least: int) -> int:
@@ -557,23 +534,18 @@ def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | N
     return finished, there.get(_FIRST_PATH)
 
 
-def _row(name: str, settings: dict) -> tuple[np.dtype, tuple[int, ...]]:
-    """Return type and shape of one character in an array."""
-    dtype, shape = _ARRAYS[name]
-    return np.dtype(dtype), shape(settings["num_frames"], len(settings["joints"]))
-
-
-def _row_bytes(name: str, settings: dict) -> int:
-    dtype, shape = _row(name, settings)
-    return dtype.itemsize * math.prod(shape)
+def _shape(name: str, settings: dict) -> tuple[int, ...]:
+    """Return the shape of an array of all characters."""
+    count, frames = settings["num_characters"], settings["num_frames"]
+    last = {"root": (frames, 3), "rotations": (frames, len(settings["joints"]), 6), "path": (frames, 3), "styles": ()}
+    return count, *last[name]
 
 
 def _check_room(out: Path, settings: dict) -> None:
-    """Raise ValueError if the disk lacks room for what is still to be written."""
-    needed = settings["num_characters"] * sum(_row_bytes(name, settings) for name in _ARRAYS)
-    needed += len(_ARRAYS) * _HEADER_BYTES
-    there = [out / f"{name}.npy" for name in _ARRAYS]
-    needed -= sum(path.stat().st_size for path in there if path.exists())
+    """Raise ValueError if the disk lacks room for what is not there yet."""
+    needed = sum(np.dtype(dtype).itemsize * math.prod(_shape(name, settings)) for name, dtype in _ARRAYS.items())
+    files = [out / f"{name}.npy" for name in _ARRAYS]
+    needed -= sum(path.stat().st_size for path in files if path.exists())
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
@@ -583,60 +555,35 @@ def _check_room(out: Path, settings: dict) -> None:
         )
 
 
-def _first_row(path: Path, name: str, settings: dict) -> int:
-    """Return where a file's first character begins, in bytes; ValueError for a foreign header."""
-    dtype, shape = _row(name, settings)
+def _lay_out(out: Path, settings: dict) -> None:
+    """Make the arrays' files at their full size.
+
+    Their room is taken at once: a disk that is full halfway would kill a process that writes to a map.
+    """
+    for name, dtype in _ARRAYS.items():
+        path = out / f"{name}.npy"
+        np.lib.format.open_memmap(path, "w+", dtype, _shape(name, settings))
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+
+
+def _open_array(folder: Path, name: str, settings: dict, mode: str = "r") -> np.memmap:
+    """Map an array's file; ValueError names one that is missing, cut short or another's."""
+    path = folder / f"{name}.npy"
     if not path.is_file():
         raise ValueError(f"{path}: missing; the crowd has to be made anew")
-    with path.open("rb") as file, errors_name(path):
-        np.lib.format.read_magic(file)
-        header = np.lib.format.read_array_header_1_0(file)
-        if header != ((settings["num_characters"], *shape), False, dtype):
-            raise ValueError(f"holds {header[2]} {header[0]}, which is not what {_SETTINGS} says")
-        return file.tell()
+    with errors_name(path):
+        array = np.lib.format.open_memmap(path, mode)
+        if (array.shape, array.dtype) != (_shape(name, settings), np.dtype(_ARRAYS[name])):
+            raise ValueError(f"holds {array.dtype} {array.shape}, which is not what {_SETTINGS} says")
+        return array
 
 
-def _open_rows(out: Path, name: str, settings: dict, finished: int):
-    """Open an array's file behind the finished characters; what lies beyond is written over."""
-    path = out / f"{name}.npy"
-    if finished == 0:
-        file = path.open("wb")
-        dtype, shape = _row(name, settings)
-        np.lib.format.write_array_header_1_0(
-            file,
-            {
-                "descr": np.lib.format.dtype_to_descr(dtype),
-                "fortran_order": False,
-                "shape": (settings["num_characters"], *shape),
-            },
-        )
-        return file
-    end = _first_row(path, name, settings) + finished * _row_bytes(name, settings)
-    if path.stat().st_size < end:
-        raise ValueError(
-            f"{path}: cut short, it does not hold the {finished} characters that {_SETTINGS} "
-            "counts; pass overwrite=True to begin anew"
-        )
-    file = path.open("r+b")
-    file.seek(end)
-    return file
+def _write_rows(out: Path, name: str, settings: dict, first: int, values: np.ndarray) -> None:
+    """Write a chunk's rows down to the disk.
 
-
-def _append(file, rows: np.ndarray) -> None:
-    """Write rows behind the others, down to the disk.
-
-    Plain writes, as pages of a writable memory map would count as this process's memory.
+    The file is mapped for one chunk only, as mapped pages count as this process's memory.
     """
-    file.write(np.ascontiguousarray(rows))
-    file.flush()
-    os.fsync(file.fileno())
-
-
-def _open_array(folder: Path, name: str, settings: dict) -> np.ndarray:
-    """Map a finished array; ValueError if the file is not exactly as long as it should be."""
-    path = folder / f"{name}.npy"
-    end = _first_row(path, name, settings)
-    end += settings["num_characters"] * _row_bytes(name, settings)
-    if path.stat().st_size != end:
-        raise ValueError(f"{path}: has {path.stat().st_size} bytes, should have {end}; cut short?")
-    return np.load(path, mmap_mode="r", allow_pickle=False)
+    rows = _open_array(out, name, settings, "r+")
+    rows[first : first + len(values)] = values
+    rows.flush()
