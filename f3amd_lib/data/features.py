@@ -31,7 +31,7 @@ def num_channels(skeleton: Skeleton) -> int:
 
 def world_frames(motion: Motion) -> np.ndarray:
     """Turn a motion into world frames, [T, C], float64."""
-    rotation_6d = rotation_6d_from_matrix(np.asarray(motion.rotations, np.float64))
+    rotation_6d = rotation_6d_from_matrix(np.asarray(motion.needed_rotations("a frame of features"), np.float64))
     flat = rotation_6d.reshape(motion.num_frames, -1)
     return np.concatenate([np.asarray(motion.root_position, np.float64), flat], axis=-1)
 

@@ -156,7 +156,7 @@ def _compact(clip: Clip):
     return (
         motion.skeleton,
         motion.root_position.astype(np.float32),
-        rotation_6d_from_matrix(motion.rotations).astype(np.float16),
+        rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16),
         lowest_toe_height(motion),
     )
 

@@ -327,7 +327,7 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     lowered = gaussian_filter1d(lowered, radius / 2.2, radius=radius, mode="nearest")
     drop = lowered[:, None] * np.array([0.0, -1.0, 0.0])
 
-    rotations = np.array(motion.rotations, np.float64)
+    rotations = np.array(motion.needed_rotations("locking feet"), np.float64)
     turned = global_rotations(skeleton, rotations)
     across = positions[:, chains[0, 0]] - positions[:, chains[1, 0]]
     for chain, target, reach in zip(chains, targets, reaches, strict=True):
