@@ -92,10 +92,7 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
         data = _clean(text, name)
         motion = _MOTION_LINE.search(data)
         if motion is None:
-            raise _Broken(
-                data.count(b"\n") + 1,
-                "the file ends without a MOTION line; it is cut off or not a BVH file: export or copy it again",
-            )
+            raise _Broken(data.count(b"\n") + 1, "the file ends without a MOTION line; export or copy it again")
         joints, end_sites = _parse_hierarchy(data[: motion.start()])
         line = data.count(b"\n", 0, motion.start()) + 1
         num_frames, frame_time, rows, line = _parse_motion_head(data[motion.end() :], line)
@@ -351,11 +348,8 @@ def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, s
         label, label_line = tokens.take(f"channel names of {joint!r}")
         channel = _CHANNELS.get(label.lower())
         if channel is None:
-            raise _Broken(
-                label_line,
-                f"unknown channel {label!r} of joint {joint!r}, which says it has {count}; channels "
-                "are X, Y or Z with position or rotation, such as Xposition or Zrotation",
-            )
+            what = f"unknown channel {label!r} of joint {joint!r}, which says it has {count}"
+            raise _Broken(label_line, f"{what}; channels are X, Y or Z with position or rotation, such as Xposition")
         if channel in channels:
             raise _Broken(label_line, f"joint {joint!r} has the channel {label!r} twice; remove one")
         channels.append(channel)
@@ -406,11 +400,8 @@ def _parse_rows(rows: bytes, first_line: int, joints, num_frames) -> np.ndarray:
     if values.shape == (count, columns) and np.isfinite(values).all():
         return values
     _explain_rows(rows, first_line, joints, columns)
-    raise _Broken(
-        count_line,
-        f"Frames: says {count}, but {len(values)} rows of numbers follow; the file is cut off or the "
-        "count is wrong: export it again or mend the count",
-    )
+    what = f"Frames: says {count}, but {len(values)} rows of numbers follow"
+    raise _Broken(count_line, f"{what}; export the file again or mend the count")
 
 
 def _rows_with_lines(rows: bytes, first_line: int):
@@ -428,18 +419,12 @@ def _explain_rows(rows: bytes, first_line: int, joints, columns: int):
         for column, word in enumerate(words):
             if _finite_number(word) is None:
                 what = labels[column] if column < columns else "beyond the last channel"
-                raise _Broken(
-                    line,
-                    f"{word[:40]!r} (number {column + 1} of frame {frame}, {what}) is not a finite "
-                    "number; mend it or export the file again",
-                )
+                place = f"number {column + 1} of frame {frame}, {what}"
+                raise _Broken(line, f"{word[:40]!r} ({place}) is not a finite number; mend it or export again")
         if len(words) != columns:
             how = "cut off" if len(words) < columns else "too long"
-            raise _Broken(
-                line,
-                f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} "
-                f"channels: the row is {how}; export the file again",
-            )
+            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} channels"
+            raise _Broken(line, f"{what}: the row is {how}; export the file again")
 
 
 def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, first_line) -> Motion:
@@ -478,11 +463,8 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, firs
         if error.max() > RIGID_TOLERANCE:
             frame = int(error.argmax())
             line = [line for line, _ in _rows_with_lines(rows, first_line)][frame]
-            raise _Broken(
-                line,
-                f"the position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame "
-                f"{frame}; bones must be rigid: bake the motion to rotations before exporting",
-            )
+            what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame {frame}"
+            raise _Broken(line, f"{what}; bones must be rigid: bake the motion to rotations before exporting")
     skeleton = Skeleton(
         names=tuple(joint.name for joint in joints[root:]),
         parents=tuple(max(parent - root, -1) for parent in parents[root:]),

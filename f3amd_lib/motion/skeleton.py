@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, finite_array
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
 CONTACT_SPEED = 0.01
@@ -31,15 +31,12 @@ _ROLE_NAMES = {
 def _other_side(name: str) -> str | None:
     """Return the name of the joint on the other side of the body, or None for a middle joint."""
     for left, right in (("Left", "Right"), ("left", "right")):
-        if left in name:
-            return name.replace(left, right)
-        if right in name:
-            return name.replace(right, left)
-    for left, right in (("_L", "_R"), ("_l", "_r")):
-        if name.endswith(left):
-            return name.removesuffix(left) + right
-        if name.endswith(right):
-            return name.removesuffix(right) + left
+        for own, other in ((left, right), (right, left)):
+            if own in name:
+                return name.replace(own, other)
+    for own, other in (("_L", "_R"), ("_R", "_L"), ("_l", "_r"), ("_r", "_l")):
+        if name.endswith(own):
+            return name.removesuffix(own) + other
     return None
 
 
@@ -71,15 +68,11 @@ class Skeleton:
         object.__setattr__(self, "offsets", offsets)
         count = len(self.names)
         if count == 0 or len(self.parents) != count or offsets.shape != (count, 3):
-            raise ValueError(
-                f"skeleton needs one name, parent and offset a joint; got {count} names, "
-                f"{len(self.parents)} parents and offsets of shape {offsets.shape}"
-            )
+            there = f"{count} names, {len(self.parents)} parents and offsets of shape {offsets.shape}"
+            raise ValueError(f"skeleton needs one name, parent and offset a joint; got {there}")
         if len(set(self.names)) != count:
             raise ValueError("skeleton joint names must be unique")
-        if self.parents[0] != -1 or any(
-            not 0 <= parent < joint for joint, parent in enumerate(self.parents[1:], start=1)
-        ):
+        if self.parents[0] != -1 or any(not 0 <= parent <= k for k, parent in enumerate(self.parents[1:])):
             raise ValueError("skeleton needs the root first and every parent before its children")
         if not np.all(np.isfinite(offsets)):
             raise ValueError("skeleton offsets must be finite")
@@ -112,10 +105,8 @@ class Skeleton:
         for name in _ROLE_NAMES[role]:
             if name in self.names:
                 return self.names.index(name)
-        raise ValueError(
-            f"no joint of this skeleton is known as its {role}; looked for "
-            f"{', '.join(_ROLE_NAMES[role])} among {', '.join(self.names)}"
-        )
+        wanted = ", ".join(_ROLE_NAMES[role])
+        raise ValueError(f"no joint is known as its {role}; looked for {wanted} among {', '.join(self.names)}")
 
     @property
     def toes(self) -> tuple[int, int]:
@@ -129,9 +120,7 @@ class Skeleton:
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
                 depth[joint] = depth[parent] + 1
-        return tuple(
-            tuple(joint for joint in range(self.num_joints) if depth[joint] == level) for level in range(max(depth) + 1)
-        )
+        return tuple(tuple(np.flatnonzero(np.equal(depth, level)).tolist()) for level in range(max(depth) + 1))
 
     @functools.cached_property
     def mirror_permutation(self) -> tuple[int, ...]:
@@ -169,11 +158,8 @@ class Skeleton:
             tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
             parent = self.parents[joint]
             inherited = [k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])]
-            if inherited:
-                choice = inherited[0]
-            else:
-                choice = 3 if 3 in tied and parent >= 0 else tied[0]
-            frames[joint] = candidates[choice]
+            backwards = [3] if 3 in tied and parent >= 0 else []
+            frames[joint] = candidates[[*inherited, *backwards, *tied][0]]
         return frames
 
 
@@ -208,19 +194,14 @@ class Motion:
         label = f"motion {self.name!r}"
         if (self.rotations is None) == (self.joint_positions is None):
             raise ValueError(f"{label} needs either rotations or joint_positions")
-        for name in _ARRAYS:
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, np.asarray(getattr(self, name)))
-        frames = len(self.root_position) if self.root_position.ndim else 0
         joints = self.skeleton.num_joints
         shapes = {"root_position": (3,), "rotations": (joints, 3, 3), "joint_positions": (joints, 3)}
         for what, array in self._arrays().items():
-            if frames == 0 or array.shape != (frames, *shapes[what]):
-                wanted = ", ".join(map(str, shapes[what]))
-                raise ValueError(f"{label}: {what} must be [T, {wanted}] with one T > 0 for all; got {array.shape}")
-            if not np.all(np.isfinite(array)):
-                frame = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise ValueError(f"{label}: {what} is not finite at frame {frame}")
+            array = finite_array(f"{label}: {what}", array, ("frame", *shapes[what]), dtype=None)
+            object.__setattr__(self, what, array)
+        lengths = {what: len(array) for what, array in self._arrays().items()}
+        if len(set(lengths.values())) != 1:
+            raise ValueError(f"{label}: arrays have unlike numbers of frames, {lengths}")
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise ValueError(f"{label}: fps must be positive, got {self.fps}")
 
@@ -295,9 +276,8 @@ def _walk(skeleton: Skeleton, root_position, rotations):
         slot = np.array([previous.index(skeleton.parents[joint]) for joint in level])
         joints = np.array(level)
         above = level_rotations[-1][..., slot, :, :]
-        level_positions.append(
-            level_positions[-1][..., slot, :] + sum(above[..., k] * offsets[joints, k, None] for k in range(3))
-        )
+        bones = sum(above[..., k] * offsets[joints, k, None] for k in range(3))
+        level_positions.append(level_positions[-1][..., slot, :] + bones)
         level_rotations.append(_compose(above, rotations[..., joints, :, :]))
     order = np.argsort(np.array([joint for level in skeleton.levels for joint in level]))
     positions = xp.concatenate(level_positions, axis=-2)[..., order, :]
