@@ -52,10 +52,8 @@ def motion_from_frames(skeleton: Skeleton, frames, fps: float = 30.0, name: str 
     """
     frames = np.asarray(frames, np.float64)
     if frames.ndim != 2 or frames.shape[1] != num_channels(skeleton):
-        raise ValueError(
-            f"frames must be [T, {num_channels(skeleton)}] for this skeleton of "
-            f"{skeleton.num_joints} joints, got {frames.shape}"
-        )
+        what = f"[T, {num_channels(skeleton)}] for this skeleton of {skeleton.num_joints} joints"
+        raise ValueError(f"frames must be {what}, got {frames.shape}")
     root_position, rotation_6d = split_frames(frames)
     return Motion(skeleton, root_position, matrix_from_rotation_6d(rotation_6d), fps, name)
 

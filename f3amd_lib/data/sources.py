@@ -21,6 +21,7 @@ import hashlib
 import io
 import json
 import os
+import tomllib
 import warnings
 import zipfile
 import zlib
@@ -37,7 +38,8 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.skeleton import Motion, resample
 
-NAMES = ("synthetic", "bandai", "100style", "folder")
+_SETS = tomllib.loads((resources.files("f3amd_lib.data") / "data_sets.toml").read_text(encoding="utf-8"))
+NAMES = tuple(_SETS)
 SPLITS = ("train", "validation", "test")
 FPS = 30.0
 """Frame rate of every clip, frames per second (paper section 4)."""
@@ -46,46 +48,6 @@ MINIMUM_FRAMES = 42
 """Shortest useful clip: 10 history and 32 future frames (paper section 3.2)."""
 
 DATA_DIR_VARIABLE = "F3AMD_DATA_DIR"
-
-_BANDAI_REPOSITORY = "BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
-_BANDAI_COMMIT = "74ead3ba1ae4696404e6086233779f60de8bf9ef"
-_BANDAI_LOCOMOTION = {
-    "dataset-1": ("walk", "run", "dash", "walk-back", "walk-left", "walk-right"),
-    "dataset-2": ("walk", "run", "walk-turn-left", "walk-turn-right"),
-}
-_100STYLE_DOI = "10.5281/zenodo.8127870"
-
-# URL, hash and file name of what is downloaded. The archive that the code host packs on request has no
-# stable hash of its own (the packer may change), so what is pinned is the commit, and every file is
-# checked against `bandai_files.csv`.
-_DOWNLOADS = {
-    "bandai": (
-        f"https://github.com/{_BANDAI_REPOSITORY}/archive/{_BANDAI_COMMIT}.zip",
-        None,
-        f"Bandai-Namco-Research-Motiondataset-{_BANDAI_COMMIT}.zip",
-    ),
-    "100style": (f"doi:{_100STYLE_DOI}/100STYLE.zip", "md5:3cf627852fd8192024c04a8d0ef49583", "100STYLE.zip"),
-}
-_USUAL_NAMES = {
-    "bandai": ("bandai_namco.zip", _DOWNLOADS["bandai"][2], "Bandai-Namco-Research-Motiondataset.zip"),
-    "100style": ("100STYLE.zip",),
-}
-"""What archives are called; in a folder they win over other zips, the first one over the rest."""
-
-_TERMS = {
-    "synthetic": ("Apache-2.0", "Motion data: procedural walker of this repository."),
-    "bandai": (
-        "CC BY-NC 4.0",
-        "Motion data: Bandai-Namco-Research-Motiondataset, © 2022 Bandai Namco Research Inc., "
-        "CC BY-NC 4.0; converted to arrays, otherwise unchanged.",
-    ),
-    "100style": (
-        "CC BY 4.0",
-        "Motion data: The 100STYLE Dataset - Ian Mason, CC BY 4.0; cut to the usable ranges, resampled to 30 fps.",
-    ),
-    "folder": ("as its owner says", "Motion data: files of the user."),
-}
-"""Licence and credit of each data set."""
 
 
 @dataclass(frozen=True)
@@ -170,10 +132,8 @@ def open_dataset(
         dataset = _open_synthetic(seconds_per_style, num_styles)
     elif name == "bandai":
         dataset = _open_bandai(path, locomotion_only)
-    elif name == "100style":
-        dataset = _open_100style(path)
     else:
-        dataset = _open_folder(path)
+        dataset = _open_100style(path) if name == "100style" else _open_folder(path)
     return dataset if num_styles is None else _keep_styles(dataset, num_styles)
 
 
@@ -263,6 +223,10 @@ class _Archive:
     def label(self, name: str) -> str:
         return f"{self.path}: {name}"
 
+    def file(self, name: str, **how) -> _BvhFile:
+        """Return the loader of a file as it is now."""
+        return _BvhFile(self, name, *self.size_and_crc(name), **how)
+
 
 def _archive_at(path) -> _Archive:
     path = Path(path).expanduser()
@@ -286,26 +250,23 @@ def _find_archive(name: str, path) -> _Archive:
     folder = Path(archive.path)
     zips = [item.name for item in sorted(folder.iterdir()) if item.suffix.lower() == ".zip" and item.is_file()]
     zips = [item for item in zips if name in item.lower() and not item.startswith("._")]
-    usual = [item for item in _USUAL_NAMES[name] if item in zips]
+    usual = [item for item in _SETS[name]["usual"] if item in zips]
     if len(zips) > 1 and not usual:
-        raise ValueError(
-            f"{folder}: several archives may be meant ({', '.join(zips)}); "
-            f"point {DATA_DIR_VARIABLE} (or path=...) at one of them"
-        )
+        what = f"several archives may be meant ({', '.join(zips)})"
+        raise ValueError(f"{folder}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
     return _archive_at(folder / (usual + zips)[0]) if zips else archive
 
 
 def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
-    url, known_hash, file_name = _DOWNLOADS[name]
+    about, folder = _SETS[name], pooch.os_cache("f3amd")
     pooch.get_logger().setLevel("WARNING")
     try:
-        return pooch.retrieve(url, known_hash, fname=file_name, path=pooch.os_cache("f3amd"), progressbar=True)
+        return pooch.retrieve(about["url"], about.get("hash"), fname=about["file"], path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         raise ValueError(
-            f"the data set {name!r} could not be downloaded from {url} ({type(error).__name__}: {error}); "
-            f"fetch it by other means and set the environment variable {DATA_DIR_VARIABLE} to the "
-            "zip file or to the folder that holds it"
+            f"data set {name!r} could not be downloaded from {about['url']} ({type(error).__name__}: {error}); fetch "
+            f"it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip file or its folder"
         ) from error
 
 
@@ -315,10 +276,8 @@ def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:
     for member in files:
         base = PurePosixPath(member)
         if base.stem in members:
-            raise ValueError(
-                f"{archive.path}: holds {base.name} twice ({members[base.stem]} and {member}); "
-                "leave one copy of the data set there"
-            )
+            what = f"holds {base.name} twice ({members[base.stem]} and {member})"
+            raise ValueError(f"{archive.path}: {what}; leave one copy of the data set there")
         members[base.stem] = member
     return members
 
@@ -345,11 +304,10 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
     """
     clips = tuple(clips)
     styles = tuple(sorted({clip.style for clip in clips}))
-    licence, credit = _TERMS[name]
     return Dataset(
         name=name,
-        licence=licence,
-        credit=credit,
+        licence=_SETS[name]["licence"],
+        credit=_SETS[name]["credit"],
         fingerprint=_fingerprint(name, clips, content),
         styles=styles,
         clips=clips,
@@ -394,19 +352,14 @@ class _BvhFile:
         label = self.archive.label(self.member)
         sound = (len(data), zlib.crc32(data)) == (self.size, self.crc32)
         if not (sound and hashlib.sha256(data).hexdigest().startswith(self.sha256_prefix)):
-            raise ValueError(
-                f"{label}: is not the file that it should be (size or checksum differs), nothing "
-                "of it is used; fetch it again"
-            )
+            raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
         motion = parse_bvh(data, label)
         if self.stop is None:
             return motion
         motion = resample(motion, FPS)
         if self.stop > motion.num_frames:
-            raise ValueError(
-                f"{label}: has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at "
-                f"{self.stop}; the file or the table is not the original: fetch both again"
-            )
+            what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {self.stop}"
+            raise ValueError(f"{label}: {what}; the file or the table is not the original: fetch both again")
         return motion.slice(self.start, self.stop)
 
 
@@ -431,10 +384,8 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
     """List takes of about ten seconds: one long take would leave nothing to split by clip."""
     shortest = 3 * MINIMUM_FRAMES / FPS
     if not shortest <= seconds_per_style < float("inf"):
-        raise ValueError(
-            f"seconds_per_style must be at least {shortest:.1f} (three takes of {MINIMUM_FRAMES} "
-            f"frames), got {seconds_per_style}"
-        )
+        what = f"at least {shortest:.1f} (three takes of {MINIMUM_FRAMES} frames)"
+        raise ValueError(f"seconds_per_style must be {what}, got {seconds_per_style}")
     num_takes = max(3, round(seconds_per_style / 10.0))
     seconds = seconds_per_style / num_takes
     # A few styles are those that pictures show; all of them are in alphabetical order either way.
@@ -442,9 +393,8 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
     styles = tuple(sorted([*SHOWN_STYLES, *others][:num_styles]))
     takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
     splits = assign_splits((name, style) for name, style, _ in takes)
-    clips = [
-        Clip(name, style, "mixed", splits[name], _SyntheticTake(style, seconds, seed)) for name, style, seed in takes
-    ]
+    takes = [(name, style, _SyntheticTake(style, seconds, seed)) for name, style, seed in takes]
+    clips = [Clip(name, style, "mixed", splits[name], take) for name, style, take in takes]
     symmetric = lambda style: synthetic.style_parameters(style).symmetric
     return _dataset("synthetic", clips, [seconds, _synthetic_probe(styles)], mirror=symmetric)
 
@@ -484,7 +434,7 @@ class _ListedFile:
 
     @property
     def is_locomotion(self) -> bool:
-        return self.parts[1] in _BANDAI_LOCOMOTION[self.parts[0]]
+        return self.parts[1] in _SETS["bandai"]["locomotion"][self.parts[0]]
 
 
 @functools.lru_cache(maxsize=1)
@@ -508,16 +458,12 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     members = _by_stem(archive, (file for file in files if PurePosixPath(file).stem in wanted))
     missing = sorted(wanted - set(members))
     if missing:
-        raise ValueError(
-            f"{archive.path}: {len(missing)} of the {len(wanted)} Bandai files needed are missing, "
-            f"the first is {missing[0]}.bvh; fetch the whole archive of {_BANDAI_REPOSITORY} again"
-        )
+        what = f"{len(missing)} of the {len(wanted)} Bandai files needed are missing, the first is {missing[0]}.bvh"
+        raise ValueError(f"{archive.path}: {what}; fetch the whole archive again")
     for item in listed:
         if archive.size_and_crc(members[item.name]) != (item.size, item.crc32):
-            raise ValueError(
-                f"{archive.label(members[item.name])}: is not the published file (size or "
-                "checksum differs), the archive is refused; fetch it again"
-            )
+            label = archive.label(members[item.name])
+            raise ValueError(f"{label}: is not the published file, the archive is refused; fetch it again")
     # Locomotion and other clips are split apart, so that a clip's split does not depend on
     # `locomotion_only`. Clips too short for a window reach no split at all once packed, so they
     # must not take a place in validation or test.
@@ -538,14 +484,14 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     )
 
 
+_100STYLE_URL = _SETS["100style"]["url"]
 _100STYLE_CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
 
 
 def _open_100style(path) -> Dataset:
     """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
     archive = _find_archive("100style", path)
-    cuts = _read_frame_cuts(archive, _find_table(archive, "Frame_Cuts.csv"))
-    symmetric = _read_symmetric(archive, _find_table(archive, "Dataset_List.csv"))
+    cuts, symmetric = _read_frame_cuts(archive), _read_symmetric(archive)
     members = _by_stem(archive, archive.bvh_files())
     # A transition take may be called TR for TR1, as in the author's own exporter.
     for style, _ in cuts:
@@ -559,61 +505,45 @@ def _open_100style(path) -> Dataset:
         if name not in members:
             missing.append(f"{name}.bvh")
             continue
-        size, crc32 = archive.size_and_crc(members[name])
         # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
         # the same as cutting at even frames of the original and then halving.
-        loader = _BvhFile(archive, members[name], size, crc32, start=start // 2, stop=stop // 2)
+        loader = archive.file(members[name], start=start // 2, stop=stop // 2)
         clips.append(Clip(name, style, code, splits[name], loader))
-        content.append((name, size, crc32, start, stop))
+        content.append((name, loader.size, loader.crc32, start, stop))
     if not clips:
-        raise ValueError(
-            f"{archive.path}: none of the {len(missing)} files that Frame_Cuts.csv names is there, "
-            f"such as {missing[0]}; fetch the whole of 100STYLE (doi {_100STYLE_DOI})"
-        )
-    unknown = sorted(set(members) - {f"{style}_{code}" for style, code in cuts})
+        what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there, such as {missing[0]}"
+        raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_100STYLE_URL})")
     notes = [f"missing {name}" for name in missing]
-    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in unknown]
+    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in sorted(set(members) - set(splits))]
     if missing:
-        warnings.warn(
-            f"{archive.path}: {len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as "
-            f"{missing[0]}; the data set goes without them (see its notes)",
-            stacklevel=3,
-        )
-    for clip in clips:
-        if clip.style not in symmetric:
-            raise ValueError(
-                f"{archive.path}: Dataset_List.csv has no row for style {clip.style!r} of "
-                "Frame_Cuts.csv; take both tables from the same release"
-            )
+        what = f"{len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as {missing[0]}"
+        warnings.warn(f"{archive.path}: {what}; the data set goes without them (see its notes)", stacklevel=3)
+    if unlisted := {clip.style for clip in clips} - symmetric.keys():
+        what = f"Dataset_List.csv has no row for style {min(unlisted)!r} of Frame_Cuts.csv"
+        raise ValueError(f"{archive.path}: {what}; take both tables from the same release")
     clips.sort(key=lambda clip: clip.name)
     return _dataset("100style", clips, sorted(content), mirror=symmetric.get, notes=notes)
 
 
-def _find_table(archive: _Archive, table: str) -> str:
+def _read_table(archive: _Archive, table: str) -> tuple[str, list[dict[str, str]]]:
+    """Return where a table of 100STYLE lies, for messages, and its rows."""
     found = [name for name in archive.names() if PurePosixPath(name).name == table]
     if len(found) != 1:
-        how = "is missing" if not found else f"is there {len(found)} times ({', '.join(found)})"
-        raise ValueError(
-            f"{archive.path}: {table} of 100STYLE {how}; the folder or zip must hold one copy of "
-            f"the data set, with its tables (doi {_100STYLE_DOI})"
-        )
-    return found[0]
-
-
-def _read_table(archive: _Archive, member: str) -> list[dict[str, str]]:
-    data = archive.read(member)
+        how = f"is there {len(found)} times ({', '.join(found)})" if found else "is missing"
+        what = f"the folder or zip must hold one copy of the data set, with its tables ({_100STYLE_URL})"
+        raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what}")
+    label = archive.label(found[0])
     try:
-        text = data.decode("utf-8-sig")
+        text = archive.read(found[0]).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{archive.label(member)}: is not UTF-8 text; fetch it again") from error
-    return list(csv.DictReader(io.StringIO(text, newline="")))
+        raise ValueError(f"{label}: is not UTF-8 text; fetch it again") from error
+    return label, list(csv.DictReader(io.StringIO(text, newline="")))
 
 
-def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tuple[int, int]]:
+def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[tuple[str, str], tuple[int, int]]:
     """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges are left out."""
-    label = archive.label(member)
-    cuts = {}
-    for line, row in enumerate(_read_table(archive, member), start=2):
+    (label, rows), cuts = _read_table(archive, table), {}
+    for line, row in enumerate(rows, start=2):
         style = (row.get("STYLE_NAME") or "").strip()
         if not style:
             raise ValueError(f"{label}, line {line}: no STYLE_NAME; fetch the table again")
@@ -622,10 +552,8 @@ def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tu
             if texts == ["N/A", "N/A"]:
                 continue
             if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
-                raise ValueError(
-                    f"{label}, line {line}: {code} of {style} has the range {texts[0]!r} to "
-                    f"{texts[1]!r}; it needs two whole numbers, the first one smaller, or N/A twice"
-                )
+                what = f"{code} of {style} has the range {texts[0]!r} to {texts[1]!r}"
+                raise ValueError(f"{label}, line {line}: {what}; it needs two rising whole numbers, or N/A twice")
             if (style, code) in cuts:
                 raise ValueError(f"{label}, line {line}: style {style} is listed twice")
             cuts[style, code] = (int(texts[0]), int(texts[1]))
@@ -634,18 +562,14 @@ def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tu
     return cuts
 
 
-def _read_symmetric(archive: _Archive, member: str) -> dict[str, bool]:
+def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> dict[str, bool]:
     """Return, per style, whether its mirror image is the same style."""
-    label = archive.label(member)
-    symmetric = {}
-    for line, row in enumerate(_read_table(archive, member), start=2):
-        style = (row.get("Style Name") or "").strip()
-        answer = (row.get("Symmetric") or "").strip()
+    (label, rows), symmetric = _read_table(archive, table), {}
+    for line, row in enumerate(rows, start=2):
+        style, answer = ((row.get(column) or "").strip() for column in ("Style Name", "Symmetric"))
         if not style or answer not in ("Yes", "No"):
-            raise ValueError(
-                f"{label}, line {line}: needs a Style Name, and Yes or No under Symmetric; found "
-                f"{style!r} and {answer!r}"
-            )
+            what = "needs a Style Name, and Yes or No under Symmetric"
+            raise ValueError(f"{label}, line {line}: {what}; found {style!r} and {answer!r}")
         symmetric[style] = answer == "Yes"
     return symmetric
 
@@ -654,16 +578,10 @@ def _open_folder(path) -> Dataset:
     """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
     place = path or os.environ.get(DATA_DIR_VARIABLE)
     if not place:
-        raise ValueError(
-            "the data set 'folder' needs to know which: pass path=... or set the environment "
-            f"variable {DATA_DIR_VARIABLE}"
-        )
+        raise ValueError(f"the data set 'folder' needs path=..., or set the environment variable {DATA_DIR_VARIABLE}")
     archive = _archive_at(place)
-    members = archive.bvh_files()
-    if not members:
-        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     labelled = {}
-    for member in members:
+    for member in archive.bvh_files():
         relative = PurePosixPath(member)
         name = relative.with_suffix("").as_posix()
         if name in labelled:
@@ -672,11 +590,13 @@ def _open_folder(path) -> Dataset:
         if relative.parent.name:
             style, content = relative.parent.name, relative.stem
         labelled[name] = (member, style, content)
+    if not labelled:
+        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
-    clips, identities = [], []
-    for name, (member, style, content) in sorted(labelled.items()):
-        size, crc32 = archive.size_and_crc(member)
-        clips.append(Clip(name, style, content, splits[name], _BvhFile(archive, member, size, crc32)))
-        identities.append((name, size, crc32))
+    clips = [
+        Clip(name, style, content, splits[name], archive.file(member))
+        for name, (member, style, content) in sorted(labelled.items())
+    ]
+    identities = [(clip.name, clip.loader.size, clip.loader.crc32) for clip in clips]
     # Whether a style keeps its name when mirrored is not for us to guess.
     return _dataset("folder", clips, identities, mirror=lambda style: False)

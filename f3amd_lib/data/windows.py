@@ -211,17 +211,12 @@ def gather_windows(
     shift = track[..., :2] - track[:, last : last + 1, :2]
     # (x, z) turned by yaw: x' = x cos + z sin, z' = z cos - x sin
     cosine, sine = jnp.cos(yaw)[:, None], jnp.sin(yaw)[:, None]
-    position = jnp.stack(
-        [shift[..., 0] * cosine + shift[..., 1] * sine, shift[..., 1] * cosine - shift[..., 0] * sine], axis=-1
-    )
+    x, z = shift[..., 0], shift[..., 1]
+    position = jnp.stack([x * cosine + z * sine, z * cosine - x * sine], axis=-1)
     facing = wrap_angle(jnp.arctan2(track[..., 2], track[..., 3]) + yaw[:, None])
     path = path_condition(position, facing)[:, num_history:]
-    return Batch(
-        history=frames[:, :num_history],
-        future=frames[:, num_history:],
-        path=path,
-        style=windows.one_hot[windows.styles[index]],
-    )
+    style = windows.one_hot[windows.styles[index]]
+    return Batch(frames[:, :num_history], frames[:, num_history:], path, style)
 
 
 def draw_windows(windows: WindowSet, key, batch_size: int, captured_path_share: float = 0.5):
@@ -268,14 +263,8 @@ def spread_windows(windows: WindowSet, num_samples: int) -> Batch:
     """
     count = min(num_samples, windows.num_windows)
     index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
-    return gather_windows(
-        windows,
-        index,
-        jnp.zeros(count),
-        jnp.zeros(count, jnp.int32),
-        window=windows.window,
-        num_history=windows.num_history,
-    )
+    sizes = {"window": windows.window, "num_history": windows.num_history}
+    return gather_windows(windows, index, jnp.zeros(count), jnp.zeros(count, jnp.int32), **sizes)
 
 
 def restart_from(batch: Batch, history) -> Batch:
@@ -360,9 +349,7 @@ def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: in
     starts = {}
     for style, name in enumerate(packed.styles):
         for where in (split, *SPLITS):
-            chosen = np.flatnonzero(
-                (np.asarray(packed.clip_style) == style) & (np.asarray(packed.clip_split) == SPLITS.index(where))
-            )
+            chosen = np.flatnonzero((packed.clip_style == style) & (packed.clip_split == SPLITS.index(where)))
             if len(chosen):
                 break
         else:

@@ -37,6 +37,7 @@ from tqdm import tqdm
 from f3amd_lib.data.features import center_window, motion_from_frames, turn_frames
 from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
@@ -168,9 +169,8 @@ def plan_crowd(
         raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
     make_paths, _ = _path_maker(names)
     pace = np.broadcast_to(pace, (num_characters,))
-    position, yaw = keep_apart(
-        *make_paths(range(num_characters), pace, num_frames, seed), min_distance=min_distance, radius=radius, fps=_FPS
-    )
+    paths = make_paths(range(num_characters), pace, num_frames, seed)
+    position, yaw = keep_apart(*paths, min_distance=min_distance, radius=radius, fps=_FPS)
     return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
 
 
@@ -287,9 +287,8 @@ def generate_crowd(
     in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
     if not len(in_turn):
         raise ValueError("a crowd needs at least one style")
-    for style in styles:
-        if style not in trained.start_poses:
-            raise ValueError(f"no starting pose is stored for style {style!r}; leave it out")
+    if without := [style for style in styles if style not in trained.start_poses]:
+        raise ValueError(f"no starting pose is stored for style {without[0]!r}; leave it out")
     make_paths, path_names = _path_maker(paths)
 
     settings = {
@@ -323,7 +322,9 @@ def generate_crowd(
         style_index = in_turn[np.arange(part.start, part.stop) % len(in_turn)]
         pace, pose = _paces(generator, part, style_index, seed)
         made = make_paths(part, pace, num_frames, seed)
-        return style_index, pose, *_checked(made, (len(part), num_frames))
+        shape = (len(part), num_frames)
+        position = finite_array("the paths' position", made[0], (*shape, 2))
+        return style_index, pose, position, finite_array("the paths' yaw", made[1], shape)
 
     if min_distance is not None:
         _, _, *wanted = asked_of(range(num_characters))
@@ -332,10 +333,8 @@ def generate_crowd(
     beginning = asked_of(range(chunk))
     settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
     if first_path not in (None, settings[_FIRST_PATH]):
-        raise ValueError(
-            f"{out}: holds a crowd whose first character walks another path than this call's; "
-            "give the paths that it was begun with, pass overwrite=True, or choose another folder"
-        )
+        what = "holds a crowd whose first character walks another path than this call's"
+        raise ValueError(f"{out}: {what}; give the paths that it was begun with, {_WAY_OUT}")
     if finished == 0:
         _write_settings(out, settings, 0)
         _lay_out(out, settings)
@@ -355,10 +354,8 @@ def generate_crowd(
             frames = frames[: len(characters)]
             if not np.isfinite(frames).all():
                 worst = first + int(np.argwhere(~np.isfinite(frames))[0][0])
-                raise ArithmeticError(
-                    f"{trained.name} generated a number that is not finite for character {worst}; "
-                    "its weights or its noise levels are broken"
-                )
+                what = f"{trained.name} generated a number that is not finite for character {worst}"
+                raise ArithmeticError(f"{what}; its weights or its noise levels are broken")
             rows = {
                 "root": frames[..., :3],
                 "rotations": frames[..., 3:].reshape(*frames.shape[:2], -1, 6),
@@ -389,9 +386,8 @@ def read_crowd(folder) -> Crowd:
     settings = _read_settings(folder)
     total, finished = settings["num_characters"], settings["num_finished"]
     if finished != total:
-        raise ValueError(
-            f"{folder}: only {finished} of {total} characters are finished; make the same call again and it goes on"
-        )
+        what = f"only {finished} of {total} characters are finished"
+        raise ValueError(f"{folder}: {what}; make the same call again and it goes on")
     with errors_name(folder / _SETTINGS):
         skeleton = described_skeleton(settings, settings["offsets"])
     return Crowd(settings, skeleton, *(_open_array(folder, name, settings) for name in _ARRAYS))
@@ -416,18 +412,6 @@ def _path_maker(paths) -> tuple[PathMaker, list[str] | str]:
         if name not in NAMES:
             raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
     return functools.partial(crowd_paths, names=names), names
-
-
-def _checked(made, expected: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [n, F, 2] and yaw [n, F] as float64; ValueError for anything else."""
-    position, yaw = (np.asarray(array, np.float64) for array in made)
-    if position.shape != (*expected, 2) or yaw.shape != expected:
-        raise ValueError(
-            f"paths must be position {(*expected, 2)} and yaw {expected}, got {position.shape} and {yaw.shape}"
-        )
-    if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
-        raise ValueError("paths hold a number that is not finite")
-    return position, yaw
 
 
 def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
@@ -472,6 +456,7 @@ def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw
 
 
 _SETTINGS = "crowd.json"
+_WAY_OUT = "pass overwrite=True or choose another folder"
 _FIRST_PATH = "first_path"  # digest; crowds of earlier versions lack it
 _NEEDED = ("num_characters", "num_frames", "num_finished", "fps", "styles", "joints", "offsets")
 
@@ -485,9 +470,8 @@ def _read_settings(folder: Path) -> dict:
         settings = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(settings, dict) or settings.get("format") != FORMAT:
             raise ValueError("not written by this project; choose another folder")
-        for name in _NEEDED:
-            if name not in settings:
-                raise ValueError(f"{name} is missing; restore a whole copy")
+        if missing := [name for name in _NEEDED if name not in settings]:
+            raise ValueError(f"{missing[0]} is missing; restore a whole copy")
         finished, total = settings["num_finished"], settings["num_characters"]
         if not 0 <= finished <= total:
             raise ValueError(f"says that {finished} of {total} characters are finished")
@@ -506,32 +490,23 @@ def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | N
     Returns:
       (number of finished characters, digest of the first one's path if it is known).
     """
-    if not out.exists():
-        return 0, None
-    if not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: not a folder; a crowd needs one to itself")
     if not (out / _SETTINGS).exists():
-        other = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
+        other = sorted(item.name for item in out.glob("*") if not item.name.startswith("."))
         if other:
             raise ValueError(f"{out}: holds other files ({other[0]}); choose a folder of its own")
         return 0, None
     there = _read_settings(out)  # also before overwriting: what is not ours stays
     if overwrite:
         return 0, None
-    finished = there.pop("num_finished")
-    for name in settings:
-        if there.get(name) != settings[name]:
-            short = [json.dumps(value)[:60] for value in (there.get(name), settings[name])]
-            raise ValueError(
-                f"{out}: holds a crowd made with {name} {short[0]}, not {short[1]}; pass "
-                "overwrite=True or choose another folder"
-            )
-    if finished == settings["num_characters"]:
-        raise ValueError(
-            f"{out}: holds this crowd already, finished; read it with read_crowd, pass "
-            "overwrite=True, or choose another folder"
-        )
-    return finished, there.get(_FIRST_PATH)
+    for name, value in settings.items():
+        if there.get(name) != value:
+            old, new = (json.dumps(value)[:60] for value in (there.get(name), value))
+            raise ValueError(f"{out}: holds a crowd made with {name} {old}, not {new}; {_WAY_OUT}")
+    if there["num_finished"] == settings["num_characters"]:
+        raise ValueError(f"{out}: holds this crowd already, finished; read it with read_crowd, {_WAY_OUT}")
+    return there["num_finished"], there.get(_FIRST_PATH)
 
 
 def _shape(name: str, settings: dict) -> tuple[int, ...]:
@@ -549,10 +524,8 @@ def _check_room(out: Path, settings: dict) -> None:
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
-        raise ValueError(
-            f"{out}: this crowd takes {needed / 1e9:.3g} GB more, and the disk has "
-            f"{free / 1e9:.3g} GB free; make fewer characters or frames, or choose another disk"
-        )
+        what = f"this crowd takes {needed / 1e9:.3g} GB more, and the disk has {free / 1e9:.3g} GB free"
+        raise ValueError(f"{out}: {what}; make fewer characters or frames, or choose another disk")
 
 
 def _lay_out(out: Path, settings: dict) -> None:
