@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.data.windows import build_windows, fit_normaliser, seed_histories
+from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -203,7 +203,7 @@ def tiny_trained(record=None, config=None, diffusion=None, **changes) -> Trained
         skeleton=SKELETON,
         styles=packed.styles,
         diffusion=diffusion or VarianceExploding(),
-        seeds=seed_histories(packed, num_history=HISTORY),
+        start_poses=starting_poses(packed, num_history=HISTORY),
         record={"note": "made by hand"} if record is None else record,
     )
 

@@ -173,7 +173,7 @@ def test_the_table_has_the_unblended_rollout_beside_the_blended(plain):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"blend_frames": T + 1}, f"from 0 to the window's {T} frames, got {T + 1}"),
+        ({"blend_frames": T + 1}, f"from 0 to {T}, the window, got {T + 1}"),
         ({"blend_frames": -1}, "got -1"),
         ({"blend_frames": 2.5}, "got 2.5"),
         ({"window": 0}, "window must be a whole number .* got 0"),

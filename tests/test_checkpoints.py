@@ -88,8 +88,8 @@ def test_everything_but_the_weights_comes_back_exactly(trained, saved):
     for field in ("name", "config", "styles", "record"):
         assert getattr(loaded, field) == getattr(trained, field)
     assert same_tree(loaded.normaliser, trained.normaliser)
-    assert loaded.seeds.keys() == trained.seeds.keys()
-    assert same_tree(loaded.seeds, trained.seeds)
+    assert loaded.start_poses.keys() == trained.start_poses.keys()
+    assert same_tree(loaded.start_poses, trained.start_poses)
     assert loaded.skeleton == SKELETON and loaded.skeleton.end_sites == SKELETON.end_sites
     np.testing.assert_allclose(loaded.skeleton.offsets, SKELETON.offsets, atol=1e-7)
 

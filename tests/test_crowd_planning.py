@@ -145,9 +145,9 @@ def test_a_crowd_fits_into_a_given_room():
         (lambda: plan_crowd(4, 60, pace=0.0), "pace must be one number above 0"),
         (lambda: plan_crowd(0, 60), "num_characters .* got 0"),
         (lambda: plan_crowd(4, 60, names=["cirkle"]), "did you mean 'circle'"),
-        (lambda: keep_apart(np.zeros((3, 4)), np.zeros(3)), r"position must be \[B, F, 2\]"),
-        (lambda: keep_apart(np.zeros((3, 4, 2)), np.zeros((3, 5))), r"yaw must be finite and"),
-        (lambda: closest_approach(np.full((2, 3, 2), np.nan)), "character 0 at frame 0"),
+        (lambda: keep_apart(np.zeros((3, 4)), np.zeros(3)), r"position must be \[character, frame, 2\]"),
+        (lambda: keep_apart(np.zeros((3, 4, 2)), np.zeros((3, 5))), r"yaw must be \[3, 4\]"),
+        (lambda: closest_approach(np.full((2, 3, 2), np.nan)), "character 0, frame 0"),
     ],
 )
 def test_impossible_asks_are_refused(call, message):

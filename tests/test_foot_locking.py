@@ -270,7 +270,7 @@ def test_bad_input_is_refused(walk):
     positions[7, 3, 1] = np.nan
     with pytest.raises(ValueError, match="frame 7"):
         plan_contacts(positions, walk.skeleton)
-    with pytest.raises(ValueError, match=r"\[T, 23, 3\]"):
+    with pytest.raises(ValueError, match=r"\[frame, 23, 3\]"):
         plan_contacts(walk.positions[:, :-1], walk.skeleton)
     with pytest.raises(ValueError, match="floor"):
         lock_feet(walk, floor=np.nan)

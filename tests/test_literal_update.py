@@ -208,7 +208,7 @@ def test_openings_go_straight_on_at_their_own_pace():
     normaliser = trained.normaliser
     assert condition.style.shape == (len(trained.styles),) * 2
     for row, style in enumerate(trained.styles):
-        opening = trained.seeds[style][0]
+        opening = trained.start_poses[style][0]
         shown = normaliser.denormalise(condition.history[row])
         np.testing.assert_allclose(shown, opening, atol=1e-5)
         assert int(np.argmax(condition.style[row])) == trained.style_index(style)

@@ -179,12 +179,12 @@ def test_csv_keeps_its_facing_while_standing(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1: column 'x' is missing"),
-        ("x,y\n0,0\n0,0\n", "line 1: column 'z' is missing"),
-        ("x,z,yaw\n0,0,0\n", "line 1: unknown column 'yaw'"),
-        ("x,z,x\n0,0,0\n", "line 1: a column is named twice"),
-        ("x,z\n0,0\n0,nan\n", "line 3: z is nan, not finite"),
-        ("x,z\n0,0\n\n0,far\n", "line 4: z is 'far', not a number"),
+        ("", "line 1: the header must be x,z or x,z,yaw_deg, it is empty"),
+        ("x,y\n0,0\n0,0\n", "line 1: the header must be"),
+        ("x,z,yaw\n0,0,0\n", "line 1: the header must be"),
+        ("x,z,x\n0,0,0\n", "it is x,z,x"),
+        ("x,z\n0,0\n0,nan\n", "line 3: z is 'nan', not a finite number"),
+        ("x,z\n0,0\n\n0,far\n", "line 4: z is 'far', not a finite number"),
         ("x,z\n0,0\n0,0.1\n0,0.7\n", "line 4: jumps 0.60 m"),
         ("x,z\n0,0\n0\n", "line 3: 1 cells where the header has 2"),
         ("x,z\n0,0\n", "at least 2 rows"),

@@ -9,7 +9,7 @@ import pytest
 from builders import packed_from
 
 from f3amd_lib.data.features import num_channels
-from f3amd_lib.data.windows import seed_histories
+from f3amd_lib.data.windows import starting_poses
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from f3amd_lib.experiments import measure
 from f3amd_lib.experiments import protocol as module
@@ -78,7 +78,7 @@ def generator(packed, prepared):
         packed.skeleton,
         packed.styles,
         VarianceExploding(),
-        seed_histories(packed, num_history=10),
+        starting_poses(packed, num_history=10),
         {},
     )
     return MotionGenerator(trained, 1)

@@ -95,7 +95,7 @@ def test_rollouts_start_one_step_before_the_path_and_face_along_it(trained):
     # It is one of the style's stored poses, turned and moved.
     back = turn_frames(history.astype(float), -path.yaw[0])
     back[:, [0, 2]] -= back[-1, [0, 2]]
-    assert min(np.abs(back - seed).max() for seed in trained.seeds["proud"]) < 1e-5
+    assert min(np.abs(back - seed).max() for seed in trained.start_poses["proud"]) < 1e-5
 
 
 def test_a_history_off_the_path_is_led_back_within_one_window(trained):
@@ -233,7 +233,7 @@ def test_wrong_histories_are_refused(network_generator):
 
 def test_styles_without_a_starting_pose_need_a_history():
     generator = obedient(tiny_trained())
-    generator.trained.seeds.pop("proud")
+    generator.trained.start_poses.pop("proud")
     path = named_path("straight", 10)
     with pytest.raises(ValueError, match="'proud': pass `history`"):
         generator.rollout(path, "proud")

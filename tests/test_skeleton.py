@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.generation.foot_locking import lock_feet
 from f3amd_lib.motion import rotations, skeleton
+from f3amd_lib.motion.bvh import format_bvh
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 
 # Offsets in cm of the Bandai rig without joint_Root: bones along +X on the left, along -X on the
 # right; the tiny numbers are the rig's own.
@@ -331,9 +334,11 @@ def test_unknown_joints_and_roles_list_what_there_is():
 def test_broken_motions_are_refused_by_name_and_frame():
     root = np.zeros((4, 3))
     eye = np.broadcast_to(np.eye(3), (4, 5, 3, 3)).copy()
-    with pytest.raises(ValueError, match=r"motion 'clip': root_position must be \[T, 3\]"):
+    with pytest.raises(ValueError, match="motion 'clip': arrays have unlike numbers of frames"):
         Motion(legs(), root[:3], eye, name="clip")
-    with pytest.raises(ValueError, match="with T > 0"):
+    with pytest.raises(ValueError, match=r"rotations must be \[frame, 5, 3, 3\]"):
+        Motion(legs(), root, eye[:, 1:])
+    with pytest.raises(ValueError, match="no length 0"):
         Motion(legs(), root[:0], eye[:0])
     with pytest.raises(ValueError, match="fps must be positive, got 0"):
         Motion(legs(), root, eye, fps=0)
@@ -343,6 +348,53 @@ def test_broken_motions_are_refused_by_name_and_frame():
     eye[3, 1, 0, 0] = np.inf
     with pytest.raises(ValueError, match="rotations is not finite at frame 3"):
         Motion(legs(), np.zeros((4, 3)), eye)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda motion: motion,
+        lambda motion: motion.slice(2, 7),
+        skeleton.mirror,
+        lambda motion: skeleton.turn(motion, 0.7),
+        lambda motion: skeleton.resample(motion, 15.0),
+        lambda motion: skeleton.resample(motion.slice(0, 2), 60.0),
+    ],
+)
+def test_motion_of_positions_alone_is_where_the_same_motion_with_rotations_is(change):
+    # Two frames with one pose: in between, bones keep their lengths either way.
+    whole = random_motion(SYNTHETIC_SKELETON, frames=9)
+    rotations = whole.rotations.copy()
+    rotations[1] = rotations[0]
+    whole = whole.replace(rotations=rotations)
+    alone = Motion.from_positions(whole.skeleton, whole.positions, whole.fps, whole.name)
+    there, expected = change(alone), change(whole)
+    assert there.rotations is None and (there.name, there.fps) == (expected.name, expected.fps)
+    np.testing.assert_allclose(there.positions, expected.positions, atol=1e-12)
+    np.testing.assert_allclose(there.root_position, expected.root_position, atol=1e-12)
+    np.testing.assert_allclose(there.yaw, expected.yaw, atol=1e-12)
+    np.testing.assert_array_equal(there.contacts, expected.contacts)
+
+
+@pytest.mark.parametrize("act", [format_bvh, world_frames, lock_feet])
+def test_what_needs_rotations_refuses_positions_alone_and_says_so(act):
+    whole = synthesize("Neutral", 0.5)
+    act(whole)
+    with pytest.raises(ValueError, match="'bare' has positions alone: .* needs rotations"):
+        act(Motion.from_positions(whole.skeleton, whole.positions, name="bare"))
+
+
+def test_motion_is_made_of_rotations_or_positions_not_of_both_or_neither():
+    motion = standing(legs(), np.zeros((4, 3)))
+    for turned, positions in ((motion.rotations, motion.positions), (None, None)):
+        with pytest.raises(ValueError, match="either rotations or joint_positions"):
+            Motion(motion.skeleton, motion.root_position, turned, joint_positions=positions)
+    with pytest.raises(ValueError, match=r"joint_positions must be \[frame, 5, 3\]"):
+        Motion.from_positions(motion.skeleton, motion.positions[:, 1:])
+    broken = motion.positions.copy()
+    broken[1, 4, 2] = np.nan
+    with pytest.raises(ValueError, match="joint_positions is not finite at frame 1"):
+        Motion.from_positions(motion.skeleton, broken)
 
 
 def test_slice_and_replace_keep_the_rest():

@@ -1,6 +1,8 @@
 """The synthetic walker: its skeleton, its styles, and whether a person could move like that."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,10 +90,14 @@ def test_unknown_style_names_the_nearest():
         synthesize("qqq", 1.0)
 
 
-def test_every_parameter_is_documented():
-    for record in (StyleParameters, synthetic.ArmPose):
-        for item in dataclasses.fields(record):
-            assert item.name in record.__doc__, item.name
+def test_every_parameter_is_explained_beside_its_number():
+    text = (Path(synthetic.__file__).parent / "styles.toml").read_text(encoding="utf-8")
+    text = text[text.index("[Neutral]") : text.index("# Moods")]
+    explained = set()
+    for block in re.findall(r"(?:^# .*\n)+((?:^\w+ = .*\n)+)", text, re.MULTILINE):
+        explained |= set(re.findall(r"^\w+", block, re.MULTILINE))
+    named = {item.name for record in (StyleParameters, synthetic.ArmPose) for item in dataclasses.fields(record)}
+    assert explained == named - {"left_arm", "right_arm"}
 
 
 def test_symmetric_styles_are_those_without_a_side():

@@ -33,7 +33,7 @@ from f3amd_lib.data.windows import (
     mean_poses,
     restart_from,
     sample_windows,
-    seed_histories,
+    starting_poses,
 )
 from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
 from f3amd_lib.motion.skeleton import mirror
@@ -338,26 +338,26 @@ def test_mean_poses_by_hand(packed, train):
     np.testing.assert_allclose(mean_poses(train), expected, atol=1e-5)
 
 
-def test_seed_histories_stand_at_the_origin_and_face_forward(packed):
-    seeds = seed_histories(packed, num_history=HISTORY, num_seeds=4)
-    assert {name: len(cuts) for name, cuts in seeds.items()} == {"calm": 1, "proud": 2}
-    for cuts in seeds.values():
+def test_starting_poses_stand_at_the_origin_and_face_forward(packed):
+    starts = starting_poses(packed, num_history=HISTORY, num_poses=4)
+    assert {name: len(cuts) for name, cuts in starts.items()} == {"calm": 1, "proud": 2}
+    for cuts in starts.values():
         assert cuts.shape[1:] == (HISTORY, CHANNELS) and cuts.dtype == np.float32
         np.testing.assert_allclose(cuts[:, -1, [0, 2]], 0.0, atol=1e-7)
         np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, cuts[:, -1])), 0.0, atol=1e-6)
     # From the middle of clip 0 (30 frames): frames 11 to 14, turned and moved.
     world = world_frames(packed.motion(0))[11:15]
-    back = turn_frames(seeds["calm"][0].astype(float), frame_yaw(SKELETON, world[-1]))
+    back = turn_frames(starts["calm"][0].astype(float), frame_yaw(SKELETON, world[-1]))
     back[:, [0, 2]] += world[-1, [0, 2]]
     np.testing.assert_allclose(back, world, atol=1e-5)
 
 
-def test_seed_histories_look_into_other_splits_if_they_must():
+def test_starting_poses_look_into_other_splits_if_they_must():
     packed = packed_from([(wandering_motion(20, 0), 0, 0), (wandering_motion(20, 1), 1, 2)])
-    seeds = seed_histories(packed, num_history=HISTORY)
-    assert set(seeds) == {"calm", "proud"}
+    starts = starting_poses(packed, num_history=HISTORY)
+    assert set(starts) == {"calm", "proud"}
     none = packed_from([(wandering_motion(20, 0), 0, 0)])
-    assert set(seed_histories(none, num_history=HISTORY)) == {"calm"}
+    assert set(starting_poses(none, num_history=HISTORY)) == {"calm"}
 
 
 def test_windows_of_64_frames():

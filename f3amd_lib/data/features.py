@@ -31,7 +31,7 @@ def num_channels(skeleton: Skeleton) -> int:
 
 def world_frames(motion: Motion) -> np.ndarray:
     """Turn a motion into world frames, [T, C], float64."""
-    rotation_6d = rotation_6d_from_matrix(np.asarray(motion.rotations, np.float64))
+    rotation_6d = rotation_6d_from_matrix(np.asarray(motion.needed_rotations("a frame of features"), np.float64))
     flat = rotation_6d.reshape(motion.num_frames, -1)
     return np.concatenate([np.asarray(motion.root_position, np.float64), flat], axis=-1)
 
@@ -52,10 +52,8 @@ def motion_from_frames(skeleton: Skeleton, frames, fps: float = 30.0, name: str 
     """
     frames = np.asarray(frames, np.float64)
     if frames.ndim != 2 or frames.shape[1] != num_channels(skeleton):
-        raise ValueError(
-            f"frames must be [T, {num_channels(skeleton)}] for this skeleton of "
-            f"{skeleton.num_joints} joints, got {frames.shape}"
-        )
+        what = f"[T, {num_channels(skeleton)}] for this skeleton of {skeleton.num_joints} joints"
+        raise ValueError(f"frames must be {what}, got {frames.shape}")
     root_position, rotation_6d = split_frames(frames)
     return Motion(skeleton, root_position, matrix_from_rotation_6d(rotation_6d), fps, name)
 

@@ -40,9 +40,14 @@ _ARRAYS = {
     "clip_style": np.int32,
     "clip_split": np.uint8,
     "floor_shift": np.float32,
-    "offsets": np.float64,
 }
+_TEXTS = (
+    "styles clip_names clip_contents primary_styles mirror_styles dataset licence credit fingerprint skipped"
+).split()
+"""What of `PackedMotion` is stored as arrays of which type, and what as JSON."""
 
+_SHARED = ("styles", "primary_styles", "mirror_styles", "licence", "credit", "fingerprint")
+"""What a packed data set has from its `Dataset`."""
 
 # All that numpy and zipfile raise for files that are not what they should be; the TypeError stands
 # for a single array where an archive of them is wanted.
@@ -88,12 +93,6 @@ class PackedMotion:
     skipped: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self):
-        problem = self._problem()
-        if problem:
-            raise ValueError(f"packed data set {self.dataset!r}: {problem}")
-
-    def _problem(self) -> str | None:
-        """Say what does not fit together, if anything."""
         frames, clips = len(self.root_position), len(self.clip_names)
         shapes = {
             "root_position": (frames, 3),
@@ -105,17 +104,18 @@ class PackedMotion:
         }
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
-                return f"{name} has shape {getattr(self, name).shape} instead of {shape}"
+                self._refuse(f"{name} has shape {getattr(self, name).shape} instead of {shape}")
         if len(self.clip_contents) != clips:
-            return f"{len(self.clip_contents)} contents for {clips} clips"
+            self._refuse(f"{len(self.clip_contents)} contents for {clips} clips")
         start = self.clip_start
         if clips == 0 or start[0] != 0 or start[-1] != frames or np.any(np.diff(start) <= 0):
-            return "clip_start does not cut the frames into clips"
-        if self.clip_style.min() < 0 or self.clip_style.max() >= len(self.styles):
-            return "clip_style points outside of the styles"
-        if self.clip_split.max() >= len(SPLITS):
-            return "clip_split must be 0, 1 or 2"
-        return None
+            self._refuse("clip_start does not cut the frames into clips")
+        for name, known in (("clip_style", self.styles), ("clip_split", SPLITS)):
+            if not np.isin(getattr(self, name), np.arange(len(known))).all():
+                self._refuse(f"{name} points outside of its {len(known)} names")
+
+    def _refuse(self, problem: str):
+        raise ValueError(f"packed data set {self.dataset!r}: {problem}")
 
     @property
     def name(self) -> str:
@@ -156,7 +156,7 @@ def _compact(clip: Clip):
     return (
         motion.skeleton,
         motion.root_position.astype(np.float32),
-        rotation_6d_from_matrix(motion.rotations).astype(np.float16),
+        rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16),
         lowest_toe_height(motion),
     )
 
@@ -191,51 +191,36 @@ def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> Packed
       ValueError: naming the first file that is broken, or whose skeleton differs from the others'.
     """
     kept, skipped = [], []
-    skeleton = None
-    parts = _compact_all(dataset.clips, workers)
-    bar = tqdm(
-        zip(dataset.clips, parts, strict=True),
-        total=len(dataset.clips),
-        desc=f"reading {dataset.name}",
-        unit="clip",
-        disable=not progress,
-    )
-    for clip, (clip_skeleton, root_position, rotation_6d, floor) in bar:
+    clips = tqdm(dataset.clips, desc=f"reading {dataset.name}", unit="clip", disable=not progress)
+    for clip, part in zip(clips, _compact_all(dataset.clips, workers), strict=True):
+        skeleton, root_position, *_ = part
         if len(root_position) < MINIMUM_FRAMES:
             reason = f"{len(root_position)} frames, shorter than a window of {MINIMUM_FRAMES}"
             skipped.append((clip.name, reason))
             continue
-        if skeleton is None:
-            skeleton = clip_skeleton
-        elif skeleton != clip_skeleton:
+        if kept and skeleton != kept[0][1][0]:
             raise ValueError(
                 f"{clip.name}: its skeleton differs from that of {kept[0][0].name} (names, parents "
                 "or bone lengths); a data set needs one skeleton: retarget or remove the file"
             )
-        kept.append((clip, root_position, rotation_6d, floor))
+        kept.append((clip, part))
     if not kept:
-        raise ValueError(
-            f"data set {dataset.name!r} has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are shorter"
-        )
-    clips = [clip for clip, *_ in kept]
-    lengths = [len(root_position) for _, root_position, *_ in kept]
+        what = f"has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are shorter"
+        raise ValueError(f"data set {dataset.name!r} {what}")
+    clips, parts = zip(*kept, strict=True)
+    skeletons, root_positions, rotations, floors = zip(*parts, strict=True)
     return PackedMotion(
-        skeleton=skeleton,
-        styles=dataset.styles,
-        root_position=np.concatenate([root_position for _, root_position, *_ in kept]),
-        rotation_6d=np.concatenate([rotation_6d for *_, rotation_6d, _ in kept]),
-        clip_start=np.cumsum([0, *lengths]).astype(np.int32),
+        skeleton=skeletons[0],
+        dataset=dataset.name,
+        **{name: getattr(dataset, name) for name in _SHARED},
+        root_position=np.concatenate(root_positions),
+        rotation_6d=np.concatenate(rotations),
+        clip_start=np.cumsum([0, *map(len, root_positions)]).astype(np.int32),
         clip_names=tuple(clip.name for clip in clips),
         clip_contents=tuple(clip.content for clip in clips),
         clip_style=np.array([dataset.styles.index(clip.style) for clip in clips], np.int32),
         clip_split=np.array([SPLITS.index(clip.split) for clip in clips], np.uint8),
-        floor_shift=np.array([floor for *_, floor in kept], np.float32),
-        primary_styles=dataset.primary_styles,
-        mirror_styles=dataset.mirror_styles,
-        dataset=dataset.name,
-        licence=dataset.licence,
-        credit=dataset.credit,
-        fingerprint=dataset.fingerprint,
+        floor_shift=np.array(floors, np.float32),
         skipped=tuple(skipped),
     )
 
@@ -271,30 +256,17 @@ def save_packed(path, packed: PackedMotion, *, overwrite: bool = False) -> Path:
         "joint_names": skeleton.names,
         "joint_parents": skeleton.parents,
         "end_sites": skeleton.end_sites,
-        "styles": packed.styles,
-        "clip_names": packed.clip_names,
-        "clip_contents": packed.clip_contents,
-        "primary_styles": packed.primary_styles,
+        **{name: getattr(packed, name) for name in _TEXTS},
         "mirror_styles": sorted(packed.mirror_styles),
-        "dataset": packed.dataset,
-        "licence": packed.licence,
-        "credit": packed.credit,
-        "fingerprint": packed.fingerprint,
-        "skipped": packed.skipped,
     }
     text = json.dumps(text, ensure_ascii=True).encode("ascii")
-    arrays = {
-        name: np.asarray(skeleton.offsets if name == "offsets" else getattr(packed, name), dtype)
-        for name, dtype in _ARRAYS.items()
-    }
+    arrays = {name: np.asarray(getattr(packed, name), dtype) for name, dtype in _ARRAYS.items()}
+    arrays["offsets"] = np.asarray(skeleton.offsets, np.float64)
     checksum = _checksum(arrays, text)
+    texts = {"text": text, "checksum": checksum.encode("ascii")}
+    texts = {name: np.frombuffer(content, np.uint8) for name, content in texts.items()}
     with whole_file(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file,
-            text=np.frombuffer(text, np.uint8),
-            checksum=np.frombuffer(checksum.encode("ascii"), np.uint8),
-            **arrays,
-        )
+        np.savez_compressed(file, **texts, **arrays)
     return Path(path)
 
 
@@ -313,7 +285,7 @@ def load_packed(path) -> PackedMotion:
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("text", "checksum", *_ARRAYS)}
+            arrays = {name: file[name] for name in ("text", "checksum", "offsets", *_ARRAYS)}
         strange = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
         if strange:  # numpy hands out other members of a zip as bytes
             raise ValueError(f"{strange[0]} is not an array")
@@ -325,27 +297,16 @@ def load_packed(path) -> PackedMotion:
     about = json.loads(text)
     if about["format"] != _FORMAT:
         raise ValueError(f"{path}: is of format {about['format']}, this version reads {_FORMAT}; pack again")
-    offsets = arrays.pop("offsets")
-    skeleton = Skeleton(
-        names=tuple(about["joint_names"]),
-        parents=tuple(about["joint_parents"]),
-        offsets=offsets,
-        end_sites=tuple((joint, tuple(offset)) for joint, offset in about["end_sites"]),
-    )
-    return PackedMotion(
-        skeleton=skeleton,
-        styles=tuple(about["styles"]),
-        clip_names=tuple(about["clip_names"]),
-        clip_contents=tuple(about["clip_contents"]),
-        primary_styles=tuple(about["primary_styles"]),
-        mirror_styles=frozenset(about["mirror_styles"]),
-        dataset=about["dataset"],
-        licence=about["licence"],
-        credit=about["credit"],
-        fingerprint=about["fingerprint"],
-        skipped=tuple((name, reason) for name, reason in about["skipped"]),
-        **arrays,
-    )
+    names, parents, end_sites = (_tuples(about[name]) for name in ("joint_names", "joint_parents", "end_sites"))
+    skeleton = Skeleton(names, parents, arrays.pop("offsets"), end_sites)
+    texts = {name: _tuples(about[name]) for name in _TEXTS}
+    texts["mirror_styles"] = frozenset(texts["mirror_styles"])
+    return PackedMotion(skeleton=skeleton, **arrays, **texts)
+
+
+def _tuples(value):
+    """Return JSON's lists as tuples, at every level."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def cache_path(dataset: Dataset) -> Path:

@@ -21,11 +21,12 @@ import hashlib
 import io
 import json
 import os
+import tomllib
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path, PurePosixPath
 
@@ -33,10 +34,12 @@ import numpy as np
 import pooch
 
 from f3amd_lib.ground.profiles import SHOWN_STYLES
+from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.skeleton import Motion, resample
 
-NAMES = ("synthetic", "bandai", "100style", "folder")
+_SETS = tomllib.loads((resources.files("f3amd_lib.data") / "data_sets.toml").read_text(encoding="utf-8"))
+NAMES = tuple(_SETS)
 SPLITS = ("train", "validation", "test")
 FPS = 30.0
 """Frame rate of every clip, frames per second (paper section 4)."""
@@ -45,15 +48,6 @@ MINIMUM_FRAMES = 42
 """Shortest useful clip: 10 history and 32 future frames (paper section 3.2)."""
 
 DATA_DIR_VARIABLE = "F3AMD_DATA_DIR"
-
-_BANDAI_REPOSITORY = "BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
-_BANDAI_COMMIT = "74ead3ba1ae4696404e6086233779f60de8bf9ef"
-_BANDAI_LOCOMOTION = {
-    "dataset-1": ("walk", "run", "dash", "walk-back", "walk-left", "walk-right"),
-    "dataset-2": ("walk", "run", "walk-turn-left", "walk-turn-right"),
-}
-_100STYLE_DOI = "10.5281/zenodo.8127870"
-_100STYLE_MD5 = "3cf627852fd8192024c04a8d0ef49583"
 
 
 @dataclass(frozen=True)
@@ -138,10 +132,8 @@ def open_dataset(
         dataset = _open_synthetic(seconds_per_style, num_styles)
     elif name == "bandai":
         dataset = _open_bandai(path, locomotion_only)
-    elif name == "100style":
-        dataset = _open_100style(path)
     else:
-        dataset = _open_folder(path)
+        dataset = _open_100style(path) if name == "100style" else _open_folder(path)
     return dataset if num_styles is None else _keep_styles(dataset, num_styles)
 
 
@@ -181,6 +173,10 @@ def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
         raise ValueError(f"{path}: broken or truncated zip archive ({error}); fetch it again") from error
 
 
+# All that a damaged member of a zip, or a file that went away, raises on reading.
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError, RuntimeError)
+
+
 @dataclass(frozen=True)
 class _Archive:
     """A folder or a zip file, read alike. Holds only its path, so that it can be pickled."""
@@ -196,31 +192,24 @@ class _Archive:
         return _open_zip(self.path, state.st_size, state.st_mtime_ns)
 
     def names(self) -> list[str]:
-        """Return the relative paths of all files, sorted, without macOS's companions."""
+        """Return the relative paths of all files, sorted, without macOS's `._` forks and `__MACOSX` folders."""
         if self.is_zip:
             names = [info.filename for info in self._zip().infolist() if not info.is_dir()]
         else:
             top = Path(self.path)
-            names = [
-                (Path(folder) / file).relative_to(top).as_posix() for folder, _, files in os.walk(top) for file in files
-            ]
-        return sorted(name for name in names if not _is_companion(name))
+            names = [item.relative_to(top).as_posix() for item in top.rglob("*") if item.is_file()]
+        parts = {name: PurePosixPath(name).parts for name in names}
+        return sorted(name for name in names if not parts[name][-1].startswith("._") and "__MACOSX" not in parts[name])
+
+    def bvh_files(self) -> list[str]:
+        """Return the relative paths of all BVH files, sorted."""
+        return [name for name in self.names() if PurePosixPath(name).suffix.lower() == ".bvh"]
 
     def read(self, name: str) -> bytes:
         """Return a file's bytes; ValueError names archive and file if they cannot be had."""
         try:
-            if self.is_zip:
-                return self._zip().read(name)
-            return (Path(self.path) / name).read_bytes()
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            OSError,
-            KeyError,
-            RuntimeError,
-            NotImplementedError,
-        ) as error:
+            return self._zip().read(name) if self.is_zip else (Path(self.path) / name).read_bytes()
+        except _UNREADABLE as error:
             raise ValueError(f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again") from error
 
     def size_and_crc(self, name: str) -> tuple[int, int]:
@@ -234,11 +223,9 @@ class _Archive:
     def label(self, name: str) -> str:
         return f"{self.path}: {name}"
 
-
-def _is_companion(name: str) -> bool:
-    """Tell macOS's `._` resource forks and `__MACOSX` folders, which are no motion."""
-    parts = PurePosixPath(name).parts
-    return parts[-1].startswith("._") or "__MACOSX" in parts
+    def file(self, name: str, **how) -> _BvhFile:
+        """Return the loader of a file as it is now."""
+        return _BvhFile(self, name, *self.size_and_crc(name), **how)
 
 
 def _archive_at(path) -> _Archive:
@@ -248,50 +235,54 @@ def _archive_at(path) -> _Archive:
     return _Archive(str(path))
 
 
-def _data_dir() -> str | None:
-    return os.environ.get(DATA_DIR_VARIABLE) or None
-
-
-def _find_archive(path, known: tuple[str, ...], word: str, download: Callable[[], str]) -> _Archive:
+def _find_archive(name: str, path) -> _Archive:
     """Choose where a data set is read from: `path`, then F3AMD_DATA_DIR, then the download.
 
-    In a folder a zip of a known name wins, then the only zip with `word` in its name, then the
-    folder itself with unpacked files.
+    In a folder a zip of a usual name wins, then the only zip with the data set's name in its own, then
+    the folder itself with unpacked files.
     """
-    place = path if path is not None else _data_dir()
-    if place is None:
-        return _archive_at(download())
+    place = path or os.environ.get(DATA_DIR_VARIABLE)
+    if not place:
+        return _archive_at(_download(name))
     archive = _archive_at(place)
     if archive.is_zip:
         return archive
     folder = Path(archive.path)
-    for name in known:
-        if (folder / name).is_file():
-            return _archive_at(folder / name)
-    zips = [
-        item
-        for item in sorted(folder.iterdir())
-        if item.suffix.lower() == ".zip" and word in item.name.lower() and not item.name.startswith("._")
-    ]
-    if len(zips) > 1:
-        raise ValueError(
-            f"{folder}: several archives may be meant ({', '.join(item.name for item in zips)}); "
-            f"point {DATA_DIR_VARIABLE} (or path=...) at one of them"
-        )
-    return _archive_at(zips[0]) if zips else archive
+    zips = [item.name for item in sorted(folder.iterdir()) if item.suffix.lower() == ".zip" and item.is_file()]
+    zips = [item for item in zips if name in item.lower() and not item.startswith("._")]
+    usual = [item for item in _SETS[name]["usual"] if item in zips]
+    if len(zips) > 1 and not usual:
+        what = f"several archives may be meant ({', '.join(zips)})"
+        raise ValueError(f"{folder}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
+    return _archive_at(folder / (usual + zips)[0]) if zips else archive
 
 
-def _download(url: str, known_hash: str | None, file_name: str, title: str) -> str:
-    """Fetch a file once into pooch's cache, with a progress bar; return where it lies."""
+def _download(name: str) -> str:
+    """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
+    about, folder = _SETS[name], pooch.os_cache("f3amd")
     pooch.get_logger().setLevel("WARNING")
     try:
-        return pooch.retrieve(url, known_hash, fname=file_name, path=pooch.os_cache("f3amd"), progressbar=True)
+        return pooch.retrieve(about["url"], about.get("hash"), fname=about["file"], path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         raise ValueError(
-            f"{title} could not be downloaded from {url} ({type(error).__name__}: {error}); "
-            f"fetch it by other means and set the environment variable {DATA_DIR_VARIABLE} to the "
-            "zip file or to the folder that holds it"
+            f"data set {name!r} could not be downloaded from {about['url']} ({type(error).__name__}: {error}); fetch "
+            f"it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip file or its folder"
         ) from error
+
+
+def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:
+    """Return files by name without folder and suffix; ValueError for one that is there twice."""
+    members: dict[str, str] = {}
+    for member in files:
+        base = PurePosixPath(member)
+        if base.stem in members:
+            what = f"holds {base.name} twice ({members[base.stem]} and {member})"
+            raise ValueError(f"{archive.path}: {what}; leave one copy of the data set there")
+        members[base.stem] = member
+    return members
+
+
+# --- data sets ------------------------------------------------------------------------------------
 
 
 def _fingerprint(name: str, clips: Iterable[Clip], content) -> str:
@@ -301,21 +292,43 @@ def _fingerprint(name: str, clips: Iterable[Clip], content) -> str:
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
+def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror, notes=()) -> Dataset:
+    """Put a data set together.
+
+    Args:
+      name: one of `NAMES`.
+      clips: all takes, sorted by name.
+      content: what identifies the contents of its files, JSON-ready.
+      primary, mirror: tell of a style whether it is a primary one (None: all are), may be mirrored.
+      notes: as in `Dataset`.
+    """
+    clips = tuple(clips)
+    styles = tuple(sorted({clip.style for clip in clips}))
+    return Dataset(
+        name=name,
+        licence=_SETS[name]["licence"],
+        credit=_SETS[name]["credit"],
+        fingerprint=_fingerprint(name, clips, content),
+        styles=styles,
+        clips=clips,
+        primary_styles=styles if primary is None else tuple(filter(primary, styles)),
+        mirror_styles=frozenset(filter(mirror, styles)),
+        notes=tuple(notes),
+    )
+
+
 def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
     """Return the data set cut down to its first styles, primary ones before others."""
     others = [style for style in dataset.styles if style not in dataset.primary_styles]
     kept = set([*dataset.primary_styles, *others][:num_styles])
     clips = tuple(clip for clip in dataset.clips if clip.style in kept)
-    return Dataset(
-        name=dataset.name,
-        licence=dataset.licence,
-        credit=dataset.credit,
+    return replace(
+        dataset,
         fingerprint=_fingerprint(dataset.name, clips, dataset.fingerprint),
         styles=tuple(sorted(kept)),
         clips=clips,
         primary_styles=tuple(style for style in dataset.primary_styles if style in kept),
         mirror_styles=dataset.mirror_styles & kept,
-        notes=dataset.notes,
     )
 
 
@@ -337,24 +350,16 @@ class _BvhFile:
     def __call__(self) -> Motion:
         data = self.archive.read(self.member)
         label = self.archive.label(self.member)
-        if (
-            len(data) != self.size
-            or zlib.crc32(data) != self.crc32
-            or not hashlib.sha256(data).hexdigest().startswith(self.sha256_prefix)
-        ):
-            raise ValueError(
-                f"{label}: is not the file that it should be (size or checksum differs), nothing "
-                "of it is used; fetch it again"
-            )
+        sound = (len(data), zlib.crc32(data)) == (self.size, self.crc32)
+        if not (sound and hashlib.sha256(data).hexdigest().startswith(self.sha256_prefix)):
+            raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
         motion = parse_bvh(data, label)
         if self.stop is None:
             return motion
         motion = resample(motion, FPS)
         if self.stop > motion.num_frames:
-            raise ValueError(
-                f"{label}: has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at "
-                f"{self.stop}; the file or the table is not the original: fetch both again"
-            )
+            what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {self.stop}"
+            raise ValueError(f"{label}: {what}; the file or the table is not the original: fetch both again")
         return motion.slice(self.start, self.stop)
 
 
@@ -367,10 +372,8 @@ class _SyntheticTake:
     seed: int
 
     def __call__(self) -> Motion:
-        from f3amd_lib.motion.synthetic import synthesize
-
         name = f"synthetic {self.style}, seed {self.seed}"
-        motion = synthesize(self.style, seconds=self.seconds, seed=self.seed, fps=FPS)
+        motion = synthetic.synthesize(self.style, seconds=self.seconds, seed=self.seed, fps=FPS)
         return parse_bvh(format_bvh(motion), name)
 
 
@@ -379,14 +382,10 @@ class _SyntheticTake:
 
 def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset:
     """List takes of about ten seconds: one long take would leave nothing to split by clip."""
-    from f3amd_lib.motion import synthetic
-
     shortest = 3 * MINIMUM_FRAMES / FPS
     if not shortest <= seconds_per_style < float("inf"):
-        raise ValueError(
-            f"seconds_per_style must be at least {shortest:.1f} (three takes of {MINIMUM_FRAMES} "
-            f"frames), got {seconds_per_style}"
-        )
+        what = f"at least {shortest:.1f} (three takes of {MINIMUM_FRAMES} frames)"
+        raise ValueError(f"seconds_per_style must be {what}, got {seconds_per_style}")
     num_takes = max(3, round(seconds_per_style / 10.0))
     seconds = seconds_per_style / num_takes
     # A few styles are those that pictures show; all of them are in alphabetical order either way.
@@ -394,19 +393,10 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
     styles = tuple(sorted([*SHOWN_STYLES, *others][:num_styles]))
     takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
     splits = assign_splits((name, style) for name, style, _ in takes)
-    clips = tuple(
-        Clip(name, style, "mixed", splits[name], _SyntheticTake(style, seconds, seed)) for name, style, seed in takes
-    )
-    return Dataset(
-        name="synthetic",
-        licence="Apache-2.0",
-        credit="Motion data: procedural walker of this repository.",
-        fingerprint=_fingerprint("synthetic", clips, [seconds, _synthetic_probe(styles)]),
-        styles=styles,
-        clips=clips,
-        primary_styles=styles,
-        mirror_styles=frozenset(_synthetic_mirror_styles(synthetic, styles)),
-    )
+    takes = [(name, style, _SyntheticTake(style, seconds, seed)) for name, style, seed in takes]
+    clips = [Clip(name, style, "mixed", splits[name], take) for name, style, take in takes]
+    symmetric = lambda style: synthetic.style_parameters(style).symmetric
+    return _dataset("synthetic", clips, [seconds, _synthetic_probe(styles)], mirror=symmetric)
 
 
 @functools.cache
@@ -416,18 +406,11 @@ def _synthetic_probe(styles: tuple[str, ...]) -> str:
     A second of each style, seed and path of its own, to a tenth of a millimetre: what is hashed is
     what the walker does, not how its source reads, and rounding differs on no machine.
     """
-    from f3amd_lib.motion.synthetic import synthesize
-
     digest = hashlib.sha256()
     for style in styles:
-        positions = synthesize(style, seconds=1.0, seed=0, fps=FPS).positions
+        positions = synthetic.synthesize(style, seconds=1.0, seed=0, fps=FPS).positions
         digest.update(np.round(1e4 * positions).astype("<i4").tobytes())
     return digest.hexdigest()
-
-
-def _synthetic_mirror_styles(synthetic, styles: tuple[str, ...]) -> list[str]:
-    """Return the styles whose parameters treat left and right alike."""
-    return [style for style in styles if synthetic.style_parameters(style).symmetric]
 
 
 @dataclass(frozen=True)
@@ -451,7 +434,7 @@ class _ListedFile:
 
     @property
     def is_locomotion(self) -> bool:
-        return self.parts[1] in _BANDAI_LOCOMOTION[self.parts[0]]
+        return self.parts[1] in _SETS["bandai"]["locomotion"][self.parts[0]]
 
 
 @functools.lru_cache(maxsize=1)
@@ -467,116 +450,49 @@ def _bandai_list() -> tuple[_ListedFile, ...]:
 
 def _open_bandai(path, locomotion_only: bool) -> Dataset:
     """List the Bandai clips of an archive whose files agree with the committed list."""
-    # The archive that the code host packs on request has no stable hash of its own (the packer may
-    # change), so what is pinned is the commit, and every file is checked against the list.
-    archive = _find_archive(
-        path,
-        (
-            "bandai_namco.zip",
-            f"Bandai-Namco-Research-Motiondataset-{_BANDAI_COMMIT}.zip",
-            "Bandai-Namco-Research-Motiondataset.zip",
-        ),
-        "bandai",
-        lambda: _download(
-            f"https://github.com/{_BANDAI_REPOSITORY}/archive/{_BANDAI_COMMIT}.zip",
-            None,
-            f"Bandai-Namco-Research-Motiondataset-{_BANDAI_COMMIT}.zip",
-            "the Bandai Namco archive",
-        ),
-    )
-    listed = _bandai_list()
-    wanted = {item.name for item in listed if item.is_locomotion or not locomotion_only}
-    known = {item.name for item in listed}
-    members: dict[str, str] = {}
-    notes = []
-    for member in archive.names():
-        base = PurePosixPath(member)
-        if base.suffix.lower() != ".bvh":
-            continue
-        if base.stem in members:
-            raise ValueError(
-                f"{archive.path}: holds {base.name} twice ({members[base.stem]} and {member}); "
-                "leave one copy of the data set there"
-            )
-        if base.stem in wanted:
-            members[base.stem] = member
-        elif base.stem not in known:
-            notes.append(f"ignored {member}: not on the list of files")
+    archive = _find_archive("bandai", path)
+    known = {item.name: item for item in _bandai_list()}
+    listed = [item for item in known.values() if item.is_locomotion or not locomotion_only]
+    wanted = {item.name for item in listed}
+    files = archive.bvh_files()
+    members = _by_stem(archive, (file for file in files if PurePosixPath(file).stem in wanted))
     missing = sorted(wanted - set(members))
     if missing:
-        raise ValueError(
-            f"{archive.path}: {len(missing)} of the {len(wanted)} Bandai files needed are missing, "
-            f"the first is {missing[0]}.bvh; fetch the whole archive of "
-            f"{_BANDAI_REPOSITORY} again"
-        )
+        what = f"{len(missing)} of the {len(wanted)} Bandai files needed are missing, the first is {missing[0]}.bvh"
+        raise ValueError(f"{archive.path}: {what}; fetch the whole archive again")
     for item in listed:
-        if item.name in wanted:
-            found = archive.size_and_crc(members[item.name])
-            if found != (item.size, item.crc32):
-                raise ValueError(
-                    f"{archive.label(members[item.name])}: is not the published file (size or "
-                    "checksum differs), the archive is refused; fetch it again"
-                )
+        if archive.size_and_crc(members[item.name]) != (item.size, item.crc32):
+            label = archive.label(members[item.name])
+            raise ValueError(f"{label}: is not the published file, the archive is refused; fetch it again")
     # Locomotion and other clips are split apart, so that a clip's split does not depend on
     # `locomotion_only`. Clips too short for a window reach no split at all once packed, so they
     # must not take a place in validation or test.
-    splits = {item.name: "train" for item in listed}
-    splits |= assign_splits(
-        (item.name, (item.style, item.is_locomotion)) for item in listed if item.frames >= MINIMUM_FRAMES
+    splits = dict.fromkeys(known, "train") | assign_splits(
+        (item.name, (item.style, item.is_locomotion)) for item in known.values() if item.frames >= MINIMUM_FRAMES
     )
-    clips = tuple(
-        Clip(
-            item.name,
-            item.style,
-            item.parts[1],
-            splits[item.name],
-            _BvhFile(archive, members[item.name], item.size, item.crc32, item.sha256_prefix),
-        )
-        for item in sorted(listed, key=lambda item: item.name)
-        if item.name in wanted
-    )
-    styles = tuple(sorted({clip.style for clip in clips}))
-    content = [(item.name, item.sha256_prefix) for item in listed if item.name in wanted]
-    return Dataset(
-        name="bandai",
-        licence="CC BY-NC 4.0",
-        credit=(
-            "Motion data: Bandai-Namco-Research-Motiondataset, © 2022 Bandai Namco Research Inc., "
-            "CC BY-NC 4.0; converted to arrays, otherwise unchanged."
-        ),
-        fingerprint=_fingerprint("bandai", clips, content),
-        styles=styles,
-        clips=clips,
-        primary_styles=tuple(style for style in styles if style.startswith("2-")),
-        mirror_styles=frozenset(styles),
-        notes=tuple(notes),
+    clips = []
+    for item in sorted(listed, key=lambda item: item.name):
+        loader = _BvhFile(archive, members[item.name], item.size, item.crc32, item.sha256_prefix)
+        clips.append(Clip(item.name, item.style, item.parts[1], splits[item.name], loader))
+    return _dataset(
+        "bandai",
+        clips,
+        [(item.name, item.sha256_prefix) for item in listed],
+        primary=lambda style: style.startswith("2-"),
+        mirror=lambda style: True,
+        notes=[f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known],
     )
 
 
+_100STYLE_URL = _SETS["100style"]["url"]
 _100STYLE_CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
 
 
 def _open_100style(path) -> Dataset:
     """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
-    archive = _find_archive(
-        path,
-        ("100STYLE.zip",),
-        "100style",
-        lambda: _download(f"doi:{_100STYLE_DOI}/100STYLE.zip", f"md5:{_100STYLE_MD5}", "100STYLE.zip", "100STYLE"),
-    )
-    names = archive.names()
-    cuts = _read_frame_cuts(archive, _find_table(archive, names, "Frame_Cuts.csv"))
-    symmetric = _read_symmetric(archive, _find_table(archive, names, "Dataset_List.csv"))
-    members: dict[str, str] = {}
-    for member in names:
-        base = PurePosixPath(member)
-        if base.suffix.lower() == ".bvh":
-            if base.stem in members:
-                raise ValueError(
-                    f"{archive.path}: holds {base.name} twice ({members[base.stem]} and {member}); "
-                    "leave one copy of the data set there"
-                )
-            members[base.stem] = member
+    archive = _find_archive("100style", path)
+    cuts, symmetric = _read_frame_cuts(archive), _read_symmetric(archive)
+    members = _by_stem(archive, archive.bvh_files())
     # A transition take may be called TR for TR1, as in the author's own exporter.
     for style, _ in cuts:
         if f"{style}_TR1" not in members and f"{style}_TR" in members:
@@ -589,74 +505,45 @@ def _open_100style(path) -> Dataset:
         if name not in members:
             missing.append(f"{name}.bvh")
             continue
-        size, crc32 = archive.size_and_crc(members[name])
         # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
         # the same as cutting at even frames of the original and then halving.
-        loader = _BvhFile(archive, members[name], size, crc32, start=start // 2, stop=stop // 2)
+        loader = archive.file(members[name], start=start // 2, stop=stop // 2)
         clips.append(Clip(name, style, code, splits[name], loader))
-        content.append((name, size, crc32, start, stop))
+        content.append((name, loader.size, loader.crc32, start, stop))
     if not clips:
-        raise ValueError(
-            f"{archive.path}: none of the {len(missing)} files that Frame_Cuts.csv names is there, "
-            f"such as {missing[0]}; fetch the whole of 100STYLE (doi {_100STYLE_DOI})"
-        )
-    unknown = sorted(set(members) - {f"{style}_{code}" for style, code in cuts})
+        what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there, such as {missing[0]}"
+        raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_100STYLE_URL})")
     notes = [f"missing {name}" for name in missing]
-    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in unknown]
+    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in sorted(set(members) - set(splits))]
     if missing:
-        warnings.warn(
-            f"{archive.path}: {len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as "
-            f"{missing[0]}; the data set goes without them (see its notes)",
-            stacklevel=3,
-        )
-    clips = tuple(sorted(clips, key=lambda clip: clip.name))
-    styles = tuple(sorted({clip.style for clip in clips}))
-    unlisted = [style for style in styles if style not in symmetric]
-    if unlisted:
-        raise ValueError(
-            f"{archive.path}: Dataset_List.csv has no row for style {unlisted[0]!r} of "
-            "Frame_Cuts.csv; take both tables from the same release"
-        )
-    return Dataset(
-        name="100style",
-        licence="CC BY 4.0",
-        credit=(
-            "Motion data: The 100STYLE Dataset - Ian Mason, CC BY 4.0; cut to the usable ranges, resampled to 30 fps."
-        ),
-        fingerprint=_fingerprint("100style", clips, sorted(content)),
-        styles=styles,
-        clips=clips,
-        primary_styles=styles,
-        mirror_styles=frozenset(style for style in styles if symmetric[style]),
-        notes=tuple(notes),
-    )
+        what = f"{len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as {missing[0]}"
+        warnings.warn(f"{archive.path}: {what}; the data set goes without them (see its notes)", stacklevel=3)
+    if unlisted := {clip.style for clip in clips} - symmetric.keys():
+        what = f"Dataset_List.csv has no row for style {min(unlisted)!r} of Frame_Cuts.csv"
+        raise ValueError(f"{archive.path}: {what}; take both tables from the same release")
+    clips.sort(key=lambda clip: clip.name)
+    return _dataset("100style", clips, sorted(content), mirror=symmetric.get, notes=notes)
 
 
-def _find_table(archive: _Archive, names: list[str], table: str) -> str:
-    found = [name for name in names if PurePosixPath(name).name == table]
+def _read_table(archive: _Archive, table: str) -> tuple[str, list[dict[str, str]]]:
+    """Return where a table of 100STYLE lies, for messages, and its rows."""
+    found = [name for name in archive.names() if PurePosixPath(name).name == table]
     if len(found) != 1:
-        how = "is missing" if not found else f"is there {len(found)} times ({', '.join(found)})"
-        raise ValueError(
-            f"{archive.path}: {table} of 100STYLE {how}; the folder or zip must hold one copy of "
-            f"the data set, with its tables (doi {_100STYLE_DOI})"
-        )
-    return found[0]
-
-
-def _read_table(archive: _Archive, member: str) -> list[dict[str, str]]:
-    data = archive.read(member)
+        how = f"is there {len(found)} times ({', '.join(found)})" if found else "is missing"
+        what = f"the folder or zip must hold one copy of the data set, with its tables ({_100STYLE_URL})"
+        raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what}")
+    label = archive.label(found[0])
     try:
-        text = data.decode("utf-8-sig")
+        text = archive.read(found[0]).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{archive.label(member)}: is not UTF-8 text; fetch it again") from error
-    return list(csv.DictReader(io.StringIO(text, newline="")))
+        raise ValueError(f"{label}: is not UTF-8 text; fetch it again") from error
+    return label, list(csv.DictReader(io.StringIO(text, newline="")))
 
 
-def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tuple[int, int]]:
+def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[tuple[str, str], tuple[int, int]]:
     """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges are left out."""
-    label = archive.label(member)
-    cuts = {}
-    for line, row in enumerate(_read_table(archive, member), start=2):
+    (label, rows), cuts = _read_table(archive, table), {}
+    for line, row in enumerate(rows, start=2):
         style = (row.get("STYLE_NAME") or "").strip()
         if not style:
             raise ValueError(f"{label}, line {line}: no STYLE_NAME; fetch the table again")
@@ -665,10 +552,8 @@ def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tu
             if texts == ["N/A", "N/A"]:
                 continue
             if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
-                raise ValueError(
-                    f"{label}, line {line}: {code} of {style} has the range {texts[0]!r} to "
-                    f"{texts[1]!r}; it needs two whole numbers, the first one smaller, or N/A twice"
-                )
+                what = f"{code} of {style} has the range {texts[0]!r} to {texts[1]!r}"
+                raise ValueError(f"{label}, line {line}: {what}; it needs two rising whole numbers, or N/A twice")
             if (style, code) in cuts:
                 raise ValueError(f"{label}, line {line}: style {style} is listed twice")
             cuts[style, code] = (int(texts[0]), int(texts[1]))
@@ -677,59 +562,41 @@ def _read_frame_cuts(archive: _Archive, member: str) -> dict[tuple[str, str], tu
     return cuts
 
 
-def _read_symmetric(archive: _Archive, member: str) -> dict[str, bool]:
+def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> dict[str, bool]:
     """Return, per style, whether its mirror image is the same style."""
-    label = archive.label(member)
-    symmetric = {}
-    for line, row in enumerate(_read_table(archive, member), start=2):
-        style = (row.get("Style Name") or "").strip()
-        answer = (row.get("Symmetric") or "").strip()
+    (label, rows), symmetric = _read_table(archive, table), {}
+    for line, row in enumerate(rows, start=2):
+        style, answer = ((row.get(column) or "").strip() for column in ("Style Name", "Symmetric"))
         if not style or answer not in ("Yes", "No"):
-            raise ValueError(
-                f"{label}, line {line}: needs a Style Name, and Yes or No under Symmetric; found "
-                f"{style!r} and {answer!r}"
-            )
+            what = "needs a Style Name, and Yes or No under Symmetric"
+            raise ValueError(f"{label}, line {line}: {what}; found {style!r} and {answer!r}")
         symmetric[style] = answer == "Yes"
     return symmetric
 
 
 def _open_folder(path) -> Dataset:
     """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
-    place = path if path is not None else _data_dir()
-    if place is None:
-        raise ValueError(
-            "the data set 'folder' needs to know which: pass path=... or set the environment "
-            f"variable {DATA_DIR_VARIABLE}"
-        )
+    place = path or os.environ.get(DATA_DIR_VARIABLE)
+    if not place:
+        raise ValueError(f"the data set 'folder' needs path=..., or set the environment variable {DATA_DIR_VARIABLE}")
     archive = _archive_at(place)
-    members = [name for name in archive.names() if PurePosixPath(name).suffix.lower() == ".bvh"]
-    if not members:
-        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     labelled = {}
-    for member in members:
+    for member in archive.bvh_files():
         relative = PurePosixPath(member)
         name = relative.with_suffix("").as_posix()
         if name in labelled:
             raise ValueError(f"{archive.label(member)}: two files differ only in the case of their suffix; rename one")
-        head, _, tail = relative.stem.partition("_")
-        style = relative.parent.name or head
-        content = relative.stem if relative.parent.name else tail
+        style, _, content = relative.stem.partition("_")
+        if relative.parent.name:
+            style, content = relative.parent.name, relative.stem
         labelled[name] = (member, style, content)
+    if not labelled:
+        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
-    clips, content_ids = [], []
-    for name, (member, style, content) in sorted(labelled.items()):
-        size, crc32 = archive.size_and_crc(member)
-        clips.append(Clip(name, style, content, splits[name], _BvhFile(archive, member, size, crc32)))
-        content_ids.append((name, size, crc32))
-    styles = tuple(sorted({clip.style for clip in clips}))
-    return Dataset(
-        name="folder",
-        licence="as its owner says",
-        credit="Motion data: files of the user.",
-        fingerprint=_fingerprint("folder", clips, content_ids),
-        styles=styles,
-        clips=tuple(clips),
-        primary_styles=styles,
-        # Whether a style keeps its name when mirrored is not for us to guess.
-        mirror_styles=frozenset(),
-    )
+    clips = [
+        Clip(name, style, content, splits[name], archive.file(member))
+        for name, (member, style, content) in sorted(labelled.items())
+    ]
+    identities = [(clip.name, clip.loader.size, clip.loader.crc32) for clip in clips]
+    # Whether a style keeps its name when mirrored is not for us to guess.
+    return _dataset("folder", clips, identities, mirror=lambda style: False)

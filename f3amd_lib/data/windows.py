@@ -211,17 +211,12 @@ def gather_windows(
     shift = track[..., :2] - track[:, last : last + 1, :2]
     # (x, z) turned by yaw: x' = x cos + z sin, z' = z cos - x sin
     cosine, sine = jnp.cos(yaw)[:, None], jnp.sin(yaw)[:, None]
-    position = jnp.stack(
-        [shift[..., 0] * cosine + shift[..., 1] * sine, shift[..., 1] * cosine - shift[..., 0] * sine], axis=-1
-    )
+    x, z = shift[..., 0], shift[..., 1]
+    position = jnp.stack([x * cosine + z * sine, z * cosine - x * sine], axis=-1)
     facing = wrap_angle(jnp.arctan2(track[..., 2], track[..., 3]) + yaw[:, None])
     path = path_condition(position, facing)[:, num_history:]
-    return Batch(
-        history=frames[:, :num_history],
-        future=frames[:, num_history:],
-        path=path,
-        style=windows.one_hot[windows.styles[index]],
-    )
+    style = windows.one_hot[windows.styles[index]]
+    return Batch(frames[:, :num_history], frames[:, num_history:], path, style)
 
 
 def draw_windows(windows: WindowSet, key, batch_size: int, captured_path_share: float = 0.5):
@@ -268,14 +263,8 @@ def spread_windows(windows: WindowSet, num_samples: int) -> Batch:
     """
     count = min(num_samples, windows.num_windows)
     index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
-    return gather_windows(
-        windows,
-        index,
-        jnp.zeros(count),
-        jnp.zeros(count, jnp.int32),
-        window=windows.window,
-        num_history=windows.num_history,
-    )
+    sizes = {"window": windows.window, "num_history": windows.num_history}
+    return gather_windows(windows, index, jnp.zeros(count), jnp.zeros(count, jnp.int32), **sizes)
 
 
 def restart_from(batch: Batch, history) -> Batch:
@@ -345,35 +334,33 @@ def fit_normaliser(
     return measure(windows, key)
 
 
-def seed_histories(packed: PackedMotion, *, num_history: int = 10, num_seeds: int = 8, split: str = "train") -> dict:
+def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8, split: str = "train") -> dict:
     """Cut a few starting poses per style out of a packed data set.
 
     Args:
       packed: the data.
       num_history: frames H of each.
-      num_seeds: most seeds per style; each comes from the middle of another clip.
+      num_poses: most per style; each comes from the middle of another clip.
       split: where to look first; a style without a clip there is looked up in the others.
 
     Returns:
       Style name -> [K, H, C] world frames, the last one at x = z = 0 and facing +Z.
     """
-    seeds = {}
+    starts = {}
     for style, name in enumerate(packed.styles):
         for where in (split, *SPLITS):
-            chosen = np.flatnonzero(
-                (np.asarray(packed.clip_style) == style) & (np.asarray(packed.clip_split) == SPLITS.index(where))
-            )
+            chosen = np.flatnonzero((packed.clip_style == style) & (packed.clip_split == SPLITS.index(where)))
             if len(chosen):
                 break
         else:
             continue
         cuts = []
-        spread = np.linspace(0, len(chosen) - 1, min(num_seeds, len(chosen))).astype(int)
+        spread = np.linspace(0, len(chosen) - 1, min(num_poses, len(chosen))).astype(int)
         for clip in chosen[spread]:
             motion = packed.motion(int(clip))
             start = max(0, motion.num_frames // 2 - num_history)
             frames = world_frames(motion.slice(start, start + num_history))
             frames = center_window(frames, frames[-1, [0, 2]])
             cuts.append(turn_frames(frames, -frame_yaw(motion.skeleton, frames[-1])))
-        seeds[name] = np.stack(cuts).astype(np.float32)
-    return seeds
+        starts[name] = np.stack(cuts).astype(np.float32)
+    return starts

@@ -104,7 +104,7 @@ def opening_condition(trained: TrainedModel) -> Condition:
       Condition of as many rows as there are styles, in the order of `trained.styles`, in network
       units.
     """
-    history = np.stack([trained.seeds[style][0] for style in trained.styles])
+    history = np.stack([trained.start_poses[style][0] for style in trained.styles])
     # Openings end at the origin and face +Z.
     ahead = pose_speed(history)[:, None] * np.arange(1, trained.config.window + 1)
     position = np.stack([0.0 * ahead, ahead], axis=-1)

@@ -79,9 +79,7 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
     if int(window) != window or window < 1:
         raise ValueError(f"window must be a whole number of frames, 1 or more, got {window}")
     if int(blend_frames) != blend_frames or not 0 <= blend_frames <= window:
-        raise ValueError(
-            f"blend_frames must be a whole number from 0 to the window's {window} frames, got {blend_frames}"
-        )
+        raise ValueError(f"blend_frames must be a whole number from 0 to {window}, the window, got {blend_frames}")
     before = np.zeros((*frames.shape[:-2], 0, frames.shape[-1]))
     if history is not None:
         before = np.asarray(history, np.float64)
@@ -97,10 +95,9 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
     start = before.shape[-2]
     for seam in range(start or window, len(whole), int(window)):
         stop = min(seam + int(blend_frames), len(whole))
-        added = _offsets(_Positions, root, seam, int(blend_frames))[: stop - seam]
-        root[seam:stop] = _Positions.add(added, root[seam:stop])
-        added = _offsets(_Rotations, turns, seam, int(blend_frames))[: stop - seam]
-        turns[seam:stop] = _Rotations.add(added, turns[seam:stop])
+        for space, values in ((_Positions, root), (_Rotations, turns)):
+            added = _offsets(space, values, seam, int(blend_frames))[: stop - seam]
+            values[seam:stop] = space.add(added, values[seam:stop])
     flat = rotation_6d_from_matrix(turns).reshape(*whole.shape[:-1], -1)
     blended = np.concatenate([root, flat], axis=-1)[start:]
     return np.moveaxis(blended, 0, -2)
@@ -141,9 +138,8 @@ def _offsets(space, values, seam: int, num_frames: int) -> np.ndarray:
     steps = [[space.between(side[k + 1], side[k]) for k in range(len(side) - 1)] for side in (earlier, later)]
     # A side of one frame goes on as the other does; one of two frames keeps its step.
     still = np.zeros_like(space.between(values[seam], values[seam]))
-    toward = [mine or [-other[0] if other else still] for mine, other in (steps, steps[::-1])]
-    toward = [(mine[0], mine[-1]) for mine in toward]
-    (left, left_before), (right, right_before) = toward
+    toward = [own or [-other[0] if other else still] for own, other in (steps, steps[::-1])]
+    (left, left_before), (right, right_before) = ((own[0], own[-1]) for own in toward)
     # Towards the seam: linear in value (equal accelerations of both sides cancel), and with its own
     # acceleration in velocity. The later side runs backwards in time.
     offset = space.between(space.add(0.5 * right, later[0]), space.add(0.5 * left, earlier[0]))
@@ -165,9 +161,7 @@ def blend_rollout(rollout: Rollout, blend_frames: int) -> Rollout:
       ValueError: for a rollout that is blended already, or N out of range.
     """
     if rollout.blend_frames:
-        raise ValueError(
-            f"this rollout is blended already (over {rollout.blend_frames} frames); blend the one that the network made"
-        )
+        raise ValueError(f"blended already, over {rollout.blend_frames} frames; blend the one that the network made")
     frames = blend_seams(rollout.frames, rollout.window, blend_frames, history=rollout.history)
     if blend_frames == 0:
         return rollout

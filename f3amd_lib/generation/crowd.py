@@ -20,7 +20,6 @@ apart (`min_distance`). Then everybody's path depends on who else is there.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import json
@@ -38,6 +37,7 @@ from tqdm import tqdm
 from f3amd_lib.data.features import center_window, motion_from_frames, turn_frames
 from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
@@ -49,16 +49,10 @@ PATHS = tuple(name for name in NAMES if name != "complex")
 
 FORMAT = "f3amd-crowd-1"
 
-_ARRAYS = {
-    "root": ("<f4", lambda frames, joints: (frames, 3)),
-    "rotations": ("<f2", lambda frames, joints: (frames, joints, 6)),
-    "path": ("<f4", lambda frames, joints: (frames, 3)),
-    "styles": ("<i4", lambda frames, joints: ()),
-}
-"""File stem -> type and shape of one character."""
+_ARRAYS = {"root": "<f4", "rotations": "<f2", "path": "<f4", "styles": "<i4"}
+"""File stem -> type of its numbers."""
 
 _FPS = 30.0
-_HEADER_BYTES = 128  # of a .npy file of so few dimensions
 # CPU time a character on two cores with 2 MiB of L2 (F3AMD-FNO-96, one step, 32 frames): least at
 # 128; 64 costs 8 % more, 512 15 %, 4096 38 %.
 _CHUNK = 128
@@ -175,9 +169,8 @@ def plan_crowd(
         raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
     make_paths, _ = _path_maker(names)
     pace = np.broadcast_to(pace, (num_characters,))
-    position, yaw = keep_apart(
-        *make_paths(range(num_characters), pace, num_frames, seed), min_distance=min_distance, radius=radius, fps=_FPS
-    )
+    paths = make_paths(range(num_characters), pace, num_frames, seed)
+    position, yaw = keep_apart(*paths, min_distance=min_distance, radius=radius, fps=_FPS)
     return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
 
 
@@ -290,13 +283,12 @@ def generate_crowd(
     chunk = min(_whole("chunk", chunk, 1), num_characters)
     styles = [styles] if isinstance(styles, str) else styles
     if styles is None:
-        styles = [style for style in trained.styles if style in trained.seeds]
+        styles = [style for style in trained.styles if style in trained.start_poses]
     in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
     if not len(in_turn):
         raise ValueError("a crowd needs at least one style")
-    for style in styles:
-        if style not in trained.seeds:
-            raise ValueError(f"no starting pose is stored for style {style!r}; leave it out")
+    if without := [style for style in styles if style not in trained.start_poses]:
+        raise ValueError(f"no starting pose is stored for style {without[0]!r}; leave it out")
     make_paths, path_names = _path_maker(paths)
 
     settings = {
@@ -318,9 +310,7 @@ def generate_crowd(
             "dtype": generator.dtype.name,
             "sampler": generator.sampler,
             "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
-            "dataset": trained.record.get("dataset"),
-            "dataset_licence": trained.record.get("dataset_licence"),
-            "dataset_credit": trained.record.get("dataset_credit"),
+            **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
         },
     }
     settings = json.loads(json.dumps(settings))
@@ -332,7 +322,9 @@ def generate_crowd(
         style_index = in_turn[np.arange(part.start, part.stop) % len(in_turn)]
         pace, pose = _paces(generator, part, style_index, seed)
         made = make_paths(part, pace, num_frames, seed)
-        return style_index, pose, *_checked(made, (len(part), num_frames))
+        shape = (len(part), num_frames)
+        position = finite_array("the paths' position", made[0], (*shape, 2))
+        return style_index, pose, position, finite_array("the paths' yaw", made[1], shape)
 
     if min_distance is not None:
         _, _, *wanted = asked_of(range(num_characters))
@@ -341,47 +333,37 @@ def generate_crowd(
     beginning = asked_of(range(chunk))
     settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
     if first_path not in (None, settings[_FIRST_PATH]):
-        raise ValueError(
-            f"{out}: holds a crowd whose first character walks another path than this call's; "
-            "give the paths that it was begun with, pass overwrite=True, or choose another folder"
-        )
+        what = "holds a crowd whose first character walks another path than this call's"
+        raise ValueError(f"{out}: {what}; give the paths that it was begun with, {_WAY_OUT}")
     if finished == 0:
         _write_settings(out, settings, 0)
+        _lay_out(out, settings)
+    for name in _ARRAYS:
+        _open_array(out, name, settings)
     noise = jax.random.key(seed)
-    with contextlib.ExitStack() as files:
-        writers = {name: files.enter_context(_open_rows(out, name, settings, finished)) for name in _ARRAYS}
-        bar = files.enter_context(
-            tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress)
-        )
+    with tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress) as bar:
         for first in range(finished, num_characters, chunk):
             characters = range(first, min(first + chunk, num_characters))
-            asked = asked_of(characters) if first else beginning
-            style_index, pose, position, yaw = asked
+            style_index, pose, position, yaw = asked_of(characters) if first else beginning
             history = _starting_poses(generator, style_index, position, yaw, pose)
             # The last chunk is filled up with its last character, so that nothing compiles twice.
             number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
             row = number - first
-            frames = generator.generate(
-                position[row],
-                yaw[row],
-                style_index[row],
-                history[row],
-                jax.vmap(jax.random.fold_in, (None, 0))(noise, number),
-            )[: len(characters)]
+            keys = jax.vmap(jax.random.fold_in, (None, 0))(noise, number)
+            frames = generator.generate(position[row], yaw[row], style_index[row], history[row], keys)
+            frames = frames[: len(characters)]
             if not np.isfinite(frames).all():
                 worst = first + int(np.argwhere(~np.isfinite(frames))[0][0])
-                raise ArithmeticError(
-                    f"{trained.name} generated a number that is not finite for character {worst}; "
-                    "its weights or its noise levels are broken"
-                )
+                what = f"{trained.name} generated a number that is not finite for character {worst}"
+                raise ArithmeticError(f"{what}; its weights or its noise levels are broken")
             rows = {
                 "root": frames[..., :3],
                 "rotations": frames[..., 3:].reshape(*frames.shape[:2], -1, 6),
                 "path": np.concatenate([position, yaw[..., None]], axis=-1),
                 "styles": style_index,
             }
-            for name, writer in writers.items():
-                _append(writer, rows[name].astype(_ARRAYS[name][0]))
+            for name, values in rows.items():
+                _write_rows(out, name, settings, first, values)
             _write_settings(out, settings, characters.stop)
             bar.update(len(characters))
     return read_crowd(out)
@@ -404,20 +386,11 @@ def read_crowd(folder) -> Crowd:
     settings = _read_settings(folder)
     total, finished = settings["num_characters"], settings["num_finished"]
     if finished != total:
-        raise ValueError(
-            f"{folder}: only {finished} of {total} characters are finished; make the same call again and it goes on"
-        )
+        what = f"only {finished} of {total} characters are finished"
+        raise ValueError(f"{folder}: {what}; make the same call again and it goes on")
     with errors_name(folder / _SETTINGS):
         skeleton = described_skeleton(settings, settings["offsets"])
-    arrays = {name: _open_array(folder, name, settings) for name in _ARRAYS}
-    return Crowd(
-        settings=settings,
-        skeleton=skeleton,
-        root=arrays["root"],
-        rotations=arrays["rotations"],
-        path=arrays["path"],
-        style_index=arrays["styles"],
-    )
+    return Crowd(settings, skeleton, *(_open_array(folder, name, settings) for name in _ARRAYS))
 
 
 def _whole(name: str, value, least: int) -> int:
@@ -441,18 +414,6 @@ def _path_maker(paths) -> tuple[PathMaker, list[str] | str]:
     return functools.partial(crowd_paths, names=names), names
 
 
-def _checked(made, expected: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [n, F, 2] and yaw [n, F] as float64; ValueError for anything else."""
-    position, yaw = (np.asarray(array, np.float64) for array in made)
-    if position.shape != (*expected, 2) or yaw.shape != expected:
-        raise ValueError(
-            f"paths must be position {(*expected, 2)} and yaw {expected}, got {position.shape} and {yaw.shape}"
-        )
-    if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
-        raise ValueError("paths hold a number that is not finite")
-    return position, yaw
-
-
 def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
     """Return a digest of one path, [F, 2] and [F], in tenths of a millimetre and milliradian.
 
@@ -472,9 +433,9 @@ def _paces(generator: MotionGenerator, characters: range, style_index, seed: int
     which, pose = _draws(characters, 2, seed, _POSES).T
     pace = np.empty(len(characters))
     for style in np.unique(style_index):
-        mine = style_index == style
-        speeds = _FPS * pose_speed(trained.seeds[trained.styles[style]])
-        pace[mine] = speeds[(which[mine] * len(speeds)).astype(int)]
+        members = style_index == style
+        speeds = _FPS * pose_speed(trained.start_poses[trained.styles[style]])
+        pace[members] = speeds[(which[members] * len(speeds)).astype(int)]
     return np.maximum(pace, _SLOWEST), pose
 
 
@@ -485,16 +446,17 @@ def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw
     speed = np.linalg.norm(position[:, 0] - start, axis=-1)
     poses = np.empty((len(start), config.num_history, config.channels))
     for style in np.unique(style_index):
-        mine = style_index == style
-        choices = trained.seeds[trained.styles[style]]
-        fitting = as_fast_as(choices, speed[mine])
-        number = (draw[mine] * fitting.sum(axis=1)).astype(int)
+        members = style_index == style
+        choices = trained.start_poses[trained.styles[style]]
+        fitting = as_fast_as(choices, speed[members])
+        number = (draw[members] * fitting.sum(axis=1)).astype(int)
         # The first place where more than `number` fitting poses have been passed.
-        poses[mine] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
+        poses[members] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
     return center_window(turn_frames(poses, yaw[:, 0]), -start).astype(np.float32)
 
 
 _SETTINGS = "crowd.json"
+_WAY_OUT = "pass overwrite=True or choose another folder"
 _FIRST_PATH = "first_path"  # digest; crowds of earlier versions lack it
 _NEEDED = ("num_characters", "num_frames", "num_finished", "fps", "styles", "joints", "offsets")
 
@@ -508,9 +470,8 @@ def _read_settings(folder: Path) -> dict:
         settings = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(settings, dict) or settings.get("format") != FORMAT:
             raise ValueError("not written by this project; choose another folder")
-        for name in _NEEDED:
-            if name not in settings:
-                raise ValueError(f"{name} is missing; restore a whole copy")
+        if missing := [name for name in _NEEDED if name not in settings]:
+            raise ValueError(f"{missing[0]} is missing; restore a whole copy")
         finished, total = settings["num_finished"], settings["num_characters"]
         if not 0 <= finished <= total:
             raise ValueError(f"says that {finished} of {total} characters are finished")
@@ -529,114 +490,73 @@ def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | N
     Returns:
       (number of finished characters, digest of the first one's path if it is known).
     """
-    if not out.exists():
-        return 0, None
-    if not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: not a folder; a crowd needs one to itself")
     if not (out / _SETTINGS).exists():
-        other = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
+        other = sorted(item.name for item in out.glob("*") if not item.name.startswith("."))
         if other:
             raise ValueError(f"{out}: holds other files ({other[0]}); choose a folder of its own")
         return 0, None
     there = _read_settings(out)  # also before overwriting: what is not ours stays
     if overwrite:
         return 0, None
-    finished = there.pop("num_finished")
-    for name in settings:
-        if there.get(name) != settings[name]:
-            short = [json.dumps(value)[:60] for value in (there.get(name), settings[name])]
-            raise ValueError(
-                f"{out}: holds a crowd made with {name} {short[0]}, not {short[1]}; pass "
-                "overwrite=True or choose another folder"
-            )
-    if finished == settings["num_characters"]:
-        raise ValueError(
-            f"{out}: holds this crowd already, finished; read it with read_crowd, pass "
-            "overwrite=True, or choose another folder"
-        )
-    return finished, there.get(_FIRST_PATH)
+    for name, value in settings.items():
+        if there.get(name) != value:
+            old, new = (json.dumps(value)[:60] for value in (there.get(name), value))
+            raise ValueError(f"{out}: holds a crowd made with {name} {old}, not {new}; {_WAY_OUT}")
+    if there["num_finished"] == settings["num_characters"]:
+        raise ValueError(f"{out}: holds this crowd already, finished; read it with read_crowd, {_WAY_OUT}")
+    return there["num_finished"], there.get(_FIRST_PATH)
 
 
-def _row(name: str, settings: dict) -> tuple[np.dtype, tuple[int, ...]]:
-    """Return type and shape of one character in an array."""
-    dtype, shape = _ARRAYS[name]
-    return np.dtype(dtype), shape(settings["num_frames"], len(settings["joints"]))
-
-
-def _row_bytes(name: str, settings: dict) -> int:
-    dtype, shape = _row(name, settings)
-    return dtype.itemsize * math.prod(shape)
+def _shape(name: str, settings: dict) -> tuple[int, ...]:
+    """Return the shape of an array of all characters."""
+    count, frames = settings["num_characters"], settings["num_frames"]
+    last = {"root": (frames, 3), "rotations": (frames, len(settings["joints"]), 6), "path": (frames, 3), "styles": ()}
+    return count, *last[name]
 
 
 def _check_room(out: Path, settings: dict) -> None:
-    """Raise ValueError if the disk lacks room for what is still to be written."""
-    needed = settings["num_characters"] * sum(_row_bytes(name, settings) for name in _ARRAYS)
-    needed += len(_ARRAYS) * _HEADER_BYTES
-    there = [out / f"{name}.npy" for name in _ARRAYS]
-    needed -= sum(path.stat().st_size for path in there if path.exists())
+    """Raise ValueError if the disk lacks room for what is not there yet."""
+    needed = sum(np.dtype(dtype).itemsize * math.prod(_shape(name, settings)) for name, dtype in _ARRAYS.items())
+    files = [out / f"{name}.npy" for name in _ARRAYS]
+    needed -= sum(path.stat().st_size for path in files if path.exists())
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
-        raise ValueError(
-            f"{out}: this crowd takes {needed / 1e9:.3g} GB more, and the disk has "
-            f"{free / 1e9:.3g} GB free; make fewer characters or frames, or choose another disk"
-        )
+        what = f"this crowd takes {needed / 1e9:.3g} GB more, and the disk has {free / 1e9:.3g} GB free"
+        raise ValueError(f"{out}: {what}; make fewer characters or frames, or choose another disk")
 
 
-def _first_row(path: Path, name: str, settings: dict) -> int:
-    """Return where a file's first character begins, in bytes; ValueError for a foreign header."""
-    dtype, shape = _row(name, settings)
+def _lay_out(out: Path, settings: dict) -> None:
+    """Make the arrays' files at their full size.
+
+    Their room is taken at once: a disk that is full halfway would kill a process that writes to a map.
+    """
+    for name, dtype in _ARRAYS.items():
+        path = out / f"{name}.npy"
+        np.lib.format.open_memmap(path, "w+", dtype, _shape(name, settings))
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+
+
+def _open_array(folder: Path, name: str, settings: dict, mode: str = "r") -> np.memmap:
+    """Map an array's file; ValueError names one that is missing, cut short or another's."""
+    path = folder / f"{name}.npy"
     if not path.is_file():
         raise ValueError(f"{path}: missing; the crowd has to be made anew")
-    with path.open("rb") as file, errors_name(path):
-        np.lib.format.read_magic(file)
-        header = np.lib.format.read_array_header_1_0(file)
-        if header != ((settings["num_characters"], *shape), False, dtype):
-            raise ValueError(f"holds {header[2]} {header[0]}, which is not what {_SETTINGS} says")
-        return file.tell()
+    with errors_name(path):
+        array = np.lib.format.open_memmap(path, mode)
+        if (array.shape, array.dtype) != (_shape(name, settings), np.dtype(_ARRAYS[name])):
+            raise ValueError(f"holds {array.dtype} {array.shape}, which is not what {_SETTINGS} says")
+        return array
 
 
-def _open_rows(out: Path, name: str, settings: dict, finished: int):
-    """Open an array's file behind the finished characters; what lies beyond is written over."""
-    path = out / f"{name}.npy"
-    if finished == 0:
-        file = path.open("wb")
-        dtype, shape = _row(name, settings)
-        np.lib.format.write_array_header_1_0(
-            file,
-            {
-                "descr": np.lib.format.dtype_to_descr(dtype),
-                "fortran_order": False,
-                "shape": (settings["num_characters"], *shape),
-            },
-        )
-        return file
-    end = _first_row(path, name, settings) + finished * _row_bytes(name, settings)
-    if path.stat().st_size < end:
-        raise ValueError(
-            f"{path}: cut short, it does not hold the {finished} characters that {_SETTINGS} "
-            "counts; pass overwrite=True to begin anew"
-        )
-    file = path.open("r+b")
-    file.seek(end)
-    return file
+def _write_rows(out: Path, name: str, settings: dict, first: int, values: np.ndarray) -> None:
+    """Write a chunk's rows down to the disk.
 
-
-def _append(file, rows: np.ndarray) -> None:
-    """Write rows behind the others, down to the disk.
-
-    Plain writes, as pages of a writable memory map would count as this process's memory.
+    The file is mapped for one chunk only, as mapped pages count as this process's memory.
     """
-    file.write(np.ascontiguousarray(rows))
-    file.flush()
-    os.fsync(file.fileno())
-
-
-def _open_array(folder: Path, name: str, settings: dict) -> np.ndarray:
-    """Map a finished array; ValueError if the file is not exactly as long as it should be."""
-    path = folder / f"{name}.npy"
-    end = _first_row(path, name, settings)
-    end += settings["num_characters"] * _row_bytes(name, settings)
-    if path.stat().st_size != end:
-        raise ValueError(f"{path}: has {path.stat().st_size} bytes, should have {end}; cut short?")
-    return np.load(path, mmap_mode="r", allow_pickle=False)
+    rows = _open_array(out, name, settings, "r+")
+    rows[first : first + len(values)] = values
+    rows.flush()

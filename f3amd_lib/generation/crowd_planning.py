@@ -25,6 +25,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.root_paths import tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 
@@ -34,6 +35,7 @@ MIN_DISTANCE = 0.8
 SPEED_BOUNDS = (0.5, 1.5)
 """A bent path is walked at this share of its own greatest speed and its own speed at that frame."""
 
+_SHAPE = ("character", "frame", 2)
 _MARGIN = 0.03  # metres more than asked for, so that rounds of bumps end
 _PASSING = 0.01  # metres a frame; who moves faster relative to another passes by
 _HALF_WIDTH = 2.5  # seconds from the middle of a bump to its end
@@ -58,7 +60,7 @@ def closest_approach(position) -> np.ndarray:
     Raises:
       ValueError: for another shape, or a number that is not finite.
     """
-    position = _checked(position)
+    position = finite_array("position", position, _SHAPE)
     if len(position) == 1:
         return np.full(position.shape[1], np.inf)
     frames = np.moveaxis(position, 1, 0)
@@ -87,9 +89,8 @@ def keep_apart(
       ValueError: for arrays that do not fit, a distance that is not above 0, or a radius within
         which so many characters cannot keep apart.
     """
-    position, yaw = _checked(position), np.asarray(yaw, np.float64)
-    if yaw.shape != position.shape[:2] or not np.isfinite(yaw).all():
-        raise ValueError(f"yaw must be finite and {position.shape[:2]}, got {yaw.shape}")
+    position = finite_array("position", position, _SHAPE)
+    yaw = finite_array("yaw", yaw, position.shape[:2])
     if not (np.isfinite(min_distance) and min_distance > 0):
         raise ValueError(f"min_distance must be above 0 metres, got {min_distance}")
     if not (np.isfinite(fps) and fps > 0):
@@ -115,25 +116,10 @@ def keep_apart(
             continue
         if radius is None or np.linalg.norm(bent[:, 0] - middle, axis=-1).max() <= radius:
             return bent, _turned(wanted, bent, yaw, fps)
-    if radius is not None:
-        raise ValueError(
-            f"{len(position)} characters found no paths {min_distance:g} m apart from starting "
-            f"places within {radius:g} m; give them more room, fewer frames or a smaller distance"
-        )
-    raise ValueError(
-        f"{len(position)} characters found no paths {min_distance:g} m apart however far they were "
-        "spread; do some of them start in the same place?"
-    )
-
-
-def _checked(position) -> np.ndarray:
-    position = np.asarray(position, np.float64)
-    if position.ndim != 3 or position.shape[-1] != 2 or 0 in position.shape:
-        raise ValueError(f"position must be [B, F, 2] with B and F above 0, got {position.shape}")
-    if not np.isfinite(position).all():
-        character, frame = np.argwhere(~np.isfinite(position))[0][:2]
-        raise ValueError(f"position is not finite for character {character} at frame {frame}")
-    return position
+    what = f"{len(position)} characters found no paths {min_distance:g} m apart"
+    if radius is None:
+        raise ValueError(f"{what} however far they were spread; do some of them start in the same place?")
+    raise ValueError(f"{what} from starting places within {radius:g} m; give them more room or a smaller distance")
 
 
 def _check_room(count: int, min_distance: float, radius: float) -> None:
@@ -143,10 +129,8 @@ def _check_room(count: int, min_distance: float, radius: float) -> None:
     room = (radius + 0.5 * min_distance) ** 2  # discs may stick out by half
     most = math.floor(_DENSEST * room / (0.5 * min_distance) ** 2)
     if count > most:
-        raise ValueError(
-            f"{count} characters cannot stand {min_distance:g} m apart within {radius:g} m: at "
-            f"most {most} can; give them more room or a smaller distance"
-        )
+        what = f"{count} characters cannot stand {min_distance:g} m apart within {radius:g} m: at most {most} can"
+        raise ValueError(f"{what}; give them more room or a smaller distance")
 
 
 def _untangle(wanted: np.ndarray, min_distance: float, fps: float) -> np.ndarray | None:

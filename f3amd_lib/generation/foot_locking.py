@@ -27,14 +27,16 @@ import dataclasses
 
 import numpy as np
 from scipy import sparse
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, median_filter, percentile_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, percentile_filter, uniform_filter1d
 from scipy.signal import find_peaks, peak_widths
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import frame_positions, world_frames
 from f3amd_lib.generation.generated import Rollout
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.measures.walking import STEP_PROMINENCE, toe_positions
+from f3amd_lib.motion.curves import smooth_above, unit
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, global_rotations
 
 FARTHEST = 0.25
@@ -61,10 +63,8 @@ def leg_chains(skeleton: Skeleton) -> np.ndarray:
         while chain[0] != hip and skeleton.parents[chain[0]] > 0:
             chain.insert(0, skeleton.parents[chain[0]])
         if len(chain) != 4 or chain[0] != hip:
-            raise ValueError(
-                f"the {side} leg must be hip, knee, ankle, toe; this skeleton has "
-                f"{', '.join(skeleton.names[joint] for joint in chain)}"
-            )
+            there = ", ".join(skeleton.names[joint] for joint in chain)
+            raise ValueError(f"the {side} leg must be hip, knee, ankle, toe; this skeleton has {there}")
         chains.append(chain)
     return np.array(chains)
 
@@ -106,12 +106,7 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
     Raises:
       ValueError: for positions that do not fit, or a number that is not finite.
     """
-    positions = np.asarray(positions, np.float64)
-    if positions.ndim != 3 or positions.shape[1:] != (skeleton.num_joints, 3):
-        raise ValueError(f"positions must be [T, {skeleton.num_joints}, 3] for this skeleton, got {positions.shape}")
-    if not np.isfinite(positions).all():
-        frame = int(np.argwhere(~np.isfinite(positions))[0][0])
-        raise ValueError(f"positions are not finite at frame {frame}")
+    positions = finite_array("positions", positions, ("frame", skeleton.num_joints, 3))
     toes = toe_positions(positions, skeleton)
     height = toes[..., 1]
     contacts = np.zeros(height.shape, dtype=bool)
@@ -121,7 +116,7 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
     def frames(seconds):  # an odd number of them
         return 2 * round(0.5 * seconds * fps) + 1
 
-    floor = np.percentile(height, 12) if floor is None else _checked_floor(floor)
+    floor = np.percentile(height, 12) if floor is None else finite_array("floor", floor, ())
     lowest = percentile_filter(height, 12, size=(frames(1.2), 1), mode="nearest")
     above = height - np.minimum(lowest, floor + 0.04)
     speed = fps * np.linalg.norm(np.gradient(toes[..., [0, 2]], axis=0), axis=-1)
@@ -149,12 +144,6 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
                 contact[start:stop] = True
         _drop_short(contact, fps)
     return contacts
-
-
-def _checked_floor(floor) -> float:
-    if not np.isfinite(floor):
-        raise ValueError(f"floor must be a finite height in metres, got {floor}")
-    return float(floor)
 
 
 # ------------------------------------------------------------------------------ where feet stand
@@ -235,15 +224,11 @@ def _plan_toe(hip, ankle, toe, contact, floor: float, limit, fps: float):
 # -------------------------------------------------------------------------------------- the legs
 
 
-def _unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
 def _shortest_turn(first, second) -> np.ndarray:
     """Return the smallest rotations that turn unit vectors [T, 3] into others, [T, 3, 3]."""
     axis = np.cross(first, second)
     angle = np.arctan2(np.linalg.norm(axis, axis=-1), (first * second).sum(axis=-1))
-    return Rotation.from_rotvec(_unit(axis) * angle[:, None]).as_matrix()
+    return Rotation.from_rotvec(unit(axis) * angle[:, None]).as_matrix()
 
 
 def _bend_leg(hip, knee, ankle, thigh_turn, across, line, reach):
@@ -259,7 +244,7 @@ def _bend_leg(hip, knee, ankle, thigh_turn, across, line, reach):
     Returns:
       Rotations to multiply from the left to the global ones of thigh and shank, [T, 3, 3] each.
     """
-    thigh, shank = _unit(knee - hip), _unit(ankle - knee)
+    thigh, shank = unit(knee - hip), unit(ankle - knee)
     upper, lower = np.linalg.norm(knee - hip, axis=-1), np.linalg.norm(ankle - knee, axis=-1)
     near, far = reach.T
     length, room = np.linalg.norm(line, axis=-1), np.maximum(far - near, 1e-9)
@@ -269,13 +254,13 @@ def _bend_leg(hip, knee, ankle, thigh_turn, across, line, reach):
     # The knee's axis; in a straight leg the usual one of this motion, which keeps the knee's side.
     axis = np.cross(thigh, shank)
     local = np.einsum("tba,tb->a", thigh_turn, axis + 1e-3 * across)
-    usual = thigh_turn @ _unit(local)
+    usual = thigh_turn @ unit(local)
     straight = np.maximum(0.03 - (axis * usual).sum(axis=-1, keepdims=True), 0.0)
     axis = axis + straight * usual
-    axis = _unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
+    axis = unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
     bent = np.cos(angle) * thigh + np.sin(angle) * np.cross(axis, thigh)
     knee_turn = _shortest_turn(shank, bent)
-    hip_turn = _shortest_turn(_unit(upper[:, None] * thigh + lower[:, None] * bent), _unit(line))
+    hip_turn = _shortest_turn(unit(upper[:, None] * thigh + lower[:, None] * bent), unit(line))
     return hip_turn, hip_turn @ knee_turn
 
 
@@ -307,7 +292,7 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     if floor is None:
         height = toe_positions(positions, skeleton)[..., 1]
         floor = np.median(height[contacts]) if contacts.any() else height.min()
-    floor = _checked_floor(floor)
+    floor = float(finite_array("floor", floor, ()))
     if motion.num_frames < 3:
         return motion
 
@@ -321,13 +306,10 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
         lowered = np.maximum(lowered, lack)
         targets.append(target)
         reaches.append(reach)
-    # A running maximum, then an average over the same span, stays above the need itself.
-    radius = max(2, round(0.13 * fps))
-    lowered = maximum_filter1d(lowered, 2 * radius + 1, mode="nearest")
-    lowered = gaussian_filter1d(lowered, radius / 2.2, radius=radius, mode="nearest")
+    lowered = smooth_above(lowered, fps)
     drop = lowered[:, None] * np.array([0.0, -1.0, 0.0])
 
-    rotations = np.array(motion.rotations, np.float64)
+    rotations = np.array(motion.needed_rotations("locking feet"), np.float64)
     turned = global_rotations(skeleton, rotations)
     across = positions[:, chains[0, 0]] - positions[:, chains[1, 0]]
     for chain, target, reach in zip(chains, targets, reaches, strict=True):
@@ -355,13 +337,13 @@ def lock_rollout(rollout: Rollout, floor=None) -> Rollout:
         as for `lock_feet`.
 
     Returns:
-      The rollout with other frames; `feet_locked` says so, where rollouts have that field. The
-      history, which counts as the past of contacts and is not changed, is as it was.
+      The rollout with other frames; its `feet_locked` says so. The history, which counts as the past of
+      contacts, is as it was.
 
     Raises:
       ValueError: for a rollout whose feet are locked already, or as `lock_feet`.
     """
-    if getattr(rollout, "feet_locked", False):
+    if rollout.feet_locked:
         raise ValueError("the feet of this rollout are locked already")
     count, before = len(rollout.styles), rollout.history.shape[1]
     if floor is None:
@@ -371,8 +353,6 @@ def lock_rollout(rollout: Rollout, floor=None) -> Rollout:
         floors = [one[rests].min() if rests.any() else None for one, rests in zip(height, resting, strict=True)]
     else:
         floors = np.broadcast_to(np.asarray(floor, np.float64), (count,))
-    frames = [
-        world_frames(lock_feet(rollout.motion(k, with_history=True), floor=floors[k]))[before:] for k in range(count)
-    ]
-    flag = {field.name: True for field in dataclasses.fields(rollout) if field.name == "feet_locked"}
-    return dataclasses.replace(rollout, frames=np.asarray(frames, rollout.frames.dtype), **flag)
+    locked = [lock_feet(rollout.motion(k, with_history=True), floor=floors[k]) for k in range(count)]
+    frames = [world_frames(motion)[before:] for motion in locked]
+    return dataclasses.replace(rollout, frames=np.asarray(frames, rollout.frames.dtype), feet_locked=True)

@@ -20,6 +20,7 @@ from f3amd_lib.generation.blending import blend_rollout
 from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.networks.conditioning import Condition
@@ -216,16 +217,12 @@ class MotionGenerator:
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
             history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
-        history = np.asarray(history, np.float32)
-        expected = (batch, config.num_history, config.channels)
-        if history.shape != expected:
-            raise ValueError(f"history must have shape {expected}, got {history.shape}")
-        if not np.isfinite(history).all():
-            raise ValueError("history holds a number that is not finite")
+        shape = (batch, config.num_history, config.channels)
+        history = finite_array("history", history, shape, np.float32)
         rollout = Rollout(
             skeleton=trained.skeleton,
             frames=self.generate(position, yaw, indices, history, jax.random.key(seed)),
-            history=np.asarray(history),
+            history=history,
             paths=tuple(paths),
             styles=tuple(styles),
             window=config.window,
@@ -238,9 +235,9 @@ class MotionGenerator:
         taken = dict.fromkeys(styles, 0)
         poses = []
         for character, style in enumerate(styles):
-            if style not in self.trained.seeds:
+            if style not in self.trained.start_poses:
                 raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
-            choices = self.trained.seeds[style]
+            choices = self.trained.start_poses[style]
             choices = choices[as_fast_as(choices, speed[character])]
             order = np.random.default_rng([seed, self.trained.style_index(style)])
             number = order.permutation(len(choices))[taken[style] % len(choices)]

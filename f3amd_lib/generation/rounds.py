@@ -50,14 +50,9 @@ def sample_round(
     elif noise.shape != shape:
         raise ValueError(f"noise must have shape {shape}, got {noise.shape}")
     context = network.encode(condition)
-    return sample(
-        sampler,
-        lambda x_noisy, sigma: network(x_noisy, sigma, context),
-        jnp.asarray(sigmas[0], noise.dtype) * noise,
-        sigmas,
-        key=key_steps,
-        unroll=unroll,
-    )
+    denoise = lambda x_noisy, sigma: network(x_noisy, sigma, context)
+    start = jnp.asarray(sigmas[0], noise.dtype) * noise
+    return sample(sampler, denoise, start, sigmas, key=key_steps, unroll=unroll)
 
 
 def sample_round_on_devices(
@@ -86,10 +81,8 @@ def sample_round_on_devices(
     (axis,) = mesh.axis_names
     characters = condition.history.shape[0]
     if characters % mesh.size:
-        raise ValueError(
-            f"{characters} characters cannot be shared equally by {mesh.size} devices: pad them to "
-            f"{-(-characters // mesh.size) * mesh.size}"
-        )
+        padded = -(-characters // mesh.size) * mesh.size
+        raise ValueError(f"{characters} characters do not divide among {mesh.size} devices: pad them to {padded}")
 
     def share(condition, key, noise):
         if key is not None:

@@ -1,4 +1,4 @@
-"""One code for numpy and JAX."""
+"""One code for numpy and JAX, and one check of the arrays that people hand in."""
 
 from __future__ import annotations
 
@@ -10,3 +10,27 @@ import numpy as np
 def array_module(*arrays):
     """Return `jax.numpy` if any argument is a JAX array (or tracer), else `numpy`."""
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+
+
+def finite_array(name: str, value, shape: tuple, dtype=np.float64) -> np.ndarray:
+    """Return a value as an array of a shape, all of it finite.
+
+    Args:
+      name: what messages call it.
+      value: anything that numpy takes for an array.
+      shape: lengths; a word such as "frame" stands for any length above 0.
+      dtype: wanted; None keeps the value's own.
+
+    Raises:
+      ValueError: for another shape, or naming the first place of a number that is not finite.
+    """
+    array = np.asarray(value, dtype)
+    pairs = list(zip(shape, array.shape, strict=False))
+    fits = all(length > 0 if isinstance(wanted, str) else length == wanted for wanted, length in pairs)
+    if array.ndim != len(shape) or not fits:
+        raise ValueError(f"{name} must be [{', '.join(map(str, shape))}] with no length 0, got {array.shape}")
+    if not np.isfinite(array).all():
+        place = np.argwhere(~np.isfinite(array))[0].tolist()
+        words = [f"{wanted} {number}" for wanted, number in zip(shape, place, strict=True) if isinstance(wanted, str)]
+        raise ValueError(f"{name} is not finite at {', '.join(words) or place}")
+    return array

@@ -11,6 +11,8 @@ import dataclasses
 import math
 import numbers
 import os
+import tomllib
+from importlib import resources
 from pathlib import Path
 
 from f3amd_lib.ground.names import nearest_hint
@@ -18,7 +20,8 @@ from f3amd_lib.ground.names import nearest_hint
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
 RESULT_FOLDERS = ("records", "tables", "figures", "media")
-SHOWN_STYLES = ("Neutral", "March", "Zombie", "Old", "LimpLeft", "ArmsWide", "Tiptoe", "Runner")
+_NUMBERS = tomllib.loads((resources.files("f3amd_lib.ground") / "profiles.toml").read_text(encoding="utf-8"))
+SHOWN_STYLES = tuple(_NUMBERS["on"]["synthetic"]["laptop"]["evaluation_styles"])
 """Styles of `synthetic` that differ in posture, arms, rhythm and symmetry: what figures show and
 walking checks judge."""
 RESULTS_DIR_VARIABLE = "F3AMD_RESULTS_DIR"
@@ -68,64 +71,13 @@ class Profile:
     seed: int
 
 
-# The paper's own numbers (section 4.5), where a profile says nothing else.
-_COMMON = {
-    "preset": "F3AMD-FNO-96",
-    "compare_preset": None,
-    "learning_rate": 5e-4,
-    "window": 32,
-    "num_history": 10,
-    "num_steps": 8,
-    "num_styles": None,
-    "seconds_per_style": 60.0,
-    "rollout_rounds": 80,
-    "evaluation_styles": (),
-    "seed": 0,
+# Type of a field -> what its values are instances of, and what they are called.
+_KINDS = {
+    "int": (numbers.Integral, "a whole number"),
+    "float": (numbers.Real, "a finite number"),
+    "str": (str, "a name"),
+    "tuple[str, ...]": ((list, tuple), "a list of names"),
 }
-
-_PROFILE_DEFAULTS = {
-    "smoke": {
-        "preset": "F3AMD-FNO-32",
-        "train_steps": 20,
-        "batch_size": 16,
-        "learning_rate": 2e-3,
-        "num_steps": 2,
-        "num_styles": 3,
-        "seconds_per_style": 8.0,
-        "rollout_rounds": 3,
-        "num_characters": 2,
-    },
-    "laptop": {
-        "preset": "F3AMD-FNO-64-steady",
-        "compare_preset": "F3AMD-FNO-32",
-        "train_steps": 1_500,
-        "batch_size": 128,
-        "learning_rate": 2e-3,
-        "num_characters": 8,
-    },
-    "gpu": {"train_steps": 100_000, "batch_size": 512, "num_characters": 100},
-}
-
-# Where a data set asks for something else than its profile.
-_DATASET_DEFAULTS = {
-    ("laptop", "synthetic"): {"evaluation_styles": SHOWN_STYLES},
-    ("laptop", "bandai"): {"preset": "F3AMD-FNO-96-plus", "compare_preset": "F3AMD-FNO-96", "train_steps": 4_000},
-    ("laptop", "100style"): {"train_steps": 4_000},
-}
-
-_POSITIVE = (
-    "train_steps",
-    "batch_size",
-    "learning_rate",
-    "window",
-    "num_history",
-    "num_steps",
-    "num_styles",
-    "seconds_per_style",
-    "rollout_rounds",
-    "num_characters",
-)
-_NOT_NEGATIVE = ("seed",)
 
 
 def load_profile(name: str, dataset: str, **overrides) -> Profile:
@@ -144,46 +96,39 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
       ValueError: for an unknown profile, data set or field (with the nearest known one), a value
         of the wrong type (True is no number, 8.0 no count) or one out of range.
     """
-    for what, value, known in (("profile", name, PROFILES), ("data set", dataset, DATASETS)):
-        if value not in known:
-            raise ValueError(f"unknown {what} {value!r}{nearest_hint(value, known)}")
+    _check_names(dataset, name)
     types = {item.name: item.type for item in dataclasses.fields(Profile) if item.name not in ("name", "dataset")}
     for key in overrides:
         if key not in types:
             raise ValueError(f"unknown profile field {key!r}{nearest_hint(key, types)}")
-    values = _COMMON | _PROFILE_DEFAULTS[name] | _DATASET_DEFAULTS.get((name, dataset), {})
-    values |= {key: _checked(key, value, types[key]) for key, value in overrides.items()}
-    return Profile(name=name, dataset=dataset, **values)
+    values = _NUMBERS["common"] | _NUMBERS[name] | _NUMBERS["on"].get(dataset, {}).get(name, {}) | overrides
+    return Profile(name=name, dataset=dataset, **{key: _checked(key, values.get(key), types[key]) for key in types})
 
 
 def _checked(key: str, value, annotation: str):
-    """Return an override as its field's type, or say why not."""
+    """Return a value as its field's type, or say why not."""
     # `from __future__ import annotations` leaves types as their source text.
     kind, *rest = annotation.split(" | ")
-    if value is None and "None" in rest:
+    if value is None and rest:
         return None
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if kind == "int" and is_number and isinstance(value, numbers.Integral):
-        value = int(value)
-    elif kind == "float" and is_number and math.isfinite(value):
-        value = float(value)
-    elif kind == "str" and isinstance(value, str) and value:
-        return value
-    elif kind.startswith("tuple") and isinstance(value, (list, tuple)) and all(isinstance(item, str) for item in value):
-        return tuple(value)
-    else:
-        wanted = {
-            "int": "a whole number",
-            "float": "a finite number",
-            "str": "a name",
-            "tuple[str, ...]": "a list of names",
-        }[kind] + (" or None" if "None" in rest else "")
-        raise ValueError(f"{key} must be {wanted}, got {value!r} ({type(value).__name__})")
-    if key in _POSITIVE and value <= 0:
-        raise ValueError(f"{key} must be above 0, got {value!r}")
-    if key in _NOT_NEGATIVE and value < 0:
-        raise ValueError(f"{key} must be 0 or more, got {value!r}")
-    return value
+    accepted, called = _KINDS[kind]
+    fits = isinstance(value, accepted) and not isinstance(value, bool)
+    if fits and kind == "float":
+        fits = math.isfinite(value)
+    elif fits and kind == "tuple[str, ...]":
+        fits = all(isinstance(item, str) for item in value)
+    if not fits or value == "":
+        called += " or None" if rest else ""
+        raise ValueError(f"{key} must be {called}, got {value!r} ({type(value).__name__})")
+    if kind in ("int", "float") and (value < 0 or (value == 0 and key != "seed")):
+        raise ValueError(f"{key} must be {'0 or more' if key == 'seed' else 'above 0'}, got {value!r}")
+    return {"int": int, "float": float, "str": str}.get(kind, tuple)(value)
+
+
+def _check_names(dataset: str, profile: str) -> None:
+    for what, value, known in (("profile", profile, PROFILES), ("data set", dataset, DATASETS)):
+        if value not in known:
+            raise ValueError(f"unknown {what} {value!r}{nearest_hint(value, known)}")
 
 
 def repository_root() -> Path:
@@ -199,7 +144,8 @@ def runs_dir(dataset: str, profile: str) -> Path:
       dataset: one of `DATASETS`.
       profile: one of `PROFILES`.
     """
-    return _named_folder(repository_root() / "runs", dataset, profile)
+    _check_names(dataset, profile)
+    return repository_root() / "runs" / dataset / profile
 
 
 def results_dir(dataset: str, profile: str, *, root=None) -> Path:
@@ -219,17 +165,9 @@ def results_dir(dataset: str, profile: str, *, root=None) -> Path:
     Raises:
       ValueError: for an unknown data set or profile.
     """
-    if root is None:
-        root = os.environ.get(RESULTS_DIR_VARIABLE) or repository_root() / "runs"
-    folder = _named_folder(Path(root), dataset, profile)
+    _check_names(dataset, profile)
+    root = root or os.environ.get(RESULTS_DIR_VARIABLE) or repository_root() / "runs"
+    folder = Path(root) / dataset / profile
     for name in RESULT_FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     return folder
-
-
-def _named_folder(root: Path, dataset: str, profile: str) -> Path:
-    if dataset not in DATASETS:
-        raise ValueError(f"unknown data set {dataset!r}{nearest_hint(dataset, DATASETS)}")
-    if profile not in PROFILES:
-        raise ValueError(f"unknown profile {profile!r}{nearest_hint(profile, PROFILES)}")
-    return root / dataset / profile

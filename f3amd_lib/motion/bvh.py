@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,11 @@ _FRAMES_LINE = re.compile(r"frames\s*:\s*(.*)", re.IGNORECASE)
 _FRAME_TIME_LINE = re.compile(r"frame\s*time\s*:\s*(.*)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _CHANNELS = {f"{axis}{kind}".lower(): (axis, kind) for axis in "XYZ" for kind in ("position", "rotation")}
+_BRACES = "check that every '{' has its '}'"
+
+
+class _Broken(Exception):
+    """(line, what is wrong and what to do); `parse_bvh` adds the file's name."""
 
 
 def read_bvh(path_or_file=None, *, text=None, name=None, scale: float = 0.01) -> Motion:
@@ -83,19 +88,19 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
     Raises:
       ValueError: "name, line n: what is wrong; what to do" for anything that is not a sound BVH.
     """
-    data = _clean(text, name)
-    found = _MOTION_LINE.search(data)
-    if found is None:
-        _fail(
-            name,
-            data.count(b"\n") + 1,
-            "the file ends without a MOTION line; it is cut off or not a BVH file: export or copy it again",
-        )
-    joints, end_sites = _parse_hierarchy(data[: found.start()], name)
-    first_line = data.count(b"\n", 0, found.start()) + 1
-    num_frames, frame_time, rows, rows_line = _parse_motion_head(data[found.end() :], name, first_line)
-    values = _parse_rows(rows, name, rows_line, joints, num_frames)
-    return _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows_line)
+    try:
+        data = _clean(text, name)
+        motion = _MOTION_LINE.search(data)
+        if motion is None:
+            raise _Broken(data.count(b"\n") + 1, "the file ends without a MOTION line; export or copy it again")
+        joints, end_sites = _parse_hierarchy(data[: motion.start()])
+        line = data.count(b"\n", 0, motion.start()) + 1
+        num_frames, frame_time, rows, line = _parse_motion_head(data[motion.end() :], line)
+        values = _parse_rows(rows, line, joints, num_frames)
+        return _build_motion(joints, end_sites, values, frame_time, name, scale, rows, line)
+    except _Broken as error:
+        line, message = error.args
+        raise ValueError(f"{name}, line {line}: {message}") from None
 
 
 def write_bvh(path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY", overwrite: bool = False) -> Path:
@@ -137,46 +142,38 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
     """
     if sorted(order) != ["X", "Y", "Z"]:
         raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
-    skeleton = motion.skeleton
-    rotation_channels = " ".join(f"{axis}rotation" for axis in order)
-    children = [[] for _ in skeleton.names]
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            children[parent].append(joint)
-    tips = [[] for _ in skeleton.names]
-    for joint, offset in skeleton.end_sites:
-        tips[joint].append(offset)
-    lines, depth_first = ["HIERARCHY"], []
+    rotations = motion.needed_rotations("a BVH file")
+    skeleton, lines, depth_first = motion.skeleton, ["HIERARCHY"], []
 
-    def offset_line(indent, offset):
-        numbers = " ".join(f"{scale * float(value):.6f}" for value in offset)
-        lines.append(f"{indent}OFFSET {numbers}")
+    def add_offset(indent, offset):
+        lines.append(f"{indent}OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset))
 
-    def joint_lines(joint, depth):
+    def add_joint(joint, depth):
         depth_first.append(joint)
         outer, inner = "\t" * depth, "\t" * (depth + 1)
-        lines.append(f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}")
-        lines.append(f"{outer}{{")
-        offset_line(inner, skeleton.offsets[joint])
-        if depth:
-            lines.append(f"{inner}CHANNELS 3 {rotation_channels}")
-        else:
-            lines.append(f"{inner}CHANNELS 6 Xposition Yposition Zposition {rotation_channels}")
-        for child in children[joint]:
-            joint_lines(child, depth + 1)
+        lines.extend([f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"])
+        add_offset(inner, skeleton.offsets[joint])
+        channels = [f"{axis}rotation" for axis in order]
+        if depth == 0:
+            channels = ["Xposition", "Yposition", "Zposition", *channels]
+        lines.append(f"{inner}CHANNELS {len(channels)} {' '.join(channels)}")
+        children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        for child in children:
+            add_joint(child, depth + 1)
+        tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
         # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
-        for tip in tips[joint] or ([] if children[joint] else [(0.0, 0.0, 0.0)]):
+        for tip in tips or ([] if children else [(0.0, 0.0, 0.0)]):
             lines.extend([f"{inner}End Site", f"{inner}{{"])
-            offset_line(inner + "\t", tip)
+            add_offset(inner + "\t", tip)
             lines.append(f"{inner}}}")
         lines.append(f"{outer}}}")
 
-    joint_lines(0, 0)
+    add_joint(0, 0)
     lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
     with warnings.catch_warnings():
         # At gimbal lock any of the equal answers will do: the matrix is the same.
         warnings.filterwarnings("ignore", message="Gimbal lock")
-        degrees = euler_from_matrix(order, motion.rotations[:, depth_first])
+        degrees = euler_from_matrix(order, rotations[:, depth_first])
     root = scale * np.asarray(motion.root_position, dtype=np.float64)
     rows = np.concatenate([root, degrees.reshape(motion.num_frames, -1)], axis=1)
     row_format = " ".join(["%.6f"] * rows.shape[1])
@@ -194,19 +191,10 @@ class _Joint:
     offset: tuple[float, ...] | None = None
     channels: list[tuple[str, str]] | None = None
     first_column: int = 0
-    position: dict[str, int] = field(default_factory=dict)  # axis -> column of the MOTION block
 
-    @property
-    def rotation_order(self) -> str:
-        return "".join(axis for axis, kind in self.channels if kind == "rotation")
-
-    @property
-    def rotation_columns(self) -> list[int]:
-        return [self.first_column + k for k, (_, kind) in enumerate(self.channels) if kind == "rotation"]
-
-
-def _fail(name: str, line: int, message: str):
-    raise ValueError(f"{name}, line {line}: {message}")
+    def columns(self, wanted: str) -> dict[str, int]:
+        """Return axis -> column of the MOTION block, for "position" or "rotation", as listed."""
+        return {axis: self.first_column + k for k, (axis, kind) in enumerate(self.channels) if kind == wanted}
 
 
 def _clean(text: str | bytes, name: str) -> bytes:
@@ -218,52 +206,45 @@ def _clean(text: str | bytes, name: str) -> bytes:
     else:
         raise ValueError(f"{name}: BVH content must be str or bytes, not {type(text).__name__}")
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        _fail(name, 1, "the file is UTF-16 text; save it as UTF-8 or ASCII")
+        raise _Broken(1, "the file is UTF-16 text; save it as UTF-8 or ASCII")
     data = data.removeprefix(b"\xef\xbb\xbf")
     if not data.strip():
-        _fail(name, 1, "the file is empty; export or copy it again")
+        raise _Broken(1, "the file is empty; export or copy it again")
     if b"\x00" in data:
         line = data.count(b"\n", 0, data.index(b"\x00")) + 1
-        _fail(name, line, "holds zero bytes, so it is not text; is it really a BVH file?")
-    if b"\n" not in data:
-        data = data.replace(b"\r", b"\n")
-    return data
+        raise _Broken(line, "holds zero bytes, so it is not text; is it really a BVH file?")
+    return data if b"\n" in data else data.replace(b"\r", b"\n")
 
 
-def _finite_number(token: str) -> float | None:
-    """Return a token as a float, or None if it is no finite decimal number."""
-    if _NUMBER.fullmatch(token) is None:
-        return None
-    value = float(token)
+def _finite_number(word: str) -> float | None:
+    """Return a word as a float, or None if it is no finite decimal number."""
+    value = float(word) if _NUMBER.fullmatch(word) else np.nan
     return value if np.isfinite(value) else None
 
 
 class _Tokens:
     """Words of the HIERARCHY with their line numbers; braces stand alone."""
 
-    def __init__(self, data: bytes, name: str):
-        self.name = name
+    def __init__(self, data: bytes):
         self.items: list[tuple[str, int]] = []
+        self.position = 0
         lines = data.split(b"\n")
         self.last_line = len(lines)
         for line, raw in enumerate(lines, start=1):
             try:
                 words = raw.decode("utf-8")
             except UnicodeDecodeError:
-                _fail(name, line, "holds bytes that are not UTF-8 text; is it a BVH file?")
-            for word in words.replace("{", " { ").replace("}", " } ").split():
-                self.items.append((word, line))
-        self.position = 0
+                raise _Broken(line, "holds bytes that are not UTF-8 text; is it a BVH file?") from None
+            self.items += [(word, line) for word in words.replace("{", " { ").replace("}", " } ").split()]
 
     def peek(self) -> tuple[str, int]:
-        if self.position < len(self.items):
-            return self.items[self.position]
-        return "", self.last_line
+        """Return the next word, "" at the end, and its line."""
+        return self.items[self.position] if self.position < len(self.items) else ("", self.last_line)
 
     def take(self, expected: str) -> tuple[str, int]:
         word, line = self.peek()
         if not word:
-            _fail(self.name, line, f"expected {expected}, but MOTION starts here; {_BRACES}")
+            raise _Broken(line, f"expected {expected}, but MOTION starts here; {_BRACES}")
         self.position += 1
         return word, line
 
@@ -277,275 +258,213 @@ class _Tokens:
     def expect(self, wanted: str, where: str):
         word, line = self.take(f"{wanted!r} {where}")
         if word.upper() != wanted.upper():
-            _fail(self.name, line, f"expected {wanted!r} {where}, found {word!r}")
+            raise _Broken(line, f"expected {wanted!r} {where}, found {word!r}")
 
-    def numbers(self, count: int, what: str) -> tuple[float, ...]:
+    def offset(self) -> tuple[float, ...]:
+        """Take the three numbers after an OFFSET."""
         values = []
-        for _ in range(count):
-            word, line = self.take(f"a number of {what}")
-            value = _finite_number(word)
-            if value is None:
-                _fail(self.name, line, f"{what} needs {count} finite numbers, found {word!r} among them")
-            values.append(value)
+        for _ in range(3):
+            word, line = self.take("a number of OFFSET")
+            values.append(_finite_number(word))
+            if values[-1] is None:
+                raise _Broken(line, f"OFFSET needs 3 finite numbers, found {word!r} among them")
         return tuple(values)
 
 
-_BRACES = "check that every '{' has its '}'"
-
-
-def _parse_hierarchy(data: bytes, name: str):
+def _parse_hierarchy(data: bytes):
     """Return the joints in file order and the End Sites as (joint, offset) in file units."""
-    tokens = _Tokens(data, name)
+    tokens = _Tokens(data)
     word, line = tokens.peek()
     if word.upper() != "HIERARCHY":
-        _fail(name, line, f"a BVH file starts with HIERARCHY, this one with {word!r}")
+        raise _Broken(line, f"a BVH file starts with HIERARCHY, this one with {word!r}")
     tokens.take("HIERARCHY")
     joints: list[_Joint] = []
     end_sites: list[tuple[int, tuple[float, ...]]] = []
-    lines_of: dict[str, int] = {}
     open_blocks: list[int] = []  # joints whose braces are open, innermost last
     column = 0
     while tokens.peek()[0]:
         word, line = tokens.take("a keyword")
         keyword = word.upper()
         current = joints[open_blocks[-1]] if open_blocks else None
-        if keyword == "ROOT" and joints:
-            _fail(
-                name,
-                line,
-                f"a second ROOT (the first is {joints[0].name!r} in line {joints[0].line}); "
-                "a file holds one character: split it",
-            )
-        elif keyword in ("ROOT", "JOINT"):
+        if keyword in ("ROOT", "JOINT"):
+            if keyword == "ROOT" and joints:
+                first = f"the first is {joints[0].name!r} in line {joints[0].line}"
+                raise _Broken(line, f"a second ROOT ({first}); a file holds one character: split it")
             if keyword == "JOINT" and current is None:
-                _fail(name, line, f"JOINT stands outside of the ROOT's braces; {_BRACES}")
-            joint_name = tokens.rest_of_line(line)
-            if not joint_name:
-                _fail(name, line, f"{keyword} needs a name on the same line")
-            if joint_name in lines_of:
-                _fail(
-                    name,
-                    line,
-                    f"joint name {joint_name!r} is taken (line {lines_of[joint_name]}); rename one of the two",
-                )
-            lines_of[joint_name] = line
-            tokens.expect("{", f"after {keyword} {joint_name}")
-            parent = open_blocks[-1] if open_blocks else -1
+                raise _Broken(line, f"JOINT stands outside of the ROOT's braces; {_BRACES}")
+            joint = _Joint(tokens.rest_of_line(line), line, open_blocks[-1] if open_blocks else -1)
+            if not joint.name:
+                raise _Broken(line, f"{keyword} needs a name on the same line")
+            for other in joints:
+                if other.name == joint.name:
+                    raise _Broken(line, f"joint name {joint.name!r} is taken (line {other.line}); rename one")
+            tokens.expect("{", f"after {keyword} {joint.name}")
             open_blocks.append(len(joints))
-            joints.append(_Joint(joint_name, line, parent))
+            joints.append(joint)
+        elif current is None:
+            why = f"the ROOT's braces are closed; {_BRACES}" if joints else "expected ROOT"
+            raise _Broken(line, f"unexpected {word!r}: {why}" if keyword != "}" else f"a '}}' too many; {_BRACES}")
         elif keyword == "}":
-            if current is None:
-                _fail(name, line, f"a '}}' too many; {_BRACES}")
             for what, value in (("OFFSET", current.offset), ("CHANNELS", current.channels)):
                 if value is None:
-                    _fail(name, line, f"joint {current.name!r} ends without {what}; add the line")
+                    raise _Broken(line, f"joint {current.name!r} ends without {what}; add the line")
             open_blocks.pop()
-        elif current is None:
-            _fail(
-                name,
-                line,
-                f"unexpected {word!r}: " + (f"the ROOT's braces are closed; {_BRACES}" if joints else "expected ROOT"),
-            )
-        elif keyword == "OFFSET":
-            if current.offset is not None:
-                _fail(name, line, f"joint {current.name!r} has a second OFFSET; remove one")
-            current.offset = tokens.numbers(3, "OFFSET")
-        elif keyword == "CHANNELS":
-            if current.channels is not None:
-                _fail(name, line, f"joint {current.name!r} has a second CHANNELS; remove one")
-            current.channels = _parse_channels(tokens, line, current.name)
-            current.first_column = column
-            current.position = {
-                axis: column + k for k, (axis, kind) in enumerate(current.channels) if kind == "position"
-            }
-            column += len(current.channels)
+        elif keyword in ("OFFSET", "CHANNELS"):
+            if getattr(current, keyword.lower()) is not None:
+                raise _Broken(line, f"joint {current.name!r} has a second {keyword}; remove one")
+            if keyword == "OFFSET":
+                current.offset = tokens.offset()
+            else:
+                current.channels, current.first_column = _parse_channels(tokens, line, current.name), column
+                column += len(current.channels)
         elif keyword == "END":
             tokens.expect("Site", "after End")
             # A few exporters name their tips; the name carries nothing.
             tokens.rest_of_line(line)
             tokens.expect("{", "after End Site")
             tokens.expect("OFFSET", "inside End Site")
-            end_sites.append((open_blocks[-1], tokens.numbers(3, "OFFSET")))
+            end_sites.append((open_blocks[-1], tokens.offset()))
             tokens.expect("}", "after the OFFSET of End Site")
         else:
-            _fail(name, line, f"unexpected {word!r}; known here are OFFSET, CHANNELS, JOINT, End Site and '}}'")
+            raise _Broken(line, f"unexpected {word!r}; known here are OFFSET, CHANNELS, JOINT, End Site and '}}'")
     if open_blocks:
         unclosed = joints[open_blocks[-1]]
-        _fail(
-            name,
-            tokens.last_line,
-            f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open; {_BRACES}",
-        )
+        what = f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open; {_BRACES}"
+        raise _Broken(tokens.last_line, what)
     if not joints:
-        _fail(name, tokens.last_line, "MOTION starts, but there is no ROOT")
+        raise _Broken(tokens.last_line, "MOTION starts, but there is no ROOT")
     if column == 0:
-        _fail(name, tokens.last_line, "no joint has a channel, so there is no motion to read")
+        raise _Broken(tokens.last_line, "no joint has a channel, so there is no motion to read")
     return joints, end_sites
 
 
 def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, str]]:
     """Return (axis, kind) of a CHANNELS line, its keyword already taken."""
-    name = tokens.name
-    word, _ = tokens.take("the number of channels")
-    if not word.isdecimal():
-        _fail(name, line, f"CHANNELS needs a count first, found {word!r}")
+    count, _ = tokens.take("the number of channels")
+    if not count.isdecimal():
+        raise _Broken(line, f"CHANNELS needs a count first, found {count!r}")
     channels = []
-    for _ in range(int(word)):
+    for _ in range(int(count)):
         label, label_line = tokens.take(f"channel names of {joint!r}")
         channel = _CHANNELS.get(label.lower())
         if channel is None:
-            _fail(
-                name,
-                label_line,
-                f"unknown channel {label!r} of joint {joint!r}, which says it has {word}; channels "
-                "are X, Y or Z with position or rotation, such as Xposition or Zrotation",
-            )
+            what = f"unknown channel {label!r} of joint {joint!r}, which says it has {count}"
+            raise _Broken(label_line, f"{what}; channels are X, Y or Z with position or rotation, such as Xposition")
         if channel in channels:
-            _fail(name, label_line, f"joint {joint!r} has the channel {label!r} twice; remove one")
+            raise _Broken(label_line, f"joint {joint!r} has the channel {label!r} twice; remove one")
         channels.append(channel)
     extra, extra_line = tokens.peek()
     if extra.lower() in _CHANNELS:
-        _fail(name, extra_line, f"joint {joint!r} says it has {word} channels, but lists {extra!r} too: mend the count")
+        raise _Broken(extra_line, f"joint {joint!r} says it has {count} channels, but lists {extra!r} too")
     return channels
 
 
-def _parse_motion_head(data: bytes, name: str, line: int):
-    """Read "Frames:" and "Frame Time:"; return both, the rows' bytes and their first line."""
-    position = data.find(b"\n") + 1 or len(data)
-    values = []
-    for pattern, label, example in (
-        (_FRAMES_LINE, "Frames:", "Frames: 120"),
-        (_FRAME_TIME_LINE, "Frame Time:", "Frame Time: 0.0333333"),
-    ):
+def _parse_motion_head(data: bytes, line: int):
+    """Read "Frames:" (with its line) and "Frame Time:"; return both, the rows' bytes and their first line."""
+    rest = data.partition(b"\n")[2]
+    answers = []
+    for pattern, example in ((_FRAMES_LINE, "Frames: 120"), (_FRAME_TIME_LINE, "Frame Time: 0.0333333")):
         words = ""
-        while position < len(data) and not words:
-            stop = data.find(b"\n", position) + 1 or len(data)
-            words = data[position:stop].decode("utf-8", errors="replace").strip()
-            position, line = stop, line + 1
+        while rest and not words:
+            head, _, rest = rest.partition(b"\n")
+            words, line = head.decode("utf-8", errors="replace").strip(), line + 1
         match = pattern.fullmatch(words)
         if match is None:
-            found = f"found {words[:40]!r}" if words else "the file ends"
-            _fail(name, line, f"expected a line like {example!r} here, {found}")
-        value = match.group(1).strip()
-        if label == "Frames:":
-            if not value.isdecimal() or int(value) == 0:
-                _fail(name, line, f"Frames: must be a whole number above 0, found {value!r}")
-            values.append((int(value), line))
-        else:
-            frame_time = _finite_number(value)
-            if frame_time is None or frame_time <= 0:
-                _fail(
-                    name,
-                    line,
-                    f"Frame Time: must be a positive number of seconds, found {value!r}; "
-                    "30 frames per second are 0.0333333",
-                )
-            values.append(frame_time)
-    (num_frames, frames_line), frame_time = values
-    return (num_frames, frames_line), frame_time, data[position:], line + 1
+            there = f"found {words[:40]!r}" if words else "the file ends"
+            raise _Broken(line, f"expected a line like {example!r} here, {there}")
+        answers.append((match.group(1).strip(), line))
+    (count, count_line), (seconds, _) = answers
+    if not count.isdecimal() or int(count) == 0:
+        raise _Broken(count_line, f"Frames: must be a whole number above 0, found {count!r}")
+    frame_time = _finite_number(seconds)
+    if frame_time is None or frame_time <= 0:
+        what = f"Frame Time: must be a positive number of seconds, found {seconds!r}"
+        raise _Broken(line, f"{what}; 30 frames per second are 0.0333333")
+    return (int(count), count_line), frame_time, rest, line + 1
 
 
-def _parse_rows(rows: bytes, name: str, rows_line: int, joints, num_frames) -> np.ndarray:
+def _parse_rows(rows: bytes, first_line: int, joints, num_frames) -> np.ndarray:
     """Return the MOTION block, [frames, channels], in one pass over all of it.
 
     numpy's text reader is fast but its messages know no BVH; so when anything is amiss, a second,
     slow pass finds out where and what.
     """
-    count, frames_line = num_frames
+    count, count_line = num_frames
     columns = sum(len(joint.channels) for joint in joints)
-    values = None
+    values = np.empty((0, columns))
     if rows.strip():
         try:
             values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
         except ValueError:  # UnicodeDecodeError is one, too
-            values = None
-    if values is not None and values.shape == (count, columns) and np.isfinite(values).all():
+            pass
+    if values.shape == (count, columns) and np.isfinite(values).all():
         return values
-    _explain_rows(rows, name, rows_line, joints, columns)
-    found = 0 if values is None else len(values)
-    _fail(
-        name,
-        frames_line,
-        f"Frames: says {count}, but {found} rows of numbers follow; the file is cut off or the "
-        "count is wrong: export it again or mend the count",
-    )
+    _explain_rows(rows, first_line, joints, columns)
+    what = f"Frames: says {count}, but {len(values)} rows of numbers follow"
+    raise _Broken(count_line, f"{what}; export the file again or mend the count")
 
 
-def _rows_with_lines(rows: bytes, rows_line: int):
+def _rows_with_lines(rows: bytes, first_line: int):
     """Yield (line number, words) of the rows that are not blank."""
-    for line, raw in enumerate(rows.split(b"\n"), start=rows_line):
+    for line, raw in enumerate(rows.split(b"\n"), start=first_line):
         words = raw.decode("utf-8", errors="replace").split()
         if words:
             yield line, words
 
 
-def _explain_rows(rows: bytes, name: str, rows_line: int, joints, columns: int):
+def _explain_rows(rows: bytes, first_line: int, joints, columns: int):
     """Raise for the first row that is not `columns` finite numbers; return if there is none."""
     labels = [f"{axis}{kind} of {joint.name}" for joint in joints for axis, kind in joint.channels]
-    for frame, (line, words) in enumerate(_rows_with_lines(rows, rows_line)):
+    for frame, (line, words) in enumerate(_rows_with_lines(rows, first_line)):
         for column, word in enumerate(words):
             if _finite_number(word) is None:
                 what = labels[column] if column < columns else "beyond the last channel"
-                _fail(
-                    name,
-                    line,
-                    f"{word[:40]!r} (number {column + 1} of frame {frame}, {what}) is not a finite "
-                    "number; mend it or export the file again",
-                )
+                place = f"number {column + 1} of frame {frame}, {what}"
+                raise _Broken(line, f"{word[:40]!r} ({place}) is not a finite number; mend it or export again")
         if len(words) != columns:
             how = "cut off" if len(words) < columns else "too long"
-            _fail(
-                name,
-                line,
-                f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} "
-                f"channels: the row is {how}; export the file again",
-            )
+            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} channels"
+            raise _Broken(line, f"{what}: the row is {how}; export the file again")
 
 
-def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows_line) -> Motion:
+def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, first_line) -> Motion:
     """Turn channel values into root positions, bones and matrices."""
     frames, count = len(values), len(joints)
-    rotations = np.empty((frames, count, 3, 3))
-    by_order: dict[str, list[int]] = {}
-    for joint, item in enumerate(joints):
-        by_order.setdefault(item.rotation_order, []).append(joint)
-    for order, members in by_order.items():
-        if order:
-            columns = [joints[joint].rotation_columns for joint in members]
-            rotations[:, members] = matrix_from_euler(order, values[:, columns])
-        else:
-            rotations[:, members] = np.eye(3)
+    turns = [joint.columns("rotation") for joint in joints]
+    rotations = np.broadcast_to(np.eye(3), (frames, count, 3, 3)).copy()
+    # All joints of one rotation order at once.
+    for order in {"".join(columns) for columns in turns} - {""}:
+        members = [joint for joint, columns in enumerate(turns) if "".join(columns) == order]
+        rotations[:, members] = matrix_from_euler(order, values[:, [list(turns[joint].values()) for joint in members]])
 
     def channel_positions(joint):
         position = np.tile(scale * np.array(joints[joint].offset), (frames, 1))
-        for axis, column in joints[joint].position.items():
+        for axis, column in moves[joint].items():
             position[:, "XYZ".index(axis)] = scale * values[:, column]
         return position
 
+    moves = [joint.columns("position") for joint in joints]
     parents = [joint.parent for joint in joints]
     root, root_position = 0, channel_positions(0)
-    if count > 1 and joints[0].position and joints[1].position and parents.count(0) == 1:
+    if count > 1 and moves[0] and moves[1] and parents.count(0) == 1:
+        # The first joint only carries the second, which becomes the root.
         root = 1
         root_position = root_position + np.einsum("tab,tb->ta", rotations[:, 0], channel_positions(1))
         rotations[:, 1] = rotations[:, 0] @ rotations[:, 1]
 
     offsets = np.zeros((count, 3))
     for joint in range(root + 1, count):
-        offsets[joint] = scale * np.array(joints[joint].offset)
-        if joints[joint].position:
-            position = channel_positions(joint)
-            offsets[joint] = position.mean(axis=0)
-            error = np.abs(position - offsets[joint]).max(axis=1)
-            if error.max() > RIGID_TOLERANCE:
-                frame = int(error.argmax())
-                line = [line for line, _ in _rows_with_lines(rows, rows_line)][frame]
-                _fail(
-                    name,
-                    line,
-                    f"the position channels of {joints[joint].name!r} move by "
-                    f"{1000 * error.max():.1f} mm in frame {frame}; bones must be rigid: bake the "
-                    "motion to rotations before exporting",
-                )
+        if not moves[joint]:
+            offsets[joint] = scale * np.array(joints[joint].offset)
+            continue
+        position = channel_positions(joint)
+        offsets[joint] = position.mean(axis=0)
+        error = np.abs(position - offsets[joint]).max(axis=1)
+        if error.max() > RIGID_TOLERANCE:
+            frame = int(error.argmax())
+            line = [line for line, _ in _rows_with_lines(rows, first_line)][frame]
+            what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame {frame}"
+            raise _Broken(line, f"{what}; bones must be rigid: bake the motion to rotations before exporting")
     skeleton = Skeleton(
         names=tuple(joint.name for joint in joints[root:]),
         parents=tuple(max(parent - root, -1) for parent in parents[root:]),
@@ -554,6 +473,4 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, rows
             (joint - root, tuple(scale * value for value in offset)) for joint, offset in end_sites if joint >= root
         ),
     )
-    return Motion(
-        skeleton=skeleton, root_position=root_position, rotations=rotations[:, root:], fps=1.0 / frame_time, name=name
-    )
+    return Motion(skeleton, root_position, rotations[:, root:], fps=1.0 / frame_time, name=name)

@@ -16,7 +16,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.curves import smoothstep
 from f3amd_lib.motion.skeleton import Motion
 
 NAMES = ("straight", "circle", "figure-eight", "slalom", "square", "spiral", "complex")
@@ -46,23 +48,15 @@ class RootPath:
     fps: float = 30.0
 
     def __post_init__(self):
-        position = np.array(self.position, dtype=np.float64)
-        yaw = np.array(self.yaw, dtype=np.float64)
-        if position.ndim != 2 or position.shape[1] != 2 or yaw.shape != position.shape[:1]:
-            raise ValueError(f"a path needs position [T, 2] and yaw [T]; got {position.shape} and {yaw.shape}")
-        if len(position) == 0:
-            raise ValueError("a path needs at least one frame")
+        position = finite_array("path position", self.position, ("frame", 2)).copy()
+        yaw = np.unwrap(finite_array("path yaw", self.yaw, ("frame",)))
+        if len(yaw) != len(position):
+            raise ValueError(f"a path's position has {len(position)} frames, its yaw {len(yaw)}")
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise ValueError(f"a path's fps must be positive, got {self.fps}")
-        for what, array in (("position", position), ("yaw", yaw)):
-            if not np.all(np.isfinite(array)):
-                frame = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise ValueError(f"path {what} is not finite at frame {frame}")
-        yaw = np.unwrap(yaw)
-        position.setflags(write=False)
-        yaw.setflags(write=False)
-        object.__setattr__(self, "position", position)
-        object.__setattr__(self, "yaw", yaw)
+        for name, array in (("position", position), ("yaw", yaw)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @property
     def num_frames(self) -> int:
@@ -148,7 +142,7 @@ def named_path(
         fine_speed = np.full_like(fine_time, speed)
         heading, facing_offset = None, 0.0
     if ramp_seconds > 0:
-        fine_speed = fine_speed * _smoothstep(fine_time / ramp_seconds)
+        fine_speed = fine_speed * smoothstep(fine_time / ramp_seconds)
     distance = _integrate(fine_speed, fine_time)
     if heading is None:
         heading = _HEADINGS[name](distance)
@@ -165,12 +159,6 @@ def _integrate(rate: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Integrate a rate over time by the trapezium rule, starting at 0."""
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
     return np.concatenate([np.zeros(1), np.cumsum(steps)])
-
-
-def _smoothstep(u: np.ndarray) -> np.ndarray:
-    """Rise from 0 to 1 over [0, 1] with level ends."""
-    u = np.clip(u, 0.0, 1.0)
-    return u * u * (3.0 - 2.0 * u)
 
 
 def _heading_figure_eight(distance: np.ndarray) -> np.ndarray:
@@ -191,7 +179,7 @@ def _heading_square(distance: np.ndarray) -> np.ndarray:
     along = (distance + straight / 2.0) / (straight + corner)
     side = np.floor(along)
     within = (along - side) * (straight + corner) - straight
-    return 0.5 * np.pi * (side + _smoothstep(within / corner))
+    return 0.5 * np.pi * (side + smoothstep(within / corner))
 
 
 def _heading_spiral(distance: np.ndarray) -> np.ndarray:
@@ -277,51 +265,33 @@ def read_path_csv(path) -> RootPath:
         raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
     reader = csv.reader(text.splitlines())
     header = [cell.strip() for cell in next(reader, [])]
-    if len(set(header)) != len(header):
-        raise ValueError(f"{path}: line 1: a column is named twice in {', '.join(header)}")
-    for column in ("x", "z"):
-        if column not in header:
-            raise ValueError(
-                f"{path}: line 1: column {column!r} is missing; the header must be x,z or "
-                f"x,z,yaw_deg, it is {','.join(header) or 'empty'}"
-            )
-    unknown = set(header) - {"x", "z", "yaw_deg"}
-    if unknown:
-        raise ValueError(
-            f"{path}: line 1: unknown column {min(unknown)!r}; the header must be x,z or "
-            "x,z,yaw_deg (facing in degrees)"
-        )
-
-    rows: list[list[float]] = []
+    if sorted(header) not in (["x", "z"], ["x", "yaw_deg", "z"]):
+        raise ValueError(f"{path}: line 1: the header must be x,z or x,z,yaw_deg, it is {','.join(header) or 'empty'}")
+    rows: list[dict[str, float]] = []
     for cells in reader:
-        line = reader.line_num
         if not "".join(cells).strip():
             continue
+        where = f"{path}: line {reader.line_num}:"
         if len(cells) != len(header):
-            raise ValueError(f"{path}: line {line}: {len(cells)} cells where the header has {len(header)}")
-        row = []
+            raise ValueError(f"{where} {len(cells)} cells where the header has {len(header)}")
+        row = {}
         for column, cell in zip(header, cells, strict=True):
             try:
-                number = float(cell)
+                row[column] = float(cell)
             except ValueError:
-                raise ValueError(f"{path}: line {line}: {column} is {cell.strip()!r}, not a number") from None
-            if not np.isfinite(number):
-                raise ValueError(f"{path}: line {line}: {column} is {cell.strip()}, not finite")
-            row.append(number)
-        if rows:
-            jump = float(np.hypot(*(row[header.index(c)] - rows[-1][header.index(c)] for c in ("x", "z"))))
-            if jump > MAX_STEP:
-                raise ValueError(
-                    f"{path}: line {line}: jumps {jump:.2f} m in one frame (at most {MAX_STEP} m "
-                    "at 30 fps); units are metres and one row is one frame"
-                )
+                row[column] = np.nan
+            if not np.isfinite(row[column]):
+                raise ValueError(f"{where} {column} is {cell.strip()!r}, not a finite number")
+        jump = np.hypot(row["x"] - rows[-1]["x"], row["z"] - rows[-1]["z"]) if rows else 0.0
+        if jump > MAX_STEP:
+            limit = f"at most {MAX_STEP} m at 30 fps"
+            raise ValueError(f"{where} jumps {jump:.2f} m in a frame ({limit}); units are metres, a row is a frame")
         rows.append(row)
     if len(rows) < 2:
         raise ValueError(f"{path}: a path needs at least 2 rows below its header, has {len(rows)}")
-    table = np.array(rows)
-    position = table[:, [header.index("x"), header.index("z")]]
+    position = np.array([[row["x"], row["z"]] for row in rows])
     if "yaw_deg" in header:
-        return RootPath(position, np.deg2rad(table[:, header.index("yaw_deg")]))
+        return RootPath(position, np.deg2rad([row["yaw_deg"] for row in rows]))
     return RootPath(position, tangent_yaw(position))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, finite_array
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
 CONTACT_SPEED = 0.01
@@ -31,15 +31,12 @@ _ROLE_NAMES = {
 def _other_side(name: str) -> str | None:
     """Return the name of the joint on the other side of the body, or None for a middle joint."""
     for left, right in (("Left", "Right"), ("left", "right")):
-        if left in name:
-            return name.replace(left, right)
-        if right in name:
-            return name.replace(right, left)
-    for left, right in (("_L", "_R"), ("_l", "_r")):
-        if name.endswith(left):
-            return name.removesuffix(left) + right
-        if name.endswith(right):
-            return name.removesuffix(right) + left
+        for own, other in ((left, right), (right, left)):
+            if own in name:
+                return name.replace(own, other)
+    for own, other in (("_L", "_R"), ("_R", "_L"), ("_l", "_r"), ("_r", "_l")):
+        if name.endswith(own):
+            return name.removesuffix(own) + other
     return None
 
 
@@ -71,15 +68,11 @@ class Skeleton:
         object.__setattr__(self, "offsets", offsets)
         count = len(self.names)
         if count == 0 or len(self.parents) != count or offsets.shape != (count, 3):
-            raise ValueError(
-                f"skeleton needs one name, parent and offset a joint; got {count} names, "
-                f"{len(self.parents)} parents and offsets of shape {offsets.shape}"
-            )
+            there = f"{count} names, {len(self.parents)} parents and offsets of shape {offsets.shape}"
+            raise ValueError(f"skeleton needs one name, parent and offset a joint; got {there}")
         if len(set(self.names)) != count:
             raise ValueError("skeleton joint names must be unique")
-        if self.parents[0] != -1 or any(
-            not 0 <= parent < joint for joint, parent in enumerate(self.parents[1:], start=1)
-        ):
+        if self.parents[0] != -1 or any(not 0 <= parent <= k for k, parent in enumerate(self.parents[1:])):
             raise ValueError("skeleton needs the root first and every parent before its children")
         if not np.all(np.isfinite(offsets)):
             raise ValueError("skeleton offsets must be finite")
@@ -112,10 +105,8 @@ class Skeleton:
         for name in _ROLE_NAMES[role]:
             if name in self.names:
                 return self.names.index(name)
-        raise ValueError(
-            f"no joint of this skeleton is known as its {role}; looked for "
-            f"{', '.join(_ROLE_NAMES[role])} among {', '.join(self.names)}"
-        )
+        wanted = ", ".join(_ROLE_NAMES[role])
+        raise ValueError(f"no joint is known as its {role}; looked for {wanted} among {', '.join(self.names)}")
 
     @property
     def toes(self) -> tuple[int, int]:
@@ -129,9 +120,7 @@ class Skeleton:
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
                 depth[joint] = depth[parent] + 1
-        return tuple(
-            tuple(joint for joint in range(self.num_joints) if depth[joint] == level) for level in range(max(depth) + 1)
-        )
+        return tuple(tuple(np.flatnonzero(np.equal(depth, level)).tolist()) for level in range(max(depth) + 1))
 
     @functools.cached_property
     def mirror_permutation(self) -> tuple[int, ...]:
@@ -169,55 +158,68 @@ class Skeleton:
             tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
             parent = self.parents[joint]
             inherited = [k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])]
-            if inherited:
-                choice = inherited[0]
-            else:
-                choice = 3 if 3 in tied and parent >= 0 else tied[0]
-            frames[joint] = candidates[choice]
+            backwards = [3] if 3 in tied and parent >= 0 else []
+            frames[joint] = candidates[[*inherited, *backwards, *tied][0]]
         return frames
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A skeleton in motion.
+    """A skeleton in motion: where all joints are, and how they are turned where that is known.
+
+    Motion with rotations is made of these and the root's path, and `positions` follow from them. Motion
+    without (`Motion.from_positions`) is made of positions alone; what needs rotations refuses it.
 
     Attributes:
       skeleton: the joints.
       root_position: [T, 3], metres, global.
-      rotations: [T, J, 3, 3], local rotation matrices; the root's is global.
+      rotations: [T, J, 3, 3], local rotation matrices; the root's is global. None for positions alone.
       fps: frames per second.
       name: where it came from, for messages and titles.
+      joint_positions: [T, J, 3], metres, global, for positions alone; None where there are rotations.
 
     Raises:
-      ValueError: for shapes that do not agree, no frames, a bad fps, or numbers not finite.
+      ValueError: for shapes that do not agree, no frames, a bad fps, numbers not finite, or not exactly
+        one of rotations and joint_positions.
     """
 
     skeleton: Skeleton
     root_position: np.ndarray
-    rotations: np.ndarray
+    rotations: np.ndarray | None
     fps: float = 30.0
     name: str = ""
+    joint_positions: np.ndarray | None = None
 
     def __post_init__(self):
-        root_position = np.asarray(self.root_position)
-        rotations = np.asarray(self.rotations)
-        object.__setattr__(self, "root_position", root_position)
-        object.__setattr__(self, "rotations", rotations)
         label = f"motion {self.name!r}"
-        frames = root_position.shape[0] if root_position.ndim else 0
-        expected = (frames, self.skeleton.num_joints, 3, 3)
-        if frames == 0 or root_position.shape != (frames, 3) or rotations.shape != expected:
-            raise ValueError(
-                f"{label}: root_position must be [T, 3] with T > 0 and rotations "
-                f"[T, {self.skeleton.num_joints}, 3, 3]; got {root_position.shape} and "
-                f"{rotations.shape}"
-            )
+        if (self.rotations is None) == (self.joint_positions is None):
+            raise ValueError(f"{label} needs either rotations or joint_positions")
+        joints = self.skeleton.num_joints
+        shapes = {"root_position": (3,), "rotations": (joints, 3, 3), "joint_positions": (joints, 3)}
+        for what, array in self._arrays().items():
+            array = finite_array(f"{label}: {what}", array, ("frame", *shapes[what]), dtype=None)
+            object.__setattr__(self, what, array)
+        lengths = {what: len(array) for what, array in self._arrays().items()}
+        if len(set(lengths.values())) != 1:
+            raise ValueError(f"{label}: arrays have unlike numbers of frames, {lengths}")
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise ValueError(f"{label}: fps must be positive, got {self.fps}")
-        for what, array in (("root_position", root_position), ("rotations", rotations)):
-            if not np.all(np.isfinite(array)):
-                frame = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise ValueError(f"{label}: {what} is not finite at frame {frame}")
+
+    @classmethod
+    def from_positions(cls, skeleton: Skeleton, positions, fps: float = 30.0, name: str = "") -> Motion:
+        """Return motion of positions alone, [T, J, 3] in metres, the root's first."""
+        positions = np.asarray(positions)
+        return cls(skeleton, positions[..., 0, :], None, fps, name, positions)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays that this motion is made of, by name."""
+        return {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+
+    def needed_rotations(self, why: str) -> np.ndarray:
+        """Return the rotations; ValueError says `why` they are needed where there are none."""
+        if self.rotations is None:
+            raise ValueError(f"motion {self.name!r} has positions alone: {why} needs rotations, so fit some first")
+        return self.rotations
 
     @property
     def num_frames(self) -> int:
@@ -227,6 +229,8 @@ class Motion:
     @functools.cached_property
     def positions(self) -> np.ndarray:
         """Global joint positions, [T, J, 3], metres."""
+        if self.rotations is None:
+            return self.joint_positions
         return forward_kinematics(self.skeleton, self.root_position, self.rotations)
 
     @functools.cached_property
@@ -241,13 +245,14 @@ class Motion:
 
     def slice(self, start: int, stop: int) -> Motion:
         """Return frames start (included) to stop (excluded)."""
-        return dataclasses.replace(
-            self, root_position=self.root_position[start:stop], rotations=self.rotations[start:stop]
-        )
+        return self.replace(**{name: array[start:stop] for name, array in self._arrays().items()})
 
     def replace(self, **changes) -> Motion:
         """Return a copy with some attributes changed."""
         return dataclasses.replace(self, **changes)
+
+
+_ARRAYS = ("root_position", "rotations", "joint_positions")
 
 
 def _compose(first, second):
@@ -271,9 +276,8 @@ def _walk(skeleton: Skeleton, root_position, rotations):
         slot = np.array([previous.index(skeleton.parents[joint]) for joint in level])
         joints = np.array(level)
         above = level_rotations[-1][..., slot, :, :]
-        level_positions.append(
-            level_positions[-1][..., slot, :] + sum(above[..., k] * offsets[joints, k, None] for k in range(3))
-        )
+        bones = sum(above[..., k] * offsets[joints, k, None] for k in range(3))
+        level_positions.append(level_positions[-1][..., slot, :] + bones)
         level_rotations.append(_compose(above, rotations[..., joints, :, :]))
     order = np.argsort(np.array([joint for level in skeleton.levels for joint in level]))
     positions = xp.concatenate(level_positions, axis=-2)[..., order, :]
@@ -355,18 +359,18 @@ def mirror(motion: Motion) -> Motion:
     """
     skeleton = motion.skeleton
     twin = np.array(skeleton.mirror_permutation)
-    reflect = np.diag([-1.0, 1.0, 1.0])
+    name = f"{motion.name} (mirrored)" if motion.name else ""
+    flip = np.array([-1.0, 1.0, 1.0])
+    if motion.rotations is None:
+        return Motion.from_positions(skeleton, motion.positions[:, twin] * flip, motion.fps, name)
     turned = global_rotations(skeleton, np.asarray(motion.rotations, dtype=np.float64))
-    turned = reflect @ turned[:, twin] * skeleton.mirror_frames[None, :, None, :]
+    turned = np.diag(flip) @ turned[:, twin] * skeleton.mirror_frames[None, :, None, :]
     local = turned.copy()
     for joint, parent in enumerate(skeleton.parents):
         if parent >= 0:
             local[:, joint] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, joint]
-    return motion.replace(
-        root_position=motion.root_position * np.array([-1.0, 1.0, 1.0]),
-        rotations=local.astype(motion.rotations.dtype),
-        name=f"{motion.name} (mirrored)" if motion.name else "",
-    )
+    local = local.astype(motion.rotations.dtype)
+    return motion.replace(root_position=motion.root_position * flip, rotations=local, name=name)
 
 
 def resample(motion: Motion, fps: float = 30.0) -> Motion:
@@ -385,23 +389,29 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
         raise ValueError(f"fps must be positive, got {fps}")
     ratio = motion.fps / fps
     if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
-        stride = int(round(ratio))
-        return motion.replace(
-            root_position=motion.root_position[::stride], rotations=motion.rotations[::stride], fps=float(fps)
-        )
+        every = {name: array[:: round(ratio)] for name, array in motion._arrays().items()}
+        return motion.replace(**every, fps=float(fps))
     duration = (motion.num_frames - 1) / motion.fps
     times = np.arange(int(np.floor(duration * fps + 1e-6)) + 1) / fps * motion.fps
     low = np.minimum(np.floor(times).astype(int), motion.num_frames - 1)
     high = np.minimum(low + 1, motion.num_frames - 1)
-    weight = times - low
-    root = (1 - weight)[:, None] * motion.root_position[low] + weight[:, None] * motion.root_position[high]
-    rotations = slerp_matrices(motion.rotations[low], motion.rotations[high], weight[:, None])
-    return motion.replace(root_position=root, rotations=rotations, fps=float(fps))
+    weight = (times - low)[:, None]
+
+    def between(positions):
+        across = weight.reshape(-1, *[1] * (positions.ndim - 1))
+        return (1 - across) * positions[low] + across * positions[high]
+
+    if motion.rotations is None:
+        return Motion.from_positions(motion.skeleton, between(motion.positions), float(fps), motion.name)
+    rotations = slerp_matrices(motion.rotations[low], motion.rotations[high], weight)
+    return motion.replace(root_position=between(motion.root_position), rotations=rotations, fps=float(fps))
 
 
 def turn(motion: Motion, yaw: float) -> Motion:
     """Turn a whole motion about the world's +Y axis through the origin by `yaw` radians."""
     matrix = matrix_from_yaw(np.float64(yaw))
+    if motion.rotations is None:
+        return Motion.from_positions(motion.skeleton, motion.positions @ matrix.T, motion.fps, motion.name)
     rotations = np.array(motion.rotations, copy=True)
     rotations[:, 0] = matrix @ rotations[:, 0]
     return motion.replace(root_position=motion.root_position @ matrix.T, rotations=rotations)

@@ -17,227 +17,95 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, make_dataclass
 from importlib import resources
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 # ------------------------------------------------------------------------------------ skeleton
 
+
+def _read_skeleton() -> Skeleton:
+    """Read `walker_skeleton.csv`: a T-pose that faces +Z with the left at +X; rows without a name are tips."""
+    with (resources.files("f3amd_lib.motion") / "walker_skeleton.csv").open(encoding="utf-8", newline="") as file:
+        rows = [(row["joint"], row["parent"], [float(row[axis]) for axis in "xyz"]) for row in csv.DictReader(file)]
+    names = [joint for joint, _, _ in rows if joint]
+    return Skeleton(
+        names=tuple(names),
+        parents=tuple(names.index(parent) if parent else -1 for joint, parent, _ in rows if joint),
+        offsets=np.array([offset for joint, _, offset in rows if joint]),
+        end_sites=tuple((names.index(parent), tuple(offset)) for joint, parent, offset in rows if not joint),
+    )
+
+
+SYNTHETIC_SKELETON = _read_skeleton()
+"""23 joints with 100STYLE's names and axis-aligned T-pose (zero rotations), own proportions."""
+
 _SPINE = ("Chest", "Chest2", "Chest3", "Chest4")
-_THIGH, _SHANK = 0.430, 0.420
-_HIP_OFFSET = np.array([0.092, -0.010, 0.0])
-_TOE_OFFSET = np.array([0.0, -0.075, 0.135])
+_HIP_OFFSET, _KNEE_OFFSET, _ANKLE_OFFSET, _TOE_OFFSET = (
+    SYNTHETIC_SKELETON.offsets[SYNTHETIC_SKELETON.index(f"Left{joint}")] for joint in ("Hip", "Knee", "Ankle", "Toe")
+)
+_THIGH, _SHANK = -_KNEE_OFFSET[1], -_ANKLE_OFFSET[1]
 _TOE_HEIGHT = 0.012
 _FOOT_LENGTH = float(np.hypot(_TOE_OFFSET[1], _TOE_OFFSET[2])) + 0.05
 """From the back of the heel to the toe joint, metres: how far a toe rises on the heel."""
 
 
-def _build_skeleton() -> Skeleton:
-    """Lay out 23 joints in a T-pose that faces +Z with the left at +X."""
-    joints: list[tuple[str, str | None, tuple[float, float, float]]] = [
-        ("Hips", None, (0.0, 0.0, 0.0)),
-        ("Chest", "Hips", (0.0, 0.115, 0.0)),
-        ("Chest2", "Chest", (0.0, 0.100, 0.0)),
-        ("Chest3", "Chest2", (0.0, 0.095, 0.0)),
-        ("Chest4", "Chest3", (0.0, 0.095, 0.0)),
-        ("Neck", "Chest4", (0.0, 0.130, 0.0)),
-        ("Head", "Neck", (0.0, 0.090, 0.010)),
-    ]
-    ends: list[tuple[str, tuple[float, float, float]]] = [("Head", (0.0, 0.175, 0.0))]
-    for side, sign in (("Right", -1.0), ("Left", 1.0)):
-        joints += [
-            (f"{side}Collar", "Chest4", (sign * 0.030, 0.080, 0.0)),
-            (f"{side}Shoulder", f"{side}Collar", (sign * 0.150, 0.0, 0.0)),
-            (f"{side}Elbow", f"{side}Shoulder", (sign * 0.290, 0.0, 0.0)),
-            (f"{side}Wrist", f"{side}Elbow", (sign * 0.250, 0.0, 0.0)),
-        ]
-        ends.append((f"{side}Wrist", (sign * 0.180, 0.0, 0.0)))
-    mirror_x = np.array([-1.0, 1.0, 1.0])
-    for side, sign in (("Right", mirror_x), ("Left", np.ones(3))):
-        joints += [
-            (f"{side}Hip", "Hips", tuple(sign * _HIP_OFFSET)),
-            (f"{side}Knee", f"{side}Hip", (0.0, -_THIGH, 0.0)),
-            (f"{side}Ankle", f"{side}Knee", (0.0, -_SHANK, 0.0)),
-            (f"{side}Toe", f"{side}Ankle", tuple(sign * _TOE_OFFSET)),
-        ]
-        ends.append((f"{side}Toe", (0.0, -0.006, 0.065)))
-    names = tuple(name for name, _, _ in joints)
-    return Skeleton(
-        names=names,
-        parents=tuple(-1 if above is None else names.index(above) for _, above, _ in joints),
-        offsets=np.array([offset for _, _, offset in joints]),
-        end_sites=tuple((names.index(name), offset) for name, offset in ends),
-    )
-
-
-SYNTHETIC_SKELETON = _build_skeleton()
-"""23 joints with 100STYLE's names and axis-aligned T-pose (zero rotations), own proportions."""
-
-
 # ---------------------------------------------------------------------------------- parameters
 
 
-@dataclass(frozen=True)
-class ArmPose:
-    """How one arm is held and how it moves. All angles are relative to an arm hanging down.
-
-    Attributes:
-      forward_deg: shoulder raised forwards, degrees.
-      side_deg: shoulder raised sideways, away from the body, degrees.
-      twist_deg: upper arm turned inwards, degrees (brings a bent forearm across the body).
-      elbow_deg: elbow bend, degrees.
-      swing_deg: amplitude of the swing against the legs, degrees.
-      elbow_swing_deg: extra elbow bend while the arm is in front, degrees.
-      wave_forward_deg, wave_side_deg, wave_twist_deg, wave_elbow_deg: amplitudes of a gesture that
-        runs beside the gait (waving, flapping, rowing), degrees.
-      wave_hz: rate of that gesture, cycles per second.
-      hang: share of the trunk's lean that gravity takes back, 0 (held stiff) to 1 (hangs).
-    """
-
-    forward_deg: float = 2.0
-    side_deg: float = 10.0
-    twist_deg: float = 12.0
-    elbow_deg: float = 16.0
-    swing_deg: float = 22.0
-    elbow_swing_deg: float = 10.0
-    wave_forward_deg: float = 0.0
-    wave_side_deg: float = 0.0
-    wave_twist_deg: float = 0.0
-    wave_elbow_deg: float = 0.0
-    wave_hz: float = 1.0
-    hang: float = 0.8
+def _symmetric(style) -> bool:
+    """Whether a mirrored clip is again a clip of the same style."""
+    one_sided = ("limp", "heading_deg", "spine_roll_deg", "spine_twist_deg", "head_roll_deg", "head_yaw_deg")
+    return (
+        style.left_arm == style.right_arm
+        and style.left_lift_scale == style.right_lift_scale
+        and style.rhythm == 0.5
+        and not any(getattr(style, name) for name in one_sided)
+    )
 
 
-@dataclass(frozen=True)
-class StyleParameters:
-    """Everything that tells one style from another; the defaults are the style Neutral.
+_STYLE_TABLE = tomllib.loads((resources.files("f3amd_lib.motion") / "styles.toml").read_text(encoding="utf-8"))
+_NEUTRAL, _NEUTRAL_ARM = _STYLE_TABLE["Neutral"], _STYLE_TABLE["Neutral"].pop("arms")
 
-    Attributes:
-      speed: usual speed on a straight path, m/s.
-      step_length: length of a step at that speed, metres.
-      duty: share of the stride for which a toe stays planted, 0 to 1 (walks 0.55, runs 0.35).
-      rhythm: share of the stride between a left and the next right footfall (0.5 is even; 0.3
-        gallops, 0.05 jumps off both feet).
-      step_width: distance between the feet across the direction of facing, metres.
-      toe_out_deg: feet turned outwards, degrees.
-      knee_out_deg: knees turned outwards, degrees.
-      foot_lift: height of the toe's arc, metres.
-      left_lift_scale, right_lift_scale: factor on the lift of one foot (0.1 drags it).
-      circumduction: how far a swinging foot is carried outwards, metres.
-      heel_off_deg: pitch of the foot as it leaves the ground, degrees.
-      toe_up_deg: how far the toes are raised before landing, degrees.
-      heel_raise_deg: heel held off the ground throughout, degrees (tiptoe).
-      crouch: pelvis lowered by this much, metres.
-      bounce: amplitude of the pelvis' rise at mid-stance, metres; negative for runs, which are
-        lowest there.
-      hop: amplitude of the pelvis' flight, once a stride, metres (jumps and gallops).
-      sway: amplitude of the pelvis' travel towards the standing leg, metres.
-      hip_twist_deg: amplitude of the pelvis' turn with the legs, degrees.
-      hip_roll_deg: amplitude of the pelvis' drop on the swinging side, degrees.
-      chest_twist_deg: amplitude of the shoulders' turn against the legs, degrees.
-      chest_roll_deg: amplitude of the shoulders' sideways rocking, degrees.
-      pelvis_pitch_deg: pelvis tipped forwards, degrees.
-      spine_pitch_deg, spine_roll_deg, spine_twist_deg: posture of the whole spine, degrees:
-        forwards, to the left, turned to the left.
-      head_pitch_deg, head_roll_deg, head_yaw_deg: head bowed, tilted to the left, turned left.
-      head_bob_deg: amplitude of nodding with each step, degrees.
-      shrug_deg: shoulders drawn up, degrees.
-      left_arm, right_arm: see `ArmPose`.
-      opposed_waves: the arms' gestures run in opposite phase.
-      limp: -1 to 1; positive spares the left leg (short stance, dip over it), negative the right.
-      heading_deg: moving direction against facing on a straight path, degrees, left positive.
-      unsteadiness: random scatter of footfalls and trunk, 0 (drilled) upwards; 1 is drunk.
-      stop_share: share of the time spent standing, 0 to 1.
-      turn_scale: factor on how sharply the path turns.
-    """
+# What a parameter means stands beside its number, in [Neutral] of styles.toml.
+ArmPose = make_dataclass("ArmPose", [(name, float, value) for name, value in _NEUTRAL_ARM.items()], frozen=True)
+"""How one arm is held and how it moves; the defaults are those of the style Neutral."""
 
-    speed: float = 1.20
-    step_length: float = 0.62
-    duty: float = 0.55
-    rhythm: float = 0.5
-    step_width: float = 0.17
-    toe_out_deg: float = 7.0
-    knee_out_deg: float = 0.0
-    foot_lift: float = 0.045
-    left_lift_scale: float = 1.0
-    right_lift_scale: float = 1.0
-    circumduction: float = 0.01
-    heel_off_deg: float = 48.0
-    toe_up_deg: float = 14.0
-    heel_raise_deg: float = 0.0
-    crouch: float = 0.0
-    bounce: float = 0.022
-    hop: float = 0.0
-    sway: float = 0.022
-    hip_twist_deg: float = 5.0
-    hip_roll_deg: float = 3.0
-    chest_twist_deg: float = 6.0
-    chest_roll_deg: float = 1.0
-    pelvis_pitch_deg: float = 2.0
-    spine_pitch_deg: float = 3.0
-    spine_roll_deg: float = 0.0
-    spine_twist_deg: float = 0.0
-    head_pitch_deg: float = 2.0
-    head_roll_deg: float = 0.0
-    head_yaw_deg: float = 0.0
-    head_bob_deg: float = 1.0
-    shrug_deg: float = 0.0
-    left_arm: ArmPose = field(default_factory=ArmPose)
-    right_arm: ArmPose = field(default_factory=ArmPose)
-    opposed_waves: bool = False
-    limp: float = 0.0
-    heading_deg: float = 0.0
-    unsteadiness: float = 0.08
-    stop_share: float = 0.10
-    turn_scale: float = 1.0
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether a mirrored clip is again a clip of the same style."""
-        return (
-            self.left_arm == self.right_arm
-            and self.left_lift_scale == self.right_lift_scale
-            and self.rhythm == 0.5
-            and not any(
-                (
-                    self.limp,
-                    self.heading_deg,
-                    self.spine_roll_deg,
-                    self.spine_twist_deg,
-                    self.head_roll_deg,
-                    self.head_yaw_deg,
-                )
-            )
-        )
+StyleParameters = make_dataclass(
+    "StyleParameters",
+    [(name, type(value), value) for name, value in _NEUTRAL.items()]
+    + [(name, ArmPose, ArmPose()) for name in ("left_arm", "right_arm")],
+    frozen=True,
+    namespace={"symmetric": property(_symmetric)},
+)
+"""Everything that tells one style from another; the defaults are the style Neutral."""
 
 
-def _read_styles() -> dict[str, StyleParameters]:
-    """Read `styles.toml`, which holds what differs from the defaults."""
-    text = (resources.files("f3amd_lib.motion") / "styles.toml").read_text(encoding="utf-8")
-    styles = {}
-    for name, values in tomllib.loads(text).items():
-        both = values.pop("arms", {})
-        for side in ("left_arm", "right_arm"):
-            values[side] = ArmPose(**values.get(side, both))
-        # A slower walk takes shorter steps unless it says otherwise.
-        speed = values.get("speed", StyleParameters.speed)
-        values.setdefault("step_length", float(0.62 * np.sqrt(min(speed / 1.20, 1.3))))
-        styles[name] = StyleParameters(**values)
-    return styles
+def _complete(values: dict) -> StyleParameters:
+    """Return a style from what differs from Neutral."""
+    both = values.get("arms", {})
+    arms = {side: ArmPose(**values.get(side, both)) for side in ("left_arm", "right_arm")}
+    # A slower walk takes shorter steps unless it says otherwise.
+    step_length = float(0.62 * np.sqrt(min(values.get("speed", _NEUTRAL["speed"]) / 1.20, 1.3)))
+    own = {name: value for name, value in values.items() if name != "arms"}
+    return StyleParameters(**{"step_length": step_length, **own, **arms})
 
 
-_STYLE_TABLE = _read_styles()
-STYLES: tuple[str, ...] = tuple(sorted(_STYLE_TABLE))
+_STYLES = {name: _complete(values) for name, values in _STYLE_TABLE.items()}
+STYLES: tuple[str, ...] = tuple(sorted(_STYLES))
 """The hundred style names, sorted."""
 
 
@@ -254,12 +122,9 @@ def style_parameters(name: str) -> StyleParameters:
       ValueError: for an unknown name; the message lists the nearest known ones.
     """
     try:
-        return _STYLE_TABLE[name]
+        return _STYLES[name]
     except KeyError:
-        raise ValueError(
-            f"unknown synthetic style {name!r}{nearest_hint(name, STYLES)}; "
-            "f3amd_lib.motion.synthetic.STYLES lists them"
-        ) from None
+        raise ValueError(f"unknown synthetic style {name!r}{nearest_hint(name, STYLES)}") from None
 
 
 # ---------------------------------------------------------------------------------- small tools
@@ -292,12 +157,6 @@ def _wander(rng: np.random.Generator, count: int, sigma: float, channels: int) -
     return gaussian_filter1d(noise, width, axis=0, mode="reflect") * np.sqrt(2.0 * np.sqrt(np.pi) * width)
 
 
-def _ramp(x: np.ndarray) -> np.ndarray:
-    """Rise from 0 to 1 with level ends (3 x^2 - 2 x^3)."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
-
-
 def _about(axis: int, degrees) -> np.ndarray:
     """Return rotations about one coordinate axis, [..., 3, 3]; degrees in."""
     angle = np.radians(np.asarray(degrees, dtype=np.float64))
@@ -314,10 +173,6 @@ def _about(axis: int, degrees) -> np.ndarray:
 def _yaw_pitch_roll(yaw_deg, pitch_deg, left_roll_deg) -> np.ndarray:
     """Turn left, then bow forwards, then lean to the left (all in degrees), [..., 3, 3]."""
     return _about(1, yaw_deg) @ _about(0, pitch_deg) @ _about(2, -np.asarray(left_roll_deg))
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
 
 
 # ------------------------------------------------------------------------------- 1. root path
@@ -574,7 +429,7 @@ def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: 
     travel = plants.position[after] - plants.position[index]
     # Between minimum jerk and a cubic: soft ends, and a foot that does not lag behind.
     quintic = progress**3 * (10.0 - 15.0 * progress + 6.0 * progress**2)
-    share = 0.3 * quintic + 0.7 * _ramp(progress)
+    share = 0.3 * quintic + 0.7 * smoothstep(progress)
     flat = plants.position[index] + share[:, None] * travel
     yaw = plants.yaw[index] + share * (plants.yaw[after] - plants.yaw[index])
     # Short steps (settling, turning on the spot) lift and roll less.
@@ -608,7 +463,7 @@ def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: 
     height = height + _FOOT_LENGTH * np.sin(np.radians(np.maximum(-pitch, 0.0))) * ~planted
     toe = np.stack([flat[:, 0], _TOE_HEIGHT + height, flat[:, 1]], axis=-1)
     # On the ground toes stay flat while the heel rises; in the air they follow the foot.
-    flex = np.where(planted, 1.0, 1.0 - 0.85 * _ramp(progress / 0.3) * _ramp((1 - progress) / 0.2))
+    flex = np.where(planted, 1.0, 1.0 - 0.85 * smoothstep(progress / 0.3) * smoothstep((1 - progress) / 0.2))
     return toe, yaw, pitch, -np.maximum(pitch, 0.0) * flex, planted
 
 
@@ -624,10 +479,7 @@ def _lower_pelvis(height, root_flat, pelvis, ankles, reach, fps):
         rise = np.sqrt(np.maximum(reach**2 - across, 0.30**2))
         room = np.minimum(room, ankle[:, 1] + rise - hip[:, 1])
     lack = np.maximum(height - room, 0.0)
-    # A running maximum, then an average over the same span, stays above the need itself.
-    radius = max(2, int(round(0.13 * fps)))
-    lack = maximum_filter1d(lack, 2 * radius + 1, mode="nearest")
-    return height - gaussian_filter1d(lack, radius / 2.2, radius=radius, mode="nearest")
+    return height - smooth_above(lack, fps)
 
 
 def _bend_leg(hip: np.ndarray, ankle: np.ndarray, pole: np.ndarray):
@@ -635,15 +487,15 @@ def _bend_leg(hip: np.ndarray, ankle: np.ndarray, pole: np.ndarray):
     line = ankle - hip
     distance = np.linalg.norm(line, axis=-1)
     distance = np.clip(distance, abs(_THIGH - _SHANK) + 0.05, 0.9995 * (_THIGH + _SHANK))
-    down = _unit(line)
-    hinge = _unit(np.cross(-down, pole))
+    down = unit(line)
+    hinge = unit(np.cross(-down, pole))
     front = np.cross(hinge, -down)
     cosine = (distance**2 + _THIGH**2 - _SHANK**2) / (2.0 * distance * _THIGH)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
     knee = hip + _THIGH * (np.cos(angle) * down + np.sin(angle) * front)
     frames = []
     for upper, lower in ((hip, knee), (knee, hip + distance[:, None] * down)):
-        axis_y = _unit(upper - lower)
+        axis_y = unit(upper - lower)
         frames.append(np.stack([hinge, axis_y, np.cross(hinge, axis_y)], axis=-1))
     return frames
 
@@ -683,11 +535,10 @@ def walk_along(style: str, position, yaw, seed: int = 0, fps: float = 30.0) -> M
     Raises:
       ValueError: for an unknown style, shapes that do not fit, or a number that is not finite.
     """
-    position, yaw = np.asarray(position, np.float64), np.asarray(yaw, np.float64)
-    if position.ndim != 2 or position.shape != (len(yaw), 2) or yaw.ndim != 1 or len(yaw) < 4:
-        raise ValueError(f"a path needs position [T, 2] and yaw [T], T >= 4; got {position.shape}, {yaw.shape}")
-    if not (np.isfinite(position).all() and np.isfinite(yaw).all()):
-        raise ValueError("a path must hold finite numbers alone")
+    position = finite_array("path position", position, ("frame", 2))
+    yaw = finite_array("path yaw", yaw, (len(position),))
+    if len(yaw) < 4:
+        raise ValueError(f"a path needs 4 frames or more, got {len(yaw)}")
     return _walk(style_parameters(style), style, seed, fps, len(yaw), (position, yaw))[0]
 
 
@@ -718,9 +569,7 @@ def synthesize_with_contacts(
     return _walk(parameters, style, seed, fps, int(round(seconds * fps)))
 
 
-def _walk(
-    parameters: StyleParameters, style: str, seed: int, fps: float, frames: int, drawn=None
-) -> tuple[Motion, np.ndarray]:
+def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None) -> tuple[Motion, np.ndarray]:
     """Make motion and contacts along a random path, or along a drawn one (position, yaw)."""
     rng = _generator(style, seed)
     if drawn is None:
@@ -734,11 +583,9 @@ def _walk(
     # Everything below is evaluated on the clip's own frames, plus a margin for the filters.
     margin = int(np.ceil(1.0 * fps))
     time = np.arange(-margin, frames + margin) / fps
-    columns = [path.position, path.yaw[:, None], path.speed[:, None], path.turn[:, None]]
-    columns += [path.heading[:, None], drift]
-    sampled = CubicSpline(path.time, np.concatenate(columns, axis=-1))(time)
-    root_flat, yaw, speed, turn = sampled[:, :2], sampled[:, 2], sampled[:, 3], sampled[:, 4]
-    heading = sampled[:, 5]
+    columns = np.column_stack([path.position, path.yaw, path.speed, path.turn, path.heading, drift])
+    sampled = CubicSpline(path.time, columns)(time)
+    root_flat, (yaw, speed, turn, heading) = sampled[:, :2], sampled[:, 2:6].T
     drift = sampled[:, 6:] * (0.4 + 2.0 * parameters.unsteadiness)
     phase = _smooth(PchipInterpolator(knots, strides, extrapolate=True)(np.clip(time, knots[0], knots[-1])), 0.05, fps)
     cycle = 2.0 * np.pi * phase
@@ -750,11 +597,9 @@ def _walk(
     # Pelvis: sway, twist, roll and bounce ride on the gait phase (left footfall at whole strides).
     accelerate = np.gradient(speed, time)
     bank = np.degrees(np.arctan(speed * turn / 9.81))
-    spared = np.square(0.5 + 0.5 * np.sin(cycle) * np.sign(parameters.limp or 1.0)) * abs(parameters.limp)
-    spared = spared * effort
+    spared = np.square(0.5 + 0.5 * np.sin(cycle) * np.sign(parameters.limp or 1.0)) * abs(parameters.limp) * effort
     pelvis_yaw = np.degrees(yaw) - effort * parameters.hip_twist_deg * np.cos(cycle)
-    pelvis_roll = effort * parameters.hip_roll_deg * np.sin(cycle) * -1.0 + 0.5 * bank
-    pelvis_roll = pelvis_roll + 0.6 * drift[:, 0] * 0.5
+    pelvis_roll = effort * parameters.hip_roll_deg * np.sin(cycle) * -1.0 + 0.5 * bank + 0.6 * drift[:, 0] * 0.5
     pelvis_pitch = parameters.pelvis_pitch_deg + 1.5 * np.clip(accelerate, -2, 2) + 0.3 * drift[:, 1]
     pelvis = _yaw_pitch_roll(pelvis_yaw, pelvis_pitch, pelvis_roll)
     left = np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
@@ -799,9 +644,8 @@ def _walk(
         local[:, joint(f"{name}Toe")] = toe_frames[foot]
 
     # Spine: posture, shoulders against hips, and a trunk that stays upright over a rolling pelvis.
-    spine_yaw = parameters.spine_twist_deg + effort * np.cos(cycle) * (
-        parameters.hip_twist_deg + parameters.chest_twist_deg
-    )
+    twist = parameters.hip_twist_deg + parameters.chest_twist_deg
+    spine_yaw = parameters.spine_twist_deg + effort * np.cos(cycle) * twist
     spine_pitch = parameters.spine_pitch_deg + 1.2 * np.clip(accelerate, -2, 2) + 0.8 * drift[:, 5]
     spine_pitch = spine_pitch + 6.0 * spared + 0.8 * effort * np.cos(2.0 * cycle)
     spine_roll = parameters.spine_roll_deg - 0.8 * pelvis_roll + 0.9 * bank + 0.8 * drift[:, 6]
@@ -840,14 +684,7 @@ def _walk(
     keep = slice(margin, margin + frames)
     planted = np.stack([foot[4] for foot in feet], axis=-1)
     contacts = (planted & np.roll(planted, -1, axis=0))[keep]
-    motion = Motion(
-        skeleton=SYNTHETIC_SKELETON,
-        root_position=root[keep],
-        rotations=local[keep],
-        fps=float(fps),
-        name=f"{style}_{int(seed)}",
-    )
-    return motion, contacts
+    return Motion(SYNTHETIC_SKELETON, root[keep], local[keep], float(fps), f"{style}_{int(seed)}"), contacts
 
 
 def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0) -> Motion:

@@ -167,7 +167,7 @@ class TrainedModel:
       skeleton: of the data it was trained on.
       styles: names, in the order of the one-hot vector.
       diffusion: the noise schedule it was trained with.
-      seeds: per style name, seed histories as world frames, [K, H, C], metres and 6D; K may differ.
+      start_poses: per style name, histories to start from as world frames, [K, H, C], metres and 6D; K may differ.
       record: how it was trained, on what, under what terms.
     """
 
@@ -178,7 +178,7 @@ class TrainedModel:
     skeleton: Skeleton
     styles: tuple[str, ...]
     diffusion: NoiseSchedule
-    seeds: dict
+    start_poses: dict
     record: dict
 
     def network(self):
@@ -238,7 +238,7 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
     tree = {
         "params": params,
         "normaliser": trained.normaliser._asdict(),
-        "seeds": {name: jnp.asarray(seed, poses) for name, seed in trained.seeds.items()},
+        "seeds": {name: jnp.asarray(frames, poses) for name, frames in trained.start_poses.items()},
         "offsets": jnp.asarray(trained.skeleton.offsets, jnp.float32),
     }
     metadata = {
@@ -249,7 +249,7 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "styles": list(trained.styles),
         "diffusion": dataclasses.asdict(trained.diffusion),
         **describe_skeleton(trained.skeleton),
-        "seed_shapes": {name: list(np.shape(seed)) for name, seed in trained.seeds.items()},
+        "seed_shapes": {name: list(np.shape(poses)) for name, poses in trained.start_poses.items()},
         "record": trained.record,
     }
     save_tree(path, tree, metadata)
@@ -271,7 +271,7 @@ def load_model(path: Path) -> TrainedModel:
             skeleton=described_skeleton(metadata, tree["offsets"]),
             styles=tuple(metadata["styles"]),
             diffusion=schedule_from_dict(metadata["diffusion"]),
-            seeds={name: np.asarray(seed) for name, seed in tree["seeds"].items()},
+            start_poses={name: np.asarray(poses) for name, poses in tree["seeds"].items()},
             record=metadata["record"],
         )
 

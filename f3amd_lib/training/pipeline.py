@@ -26,7 +26,7 @@ from jax.sharding import Mesh
 from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
-from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, seed_histories
+from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, starting_poses
 from f3amd_lib.ground.files import set_aside
 from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, write_table
@@ -280,7 +280,7 @@ def train(
         skeleton=packed.skeleton,
         styles=packed.styles,
         diffusion=config.diffusion,
-        seeds=seed_histories(packed, num_history=prepared.num_history),
+        start_poses=starting_poses(packed, num_history=prepared.num_history),
         record=record,
     )
     if parallel.is_first_process():
