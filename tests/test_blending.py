@@ -7,7 +7,7 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import motion_from_frames, split_frames, world_frames
-from f3amd_lib.experiments.quality import blending_table
+from f3amd_lib.experiments.rollout_measures import blending_table
 from f3amd_lib.generation.blending import blend_rollout, blend_seams, dying_offset
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.measures.metrics import ird, ird_excess

@@ -7,7 +7,7 @@ import pytest
 from builders import wandering_motion
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.experiments.quality import own_path
+from f3amd_lib.experiments.real_clips import own_path
 from f3amd_lib.measures import distributions, metrics
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt, frozen_pose, noisy_motion, shuffled_frames
 from f3amd_lib.motion.rotations import matrix_from_yaw
@@ -27,8 +27,8 @@ def measured(name=None):
     """Metrics of the walk, broken or not, against the whole walk's own path without its sway."""
     motion = walker() if name is None else corrupt(name, walker())
     path, skeleton = own_path(walker()), motion.skeleton
-    values = metrics.first_metrics(motion.positions, None, path, WINDOW, skeleton)
-    return values | metrics.camdm_metrics(motion.positions, None, path, skeleton)
+    values = metrics.first_metrics(motion.positions, path, WINDOW, skeleton)
+    return values | metrics.camdm_metrics(motion.positions, path, skeleton)
 
 
 # ---------------------------------------------------------------------------------------- recipes

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.measures import metrics
-from f3amd_lib.motion.root_paths import RootPath, named_path
+from f3amd_lib.measures import metrics, registry
+from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Skeleton
 
@@ -36,7 +36,6 @@ def wobble(num_frames=4 * WINDOW, seed=0):
 def test_seams_of_a_paper_rollout():
     seams = metrics.seam_frames(2560, 32)
     assert len(seams) == 79 and seams[0] == 32 and seams[-1] == 2528
-    np.testing.assert_array_equal(metrics.seam_frames(10 + 96, 32, history=10), [42, 74])
 
 
 def test_seam_of_three_centimetres_reads_three():
@@ -308,77 +307,56 @@ def test_camdm_foot_sliding_counts_a_last_frame_that_cannot_slide():
     assert np.isnan(metrics.camdm_foot_sliding(np.tile(POSE, (9, 1, 1)), (3, 4)))
 
 
-def test_camdm_metrics_of_a_batch_one_by_one_in_any_order_and_after_a_history():
-    batch = np.stack([wobble(seed=seed) for seed in range(3)])
-    paths = [named_path("slalom", batch.shape[1], seed=seed) for seed in range(3)]
-    together = metrics.camdm_metrics(batch, None, paths, SKELETON)
-    backwards = metrics.camdm_metrics(batch[::-1], None, paths[::-1], SKELETON)
-    assert set(together) == set(metrics.CAMDM_METRICS)
-    for index in range(3):
-        alone = metrics.camdm_metrics(batch[index], None, paths[index], SKELETON)
-        started = np.concatenate([batch[2 - index, :10], batch[index]])
-        after = metrics.camdm_metrics(started, None, paths[index], SKELETON, history=10)
-        assert after == pytest.approx(alone)
-        for key, value in alone.items():
-            assert isinstance(value, float)
-            assert together[key][index] == pytest.approx(value), key
-            assert backwards[key][2 - index] == pytest.approx(value), key
-
-
 def test_camdm_metrics_and_the_place_and_turn_of_the_world():
     """All may be moved; turned, only those without angles, as the text of the angles says."""
     positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
     path = named_path("slalom", len(positions))
-    before = metrics.camdm_metrics(positions, None, path, SKELETON)
-    moved = metrics.camdm_metrics(positions + shift, None, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON)
+    before = metrics.camdm_metrics(positions, path, SKELETON)
+    moved = metrics.camdm_metrics(positions + shift, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON)
     assert moved == pytest.approx(before)
     turned = positions @ matrix_from_yaw(np.float64(angle)).T
-    after = metrics.camdm_metrics(turned, None, path.placed((0, 0), angle), SKELETON)
+    after = metrics.camdm_metrics(turned, path.placed((0, 0), angle), SKELETON)
     for key in ("camdm_foot_sliding", "coherence"):
         assert after[key] == pytest.approx(before[key])
-
-
-def test_camdm_metrics_cannot_be_taken_for_those_of_the_text():
-    for key, (name, _, _) in metrics.CAMDM_METRICS.items():
-        if key != "coherence":  # the text has nothing of that name
-            assert key.startswith("camdm_") and name.startswith("CAMDM_")
-            assert key not in metrics.METRICS
-    both = metrics.METRICS | metrics.CAMDM_METRICS
-    assert len({name for name, _, _ in both.values()}) == len(both)
-    values = metrics.camdm_metrics(glide(), None, None, SKELETON)
-    assert set(values) == {"camdm_foot_sliding", "coherence"}
-    rows = metrics.tidy_metrics(values, model="CAMDM")
-    assert [row["metric"] for row in rows] == ["CAMDM_foot_sliding", "coherence"]
 
 
 # ------------------------------------------------------------------------------------- all together
 
 
-def test_batch_equals_one_by_one_and_order_does_not_matter():
+def test_a_batch_is_measured_one_by_one():
+    """One path for all of them, or one each."""
     batch = np.stack([wobble(seed=seed) for seed in range(3)])
-    path = named_path("slalom", batch.shape[1])
-    together = metrics.first_metrics(batch, None, path, WINDOW, SKELETON)
-    backwards = metrics.first_metrics(batch[::-1], None, path, WINDOW, SKELETON)
-    assert set(together) == set(metrics.METRICS)
-    for index in range(3):
-        alone = metrics.first_metrics(batch[index], None, path, WINDOW, SKELETON)
-        for key, value in alone.items():
-            assert isinstance(value, float)
-            assert together[key][index] == pytest.approx(value), key
-            assert backwards[key][2 - index] == pytest.approx(value), key
+    paths = [named_path("slalom", batch.shape[1], seed=seed) for seed in range(3)]
+    targets = np.stack([path.position for path in paths])
+    for metric in (
+        lambda positions, path: metrics.trajectory_error(positions, path, WINDOW),
+        metrics.path_drift,
+        metrics.camdm_trajectory_error,
+        lambda positions, path: metrics.foot_sliding(positions, SKELETON)[0],
+        lambda positions, path: metrics.camdm_foot_sliding(positions, SKELETON),
+        lambda positions, path: metrics.ird_excess(positions, WINDOW),
+        lambda positions, path: metrics.smoothness(positions),
+    ):
+        np.testing.assert_allclose(metric(batch, targets), [metric(*each) for each in zip(batch, paths, strict=True)])
+        np.testing.assert_allclose(metric(batch, targets[0]), [metric(each, paths[0]) for each in batch])
 
 
-def test_one_path_a_character():
-    paths = [named_path("straight", 4 * WINDOW), named_path("circle", 4 * WINDOW)]
-    batch = np.tile(POSE, (2, 4 * WINDOW, 1, 1))
-    for character, path in zip(batch, paths, strict=True):
-        character[:, :, [0, 2]] += path.position[:, None]
-    yaw = np.stack([path.yaw for path in paths])
-    values = metrics.first_metrics(batch, yaw, paths, WINDOW, SKELETON)
-    np.testing.assert_allclose(values["trajectory_error_m"], 0.0, atol=1e-12)
-    np.testing.assert_allclose(values["direction_error_deg"], 0.0, atol=1e-9)
-    swapped = metrics.first_metrics(batch, yaw, paths[::-1], WINDOW, SKELETON)
-    assert np.all(swapped["trajectory_error_m"] > 0.05)
+def test_all_together_bear_the_keys_of_the_registry():
+    path = named_path("slalom", len(wobble()))
+    first = metrics.first_metrics(wobble(), path, WINDOW, SKELETON)
+    theirs = metrics.camdm_metrics(wobble(), path, SKELETON)
+    assert list(first) == [metric.key for metric in registry.SHOWN["first"]]
+    assert set(theirs) <= set(registry.BY_KEY) and set(first) & set(theirs) == {"coherence"}
+    assert first["ird_cm"] == metrics.ird(wobble(), WINDOW)
+    assert theirs["camdm_foot_sliding"] == metrics.camdm_foot_sliding(wobble(), SKELETON)
+
+
+def test_every_metric_has_a_direction_a_definition_and_a_key_of_its_own():
+    for metric in registry.METRICS.values():
+        assert metric.better in ("down", "up", "near real") and metric.definition, metric.name
+    assert len(registry.BY_KEY) == len(registry.METRICS)
+    titles = {registry.METRICS[name].title for name in ("direction_error", "joint_acceleration", "smoothness")}
+    assert titles == {"Dir. (°)", "joint acceleration (cm/frame²)", "Smooth"}
 
 
 def test_turning_and_moving_the_world_changes_nothing():
@@ -386,49 +364,10 @@ def test_turning_and_moving_the_world_changes_nothing():
     path = named_path("slalom", len(positions))
     moved = positions @ matrix_from_yaw(np.float64(angle)).T + shift
     target = path.placed(shift[[0, 2]], angle)
-    before = metrics.first_metrics(positions, None, path, WINDOW, SKELETON)
-    after = metrics.first_metrics(moved, None, target, WINDOW, SKELETON)
+    before = metrics.first_metrics(positions, path, WINDOW, SKELETON)
+    after = metrics.first_metrics(moved, target, WINDOW, SKELETON)
     for key, value in before.items():
         assert after[key] == pytest.approx(value, rel=1e-9, abs=1e-9), key
-
-
-def test_history_is_left_out_of_every_figure():
-    history = 10
-    generated = wobble()
-    before = np.random.default_rng(9).normal(size=(history, 5, 3))
-    positions = np.concatenate([before, generated])
-    path = named_path("slalom", len(generated))
-    alone = metrics.first_metrics(generated, None, path, WINDOW, SKELETON)
-    after = metrics.first_metrics(positions, None, path, WINDOW, SKELETON, history=history)
-    assert after == alone
-    longer = RootPath(
-        np.concatenate([np.zeros((history, 2)), path.position]), np.concatenate([np.zeros(history), path.yaw])
-    )
-    again = metrics.first_metrics(positions, None, longer, WINDOW, SKELETON, history=history)
-    assert again == pytest.approx(alone)
-
-
-def test_real_motion_needs_no_path():
-    values = metrics.first_metrics(wobble(), None, None, WINDOW, SKELETON)
-    assert set(metrics.METRICS) - set(values) == {"trajectory_error_m", "direction_error_deg", "path_drift"}
-
-
-def test_tidy_rows_average_and_count():
-    rows = metrics.tidy_metrics({"ird_cm": np.array([1.0, 3.0, np.nan])}, model="CAMDM", steps=8)
-    assert rows == [
-        {
-            "model": "CAMDM",
-            "steps": 8,
-            "metric": "IRD",
-            "unit": "cm",
-            "better": "near real",
-            "value": 2.0,
-            "spread": pytest.approx(np.sqrt(2.0)),
-            "characters": 2,
-        }
-    ]
-    with pytest.raises(ValueError, match="unknown metric 'ird'; did you mean 'ird_cm'"):
-        metrics.tidy_metrics({"ird": 1.0})
 
 
 # ------------------------------------------------------------------------------------- errors
@@ -474,18 +413,7 @@ def test_paths_that_do_not_fit_are_refused():
         metrics.trajectory_error(glide(20), np.zeros((20, 2)), WINDOW)
     with pytest.raises(ValueError, match="not finite"):
         metrics.direction_error(np.full(64, np.nan), np.zeros(64), WINDOW)
-    with pytest.raises(ValueError, match="does not fit a batch"):
-        metrics.trajectory_error(glide()[None].repeat(3, 0), np.zeros((2, 128, 2)), WINDOW)
     with pytest.raises(ValueError, match="window must be"):
         metrics.ird_excess(glide(), 1)
-    for toes in ((3, 9), (-1, 3), ()):
-        with pytest.raises(ValueError, match="toes must be"):
-            metrics.foot_sliding(glide(), toes)
-    with pytest.raises(ValueError, match="for this skeleton"):
-        metrics.first_metrics(glide()[:, :4], None, None, WINDOW, SKELETON)
-    with pytest.raises(ValueError, match="for this skeleton"):
-        metrics.camdm_metrics(glide()[:, :4], None, None, SKELETON)
-    with pytest.raises(ValueError, match="path yaw has 100 frames; it needs 128"):
+    with pytest.raises(ValueError, match="path has 100 frames; it needs 128"):
         metrics.camdm_orientation_error(np.zeros(128), np.zeros(100))
-    with pytest.raises(ValueError, match="yaw must be .* for these positions"):
-        metrics.camdm_metrics(glide(), np.zeros(5), named_path("straight", 128), SKELETON)

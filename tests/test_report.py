@@ -271,57 +271,6 @@ def test_numbers_show_four_digits(value, text):
     assert f" {text} |" in tables.markdown_table(pd.DataFrame({"a": [value]}))
 
 
-def tidy(model, **metrics):
-    units = {"trajectory_error": ("m", "down"), "IRD": ("cm", "near real")}
-    return [
-        {
-            "model": model,
-            "window_frames": 32,
-            "steps": 8,
-            "metric": metric,
-            "unit": units.get(metric, ("", "down"))[0],
-            "better": units.get(metric, ("", "down"))[1],
-            "value": value,
-        }
-        for metric, value in metrics.items()
-    ]
-
-
-def test_wide_table_spreads_and_refuses_doubles():
-    rows = tidy("a", trajectory_error=0.1, IRD=4.0) + tidy("b", trajectory_error=0.2)
-    wide = tables.wide_table(pd.DataFrame(rows))
-    assert list(wide.columns) == ["model", "trajectory error (m) ↓", "IRD (cm)"]
-    assert wide["trajectory error (m) ↓"].tolist() == [0.1, 0.2] and np.isnan(wide["IRD (cm)"][1])
-    with pytest.raises(ValueError, match="two values"):
-        tables.wide_table(pd.DataFrame(rows + tidy("a", IRD=5.0)))
-    with pytest.raises(ValueError, match="no column 'dataset'"):
-        tables.wide_table(pd.DataFrame(rows), ["dataset"])
-
-
-def test_ours_beside_the_papers_with_labels():
-    ours = pd.DataFrame(
-        tidy("F3AMD-FNO-96", trajectory_error=0.0456, IRD=4.2, contact_share=0.5)
-        + tidy("F3AMD-FNO-96-plus", trajectory_error=0.02)
-    )
-    text = tables.beside_paper(ours, papers.load_paper_table(3), ours_label="ours (synthetic)")
-    lines = [[cell.strip() for cell in row.strip("|").split("|")] for row in text.splitlines()]
-    header, body = lines[0], [dict(zip(lines[0], row, strict=True)) for row in lines[2:]]
-    assert "IRD (cm) ↓" in header and "FID ↓" in header
-    assert [row["source"] for row in body] == [papers.PAPER_SETTING, *["ours (synthetic)"] * 2]
-    assert body[0]["IRD (cm) ↓"] == "1.795" and body[1]["IRD (cm) ↓"] == "4.200"
-    assert body[0]["trajectory error (m) ↓"] == "0.033"
-    assert body[0]["contact share ↓"] == "–" and body[1]["FID ↓"] == "–"
-    assert body[2]["model"] == "F3AMD-FNO-96-plus"
-
-
-def test_beside_paper_refuses_unlabelled_and_unlike_units():
-    ours, paper = pd.DataFrame(tidy("F3AMD-FNO-96", IRD=4.2)), papers.load_paper_table(3)
-    with pytest.raises(ValueError, match="ours_label"):
-        tables.beside_paper(ours, paper, ours_label="")
-    with pytest.raises(ValueError, match="IRD is in m here and in cm in the paper"):
-        tables.beside_paper(ours.assign(unit="m"), paper, ours_label="ours")
-
-
 # ------------------------------------------------------------------------------------- figures
 
 

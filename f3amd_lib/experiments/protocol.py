@@ -12,13 +12,13 @@ with 95 % intervals. One training of each model is behind its rows: what another
 given is not in the interval.
 
 FID, EMD and coverage see posture and style through one classifier. They say little of whether
-somebody walks or glides: read them beside foot alternation, acceleration and contact.
+somebody walks or glides: read them beside changes of the planted foot, acceleration and contact.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,9 +28,7 @@ from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.experiments.denoising import noise_use
-from f3amd_lib.experiments.quality import (
-    WALKING,
-    by_round,
+from f3amd_lib.experiments.real_clips import (
     facing_ahead,
     own_path,
     reference_clips,
@@ -38,53 +36,27 @@ from f3amd_lib.experiments.quality import (
     style_floor,
     style_pace,
     training_clips,
-    walking_measures,
 )
+from f3amd_lib.experiments.rollout_measures import by_round
 from f3amd_lib.generation.rollout import MotionGenerator, Rollout
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.measures import distributions
 from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
-from f3amd_lib.measures.metrics import CAMDM_METRICS, METRICS, camdm_metrics, first_metrics
+from f3amd_lib.measures.metrics import camdm_metrics, first_metrics
+from f3amd_lib.measures.registry import BY_KEY, METRICS
+from f3amd_lib.measures.walking import walking_measures
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion
 
 REFERENCE_MODELS = ("real", *CORRUPTIONS)
 """Rows that no network made: held-out clips, and the three bad generators."""
 
-_DISTRIBUTION = {
-    "FID": ("", "down"),
-    "FID_per_dimension": ("", "down"),
-    "CAMDM_FID": ("", "down"),
-    "EMD": ("", "down"),
-    "style_coverage": ("%", "up"),
-    "style_accuracy": ("%", "up"),
-}
-
-_NOISE = {
-    "diversity": ("cm", "up"),
-    "rollout_diversity": ("cm", "up"),
-    "x0_error_ratio": ("", "down"),
-    "seed_spread": ("cm", "up"),
-}
-
 _DIVERSITY_ROUNDS = 4
 """Rounds after which samples of one start are compared once more (`rollout_diversity`)."""
 
 _GROWS_WITH_LENGTH = ("path_drift", "CAMDM_trajectory_error", "CAMDM_orientation_error")
 """Figures whose size hangs on the length of a motion: no yardstick between clips and rollouts."""
-
-PROTOCOL_METRICS = (
-    {name: (unit, better) for name, unit, better in (METRICS | CAMDM_METRICS).values()}
-    | {name.replace(" ", "_"): (unit, "near real") for name, unit, _ in WALKING.values()}
-    | _DISTRIBUTION
-    | _NOISE
-)
-"""Metric -> (unit, which way is better). The paper's nine bear the names of `ground.papers`."""
-
-_KEYS = {key: name for key, (name, _, _) in (METRICS | CAMDM_METRICS).items()} | {
-    key: name.replace(" ", "_") for key, (name, _, _) in WALKING.items()
-}
 
 
 @dataclass(frozen=True)
@@ -154,62 +126,22 @@ def _sideways_in_training(packed: PackedMotion, styles: tuple[str, ...]) -> floa
     return float(np.mean([sideways_share(path_from_motion(packed.motion(clip))) for clip in clips]))
 
 
-def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
-    """Describe paths, or the tracks of real clips, by how they move and turn.
-
-    Args:
-      paths: any number of them.
-      seconds: span over which a turn is counted, so that the sway of a stride is not.
-
-    Returns:
-      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel)
-      and its 95th percentile, sideways_share, standing_share; over all moving frames of all paths.
-    """
-    speeds, turns, sideways = [], [], []
-    for path in paths:
-        step = np.diff(path.position, axis=0) * path.fps
-        speed = np.linalg.norm(step, axis=-1)
-        speeds.append(speed)
-        sideways.append((sideways_share(path), len(speed)))
-        span = max(1, round(seconds * path.fps))
-        if path.num_frames > 2 * span:
-            legs = path.position[span:] - path.position[:-span]
-            moved = np.linalg.norm(legs, axis=-1) > 0.1 * seconds
-            heading = np.unwrap(np.arctan2(legs[:, 0], legs[:, 1]))
-            turn = np.abs(heading[span:] - heading[:-span]) / seconds
-            turns.append(np.rad2deg(turn[moved[span:] & moved[:-span]]))
-    speeds = np.concatenate(speeds)
-    turns = np.concatenate(turns) if turns else np.array([np.nan])
-    moving = speeds[speeds > 0.1]
-    weights = np.array([frames for _, frames in sideways], float)
-    return {
-        "speed_m_s": float(moving.mean()),
-        "speed_p5": float(np.percentile(moving, 5)),
-        "speed_p95": float(np.percentile(moving, 95)),
-        "turn_deg_s": float(np.mean(turns)),
-        "turn_p95": float(np.percentile(turns, 95)),
-        "sideways_share": float(np.average([share for share, _ in sideways], weights=weights)),
-        "standing_share": float(1.0 - len(moving) / len(speeds)),
-    }
-
-
-def _motion_figures(motion: Motion, path: RootPath, window: int, floor: float) -> dict:
-    """Measure one motion against a path with everything that needs no classifier."""
+def _figures_without_classifier(motion: Motion, path: RootPath, window: int, floor: float) -> dict[str, float]:
+    """Measure one motion against a path; the names are those of records."""
     positions, skeleton = np.asarray(motion.positions), motion.skeleton
-    values = first_metrics(positions, None, path, window, skeleton, floor_shift=floor)
-    values |= camdm_metrics(positions, None, path, skeleton)
-    values |= walking_measures(positions, skeleton, floor_shift=floor)
-    return {_KEYS[key]: float(value) for key, value in values.items()}
+    figures = first_metrics(positions, path, window, skeleton, floor_shift=floor)
+    figures |= camdm_metrics(positions, path, skeleton)
+    figures |= walking_measures(positions, skeleton, floor_shift=floor)
+    return {BY_KEY[key].name: float(value) for key, value in figures.items()}
 
 
 def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
     """Average figures over the motions of each style, then over styles; undefined ones left out."""
-    table = pd.DataFrame(figures)
-    return table.groupby(np.asarray(styles)).mean().mean().to_dict()
+    return pd.DataFrame(figures).groupby(np.asarray(styles)).mean().mean().to_dict()
 
 
 @dataclass(frozen=True)
-class Seen:
+class ClassifiedWindows:
     """What the classifier says of the windows of some motions.
 
     Attributes:
@@ -224,15 +156,16 @@ class Seen:
     style: np.ndarray
     source: np.ndarray
 
-    def of(self, sources: Iterable[int]) -> Seen:
+    def of(self, sources: Iterable[int]) -> ClassifiedWindows:
         """Return the windows of some of the motions, motion by motion in that order."""
         order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
-        parts = (self.features, self.predicted, self.style, self.source)
-        return Seen(*(part[order] for part in parts))
+        return ClassifiedWindows(*(part[order] for part in (self.features, self.predicted, self.style, self.source)))
 
 
-def see_windows(classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]) -> Seen:
-    """Show motions to the classifier; those shorter than its window hold no window.
+def classify_windows(
+    classifier: StyleClassifier, motions: Sequence[Motion], styles: Sequence[str]
+) -> ClassifiedWindows:
+    """Cut motions into the classifier's windows and classify them; shorter ones hold no window.
 
     Args:
       classifier: whose features and classes are wanted.
@@ -255,7 +188,7 @@ def see_windows(classifier: StyleClassifier, motions: Sequence[Motion], styles: 
             "frames that the style classifier looks at"
         )
     features, predicted = classifier.features_and_classes(np.concatenate(windows))
-    return Seen(features, predicted, np.array(asked), np.array(source))
+    return ClassifiedWindows(features, predicted, np.array(asked), np.array(source))
 
 
 def real_features(
@@ -267,15 +200,15 @@ def real_features(
       packed: the data set.
       classifier: holds the features.
       styles: labels of it.
-      window: see `quality.reference_clips`.
+      window: see `real_clips.reference_clips`.
 
     Returns:
       Class number -> [N, D], in the order of `styles`.
     """
     clips = reference_clips(packed, styles, window=window, split="train")
     known = classifier.references["train"]
-    kept = np.isin(known.clips, clips)
-    return {number: known.features[kept & (known.styles == number)] for number in map(classifier.style_index, styles)}
+    wanted = np.isin(known.clips, clips)
+    return {number: known.features[wanted & (known.styles == number)] for number in map(classifier.style_index, styles)}
 
 
 def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol, *, window: int) -> int:
@@ -321,40 +254,37 @@ def _held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) ->
     return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
 
 
-def _distribution_figures(seen: Seen, real: dict[int, np.ndarray], count: int, rng: np.random.Generator) -> dict:
+def _distribution_figures(
+    seen: ClassifiedWindows, real: Mapping[int, np.ndarray], count: int, rng: np.random.Generator
+) -> dict[str, float]:
     """Score windows against real ones of the same styles, `count` of each style on either side."""
     drawn, wanted, by_style = [], [], []
     for number, reference in real.items():
-        mine = seen.features[seen.style == number]
-        for cloud, part in ((mine, drawn), (reference, wanted)):
-            if len(cloud) < count:
-                raise ValueError(f"FID and EMD want {count} windows of a style, got {len(cloud)}")
-            part.append(cloud[rng.choice(len(cloud), count, replace=False)])
-        if len(mine) > 1 and len(reference) > 1:
-            by_style.append(distributions.frechet_distance_per_dimension(mine, reference))
+        of_style = seen.features[seen.style == number]
+        for cloud, part in ((of_style, drawn), (reference, wanted)):
+            part.append(distributions.draw_windows({number: cloud}, count, rng))
+        if len(of_style) > 1 and len(reference) > 1:
+            by_style.append(distributions.frechet_distance_per_dimension(of_style, reference))
     features, reference = np.concatenate(drawn), np.concatenate(wanted)
     distance = distributions.frechet_distance(features, reference)
+    counts = [np.bincount(styles, minlength=max(real) + 1)[list(real)] for styles in (seen.predicted, seen.style)]
     return {
         "FID": distance,
         "FID_per_dimension": distance / features.shape[1],
         # The mean over styles of CAMDM's code, with all windows of the motion.
         "CAMDM_FID": float(np.mean(by_style)) if len(by_style) == len(real) else float("nan"),
         "EMD": distributions.earth_movers_distance(features, reference),
-        "style_coverage": distributions.style_coverage(
-            np.bincount(seen.predicted, minlength=max(real) + 1)[list(real)],
-            np.bincount(seen.style, minlength=max(real) + 1)[list(real)],
-        ),
+        "style_coverage": distributions.style_coverage(*counts),
         "style_accuracy": distributions.style_accuracy(seen.predicted, seen.style),
     }
 
 
-def _rows(figures: dict, **columns) -> list[dict]:
-    rows = []
-    for name, value in figures.items():
-        unit, better = PROTOCOL_METRICS[name]
-        row = {"metric": name, "unit": unit, "better": better, "value": float(value)}
-        rows.append({**columns, **row})
-    return rows
+def _rows(figures: Mapping[str, float], **columns) -> list[dict]:
+    """Give each figure a row with its unit and which way is better."""
+    return [
+        {**columns, "metric": name, "unit": METRICS[name].unit, "better": METRICS[name].better, "value": float(value)}
+        for name, value in figures.items()
+    ]
 
 
 def measure_model(
@@ -401,18 +331,17 @@ def measure_model(
         motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
         figures = _style_means(
             [
-                _motion_figures(motion, path, rollout.window, floors[style])
+                _figures_without_classifier(motion, path, rollout.window, floors[style])
                 for motion, path, style in zip(motions, paths[seed], styles, strict=True)
             ],
             styles,
         )
         rng = np.random.default_rng([protocol.path_seed, seed])
-        seen = see_windows(classifier, motions, styles)
+        seen = classify_windows(classifier, motions, styles)
         figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
         figures |= _diversities(generator, paths[seed], styles, protocol, seed)
         use = noise_use(generator, held_out, seed=seed)
-        figures["x0_error_ratio"] = use["x0_error_ratio"]
-        figures["seed_spread"] = use["seed_spread_cm"]
+        figures |= {name: use[METRICS[name].key] for name in ("x0_error_ratio", "seed_spread")}
         rows += _rows(figures, **columns, varies="seed", seed=seed)
     return pd.DataFrame(rows), _rounds(rollout, columns)
 
@@ -487,27 +416,27 @@ def measure_real(
     motions, figures = [], []
     for clip in clips:
         whole = packed.motion(int(clip))
-        seen = whole if model == "real" else corrupt(model, whole, seed=int(clip))
-        motions.append(seen)
+        shown = whole if model == "real" else corrupt(model, whole, seed=int(clip))
+        motions.append(shown)
         floor = float(packed.floor_shift[clip])
-        found = _motion_figures(seen, own_path(whole), window, floor)
-        figures.append({k: v for k, v in found.items() if k not in _GROWS_WITH_LENGTH})
-    seen = see_windows(classifier, motions, labels)
+        values = _figures_without_classifier(shown, own_path(whole), window, floor)
+        figures.append({name: value for name, value in values.items() if name not in _GROWS_WITH_LENGTH})
+    seen = classify_windows(classifier, motions, labels)
     real = real_features(packed, classifier, protocol.styles, window)
     columns = {"model": model, "window_frames": window, "steps": 0, "varies": "clips"}
     rows = []
     for repeat in range(repeats):
         rng = np.random.default_rng([protocol.path_seed, repeat])
-        half, shown = [], []
+        half, classified = [], []
         for style in protocol.styles:
-            mine = rng.permutation(np.flatnonzero(labels == style))
-            half += mine[: max(1, len(mine) // 2)].tolist()
+            order = rng.permutation(np.flatnonzero(labels == style))
+            half += order[: max(1, len(order) // 2)].tolist()
             # Halves of few clips may hold too few windows: then one clip more is looked at.
-            held = np.cumsum([np.count_nonzero(seen.source == clip) for clip in mine])
+            held = np.cumsum([np.count_nonzero(seen.source == clip) for clip in order])
             enough = 1 + int(np.searchsorted(held, protocol.windows_per_style))
-            shown += mine[: max(len(mine) // 2, enough)].tolist()
+            classified += order[: max(len(order) // 2, enough)].tolist()
         means = _style_means([figures[place] for place in half], labels[half])
-        means |= _distribution_figures(seen.of(shown), real, protocol.windows_per_style, rng)
+        means |= _distribution_figures(seen.of(classified), real, protocol.windows_per_style, rng)
         rows += _rows(means, **columns, seed=repeat)
     return pd.DataFrame(rows)
 
@@ -525,14 +454,11 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
       Columns model, window_frames, steps, metric, unit, better, varies, value, low, high, repeats,
       in the order of the rows; a figure without repeats has NaN for bounds.
     """
-    keys = ["model", "window_frames", "steps", "metric", "unit", "better", "varies"]
-    out = []
-    for key, group in rows.groupby(keys, sort=False):
-        row = dict(zip(keys, key, strict=True))
-        interval = distributions.mean_and_interval(group["value"].to_numpy())
-        if row["varies"] == "clips":
-            wider = np.sqrt(interval["repeats"])
-            for bound in ("low", "high"):
-                interval[bound] = interval["value"] + wider * (interval[bound] - interval["value"])
-        out.append(row | interval)
-    return pd.DataFrame(out)
+    table = distributions.intervals_over_repeats(
+        rows, ["model", "window_frames", "steps", "metric", "unit", "better", "varies"]
+    )
+    halves = table["varies"] == "clips"
+    for bound in ("low", "high"):
+        away = table[bound] - table["value"]
+        table.loc[halves, bound] = table["value"] + np.sqrt(table["repeats"]) * away
+    return table

@@ -16,8 +16,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.experiments.protocol import Protocol, real_features, see_windows
-from f3amd_lib.experiments.quality import reference_clips
+from f3amd_lib.experiments.protocol import Protocol, classify_windows, real_features
+from f3amd_lib.experiments.real_clips import reference_clips
 from f3amd_lib.measures import distributions
 from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
@@ -25,8 +25,6 @@ from f3amd_lib.motion.skeleton import Motion
 
 STRENGTHS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Shares of each recipe of `corruptions`: 0 is real motion, 1 the bad generator of our tables."""
-
-_DISTANCES = {"FID": distributions.frechet_distance, "EMD": distributions.earth_movers_distance}
 
 FOOT_BANDS = {"0.5-2 Hz": (0.5, 2.0), "2-5 Hz": (2.0, 5.0), "5-15 Hz": (5.0, 15.0)}
 """Bands of toe motion, Hz: strides; lift, swing and strike; what is finer, up to half of 30 fps."""
@@ -36,14 +34,6 @@ _SEGMENT = 64
 
 
 # ------------------------------------------------------------------------------ graded corruptions
-
-
-def _draw_alike(clouds: Mapping[str, np.ndarray], count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw as many windows of each style, without replacement."""
-    for style, cloud in clouds.items():
-        if len(cloud) < count:
-            raise ValueError(f"{count} windows of style {style!r} are wanted, of {len(cloud)}")
-    return np.concatenate([cloud[rng.choice(len(cloud), count, replace=False)] for cloud in clouds.values()])
 
 
 def graded_corruptions(
@@ -83,10 +73,11 @@ def graded_corruptions(
     """
     require_telling_styles(classifier)
 
-    def clips_of(split: str) -> list[int]:
-        return reference_clips(packed, protocol.styles, window=classifier.config.window, split=split)
-
-    clips = [clip for split in splits for clip in clips_of(split)]
+    clips = [
+        clip
+        for split in splits
+        for clip in reference_clips(packed, protocol.styles, window=classifier.config.window, split=split)
+    ]
     motions = [packed.motion(clip) for clip in clips]
     names = [packed.styles[packed.clip_style[clip]] for clip in clips]
     by_class = real_features(packed, classifier, protocol.styles, classifier.config.window)
@@ -98,23 +89,14 @@ def graded_corruptions(
     for name, strength, seed in tqdm(todo, unit="set", disable=not progress):
         rng = np.random.default_rng([protocol.path_seed, seed, round(1e6 * strength)])
         broken = [corrupt(name, motion, strength=strength, seed=int(rng.integers(2**31))) for motion in motions]
-        seen = see_windows(classifier, broken, names)
+        seen = classify_windows(classifier, broken, names)
         made = {style: seen.features[seen.style == classifier.style_index(style)] for style in real}
-        drawn = [_draw_alike(side, protocol.windows_per_style, rng) for side in (made, real)]
-        figures = {metric: distance(*drawn) for metric, distance in _DISTANCES.items()}
+        drawn = [distributions.draw_windows(side, protocol.windows_per_style, rng) for side in (made, real)]
+        figures = {metric: distance(*drawn) for metric, distance in distributions.DISTANCES.items()}
         figures["style_accuracy"] = distributions.style_accuracy(seen.predicted, seen.style)
         named = {"corruption": name, "strength": float(strength), "seed": seed}
         rows += [{**named, "metric": metric, "value": value} for metric, value in figures.items()]
     return pd.DataFrame(rows)
-
-
-def _over_repeats(rows: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
-    """Turn the values of repeats into means with intervals, in the order of the rows."""
-    out = []
-    for key, group in rows.groupby(list(keys), sort=False):
-        interval = distributions.mean_and_interval(group["value"].to_numpy())
-        out.append(dict(zip(keys, key, strict=True)) | interval)
-    return pd.DataFrame(out)
 
 
 def summarise_corruptions(rows: pd.DataFrame) -> pd.DataFrame:
@@ -127,7 +109,7 @@ def summarise_corruptions(rows: pd.DataFrame) -> pd.DataFrame:
       Columns corruption, strength, metric, value, low, high, repeats. The intervals are over draws
       of windows and noise, not over people or clips.
     """
-    return _over_repeats(rows, ("corruption", "strength", "metric"))
+    return distributions.intervals_over_repeats(rows, ("corruption", "strength", "metric"))
 
 
 def rank_agreement(rows: pd.DataFrame) -> pd.DataFrame:
@@ -151,17 +133,15 @@ def rank_agreement(rows: pd.DataFrame) -> pd.DataFrame:
     """
     if rows["strength"].nunique() < 2:
         raise ValueError("one strength has no order; give `graded_corruptions` at least two")
-    found = []
-    for (name, seed), group in rows.groupby(["corruption", "seed"], sort=False):
+    rows_of_seeds = []
+    for (name, _), group in rows.groupby(["corruption", "seed"], sort=False):
         ranks = {}
-        for metric in _DISTANCES:
-            mine = group[group["metric"] == metric]
-            ranks[metric] = float(spearmanr(mine["strength"], mine["value"]).statistic)
+        for metric in distributions.DISTANCES:
+            graded = group[group["metric"] == metric]
+            ranks[metric] = float(spearmanr(graded["strength"], graded["value"]).statistic)
         ranks["EMD minus FID"] = ranks["EMD"] - ranks["FID"]
-        found += [
-            {"corruption": name, "seed": seed, "metric": metric, "value": value} for metric, value in ranks.items()
-        ]
-    table = _over_repeats(pd.DataFrame(found), ("corruption", "metric"))
+        rows_of_seeds += [{"corruption": name, "metric": metric, "value": value} for metric, value in ranks.items()]
+    table = distributions.intervals_over_repeats(pd.DataFrame(rows_of_seeds), ("corruption", "metric"))
     most = np.where(table["metric"] == "EMD minus FID", 2.0, 1.0)
     return table.assign(low=np.maximum(table["low"], -most), high=np.minimum(table["high"], most))
 
@@ -175,7 +155,7 @@ def settling(
     """Follow FID and EMD of real held-out motion against real training motion over the windows.
 
     Both sides are real, so what is measured is other clips of the same people, and the number of
-    windows. (`distributions.settling_curve` does it for any two clouds, styles unknown.)
+    windows. (`distributions.settling_curve` does it for any two clouds.)
 
     Args:
       classifier: its reference features are the two clouds.
@@ -204,16 +184,7 @@ def settling(
             f"sizes must lie between 1 and {most} windows of a style, half of what the poorest "
             f"style has; got {list(sizes)}"
         )
-    rows = []
-    for size in sizes:
-        for repeat in range(repeats):
-            rng = np.random.default_rng([seed, size, repeat])
-            drawn = [_draw_alike(side, size, rng) for side in sides]
-            rows += [
-                {"metric": metric, "windows": len(drawn[0]), "value": distance(*drawn)}
-                for metric, distance in _DISTANCES.items()
-            ]
-    return _over_repeats(pd.DataFrame(rows), ("metric", "windows"))
+    return distributions.settling_curve(*sides, sizes, repeats=repeats, seed=seed)
 
 
 # ------------------------------------------------------------------------------------ foot spectra
@@ -265,12 +236,12 @@ def foot_spectrum(
         raise ValueError("toe motion is compared with real clips: add a system named 'real'")
     power = {}
     for key, pairs in systems.items():
-        found = [
+        powers = [
             {"style": style, **_toe_power(motion, bands)} for style, motion in pairs if motion.num_frames > _SEGMENT
         ]
-        if not found:
+        if not powers:
             raise ValueError(f"{key[0]}: no motion of more than {_SEGMENT} frames")
-        power[key] = pd.DataFrame(found).groupby("style", sort=False).mean()
+        power[key] = pd.DataFrame(powers).groupby("style", sort=False).mean()
     real = next(table for key, table in power.items() if key[0] == "real")
     rows = []
     for key, table in power.items():

@@ -43,3 +43,8 @@ def refuse_unknown(values: Mapping, config_class: type, what: str) -> None:
     for key in values:
         if key not in known:
             raise ValueError(f"unknown {what} {key!r}{nearest_hint(key, known)}")
+
+
+def row_label(model: str, steps: int) -> str:
+    """Return how a system is called in tables and legends: "F3AMD-FNO-96, 8 steps"."""
+    return f"{model}, {steps} step{'s' if steps > 1 else ''}"

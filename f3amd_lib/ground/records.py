@@ -22,6 +22,7 @@ from pathlib import Path, PurePath
 import numpy as np
 import pandas as pd
 
+import f3amd_lib
 from f3amd_lib.ground.files import set_aside, whole_file
 
 log = logging.getLogger("f3amd")
@@ -32,18 +33,9 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
 _EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
 _CIRCUMSTANCES = (
-    "git_commit",
-    "git_dirty",
-    "library_version",
-    "versions",
-    "device_platform",
-    "device_kind",
-    "num_devices",
-    "cores",
-    "date_utc",
-    "not_possible",
-    "table",
-)
+    "git_commit git_dirty library_version versions device_platform device_kind num_devices cores date_utc "
+    "not_possible weights_digests table"
+).split()
 
 
 def run_record(*, profile, dataset, seed: int, **extra) -> dict:
@@ -79,8 +71,9 @@ def run_record(*, profile, dataset, seed: int, **extra) -> dict:
         "seed": seed,
         "git_commit": commit,
         "git_dirty": dirty,
-        "library_version": _library_version(),
-        "versions": {"python": platform.python_version()} | {package: _version(package) for package in _PACKAGES},
+        "library_version": f3amd_lib.__version__,
+        "versions": {"python": platform.python_version()}
+        | {package: importlib.metadata.version(package) for package in _PACKAGES},
         "device_platform": devices[0].platform,
         "device_kind": devices[0].device_kind,
         "num_devices": len(devices),
@@ -125,10 +118,8 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
     path = Path(path)
     if path.suffix != ".csv":
         raise ValueError(f"{path}: a table's name must end in .csv")
-    if not isinstance(frame, pd.DataFrame) or frame.empty:
-        raise ValueError(f"{path}: there is nothing to write, the table has no rows")
-    if not frame.columns.is_unique:
-        raise ValueError(f"{path}: a column is named twice in {', '.join(map(str, frame.columns))}")
+    if frame.empty or not frame.columns.is_unique:
+        raise ValueError(f"{path}: nothing to write: no rows, or two columns of one name")
     for key in ("dataset", "profile", "seed"):
         if key not in record:
             raise ValueError(f"{path}: the record has no {key!r}; make it with run_record")
@@ -136,21 +127,14 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
     if path.exists() or record_path.exists():
         _refuse_foreign(path, record_path, record)
 
-    buffer = io.StringIO()
-    frame.to_csv(buffer, index=False, lineterminator="\n")
-    text = buffer.getvalue()
-    described = _plain(record) | {
-        "table": {
-            "file": path.name,
-            "rows": len(frame),
-            "columns": [str(column) for column in frame.columns],
-            "sha256": _text_hash(text),
-        }
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
+    text = frame.to_csv(index=False, lineterminator="\n")
+    about = {"file": path.name, "rows": len(frame), "columns": [str(column) for column in frame.columns]}
+    described = _plain(record) | {"table": about | {"sha256": _text_hash(text)}}
     # Each file appears whole. Should the run die between the two, the checksum tells.
-    _replace(path, text)
-    _replace(record_path, json.dumps(described, indent=2, ensure_ascii=False) + "\n")
+    contents = {path: text, record_path: json.dumps(described, indent=2, ensure_ascii=False) + "\n"}
+    for file, content in contents.items():
+        with whole_file(file, overwrite=True) as temporary:
+            temporary.write_text(content, encoding="utf-8", newline="\n")
     return path
 
 
@@ -206,12 +190,6 @@ def _refuse_foreign(path: Path, record_path: Path, record: dict) -> None:
                 f"{path}: holds results of {key} {there.get(key)!r} and is not overwritten with "
                 f"those of {record[key]!r}; write to another folder"
             )
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write a whole file or none."""
-    with whole_file(path, overwrite=True) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _text_hash(text: str) -> str:
@@ -285,19 +263,6 @@ def _git_state() -> tuple[str | None, bool | None]:
     return commit, None if commit is None or status is None else bool(status)
 
 
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _library_version() -> str | None:
-    import f3amd_lib
-
-    return getattr(f3amd_lib, "__version__", None) or _version("f3amd-lib") or _version("f3amd")
-
-
 def _num_cores() -> int:
     """Cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -342,6 +307,6 @@ def kept_rows(path, record: dict) -> pd.DataFrame | None:
         kept = set_aside_table(path)
         log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
         return None
-    if "unit" in rows:
-        rows["unit"] = rows["unit"].fillna("")  # CSV knows no empty text
+    for column in {"unit", "weights"} & set(rows):
+        rows[column] = rows[column].fillna("")  # CSV knows no empty text
     return rows

@@ -2,14 +2,12 @@
 
 Every function takes global joint positions `[..., T, J, 3]` in metres (one character `[T, J, 3]`,
 or many `[B, T, J, 3]`), joint 0 being the root, and answers with one number a character: a scalar
-for one, `[B]` for many. All arithmetic is float64 numpy.
+for one, `[B]` for many. All arithmetic is float64 numpy. Names, units and which way is better stand
+in `registry`.
 
-Windows: a rollout may begin with `history` frames that were given, not generated. Generated frame
-0 is frame `history`, and window k starts at generated frame `k * window`. The history is left out
-of every figure. A *seam* is the step into a window's first frame from the frame before it, for
-k = 1, 2, ...; the step from the given history into window 0 is not counted, since the paper speaks
-of the boundaries between diffusion windows. After the last whole window a remainder counts for
-smoothness, feet and seams, but not for the two window errors, whose size grows along a window.
+Window k starts at frame `k * window`. A *seam* is the step into a window's first frame from the
+frame before it, for k = 1, 2, ... After the last whole window a remainder counts for smoothness,
+feet and seams, but not for the two window errors, whose size grows along a window.
 
 A figure whose denominator vanishes (a root that does not move or accelerate) is NaN: undefined
 for that character, and no reason to lose the others. Average with `numpy.nanmean`, and count.
@@ -19,7 +17,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
@@ -27,54 +24,20 @@ from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
 CONTACT_HEIGHT = 0.01
 """A toe under this height above the floor is in contact, metres (Appendix C: 1 cm)."""
 
-METRICS = {
-    "trajectory_error_m": ("trajectory_error", "m", "down"),
-    "direction_error_deg": ("direction_error", "deg", "down"),
-    "smoothness": ("smoothness", "", "near real"),
-    "coherence": ("coherence", "", "near real"),
-    "foot_sliding": ("foot_sliding", "", "down"),
-    "contact_share": ("contact_share", "", "near real"),
-    "ird_cm": ("IRD", "cm", "near real"),
-    "ird_excess_cm": ("IRD_excess", "cm", "near real"),
-    "inter_frame_step_cm": ("inter_frame_step", "cm", "near real"),
-    "joint_acceleration_cm": ("joint_acceleration", "cm/frame^2", "near real"),
-    "path_drift": ("path_drift", "", "down"),
-}
-"""For each key of `first_metrics`: name in the paper's tables (or ours), unit, which way is better.
-
-The paper marks IRD "down". We say "near real": real motion itself takes a step at every seam.
-"""
-
-CAMDM_METRICS = {
-    "camdm_trajectory_error_deg": ("CAMDM_trajectory_error", "deg", "down"),
-    "camdm_orientation_error_deg": ("CAMDM_orientation_error", "deg", "down"),
-    "camdm_foot_sliding": ("CAMDM_foot_sliding", "", "down"),
-    "coherence": METRICS["coherence"],
-}
-"""The same for each key of `camdm_metrics`: definitions of the released CAMDM code.
-
-They are not those of the F3AMD text, though some bear the same names there. Never set a figure of
-one column beside a figure of the other. Its FID is `distributions.camdm_frechet_distance`.
-"""
-
 _STILL = 1e-6  # metres; a mean root step or acceleration under a micrometre is none
 
 
-def _checked_positions(positions, history: int = 0, least: int = 1) -> np.ndarray:
-    """Return the generated part as float64, or say what is wrong with it."""
+def _checked_positions(positions, least: int = 1) -> np.ndarray:
+    """Return positions as float64, or say what is wrong with them."""
     positions = np.asarray(positions, dtype=np.float64)
     if positions.ndim < 3 or positions.shape[-1] != 3:
         raise ValueError(f"positions must be [..., T, J, 3] in metres, got {positions.shape}")
-    if int(history) != history or history < 0:
-        raise ValueError(f"history must be a whole number of frames, 0 or more, got {history}")
     if not np.all(np.isfinite(positions)):
-        place = [int(i) for i in np.argwhere(~np.isfinite(positions))[0]]
-        character = f" of character {place[:-3]}" if len(place) > 3 else ""
-        raise ValueError(f"positions are not finite at frame {place[-3]}, joint {place[-2]}{character}")
-    generated = positions[..., int(history) :, :, :]
-    if generated.shape[-3] < least:
-        raise ValueError(f"{generated.shape[-3]} frames after a history of {history}; at least {least} needed")
-    return generated
+        *_, frame, joint, _ = (int(i) for i in np.argwhere(~np.isfinite(positions))[0])
+        raise ValueError(f"positions are not finite at frame {frame}, joint {joint}")
+    if positions.shape[-3] < least:
+        raise ValueError(f"{positions.shape[-3]} frames; at least {least} needed")
+    return positions
 
 
 def _checked_window(window: int, least: int = 1) -> int:
@@ -85,60 +48,45 @@ def _checked_window(window: int, least: int = 1) -> int:
 
 def _by_window(signal: np.ndarray, window: int) -> np.ndarray:
     """Cut [..., T, C] into whole windows, [..., K, window, C]; the remainder is left out."""
+    window = _checked_window(window)
     count = signal.shape[-2] // window
     if count < 1:
-        raise ValueError(f"{signal.shape[-2]} generated frames do not fill a window of {window}")
+        raise ValueError(f"{signal.shape[-2]} frames do not fill a window of {window}")
     whole = signal[..., : count * window, :]
     return whole.reshape(*whole.shape[:-2], count, window, whole.shape[-1])
 
 
-def _reference(reference, num_frames: int, history: int, batch: tuple, what: str) -> np.ndarray:
-    """Fit a reference [..., T or T - history, C] to the generated frames of a batch."""
-    reference = np.asarray(reference, dtype=np.float64)
-    if not np.all(np.isfinite(reference)):
-        raise ValueError(f"{what} is not finite at index {np.argwhere(~np.isfinite(reference))[0]}")
-    length = reference.shape[-2]
-    if length == num_frames + history:
-        reference = reference[..., history:, :]
-    elif length != num_frames:
-        raise ValueError(
-            f"{what} has {length} frames; it needs {num_frames} (the generated ones) or, with the "
-            f"history, {num_frames + history}"
-        )
-    try:
-        return np.broadcast_to(reference, (*batch, *reference.shape[-2:]))
-    except ValueError:
-        raise ValueError(f"{what} of shape {reference.shape[:-1]} does not fit a batch of {batch}") from None
+def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
+    """Return the change of [..., T, C] since each window's first frame, [..., K, window, C]."""
+    windows = _by_window(signal, window)
+    return windows - windows[..., :1, :]
 
 
-def _path_positions(path) -> np.ndarray:
-    position = path.position if isinstance(path, RootPath) else np.asarray(path, dtype=np.float64)
-    if position.ndim < 2 or position.shape[-1] != 2:
-        raise ValueError(f"path must be a RootPath or [..., T, 2] (x, z), got {position.shape}")
-    return position
+def _checked_target(target, num_frames: int, width: int) -> np.ndarray:
+    """Return a path's positions (width 2) or yaws (width 1) as float64, [..., T, width]."""
+    target = np.asarray(target, dtype=np.float64)
+    if target.ndim < 2 or target.shape[-1] != width:
+        raise ValueError(f"path must be a RootPath or [..., T, 2] (x, z), got {target.shape}")
+    if target.shape[-2] != num_frames:
+        raise ValueError(f"path has {target.shape[-2]} frames; it needs {num_frames}")
+    if not np.all(np.isfinite(target)):
+        raise ValueError(f"path is not finite at index {np.argwhere(~np.isfinite(target))[0]}")
+    return target
 
 
-def _checked_toes(toes, num_joints: int) -> np.ndarray:
-    """Return the toes' joint indices, of a skeleton or as given."""
-    indices = np.array(toes.toes if isinstance(toes, Skeleton) else toes, dtype=int)
-    if indices.ndim != 1 or not indices.size or not 0 <= indices.min() <= indices.max() < num_joints:
-        raise ValueError(f"toes must be joint indices from 0 to {num_joints - 1}, got {indices.tolist()}")
-    return indices
+def _root_and_target(positions, path, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return the root on the ground and where it was wanted, [..., T, 2] each."""
+    root = _checked_positions(positions, least)[..., 0, [0, 2]]
+    return root, _checked_target(path.position if isinstance(path, RootPath) else path, root.shape[-2], 2)
 
 
-def _checked_yaws(yaw, path, history: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the generated part of the facing and the wanted facing, [..., T] each."""
-    yaw = np.asarray(yaw, dtype=np.float64)
-    if yaw.ndim < 1 or yaw.shape[-1] <= history:
-        raise ValueError(f"yaw must be [..., T] with more than {history} frames, got {yaw.shape}")
+def _shown_and_wanted_yaw(yaw, path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the facing and the wanted facing, [..., T, 1] each."""
+    yaw = np.asarray(yaw, dtype=np.float64)[..., None]
     if not np.all(np.isfinite(yaw)):
-        raise ValueError(f"yaw is not finite at frame {np.argwhere(~np.isfinite(yaw))[0][-1]}")
-    generated = yaw[..., history:]
+        raise ValueError("yaw is not finite")
     wanted = path.yaw if isinstance(path, RootPath) else np.asarray(path, dtype=np.float64)
-    if wanted.ndim < 1:
-        raise ValueError("path must be a RootPath or the wanted yaw [..., T]")
-    target = _reference(wanted[..., None], generated.shape[-1], history, generated.shape[:-1], "path yaw")
-    return generated, target[..., 0]
+    return yaw, _checked_target(wanted[..., None], yaw.shape[-2], 1)
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray):
@@ -147,13 +95,28 @@ def _ratio(numerator: np.ndarray, denominator: np.ndarray):
     return np.where(moving, numerator / np.where(moving, denominator, 1.0), np.nan)[()]
 
 
-def seam_frames(num_frames: int, window: int, history: int = 0) -> np.ndarray:
+def _joint_and_root_change(positions, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean lengths of the order-th differences: of all joints, and of the root's x and z."""
+    change = np.diff(_checked_positions(positions, least=order + 1), n=order, axis=-3)
+    joints = np.linalg.norm(change, axis=-1).mean(axis=(-2, -1))
+    return joints, np.linalg.norm(change[..., 0, [0, 2]], axis=-1).mean(axis=-1)
+
+
+def _toes_and_root_step(positions, toes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return toe positions [..., T, 2, 3], their steps on the ground [..., T - 1, 2] and the root's mean one."""
+    positions = _checked_positions(positions, least=2)
+    toe = positions[..., list(toes.toes if isinstance(toes, Skeleton) else toes), :]
+    step = np.linalg.norm(np.diff(toe, axis=-3)[..., [0, 2]], axis=-1)
+    root = np.linalg.norm(np.diff(positions[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
+    return toe, step, root
+
+
+def seam_frames(num_frames: int, window: int) -> np.ndarray:
     """List the first frames of windows 1, 2, ... in a rollout.
 
     Args:
-      num_frames: frames in all, history included.
+      num_frames: frames in all.
       window: frames a window.
-      history: given frames before the first window.
 
     Returns:
       Frame numbers, [K]; each is compared with the frame before it.
@@ -162,24 +125,24 @@ def seam_frames(num_frames: int, window: int, history: int = 0) -> np.ndarray:
       ValueError: if there is no boundary between two windows.
     """
     window = _checked_window(window)
-    frames = np.arange(history + window, num_frames, window)
+    frames = np.arange(window, num_frames, window)
     if len(frames) == 0:
         raise ValueError(
-            f"{num_frames} frames with a history of {history} hold no boundary between windows of "
-            f"{window} frames; at least {history + window + 1} frames are needed"
+            f"{num_frames} frames hold no boundary between windows of {window} frames; "
+            f"at least {window + 1} frames are needed"
         )
     return frames
 
 
-def trajectory_error(positions, path, window: int, history: int = 0):
+def trajectory_error(positions, path, window: int):
     """Distance between walked and wanted root position, reckoned from each window's first frame.
 
         mean over frames of || (p_t - p_first) - (p*_t - p*_first) ||,  on the ground plane.
 
     Args:
       positions: [..., T, J, 3], metres.
-      path: the target, a `RootPath` or [..., T, 2] (x, z); T or T - history frames.
-      window, history: frames, see the module's text.
+      path: the target, a `RootPath` or [..., T, 2] (x, z).
+      window: frames.
 
     Returns:
       Metres, one a character.
@@ -190,16 +153,12 @@ def trajectory_error(positions, path, window: int, history: int = 0):
     Source: paper section 4.4 (Traj.). Our reading: "first" is the window's own first generated
     frame on both sides, and that frame, which is 0 by construction, is one of those averaged.
     """
-    generated = _checked_positions(positions, history)
-    window = _checked_window(window)
-    root = generated[..., 0, [0, 2]]
-    target = _reference(_path_positions(path), root.shape[-2], history, root.shape[:-2], "path")
-    walked, wanted = _by_window(root, window), _by_window(target, window)
-    gap = (walked - walked[..., :1, :]) - (wanted - wanted[..., :1, :])
+    walked, wanted = _root_and_target(positions, path)
+    gap = _since_window_start(walked, window) - _since_window_start(wanted, window)
     return np.linalg.norm(gap, axis=-1).mean(axis=(-2, -1))
 
 
-def direction_error(yaw, path, window: int, history: int = 0):
+def direction_error(yaw, path, window: int):
     """Difference of the turns made since each window's first frame.
 
         mean over frames of | wrap((yaw_t - yaw_first) - (yaw*_t - yaw*_first)) |.
@@ -208,8 +167,8 @@ def direction_error(yaw, path, window: int, history: int = 0):
 
     Args:
       yaw: facing of the character, [..., T], radians.
-      path: a `RootPath`, or the wanted facing [..., T], radians; T or T - history frames.
-      window, history: frames, see the module's text.
+      path: a `RootPath`, or the wanted facing [..., T], radians.
+      window: frames.
 
     Returns:
       Degrees in [0, 180], one a character.
@@ -220,14 +179,12 @@ def direction_error(yaw, path, window: int, history: int = 0):
     Source: paper section 4.4 (Dir.). Our reading: differences are wrapped to half a turn, and the
     first frame, 0 by construction, is one of those averaged.
     """
-    shown, wanted = _checked_yaws(yaw, path, history)
-    window = _checked_window(window)
-    turned, asked = _by_window(shown[..., None], window), _by_window(wanted[..., None], window)
-    gap = wrap_angle((turned - turned[..., :1, :]) - (asked - asked[..., :1, :]))
+    shown, wanted = _shown_and_wanted_yaw(yaw, path)
+    gap = wrap_angle(_since_window_start(shown, window) - _since_window_start(wanted, window))
     return np.rad2deg(np.abs(gap)).mean(axis=(-3, -2, -1))
 
 
-def smoothness(positions, history: int = 0):
+def smoothness(positions):
     """Mean joint acceleration over the root's mean acceleration on the ground.
 
         mean_{t, j} || p_{t+1} - 2 p_t + p_{t-1} ||  /  mean_t || the same of root x, z ||.
@@ -236,8 +193,7 @@ def smoothness(positions, history: int = 0):
     not better motion. Without unit; both parts scale alike with size and frame rate.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 3 after the history.
-      history: given frames to leave out.
+      positions: [..., T, J, 3], metres, T >= 3.
 
     Returns:
       One ratio a character; NaN where the root never accelerates.
@@ -249,21 +205,16 @@ def smoothness(positions, history: int = 0):
     frames and joints (root included) before the division, over the whole rollout. CAMDM's released
     code takes first differences instead: see `coherence`.
     """
-    generated = _checked_positions(positions, history, least=3)
-    second = np.diff(generated, n=2, axis=-3)
-    joints = np.linalg.norm(second, axis=-1).mean(axis=(-2, -1))
-    root = np.linalg.norm(second[..., 0, [0, 2]], axis=-1).mean(axis=-1)
-    return _ratio(joints, root)
+    return _ratio(*_joint_and_root_change(positions, 2))
 
 
-def coherence(positions, history: int = 0):
+def coherence(positions):
     """Mean joint step over the root's mean horizontal step: CAMDM's smoothness.
 
         mean_{t, j} || p_{t+1} - p_t ||  /  mean_t || the same of root x, z ||.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 2 after the history.
-      history: given frames to leave out.
+      positions: [..., T, J, 3], metres, T >= 2.
 
     Returns:
       One ratio a character; 1 for a figure that glides without moving a limb, NaN where the root
@@ -276,14 +227,10 @@ def coherence(positions, history: int = 0):
     Not comparable with `smoothness`, the F3AMD text's definition. Where the root stands still the
     code divides by 1 in its own unit, so that its figure depends on the unit: here that is NaN.
     """
-    generated = _checked_positions(positions, history, least=2)
-    first = np.diff(generated, axis=-3)
-    joints = np.linalg.norm(first, axis=-1).mean(axis=(-2, -1))
-    root = np.linalg.norm(first[..., 0, [0, 2]], axis=-1).mean(axis=-1)
-    return _ratio(joints, root)
+    return _ratio(*_joint_and_root_change(positions, 1))
 
 
-def foot_sliding(positions, toes, history: int = 0, floor_shift=None, contact_height: float = CONTACT_HEIGHT):
+def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONTACT_HEIGHT):
     """Horizontal toe step while in contact over the root's horizontal step, and the contact share.
 
         mean over toe-frames in contact of || toe_{t+1} - toe_t ||_xz
@@ -292,9 +239,8 @@ def foot_sliding(positions, toes, history: int = 0, floor_shift=None, contact_he
     A toe is in contact at t if it is less than `contact_height` above the floor there.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 2 after the history.
+      positions: [..., T, J, 3], metres, T >= 2.
       toes: joint indices of the two toes (`skeleton.toes`), or a `Skeleton`.
-      history: given frames to leave out.
       floor_shift: height of a resting toe, metres, one number or one a character. None takes each
         character's own lowest toe, so that the lowest toe counts as 0. Give it where that is
         known (from real motion of the style), lest a single dip lift the floor's reference.
@@ -311,23 +257,17 @@ def foot_sliding(positions, toes, history: int = 0, floor_shift=None, contact_he
     Source: paper Appendix C (Foot Sliding, 1 cm). The text does not mention a lowering of the
     clip; CAMDM's code does it, and without it a toe joint that rests at 4 cm would never touch.
     """
-    generated = _checked_positions(positions, history, least=2)
-    foot = generated[..., _checked_toes(toes, generated.shape[-2]), :]
+    toe, step, root = _toes_and_root_step(positions, toes)
     if floor_shift is None:
-        floor = foot[..., 1].min(axis=(-2, -1))
+        floor = toe[..., 1].min(axis=(-2, -1))
     else:
-        floor = np.broadcast_to(np.asarray(floor_shift, dtype=np.float64), foot.shape[:-3])
-        if not np.all(np.isfinite(floor)):
-            raise ValueError("floor_shift must be finite, in metres")
-    contact = (foot[..., :-1, :, 1] - floor[..., None, None]) < contact_height
-    step = np.linalg.norm(np.diff(foot, axis=-3)[..., [0, 2]], axis=-1)
-    count = contact.sum(axis=(-2, -1))
-    slide = (step * contact).sum(axis=(-2, -1)) / np.maximum(count, 1)
-    root = np.linalg.norm(np.diff(generated[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
+        floor = np.broadcast_to(np.asarray(floor_shift, dtype=np.float64), toe.shape[:-3])
+    contact = (toe[..., :-1, :, 1] - floor[..., None, None]) < contact_height
+    slide = (step * contact).sum(axis=(-2, -1)) / np.maximum(contact.sum(axis=(-2, -1)), 1)
     return _ratio(slide, root), contact.mean(axis=(-2, -1))
 
 
-def ird(positions, window: int, history: int = 0):
+def ird(positions, window: int):
     """Inter-round discontinuity, to the letter: how far joints move across a seam.
 
         100 * mean_{seams k, joints j} || p_{t_k + 1, j} - p_{t_k, j} ||.
@@ -337,7 +277,7 @@ def ird(positions, window: int, history: int = 0):
 
     Args:
       positions: [..., T, J, 3], metres.
-      window, history: frames, see the module's text.
+      window: frames.
 
     Returns:
       Centimetres, one a character.
@@ -348,13 +288,13 @@ def ird(positions, window: int, history: int = 0):
     Source: paper section 4.4 (IRD), Eq. 10 as a metric. Our reading: the norm is that of each
     joint's displacement, averaged over joints ("mean Euclidean distance"), not of all stacked.
     """
-    generated = _checked_positions(positions, history)
-    seams = seam_frames(generated.shape[-3], window)
-    jump = generated[..., seams, :, :] - generated[..., seams - 1, :, :]
+    positions = _checked_positions(positions)
+    seams = seam_frames(positions.shape[-3], window)
+    jump = positions[..., seams, :, :] - positions[..., seams - 1, :, :]
     return 100.0 * np.linalg.norm(jump, axis=-1).mean(axis=(-2, -1))
 
 
-def ird_excess(positions, window: int, history: int = 0):
+def ird_excess(positions, window: int):
     """How far a seam's step is from the step that the velocity before the seam would take.
 
         100 * mean_{k, j} || (p_{t_k + 1} - p_{t_k}) - (p_{t_k} - p_{t_k - 1}) ||.
@@ -364,7 +304,7 @@ def ird_excess(positions, window: int, history: int = 0):
 
     Args:
       positions: [..., T, J, 3], metres.
-      window, history: frames; a window needs 2, so that the velocity before a seam is its own.
+      window: frames, at least 2, so that the velocity before a seam is its own.
 
     Returns:
       Centimetres, one a character.
@@ -374,20 +314,19 @@ def ird_excess(positions, window: int, history: int = 0):
 
     Source: ours. Eq. 10 compares with standing still; this compares with going on.
     """
-    generated = _checked_positions(positions, history)
-    seams = seam_frames(generated.shape[-3], _checked_window(window, least=2))
-    before, last, first = (generated[..., seams - back, :, :] for back in (2, 1, 0))
+    positions = _checked_positions(positions)
+    seams = seam_frames(positions.shape[-3], _checked_window(window, least=2))
+    before, last, first = (positions[..., seams - back, :, :] for back in (2, 1, 0))
     return 100.0 * np.linalg.norm(first - 2.0 * last + before, axis=-1).mean(axis=(-2, -1))
 
 
-def inter_frame_step(positions, spacing: int = 1, history: int = 0):
+def inter_frame_step(positions, spacing: int = 1):
     """How far joints move between adjacent frames: what `ird` reads on motion without seams.
 
     Args:
       positions: [..., T, J, 3], metres; for the "real row", real clips.
       spacing: take the steps into frames spacing, 2 * spacing, ...; 1 takes all of them, the
         window length takes those at which `ird` would look.
-      history: given frames to leave out.
 
     Returns:
       Centimetres, one a character.
@@ -397,17 +336,16 @@ def inter_frame_step(positions, spacing: int = 1, history: int = 0):
 
     Source: ours (the row of real motion beside Eq. 10).
     """
-    return ird(positions, spacing, history)
+    return ird(positions, spacing)
 
 
-def joint_acceleration(positions, history: int = 0, fps: float = 30.0):
+def joint_acceleration(positions, fps: float = 30.0):
     """Mean magnitude of joint accelerations, not normalised by anything.
 
         100 * mean_{t, j} || p_{t+1} - 2 p_t + p_{t-1} || * (fps / 30)^2.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 3 after the history.
-      history: given frames to leave out.
+      positions: [..., T, J, 3], metres, T >= 3.
       fps: frame rate of `positions`; the result is always for 1/30 s.
 
     Returns:
@@ -418,20 +356,17 @@ def joint_acceleration(positions, history: int = 0, fps: float = 30.0):
 
     Source: ours; the numerator of `smoothness`, which a jerky root cannot flatter.
     """
-    generated = _checked_positions(positions, history, least=3)
-    second = np.linalg.norm(np.diff(generated, n=2, axis=-3), axis=-1)
-    return 100.0 * (fps / 30.0) ** 2 * second.mean(axis=(-2, -1))
+    return 100.0 * (fps / 30.0) ** 2 * _joint_and_root_change(positions, 2)[0]
 
 
-def path_drift(positions, path, history: int = 0):
+def path_drift(positions, path):
     """How far off the end is, over the length of the path: whole rollout, no windows.
 
         || (p_end - p_start) - (p*_end - p*_start) ||  /  length of p*.
 
     Args:
       positions: [..., T, J, 3], metres.
-      path: the target, a `RootPath` or [..., T, 2] (x, z); T or T - history frames.
-      history: given frames to leave out.
+      path: the target, a `RootPath` or [..., T, 2] (x, z).
 
     Returns:
       Metres of error at the end per metre of path, one a character; NaN for a path of no length.
@@ -441,9 +376,7 @@ def path_drift(positions, path, history: int = 0):
 
     Source: ours, beside Traj., which by design does not see drift between windows.
     """
-    generated = _checked_positions(positions, history, least=2)
-    root = generated[..., 0, [0, 2]]
-    target = _reference(_path_positions(path), root.shape[-2], history, root.shape[:-2], "path")
+    root, target = _root_and_target(positions, path, least=2)
     gap = (root[..., -1, :] - root[..., 0, :]) - (target[..., -1, :] - target[..., 0, :])
     length = np.linalg.norm(np.diff(target, axis=-2), axis=-1).sum(axis=-1)
     return _ratio(np.linalg.norm(gap, axis=-1), length)
@@ -456,7 +389,7 @@ def _angle_error(angle: np.ndarray, wanted: np.ndarray, counts: np.ndarray):
     return np.where(number > 0, np.rad2deg(np.abs(total)) / np.maximum(number, 1), np.nan)[()]
 
 
-def camdm_trajectory_error(positions, path, history: int = 0):
+def camdm_trajectory_error(positions, path):
     """CAMDM's trajectory error: mean angle between wanted and walked steps, over the whole rollout.
 
         | mean_t(a*_t - a_t) |,  a_t = angle of the root's step on the ground from t to t + 1.
@@ -468,9 +401,8 @@ def camdm_trajectory_error(positions, path, history: int = 0):
     same motion turned about +Y.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 2 after the history.
-      path: the target, a `RootPath` or [..., T, 2] (x, z); T or T - history frames.
-      history: given frames to leave out.
+      positions: [..., T, J, 3], metres, T >= 2.
+      path: the target, a `RootPath` or [..., T, 2] (x, z).
 
     Returns:
       Degrees, one a character.
@@ -483,16 +415,13 @@ def camdm_trajectory_error(positions, path, history: int = 0):
     in which path or root stand still have no direction and are left out; NaN if all are. (Section
     4.4 of the F3AMD text describes it with vectors from the first frame to the current one.)
     """
-    generated = _checked_positions(positions, history, least=2)
-    root = generated[..., 0, [0, 2]]
-    target = _reference(_path_positions(path), root.shape[-2], history, root.shape[:-2], "path")
-    steps = [np.diff(line, axis=-2) for line in (root, target)]
+    steps = [np.diff(line, axis=-2) for line in _root_and_target(positions, path, least=2)]
     angle, wanted = (np.arctan2(step[..., 1], -step[..., 0]) for step in steps)
     lengths = [np.linalg.norm(step, axis=-1) for step in steps]
     return _angle_error(angle, wanted, np.minimum(*lengths) > _STILL)
 
 
-def camdm_orientation_error(yaw, path, history: int = 0):
+def camdm_orientation_error(yaw, path):
     """CAMDM's orientation error: mean angle between wanted and shown facing, whole rollout.
 
         | mean_t(f*_t - f_t) |,  f_t = angle of the facing on the ground.
@@ -502,8 +431,7 @@ def camdm_orientation_error(yaw, path, history: int = 0):
 
     Args:
       yaw: facing of the character, [..., T], radians.
-      path: a `RootPath`, or the wanted facing [..., T], radians; T or T - history frames.
-      history: given frames to leave out.
+      path: a `RootPath`, or the wanted facing [..., T], radians.
 
     Returns:
       Degrees, one a character.
@@ -514,12 +442,11 @@ def camdm_orientation_error(yaw, path, history: int = 0):
     Source: the released CAMDM code ("orien_error"), angles and cut as there. It takes the facing
     from shoulders and hips together; use the `yaw` you mean (`facing_yaw` takes the hips).
     """
-    shown, wanted = _checked_yaws(yaw, path, history)
-    angle, target = (np.arctan2(np.cos(each), np.sin(each)) for each in (shown, wanted))
-    return _angle_error(angle, target, np.ones(angle.shape, dtype=bool))
+    angle, wanted = (np.arctan2(np.cos(each), np.sin(each))[..., 0] for each in _shown_and_wanted_yaw(yaw, path))
+    return _angle_error(angle, wanted, np.ones(angle.shape, dtype=bool))
 
 
-def camdm_foot_sliding(positions, toes, history: int = 0):
+def camdm_foot_sliding(positions, toes):
     """CAMDM's foot sliding: as `foot_sliding` with the clip lowered, but for its last frame.
 
         mean over toe-frames in contact of s_t  /  mean_t || root_{t+1} - root_t ||_xz,
@@ -529,9 +456,8 @@ def camdm_foot_sliding(positions, toes, history: int = 0):
     adds a step of 0, which lowers the figure by about 1 / T.
 
     Args:
-      positions: [..., T, J, 3], metres, T >= 2 after the history.
+      positions: [..., T, J, 3], metres, T >= 2.
       toes: joint indices of the two toes (`skeleton.toes`), or a `Skeleton`.
-      history: given frames to leave out.
 
     Returns:
       One ratio a character; 0 without any contact. NaN where the root stands still, where the code
@@ -542,147 +468,73 @@ def camdm_foot_sliding(positions, toes, history: int = 0):
 
     Source: the released CAMDM code.
     """
-    generated = _checked_positions(positions, history, least=2)
-    foot = generated[..., _checked_toes(toes, generated.shape[-2]), :]
-    height = foot[..., 1] - foot[..., 1].min(axis=(-2, -1), keepdims=True)
-    contact = height < CONTACT_HEIGHT
-    step = np.linalg.norm(np.diff(foot, axis=-3)[..., [0, 2]], axis=-1)
+    toe, step, root = _toes_and_root_step(positions, toes)
+    contact = toe[..., 1] - toe[..., 1].min(axis=(-2, -1), keepdims=True) < CONTACT_HEIGHT
     slide = (step * contact[..., :-1, :]).sum(axis=(-2, -1)) / np.maximum(contact.sum(axis=(-2, -1)), 1)
-    root = np.linalg.norm(np.diff(generated[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
     return _ratio(slide, root)
 
 
-def _position_and_yaw(path) -> tuple[np.ndarray, np.ndarray]:
-    """Unpack one RootPath, or stack several, into [..., T, 2] and [..., T]."""
-    if isinstance(path, RootPath):
-        return path.position, path.yaw
-    paths = list(path)
-    if not paths or not all(isinstance(item, RootPath) for item in paths):
-        raise ValueError("path must be a RootPath, or a list of one a character")
-    if len({item.num_frames for item in paths}) > 1:
-        raise ValueError("all paths of a batch must have the same number of frames")
-    return np.stack([item.position for item in paths]), np.stack([item.yaw for item in paths])
-
-
-def _checked_measurands(positions, yaw, path, skeleton: Skeleton):
-    """Return the facing and (wanted positions, wanted yaws), or None and None without a path."""
-    shape = np.shape(positions)
-    if len(shape) < 3 or shape[-2] != skeleton.num_joints:
-        raise ValueError(f"positions must be [..., T, {skeleton.num_joints}, 3] for this skeleton, got {shape}")
-    if path is None:
-        return None, None
-    if yaw is None:
-        yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
-    if np.shape(yaw) != shape[:-2]:
-        raise ValueError(f"yaw must be {shape[:-2]} for these positions, got {np.shape(yaw)}")
-    return yaw, _position_and_yaw(path)
-
-
-def _plain(values: dict) -> dict:
-    return {key: float(value) if np.ndim(value) == 0 else np.asarray(value) for key, value in values.items()}
-
-
 def first_metrics(
-    positions, yaw, path, window: int, skeleton: Skeleton, *, history: int = 0, floor_shift=None, fps: float = 30.0
-) -> dict:
+    positions, path: RootPath, window: int, skeleton: Skeleton, *, floor_shift=None, fps: float = 30.0
+) -> dict[str, float]:
     """Measure a rollout, or real motion, with everything that needs no classifier.
 
     Args:
-      positions: [..., T, J, 3], metres, history included.
-      yaw: facing, [..., T], radians; None takes it from the hips.
-      path: the target, one `RootPath` for all or a list of one a character; T or T - history
-        frames. None for real motion, which follows no target: then trajectory, direction and
-        drift are left out.
+      positions: of one character, [T, J, 3], metres.
+      path: the target, T frames; the facing is compared with that of the hips.
       window: frames a window.
-      skeleton: for the toes, and the hips if `yaw` is None.
-      history: given frames before the first window.
+      skeleton: J joints, for toes and hips.
       floor_shift: see `foot_sliding`.
       fps: frame rate of `positions`.
 
     Returns:
-      Key -> number (float for one character, [B] for many); keys, names and units are in `METRICS`.
+      Key of `registry.METRICS` -> number.
 
     Raises:
       ValueError: for NaN, shapes that do not fit, or no boundary between windows.
 
     Source: paper section 4.4 and Appendix C, and the additions marked "ours" above.
     """
-    yaw, wanted = _checked_measurands(positions, yaw, path, skeleton)
-    values = {}
-    if wanted is not None:
-        wanted_position, wanted_yaw = wanted
-        values["trajectory_error_m"] = trajectory_error(positions, wanted_position, window, history)
-        values["direction_error_deg"] = direction_error(yaw, wanted_yaw, window, history)
-    values["smoothness"] = smoothness(positions, history)
-    values["coherence"] = coherence(positions, history)
-    values["foot_sliding"], values["contact_share"] = foot_sliding(positions, skeleton, history, floor_shift)
-    values["ird_cm"] = ird(positions, window, history)
-    values["ird_excess_cm"] = ird_excess(positions, window, history)
-    values["inter_frame_step_cm"] = inter_frame_step(positions, 1, history)
-    values["joint_acceleration_cm"] = joint_acceleration(positions, history, fps)
-    if wanted is not None:
-        values["path_drift"] = path_drift(positions, wanted_position, history)
-    return _plain(values)
+    yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
+    slide, contact_share = foot_sliding(positions, skeleton, floor_shift)
+    values = {
+        "trajectory_error_m": trajectory_error(positions, path, window),
+        "direction_error_deg": direction_error(yaw, path, window),
+        "smoothness": smoothness(positions),
+        "coherence": coherence(positions),
+        "foot_sliding": slide,
+        "contact_share": contact_share,
+        "ird_cm": ird(positions, window),
+        "ird_excess_cm": ird_excess(positions, window),
+        "inter_frame_step_cm": inter_frame_step(positions),
+        "joint_acceleration_cm": joint_acceleration(positions, fps),
+        "path_drift": path_drift(positions, path),
+    }
+    return {key: float(value) for key, value in values.items()}
 
 
-def camdm_metrics(positions, yaw, path, skeleton: Skeleton, *, history: int = 0) -> dict:
+def camdm_metrics(positions, path: RootPath, skeleton: Skeleton) -> dict[str, float]:
     """Measure a rollout, or real motion, as the released CAMDM code does.
 
+    Its definitions are not those of the F3AMD text, though some bear the same names there. Never
+    set a figure of one beside a figure of the other.
+
     Args:
-      positions, yaw, path, skeleton, history: as for `first_metrics`.
+      positions, path, skeleton: as for `first_metrics`.
 
     Returns:
-      Key -> number (float for one character, [B] for many); keys, names and units are in
-      `CAMDM_METRICS`. Without a path the two angles are left out.
+      Key of `registry.METRICS` -> number.
 
     Raises:
       ValueError: for NaN or shapes that do not fit.
 
     Source: the released CAMDM code.
     """
-    yaw, wanted = _checked_measurands(positions, yaw, path, skeleton)
-    values = {}
-    if wanted is not None:
-        wanted_position, wanted_yaw = wanted
-        values["camdm_trajectory_error_deg"] = camdm_trajectory_error(positions, wanted_position, history)
-        values["camdm_orientation_error_deg"] = camdm_orientation_error(yaw, wanted_yaw, history)
-    values["camdm_foot_sliding"] = camdm_foot_sliding(positions, skeleton, history)
-    values["coherence"] = coherence(positions, history)
-    return _plain(values)
-
-
-def tidy_metrics(values: dict, **columns) -> list[dict]:
-    """Turn a dict of metrics into the rows of a tidy table, averaged over characters.
-
-    Args:
-      values: what `first_metrics` or `camdm_metrics` returned, or both together.
-      columns: what the rows are about, such as model="F3AMD-FNO-96", steps=8.
-
-    Returns:
-      One dict a metric: the columns, then metric, unit, better, value (mean over characters),
-      spread (standard deviation over characters, NaN for one), characters (those with a number).
-
-    Raises:
-      ValueError: for a key that is neither in `METRICS` nor in `CAMDM_METRICS`.
-    """
-    known = METRICS | CAMDM_METRICS
-    rows = []
-    for key, value in values.items():
-        if key not in known:
-            raise ValueError(f"unknown metric {key!r}{nearest_hint(key, known)}")
-        name, unit, better = known[key]
-        numbers = np.ravel(value)
-        numbers = numbers[np.isfinite(numbers)]
-        count = len(numbers)
-        rows.append(
-            {
-                **columns,
-                "metric": name,
-                "unit": unit,
-                "better": better,
-                "value": float(numbers.mean()) if count else float("nan"),
-                "spread": float(numbers.std(ddof=1)) if count > 1 else float("nan"),
-                "characters": count,
-            }
-        )
-    return rows
+    yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
+    values = {
+        "camdm_trajectory_error_deg": camdm_trajectory_error(positions, path),
+        "camdm_orientation_error_deg": camdm_orientation_error(yaw, path),
+        "camdm_foot_sliding": camdm_foot_sliding(positions, skeleton),
+        "coherence": coherence(positions),
+    }
+    return {key: float(value) for key, value in values.items()}

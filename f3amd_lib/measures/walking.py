@@ -8,14 +8,18 @@ floor at y = `floor`. All of this is ours: the paper has the foot-sliding ratio 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import groupby
 
 import numpy as np
 import pandas as pd
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import find_peaks
 
-from f3amd_lib.measures.metrics import joint_acceleration
-from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.ground.names import row_label
+from f3amd_lib.measures.metrics import foot_sliding, joint_acceleration
+from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, facing_yaw
 
 STEP_PROMINENCE = 0.015
 """How far a toe must rise over its surroundings to have taken a step, metres."""
@@ -25,6 +29,9 @@ SHORTEST_STEP = 0.4
 
 FAST_SLIDE = 30.0
 """cm/s over which anybody sees a foot slide."""
+
+SHORTEST_SUPPORT = 3
+"""Frames that a foot must carry alone to count as planted (0.1 s at 30 fps)."""
 
 
 def toe_positions(positions, skeleton: Skeleton) -> np.ndarray:
@@ -96,21 +103,150 @@ def seam_kick(positions, window: int):
     return acceleration[..., seam].mean(axis=-1) / acceleration[..., ~seam].mean(axis=-1)
 
 
-CHECKS = {
-    "stepping_rate": ("steps by toe height", "1/s", "within a fifth"),
-    "joint_acceleration": ("joint acceleration", "cm/frame²", "within a factor of 1.5"),
-    "slide_speed": ("slide of the lower toe", "cm/s", "at most 12"),
-    "floor_penetration": ("deepest toe under the floor", "cm", "at most 1"),
-}
-"""Key -> name, unit, and what a walking person's figure must be (our choice): the first two beside
-those of the motion that was learnt, the last two as they are."""
+def support_changes_per_s(positions, skeleton: Skeleton, fps: float = 30.0):
+    """Count how often the planted foot changes, per second.
 
-_HOLDS = {
-    "stepping_rate": lambda value, source: abs(value - source) <= 0.2 * source,
-    "joint_acceleration": lambda value, source: source / 1.5 <= value <= 1.5 * source,
-    "slide_speed": lambda value, source: value <= 12.0,
-    "floor_penetration": lambda value, source: value <= 1.0,
+    A foot carries alone while its toe rests (3D speed under 1 cm a frame) and the other's does
+    not, for at least 0.1 s. A walker who takes two steps a second reads 2; one who slides, floats,
+    hops on one leg or stands reads about 0.
+
+    Args:
+      positions: [..., T, J, 3], metres.
+      skeleton: for the toes.
+      fps: frame rate of `positions`.
+
+    Returns:
+      Changes per second, one a character. In records it is called foot_alternation.
+
+    Source: ours.
+    """
+    contact = np.asarray(contact_labels(skeleton, np.asarray(positions, np.float64), fps))
+    alone = contact[..., 0].astype(int) - contact[..., 1].astype(int)
+    flat = alone.reshape(-1, alone.shape[-1])
+    counts = []
+    for sides in flat:
+        runs = [(side, len(list(run))) for side, run in groupby(sides)]
+        steady = np.array([side for side, length in runs if side and length >= SHORTEST_SUPPORT])
+        counts.append(np.count_nonzero(np.diff(steady)))
+    return (np.array(counts) * fps / flat.shape[-1]).reshape(alone.shape[:-1])[()]
+
+
+def bone_swing(positions, skeleton: Skeleton):
+    """Say how far bones swing about their mean direction, seen by the character itself, degrees.
+
+    Directions are turned by the facing, so that walking a curve moves nothing. Per bone it is
+    sqrt(2 (1 - R)) with R the length of the mean unit vector, the root mean square angle where that
+    is small; then the mean over bones. A frozen pose reads 0, shuffled frames read as real ones do
+    (their acceleration gives them away).
+
+    Args:
+      positions: [..., T, J, 3], metres.
+      skeleton: J joints.
+
+    Returns:
+      Degrees, one a character.
+
+    Source: ours.
+    """
+    positions = np.asarray(positions, np.float64)
+    child = np.arange(1, skeleton.num_joints)
+    bones = positions[..., child, :] - positions[..., np.array(skeleton.parents[1:]), :]
+    length = np.linalg.norm(bones, axis=-1, keepdims=True)
+    real = length.reshape(-1, len(child)).max(axis=0) > 1e-6  # two joints in one place: no bone
+    turn = matrix_from_yaw(-facing_yaw(skeleton, positions))
+    unit = np.einsum("...ab,...jb->...ja", turn, bones / np.maximum(length, 1e-9))
+    together = np.linalg.norm(unit.mean(axis=-3), axis=-1)[..., real]
+    return np.rad2deg(np.sqrt(np.maximum(2.0 * (1.0 - together), 0.0))).mean(axis=-1)
+
+
+def steps_by_frame_in_window(positions, window: int, fps: float = 30.0) -> pd.DataFrame:
+    """Average joint step and acceleration by the place of the newest frame in its window.
+
+    Place 0 is the seam: its step is `metrics.ird`, its acceleration `metrics.ird_excess`. Motion
+    that does not know of windows gives level lines.
+
+    Args:
+      positions: [..., T, J, 3], metres; window k starts at frame k * window.
+      window: frames.
+      fps: frame rate; figures are for 1/30 s.
+
+    Returns:
+      Columns place, step_cm, acceleration_cm; `window` rows.
+
+    Raises:
+      ValueError: for fewer than window + 2 frames, which would leave a place without a figure.
+    """
+    positions = np.asarray(positions, np.float64)
+    if positions.shape[-3] < window + 2:
+        raise ValueError(f"{positions.shape[-3]} frames do not show every place of a window; at least {window + 2} do")
+    rate = fps / 30.0
+    columns = {"place": np.arange(window)}
+    for order, name in ((1, "step_cm"), (2, "acceleration_cm")):
+        change = np.linalg.norm(np.diff(positions, n=order, axis=-3), axis=-1).mean(axis=-1)
+        change = 100.0 * rate**order * change.reshape(-1, change.shape[-1]).mean(axis=0)
+        place = np.arange(order, positions.shape[-3]) % window
+        columns[name] = np.bincount(place, change) / np.bincount(place)
+    return pd.DataFrame(columns)
+
+
+# ----------------------------------------------------------------------------- held against real motion
+
+FACTORS = {"joint_acceleration": 1.5, "foot_alternation": 1.5, "bone_swing": 1.5, "contact_share": 2.0}
+"""Metric -> the factor within which a generated walker must come to the real one, above and below,
+to count as a walking person (our choice)."""
+
+
+def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None, fps: float = 30.0) -> dict:
+    """Measure what tells a walking person from a floating, frozen or shaking one.
+
+    Args:
+      positions: [..., T, J, 3], metres.
+      skeleton: J joints.
+      floor_shift: see `metrics.foot_sliding`.
+      fps: frame rate of `positions`.
+
+    Returns:
+      The keys of `FACTORS` in dicts of figures (`registry.Metric.key`) -> one number a character.
+    """
+    return {
+        "joint_acceleration_cm": joint_acceleration(positions, fps),
+        "foot_alternation_hz": support_changes_per_s(positions, skeleton, fps),
+        "bone_swing_deg": bone_swing(positions, skeleton),
+        "contact_share": foot_sliding(positions, skeleton, floor_shift)[1],
+    }
+
+
+def walking_checks(real: Mapping, measured: Mapping[tuple[str, int], Mapping]) -> pd.DataFrame:
+    """Compare walkers with real ones, measure by measure.
+
+    Args:
+      real: keys of `walking_measures` -> figures of real clips.
+      measured: (model, steps) -> the same of generated motion.
+
+    Returns:
+      One row per system and measure: label, measure, unit, real and value (means over characters),
+      ratio, factor, within (whether the ratio lies between 1 / factor and factor).
+    """
+    rows = []
+    for (model, steps), values in measured.items():
+        for name, factor in FACTORS.items():
+            metric = METRICS[name]
+            wanted, value = (float(np.mean(np.asarray(side[metric.key]))) for side in (real, values))
+            ratio = value / wanted if wanted > 0 else float("nan")
+            row = {"label": row_label(model, steps), "measure": name.replace("_", " "), "unit": metric.unit}
+            row |= {"real": wanted, "value": value, "ratio": ratio, "factor": factor}
+            rows.append(row | {"within": bool(1.0 / factor <= ratio <= factor)})
+    return pd.DataFrame(rows)
+
+
+CHECKS = {
+    "stepping_rate": ("within a fifth", lambda value, source: abs(value - source) <= 0.2 * source),
+    "joint_acceleration": ("within a factor of 1.5", lambda value, source: source / 1.5 <= value <= 1.5 * source),
+    "slide_speed": ("at most 12", lambda value, source: value <= 12.0),
+    "floor_penetration": ("at most 1", lambda value, source: value <= 1.0),
 }
+"""Metric -> what a walking person's figure must be (our choice), in words and as a test: the first
+two beside those of the motion that was learnt, the last two as they are."""
 
 
 def walking_figures(motion: Motion, window: int, floor: float = 0.0) -> dict[str, float]:
@@ -122,17 +258,18 @@ def walking_figures(motion: Motion, window: int, floor: float = 0.0) -> dict[str
       floor: height of the floor, metres.
 
     Returns:
-      The keys of `CHECKS`, sliding_share and seam_kick -> one number each.
+      Names of `CHECKS`, sliding_share and seam_kick -> one number each.
     """
     positions, skeleton, fps = motion.positions, motion.skeleton, motion.fps
-    return {
-        "stepping_rate": float(stepping_rate(positions, skeleton, fps)),
-        "joint_acceleration": float(joint_acceleration(positions, fps=fps)),
-        "slide_speed": float(slide_speed(positions, skeleton, fps)),
-        "sliding_share": float(sliding_share(positions, skeleton, fps)),
-        "floor_penetration": float(floor_penetration(positions, skeleton, floor)),
-        "seam_kick": float(seam_kick(positions, window)),
+    figures = {
+        "stepping_rate": stepping_rate(positions, skeleton, fps),
+        "joint_acceleration": joint_acceleration(positions, fps),
+        "slide_speed": slide_speed(positions, skeleton, fps),
+        "sliding_share": sliding_share(positions, skeleton, fps),
+        "floor_penetration": floor_penetration(positions, skeleton, floor),
+        "seam_kick": seam_kick(positions, window),
     }
+    return {name: float(value) for name, value in figures.items()}
 
 
 def check_walks(
@@ -157,10 +294,9 @@ def check_walks(
         if style not in sources:
             raise ValueError(f"no source motion of style {style!r} to hold the walk against")
         floor = float(floors.get(style, 0.0))
-        found = walking_figures(motion, window, floor)
-        source = walking_figures(sources[style], window, floor)
-        for key, (name, unit, wanted) in CHECKS.items():
-            holds = bool(_HOLDS[key](found[key], source[key]))
-            given = {"style": style, "check": name, "unit": unit, "source": source[key]}
-            rows.append(given | {"value": found[key], "wanted": wanted, "holds": holds})
+        figures, source = walking_figures(motion, window, floor), walking_figures(sources[style], window, floor)
+        for name, (wanted, holds) in CHECKS.items():
+            row = {"style": style, "check": METRICS[name].heading, "unit": METRICS[name].shown_unit}
+            row |= {"source": source[name], "value": figures[name], "wanted": wanted}
+            rows.append(row | {"holds": bool(holds(figures[name], source[name]))})
     return pd.DataFrame(rows)

@@ -11,6 +11,7 @@ import hashlib
 import logging
 import re
 import sys
+from importlib import resources
 from pathlib import Path
 
 import jax
@@ -19,84 +20,52 @@ import pandas as pd
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.reports.quality_tables import figure_text, readme_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 log = logging.getLogger("f3amd")
 
-CARD_FIGURES = {
-    "FID": "FID",
-    "EMD": "EMD",
-    "style_coverage": "Style (%)",
-    "trajectory_error": "Traj. (m)",
-    "direction_error": "Dir. (degrees)",
-    "foot_sliding": "Foot",
-    "contact_share": "contact share",
-    "foot_alternation": "changes of the resting foot (1/s)",
-    "stepping_rate": "steps by toe height (1/s)",
-    "slide_speed": "slide of the lower toe (cm/s)",
-    "sliding_share": "share of frames that slide over 30 cm/s",
-    "floor_penetration": "deepest toe under the floor (cm)",
-    "seam_kick": "kick at the seams",
-    "IRD": "IRD (cm)",
-    "IRD_excess": "IRD excess (cm)",
-    "joint_acceleration": "joint acceleration (cm/frame²)",
-    "path_drift": "drift (m per m)",
-    "seed_spread": "seed spread (cm)",
-    "x0_error_ratio": "x0 error, low over high noise",
-}
-"""Figures on a card, with their headings."""
 
-
-def _figures(name: str, weights: str, quality: pd.DataFrame | None) -> pd.DataFrame | None:
-    """Return the table of a model's figures beside real motion's, or None if not measured."""
-    if quality is None or "weights" not in quality:
-        return None
-    mine = quality[(quality["model"] == name) & (quality["weights"] == weights)]
-    if mine.empty:
-        return None
-    real = quality[quality["model"] == "real"]
-    columns = {f"{steps} steps" if steps > 1 else "1 step": mine[mine["steps"] == steps]
-               for steps in sorted(mine["steps"].unique(), reverse=True)}  # fmt: skip
+def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a model's figures beside real motion's."""
+    columns = {f"{steps} steps" if steps > 1 else "1 step": measured[measured["steps"] == steps]
+               for steps in sorted(measured["steps"].unique(), reverse=True)}  # fmt: skip
     rows = []
-    for metric, heading in CARD_FIGURES.items():
-        row = {"figure": heading}
+    for metric in SHOWN["card"]:
+        row = {"figure": "Dir. (degrees)" if metric.name == "direction_error" else metric.title}
         for label, part in (columns | {"real motion": real}).items():
-            found = part[part["metric"] == metric]
-            row[label] = "–" if found.empty else figure_text(*found.iloc[0][["value", "low", "high"]])
+            figure = part[part["metric"] == metric.name]
+            row[label] = "–" if figure.empty else figure_text(*figure.iloc[0][["value", "low", "high"]])
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _limits(name: str, weights: str, quality: pd.DataFrame | None) -> list[str]:
-    """Return sentences on what a model does badly, as far as its figures say so."""
-    if quality is None or "weights" not in quality:
-        return []
-    mine = quality[(quality["model"] == name) & (quality["weights"] == weights)]
-    mine = mine[mine["steps"] == mine["steps"].max()] if len(mine) else mine
-    value = mine.set_index("metric")["value"]
-    real = quality[quality["model"] == "real"].set_index("metric")["value"]
-    found = []
+def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
+    """Return sentences on what a model does badly with most steps, as far as its figures say so."""
+    value = measured[measured["steps"] == measured["steps"].max()].set_index("metric")["value"]
+    real = real.set_index("metric")["value"]
+    limits = []
     if value.get("x0_error_ratio", 0.0) > 0.5:
-        found.append("It hardly uses its noisy input: every seed gives nearly the same motion.")
+        limits.append("It hardly uses its noisy input: every seed gives nearly the same motion.")
     if value.get("stepping_rate", 1e9) < 0.8 * real.get("stepping_rate", 0.0):
-        found.append(
+        limits.append(
             f"It steps too rarely: {value['stepping_rate']:.1f} times a second, where the source "
             f"steps {real['stepping_rate']:.1f} times."
         )
     if value.get("slide_speed", 0.0) > 12.0:
-        found.append(
+        limits.append(
             f"It skates: its lower toe moves over the ground at {value['slide_speed']:.0f} cm/s "
             f"(median), where that of the source moves at {real['slide_speed']:.0f}."
         )
     if value.get("floor_penetration", 0.0) > 1.0:
-        found.append(
+        limits.append(
             f"Toes sink: in the worst frame of a walk by {value['floor_penetration']:.1f} cm on average over styles."
         )
     if value.get("joint_acceleration", 0.0) > 1.5 * real.get("joint_acceleration", 1e9):
-        found.append("It trembles: joints accelerate more than 1.5 times as much as in real motion.")
-    return found
+        limits.append("It trembles: joints accelerate more than 1.5 times as much as in real motion.")
+    return limits
 
 
 def model_card(path: Path, quality: pd.DataFrame | None) -> str:
@@ -104,8 +73,7 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
 
     Args:
       path: the weights.
-      quality: `records/quality_by_seed.csv` summed up with a column of weights, or None; rows of
-        other weights are not used.
+      quality: from `committed_quality`, or None; rows of other weights are not used.
 
     Returns:
       Markdown.
@@ -114,64 +82,46 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
       ValueError: if the file is broken.
     """
     path = Path(path)
-    trained, told = load_model(path), describe(path)
+    trained = load_model(path)
     record, recipe = trained.record, trained.record["training"]
     windows = recipe["num_steps"] * recipe["batch_size"]
     passes = windows / record["num_train_windows"]
-    count = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
     history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
-    losses = history["held_out_loss"].dropna()
-    state = " from a work tree with uncommitted changes" if record["git_dirty"] else ""
-    free = "NC" not in re.split(r"[\s-]+", record["dataset_licence"])
-    commit = (record["git_commit"] or "unknown")[:10]
-    lines = [
-        f"# {trained.name}, trained on `{record['dataset']}`",
-        "",
-        f"- **File**: `{path.name}`, {path.stat().st_size / 1e6:.1f} MB, {count:,} parameters in "
-        f"{told.get('weights', 'bfloat16')}",
-        f"- **Terms**: {record['dataset_licence']}, as of the data" + ("" if free else ": **non-commercial use only**"),
-        f"- **Data**: {record['dataset_credit']} The starting poses are excerpts.",
-        f"- **Styles**: {', '.join(trained.styles)}",
-        f"- **Training**: {recipe['num_steps']:,} steps of {recipe['batch_size']} windows "
-        f"({windows:,} windows, {passes:.2f} passes over {record['num_train_windows']:,}; "
-        f"the paper: 100 passes, batches of 512), learning rate {recipe['learning_rate']:g} "
-        f"(`{recipe['schedule']}`), moving average {recipe['ema_decay']:g}, "
-        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}, "
-        f"commit {commit}{state}",
-        f"- **Held-out loss**: {losses.iloc[-1]:.4f} at the end (its own loss; losses of different "
-        "recipes do not compare)",
-        "",
-    ]
-    figures = _figures(trained.name, weights_digest(trained.params), quality)
-    lines += ["## Measured", ""]
-    if figures is None:
-        lines += ["Not measured by the protocol yet.", ""]
-    else:
-        lines += [markdown_table(figures), ""]
-        lines += [
-            "Means and 95 % intervals over seeds, by notebook 07's protocol with these weights. "
-            "FID and EMD compare within this data set alone.",
-            "",
-        ]
-    lines += ["## Limits", ""]
-    limits = _limits(trained.name, weights_digest(trained.params), quality)
+    figures, limits = "Not measured by the protocol yet.", []
+    if quality is not None:
+        weights = weights_digest(trained.params)
+        measured = quality[(quality["model"] == trained.name) & (quality["weights"] == weights)]
+        real = quality[quality["model"] == "real"]
+        if len(measured):
+            figures = (
+                f"{markdown_table(_figures(measured, real))}\n\n"
+                "Means and 95 % intervals over seeds, by notebook 07's protocol with these weights. "
+                "FID and EMD compare within this data set alone."
+            )
+            limits = _limits(measured, real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     if passes < 20:
         limits.append("It was trained far shorter than the paper's models.")
-    lines += [f"- {limit}" for limit in limits]
-    lines += [
-        "",
-        "## Use",
-        "",
-        "```python",
-        "from f3amd_lib.generation.rollout import MotionGenerator",
-        "from f3amd_lib.training.checkpoints import load_model",
-        "",
-        f'generator = MotionGenerator(load_model("{path.name}"), num_steps=8)',
-        "```",
-        "",
-    ]
-    return "\n".join(lines)
+    template = (resources.files("f3amd_lib.reports") / "model_card.template").read_text(encoding="utf-8")
+    return template.format(
+        trained=trained,
+        record=record,
+        recipe=recipe,
+        file=path.name,
+        megabytes=path.stat().st_size / 1e6,
+        count=sum(leaf.size for leaf in jax.tree.leaves(trained.params)),
+        weights_type=describe(path).get("weights", "bfloat16"),
+        terms=": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else "",
+        styles=", ".join(trained.styles),
+        windows=windows,
+        passes=passes,
+        date=record["date_utc"][:10],
+        commit=(record["git_commit"] or "unknown")[:10],
+        state=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        loss=history["held_out_loss"].dropna().iloc[-1],
+        measured=figures,
+        limits="\n".join(f"- {limit}" for limit in limits),
+    )
 
 
 def checksums(folder: Path) -> str:
@@ -204,17 +154,15 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
 def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     """Sum `records/walking.csv` up in the form of the protocol's table."""
     rows = []
-    figures = [name for name in CARD_FIGURES if name in walking and name != "joint_acceleration"]
-    for (model, steps, weights), part in walking.fillna({"weights": ""}).groupby(
-        ["model", "steps", "weights"], sort=False
-    ):
+    figures = [metric.name for metric in SHOWN["card"] if metric.name in walking]
+    figures.remove("joint_acceleration")  # the protocol has its own
+    columns = ["model", "steps", "weights"]
+    for key, part in walking.fillna({"weights": ""}).groupby(columns, sort=False):
         means = part.groupby("seed")[figures].mean()
         half = 1.96 * means.std(ddof=1) / len(means) ** 0.5  # NaN for one seed
-        for name in figures:
-            value = means[name].mean()
+        for name, value in means.mean().items():
             interval = {"low": value - half[name], "high": value + half[name]}
-            rows.append({"metric": name, "value": value, **interval})
-            rows[-1] |= {"model": model, "steps": steps, "weights": weights}
+            rows.append({"metric": name, "value": value, **interval, **dict(zip(columns, key, strict=True))})
     return pd.DataFrame(rows).assign(window_frames=32)
 
 

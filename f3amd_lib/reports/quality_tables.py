@@ -9,13 +9,15 @@ disk but the paper's numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import PAPER_TABLES, load_paper_table
-from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
+from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.networks import zoo
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
@@ -24,17 +26,7 @@ QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
 PAPER_SOURCE = "paper, 100STYLE"
 NOT_MEASURED = "not measured"
 
-FIGURES = {
-    "FID": "FID",
-    "EMD": "EMD",
-    "style_coverage": "Style (%)",
-    "trajectory_error": "Traj. (m)",
-    "direction_error": "Dir. (°)",
-    "smoothness": "Smooth",
-    "foot_sliding": "Foot",
-    "diversity": "Diversity (cm)",
-    "IRD": "IRD (cm)",
-}
+FIGURES = {metric.name: metric.title for metric in SHOWN["paper"]}
 """The nine figures of the paper's quality tables in its order, with its headings."""
 
 NOTE = (
@@ -49,7 +41,6 @@ _EXTRA_NOTES = {
     11: "The paper's column of times is left out.",
 }
 
-_ARROWS = {"down": " ↓", "up": " ↑"}
 _KEYS = ["model", "window_frames", "steps", "metric"]
 
 
@@ -74,23 +65,6 @@ def figure_text(value: float, low: float = np.nan, high: float = np.nan) -> str:
     if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
         raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
     return f"{text} ± {half:.{decimals}f}"
-
-
-def _checked(quality: pd.DataFrame, dataset_label: str) -> pd.DataFrame:
-    """Return our figures of the nine metrics, or say what is wrong with them."""
-    if not dataset_label or dataset_label == PAPER_SOURCE:
-        raise ValueError(
-            f"dataset_label must say what ours were measured on, unlike the paper's label {PAPER_SOURCE!r}"
-        )
-    for column in (*_KEYS, "unit", "value", "low", "high"):
-        if column not in quality:
-            raise ValueError(f"the quality table has no column {column!r}; `protocol.summarise` makes it")
-    ours = quality[quality["metric"].isin(FIGURES)]
-    twice = ours[ours.duplicated(_KEYS)]
-    if len(twice):
-        named = ", ".join(str(twice.iloc[0][key]) for key in _KEYS)
-        raise ValueError(f"the quality table has two rows of {named}")
-    return ours
 
 
 def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.DataFrame:
@@ -118,49 +92,47 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
     if table not in QUALITY_TABLES:
         known = ", ".join(map(str, QUALITY_TABLES))
         raise ValueError(f"the paper's quality tables are {known}, not {table!r}")
-    ours = _checked(quality, dataset_label)
+    if not dataset_label or dataset_label == PAPER_SOURCE:
+        raise ValueError(f"dataset_label must say what ours were measured on, unlike {PAPER_SOURCE!r}")
     paper = load_paper_table(table)
     paper = paper[paper["metric"].isin(FIGURES)]
-    units = {row.metric: (row.unit, row.better) for row in paper.itertuples()}
-    for metric, unit in zip(ours["metric"], ours["unit"].fillna(""), strict=True):
-        if unit != units[metric][0]:
-            raise ValueError(
-                f"{metric} is in {unit or 'no unit'} here and in {units[metric][0] or 'no unit'} in the paper"
-            )
-    found = {tuple(row[:4]): row[4:] for row in ours[[*_KEYS, "value", "low", "high"]].to_numpy()}
-    measured = {key[:3] for key in found}
-    lines: list[list[dict]] = []
+    about = paper.drop_duplicates("metric").set_index("metric")[["unit", "better"]]
+    ours = quality[quality["metric"].isin(FIGURES)]
+    unlike = ours[ours["unit"].fillna("") != ours["metric"].map(about["unit"])]
+    if len(unlike):
+        metric, unit = unlike[["metric", "unit"]].iloc[0]
+        raise ValueError(
+            f"{metric} is in {unit or 'no unit'} here and in {about['unit'][metric] or 'no unit'} in the paper"
+        )
+    measured = ours.set_index(_KEYS)[["value", "low", "high"]].to_dict("index")
+    systems = {key[:3] for key in measured}
+    undefined = {"value": np.nan, "low": np.nan, "high": np.nan}
+    rows: list[dict] = []
 
-    def line(model: str, frames: int, steps: int, source: str, cells: Iterable[tuple]) -> None:
-        named = {"line": len(lines), "model": model, "window_frames": frames, "steps": steps}
-        rows = []
-        for metric, (printed, value, low, high) in zip(FIGURES, cells, strict=True):
-            unit, better = units[metric]
-            figure = {"printed": printed, "value": value, "low": low, "high": high}
-            rows.append({**named, "source": source, "metric": metric, "unit": unit, "better": better} | figure)
-        lines.append(rows)
+    def line(model: str, frames: int, steps: int, source: str, figures: Mapping[str, dict]) -> None:
+        named = {"line": len(rows) // len(FIGURES), "model": model, "window_frames": frames, "steps": steps}
+        for metric in FIGURES:
+            rows.append({**named, "source": source, "metric": metric, **about.loc[metric], **figures[metric]})
 
     def our_line(model: str, frames: int, steps: int) -> None:
-        cells = []
+        figures = {}
         for metric in FIGURES:
-            if (model, frames, steps) not in measured:
-                cells.append((NOT_MEASURED, np.nan, np.nan, np.nan))
-                continue
-            value, low, high = found.get((model, frames, steps, metric), [np.nan] * 3)
-            text = "" if np.isnan(value) else figure_text(value, low, high)
-            cells.append((text, value, low, high))
-        line(model, frames, steps, dataset_label, cells)
+            figure = measured.get((model, frames, steps, metric), undefined)
+            text = "" if np.isnan(figure["value"]) else figure_text(**figure)
+            if (model, frames, steps) not in systems:
+                text = NOT_MEASURED
+            figures[metric] = {"printed": text} | figure
+        line(model, frames, steps, dataset_label, figures)
 
     for frames in paper["window_frames"].unique():
         unmade = ours[(ours["steps"] == 0) & (ours["window_frames"] == frames)]
         for model in dict.fromkeys(["real", *unmade["model"]]):
             our_line(model, int(frames), 0)
-    for (model, frames, steps), rows in paper.groupby(_KEYS[:3], sort=False):
-        rows = rows.set_index("metric").loc[list(FIGURES)]
-        cells = [(row.printed, row.value, np.nan, np.nan) for row in rows.itertuples()]
-        line(model, int(frames), int(steps), PAPER_SOURCE, cells)
+    for (model, frames, steps), printed in paper.groupby(_KEYS[:3], sort=False):
+        figures = printed.set_index("metric")[["printed", "value"]].assign(low=np.nan, high=np.nan).to_dict("index")
+        line(model, int(frames), int(steps), PAPER_SOURCE, figures)
         our_line(zoo.find_preset(model).name, int(frames), int(steps))
-    return pd.DataFrame([row for rows in lines for row in rows])
+    return pd.DataFrame(rows)
 
 
 def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
@@ -181,7 +153,7 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
         for column, heading in (("window_frames", "frames"), ("steps", "steps"))
         if made[column].nunique() > 1
     ]
-    arrows = dict(zip(rows["metric"], rows["better"].map(_ARROWS), strict=True))
+    arrows = dict(zip(rows["metric"], rows["better"].map(ARROWS), strict=True))
     lines: list[dict] = []
     for _, cells in rows.groupby("line", sort=False):
         first = cells.iloc[0]
@@ -219,28 +191,6 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
 
 
-README_ROWS = {
-    "FID": ("FID", 1),
-    "EMD": ("EMD", 1),
-    "style_coverage": ("style coverage (%)", 0),
-    "trajectory_error": ("Traj. (m)", 3),
-    "direction_error": ("Dir. (°)", 1),
-    "smoothness": ("Smooth", 2),
-    "foot_sliding": ("Foot", 2),
-    "contact_share": ("contact share", 2),
-    "diversity": ("Diversity (cm)", 2),
-    "IRD": ("IRD (cm)", 1),
-    "IRD_excess": ("IRD excess (cm)", 1),
-    "joint_acceleration": ("joint acceleration (cm/frame²)", 2),
-    "foot_alternation": ("changes of the resting foot (1/s)", 2),
-    "stepping_rate": ("steps by toe height (1/s)", 2),
-    "slide_speed": ("slide of the lower toe (cm/s)", 0),
-    "sliding_share": ("share of frames that slide over 30 cm/s", 2),
-    "seam_kick": ("kick at the seams", 1),
-    "x0_error_ratio": ("x0 error, low over high noise", 2),
-}
-"""Metrics of README's table, with their headings and decimals."""
-
 README_COLUMNS = {
     ("real", 0): "real",
     ("frozen pose", 0): "frozen pose",
@@ -265,14 +215,88 @@ def readme_table(quality: pd.DataFrame, window: int = 32) -> str:
     """
     own = quality[quality["window_frames"] == window].set_index(["model", "steps", "metric"])
     rows = []
-    for metric, (heading, decimals) in README_ROWS.items():
-        row = {"": heading}
+    for metric in SHOWN["readme"]:
+        row = {"": "style coverage (%)" if metric.name == "style_coverage" else metric.title}
         for (model, steps), title in README_COLUMNS.items():
             row[title] = "–"
-            if (model, steps, metric) in own.index:
-                value, low, high = own.loc[(model, steps, metric), ["value", "low", "high"]]
-                row[title] = f"{value:.{decimals}f}"
+            if (model, steps, metric.name) in own.index:
+                value, low, high = own.loc[(model, steps, metric.name), ["value", "low", "high"]]
+                row[title] = f"{value:.{metric.decimals}f}"
                 if not math.isnan(high - low):  # one clip, or one seed, has no interval
-                    row[title] += f" ± {0.5 * (high - low):.{decimals}f}"
+                    row[title] += f" ± {0.5 * (high - low):.{metric.decimals}f}"
         rows.append(row)
     return markdown_table(pd.DataFrame(rows))
+
+
+# ------------------------------------------------------- rollouts beside real clips, a column a system
+
+
+def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.DataFrame]) -> pd.DataFrame:
+    """Collect the figures of several systems, real motion first.
+
+    Args:
+      real: from `rollout_measures.measure_clips`.
+      measured: (model, steps) -> what `rollout_measures.measure_rollout` returned.
+
+    Returns:
+      Tidy rows: label, model, steps (0 for real motion), metric, unit, better, value (mean over
+      characters), spread (standard deviation over characters, NaN for one), characters (those with
+      a number).
+    """
+    rows = []
+    for (model, steps), figures in {("real", 0): real, **measured}.items():
+        label = row_label(model, steps) if steps else "real"
+        for metric in SHOWN["first"]:
+            values = figures[metric.key].dropna().to_numpy()
+            row = {"label": label, "model": model, "steps": steps, "metric": metric.name, "unit": metric.unit}
+            row |= {"better": metric.better, "value": values.mean() if len(values) else np.nan}
+            spread = values.std(ddof=1) if len(values) > 1 else np.nan
+            rows.append(row | {"spread": spread, "characters": len(values)})
+    return pd.DataFrame(rows)
+
+
+def paper_rows(models: Sequence[str] = ("F3AMD-FNO-96", "CAMDM"), *, table: int = 3, window: int = 32) -> pd.DataFrame:
+    """Return printed rows of the paper with the labels that `side_by_side` wants.
+
+    Args:
+      models: names as printed.
+      table: number of a quality table (3, 5, 6, 8 to 12).
+      window: frames.
+
+    Returns:
+      Tidy rows of the paper's table, with `label` naming paper, model and steps.
+
+    Raises:
+      ValueError: if the table has no such row.
+    """
+    printed = load_paper_table(table)
+    kept = printed[printed["model"].isin(models) & (printed["window_frames"] == window)]
+    missing = sorted(set(models) - set(kept["model"]))
+    if missing:
+        raise ValueError(f"Table {table} has no row {missing[0]!r} for {window} frames")
+    labels = [f"paper, {m}, {s} steps" for m, s in zip(kept["model"], kept["steps"], strict=True)]
+    return kept.assign(label=labels)
+
+
+def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Spread a tidy table to one row a metric and one column a label, the paper's last.
+
+    Args:
+      ours: columns label, metric, unit, better, value.
+      paper: from `paper_rows`; metrics that ours lacks are left out.
+
+    Returns:
+      A DataFrame: metric (with its unit), then the labels; a figure that is not there is NaN.
+    """
+    headings = {
+        metric: metric_heading(metric, unit, better)
+        for metric, unit, better in zip(ours["metric"], ours["unit"], ours["better"], strict=True)
+    }
+    table = pd.DataFrame({"metric": list(headings.values())})
+    for part in (ours, paper):
+        if part is None:
+            continue
+        for label, rows in part.groupby("label", sort=False):
+            values = dict(zip(rows["metric"], rows["value"], strict=True))
+            table[label] = [float(values.get(metric, np.nan)) for metric in headings]
+    return table

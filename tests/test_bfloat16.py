@@ -2,10 +2,9 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config, tiny_packed, tiny_trained
 
-from f3amd_lib.experiments import precision
+from f3amd_lib.experiments import bfloat16
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.config import cast_network
@@ -35,13 +34,13 @@ def test_rollouts_in_bfloat16_stay_near_and_come_as_float32():
 def test_comparison_tells_change_and_its_yardstick(monkeypatch):
     packed = tiny_packed()
     monkeypatch.setattr(
-        precision,
+        bfloat16,
         "evaluation_paths",
         lambda packed, styles, frames, *, seed: [
             named_path("straight", frames, speed=1.0 + 0.1 * seed) for _ in styles
         ],
     )
-    table = precision.compare_precisions(
+    table = bfloat16.compare_precisions(
         tiny_trained(), packed, packed.styles, steps=1, num_frames=3 * WINDOW, seeds=(0, 1)
     ).set_index("metric")
     known = table.dropna(subset=["float32"])
@@ -49,11 +48,3 @@ def test_comparison_tells_change_and_its_yardstick(monkeypatch):
     assert 0.0 < table.loc["joint distance (cm)", "bfloat16"] < 100.0
     assert table["seed_deviation"].drop("joint distance (cm)").max() > 0.0
     assert set(table["model"]) == {"F3AMD-FNO-8"} and set(table["steps"]) == {1}
-
-
-def test_measurement_without_weights_is_refused(monkeypatch):
-    monkeypatch.setattr(precision, "available_models", lambda profile: [])
-    profile = type("P", (), {"seed": 0, "evaluation_styles": ("calm",), "dataset": "tiny"})
-    prepared = type("D", (), {"packed": tiny_packed()})
-    with pytest.raises(ValueError, match="no model of tiny has weights"):
-        precision.measure_precision(prepared, profile)

@@ -1,0 +1,243 @@
+"""Real clips beside rollouts: which ones, how fast they walk, where their floor lies.
+
+No figure of motion quality means much alone. Everything that is measured on a rollout is therefore
+measured on real held-out clips too, in the same way and as if they had window seams where a rollout
+has them: the IRD of a real walker is a step, not zero, and "a walking person" is a set of numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.motion.root_paths import RootPath, path_from_motion, tangent_yaw
+from f3amd_lib.motion.rotations import wrap_angle
+from f3amd_lib.motion.skeleton import Motion
+
+_STANDING = 0.1  # m/s
+
+
+def training_clips(packed: PackedMotion, style: str) -> np.ndarray:
+    """Return the clip numbers of a style's training split, or of all splits if that has none.
+
+    Raises:
+      ValueError: for an unknown style.
+    """
+    if style not in packed.styles:
+        raise ValueError(f"unknown style {style!r}; this data has {', '.join(packed.styles)}")
+    of_style = np.asarray(packed.clip_style) == packed.styles.index(style)
+    training = of_style & (np.asarray(packed.clip_split) == SPLITS.index("train"))
+    return np.flatnonzero(training if training.any() else of_style)
+
+
+def _speeds(packed: PackedMotion, clip: int) -> np.ndarray:
+    """Ground speed of a clip's root from frame to frame, [T - 1], m/s."""
+    start, stop = packed.clip_start[clip], packed.clip_start[clip + 1]
+    ground = np.asarray(packed.root_position[start:stop, [0, 2]], np.float64)
+    return 30.0 * np.linalg.norm(np.diff(ground, axis=0), axis=-1)
+
+
+def style_pace(packed: PackedMotion, style: str) -> float:
+    """Return how fast a style usually moves: median speed of its moving training frames, m/s.
+
+    A path that asks an exhausted walker to run asks for what no data shows.
+
+    Args:
+      packed: the data set.
+      style: a label of it.
+
+    Returns:
+      Metres a second, at least 0.1: slower frames count as standing.
+
+    Raises:
+      ValueError: for an unknown style.
+    """
+    speeds = np.concatenate([_speeds(packed, clip) for clip in training_clips(packed, style)])
+    moving = speeds[speeds > _STANDING]
+    return float(np.median(moving)) if len(moving) else _STANDING
+
+
+def style_floor(packed: PackedMotion, style: str) -> float:
+    """Return the height of a resting toe in a style: mean over its training clips, metres.
+
+    Args:
+      packed: the data set.
+      style: a label of it.
+
+    Raises:
+      ValueError: for an unknown style.
+    """
+    return float(np.mean(packed.floor_shift[training_clips(packed, style)]))
+
+
+def sideways_share(path: RootPath) -> float:
+    """Return the share of moving frames that go more than 45 degrees off the facing, in [0, 1].
+
+    A path that asks for sideways steps where the data has none asks for what nobody has shown.
+
+    Args:
+      path: of a target or, from `path_from_motion`, of a clip.
+    """
+    step = np.diff(path.position, axis=0)
+    moving = np.linalg.norm(step, axis=-1) * path.fps > _STANDING
+    if not moving.any():
+        return 0.0
+    off = wrap_angle(np.arctan2(step[:, 0], step[:, 1]) - path.yaw[:-1])
+    return float(np.mean(np.abs(off[moving]) > np.pi / 4))
+
+
+def facing_ahead(path: RootPath) -> RootPath:
+    """Return the same line, walked facing where it goes.
+
+    Args:
+      path: any path; while it stands still it keeps the last direction.
+    """
+    return replace(path, yaw=tangent_yaw(path.position))
+
+
+def own_path(motion: Motion, frames: int = 41) -> RootPath:
+    """Return the line that a real motion may be said to follow: its own path without the sway.
+
+    A root sways with every step, so that even a real walker does not follow a smooth line exactly.
+    Against this line it gets the trajectory and direction error of somebody who walks well.
+
+    Args:
+      motion: any motion.
+      frames: span of the local parabolas that are fitted to position and yaw; 41 is more than a
+        stride. Shorter motions take what they have.
+
+    Returns:
+      The path, [T].
+    """
+    path = path_from_motion(motion)
+    span = min(frames, path.num_frames)
+    span -= 1 - span % 2  # the filter wants an odd number
+    if span < 5:
+        return path
+    return RootPath(savgol_filter(path.position, span, 2, axis=0), savgol_filter(path.yaw, span, 2), path.fps)
+
+
+def follow_clip(
+    packed: PackedMotion, clip: int, *, num_history: int, num_frames: int
+) -> tuple[np.ndarray, RootPath, Motion]:
+    """Return what a model needs to walk where a real clip walked, and what that clip did.
+
+    Args:
+      packed: the data set.
+      clip: its number.
+      num_history: frames that the model is given, the clip's first.
+      num_frames: frames that it is to make after them.
+
+    Returns:
+      (history, path, motion): world frames [1, num_history, C]; the clip's own line (`own_path`)
+      and its motion over the frames that follow, num_frames each.
+
+    Raises:
+      ValueError: if there is no such clip, or it is too short.
+    """
+    whole = packed.motion(clip)
+    end = num_history + num_frames
+    if whole.num_frames < end:
+        raise ValueError(
+            f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for at most "
+            f"{max(0, whole.num_frames - num_history)} frames after the history"
+        )
+    line = own_path(whole)
+    part = slice(num_history, end)
+    return (
+        world_frames(whole)[None, :num_history].astype(np.float32),
+        RootPath(line.position[part], line.yaw[part], line.fps),
+        whole.slice(num_history, end),
+    )
+
+
+def reference_clips(
+    packed: PackedMotion,
+    styles: Sequence[str],
+    *,
+    window: int,
+    split: str = "test",
+    slowest: float = 0.4,
+    fastest: float = 1.6,
+) -> list[int]:
+    """List the real clips that stand beside a rollout: held out, same styles, same speeds.
+
+    Args:
+      packed: the data set.
+      styles: labels to take.
+      window: clips that hold no boundary between windows of this many frames are left out.
+      split: "test", or another.
+      slowest, fastest: mean speeds to take, in units of `style_pace`; by default those between
+        which `named_path("complex", speed=pace)` varies. A run would be no yardstick for a walk. A
+        style with no clip in between gives the one that comes nearest.
+
+    Returns:
+      Clip numbers, by style and then in the order of the data.
+
+    Raises:
+      ValueError: for an unknown style or split, or if no clip is left.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
+    held_out = np.asarray(packed.clip_split) == SPLITS.index(split)
+    long_enough = np.diff(packed.clip_start) > window + 1
+    clips = []
+    for style in styles:
+        pace = style_pace(packed, style)
+        of_style = np.asarray(packed.clip_style) == packed.styles.index(style)
+        available = np.flatnonzero(of_style & held_out & long_enough)
+        ratio = np.array([_speeds(packed, clip).mean() / pace for clip in available])
+        fitting = available[(slowest <= ratio) & (ratio <= fastest)]
+        if len(available) and not len(fitting):
+            fitting = available[[np.argmin(np.abs(ratio - 1.0))]]
+        clips += fitting.tolist()
+    if not clips:
+        raise ValueError(
+            f"data set {packed.dataset!r} has no {split} clip of {', '.join(styles)} with more than {window + 1} frames"
+        )
+    return clips
+
+
+def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
+    """Describe paths, or the tracks of real clips, by how they move and turn.
+
+    Args:
+      paths: any number of them.
+      seconds: span over which a turn is counted, so that the sway of a stride is not.
+
+    Returns:
+      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel)
+      and its 95th percentile, sideways_share, standing_share; over all moving frames of all paths.
+    """
+    speeds, turns, shares = [], [], []
+    for path in paths:
+        speed = np.linalg.norm(np.diff(path.position, axis=0) * path.fps, axis=-1)
+        speeds.append(speed)
+        shares.append(sideways_share(path))
+        span = max(1, round(seconds * path.fps))
+        if path.num_frames > 2 * span:
+            legs = path.position[span:] - path.position[:-span]
+            moved = np.linalg.norm(legs, axis=-1) > _STANDING * seconds
+            heading = np.unwrap(np.arctan2(legs[:, 0], legs[:, 1]))
+            turn = np.abs(heading[span:] - heading[:-span]) / seconds
+            turns.append(np.rad2deg(turn[moved[span:] & moved[:-span]]))
+    sideways = np.average(shares, weights=[len(speed) for speed in speeds])
+    speeds = np.concatenate(speeds)
+    turns = np.concatenate(turns) if turns else np.array([np.nan])
+    moving = speeds[speeds > _STANDING]
+    figures = {
+        "speed_m_s": moving.mean(),
+        "speed_p5": np.percentile(moving, 5),
+        "speed_p95": np.percentile(moving, 95),
+        "turn_deg_s": np.mean(turns),
+        "turn_p95": np.percentile(turns, 95),
+        "sideways_share": sideways,
+        "standing_share": 1.0 - len(moving) / len(speeds),
+    }
+    return {name: float(value) for name, value in figures.items()}

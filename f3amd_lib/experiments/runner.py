@@ -1,0 +1,99 @@
+"""What was asked, what is measured already, and what is still to do: records that grow row by row.
+
+A record is a table with its run record (`ground.records`). It is written after every row, so that a
+run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from f3amd_lib.ground.records import kept_rows, write_table
+
+log = logging.getLogger("f3amd")
+
+
+class Records:
+    """Tables of one measurement, with the rows that an earlier run of the same settings left.
+
+    Args:
+      folder: where the tables lie.
+      record: from `run_record`, for all of them.
+      keys: table -> columns that name a measurement: rows that agree in them are replaced together.
+      again: models that are measured again though they have rows.
+      summaries: further tables, written after each row: name -> (table, function of its rows).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        record: dict,
+        keys: Mapping[str, Sequence[str]],
+        *,
+        again: Collection[str] = (),
+        summaries: Mapping[str, tuple[str, Callable[[pd.DataFrame], pd.DataFrame]]] = {},
+    ):
+        self.folder, self.record, self.keys = Path(folder), record, keys
+        self.again, self.summaries = again, summaries
+        self.tables = {name: kept_rows(self.path(name), record) for name in keys}
+
+    def path(self, name: str) -> Path:
+        """Return where a table lies."""
+        return self.folder / f"{name}.csv"
+
+    def _same(self, name: str, row: Mapping) -> pd.Series:
+        """Tell which rows of a table are named as this one."""
+        rows = self.tables[name]
+        return (rows[list(self.keys[name])] == [row[key] for key in self.keys[name]]).all(axis=1)
+
+    def has(self, name: str, row: Mapping) -> bool:
+        """Tell whether a table has rows of this name that agree in all columns of `row`, weights among them."""
+        rows = self.tables[name]
+        if rows is None or row.get("model") in self.again or not set(row) <= set(rows):
+            return False
+        rows = rows[self._same(name, row)]
+        return len(rows) > 0 and all((rows[column] == value).all() for column, value in row.items())
+
+    def put(self, name: str, row: Mapping, rows: pd.DataFrame) -> None:
+        """Put rows in place of those that have the same name, after all others, and write the table."""
+        rows, earlier = rows.assign(**row), self.tables[name]
+        if earlier is not None:
+            rows = pd.concat([earlier[~self._same(name, row)], rows])
+        self.tables[name] = rows
+        self.write(name, rows)
+
+    def write(self, name: str, rows: pd.DataFrame) -> None:
+        """Write a table; its record names the weights that its measurement has used so far."""
+        digests = {}
+        for table, keys in self.keys.items():
+            if self.tables[table] is not None and "weights" in self.tables[table]:
+                used = self.tables[table].groupby(keys[0], sort=False)["weights"].unique()
+                digests |= used.map(list).to_dict()
+        write_table(self.path(name), rows, self.record | {"weights_digests": digests})
+
+    def measure(
+        self, todo: Iterable[Mapping], measure: Callable[[Mapping], Mapping[str, pd.DataFrame]], *, into: str = ""
+    ) -> None:
+        """Measure what has no rows yet, and keep each as soon as it is measured.
+
+        Args:
+          todo: what names each measurement, column -> value, with the digest of its weights where
+            it has some.
+          measure: function of one of them; returns table -> rows, to which the columns are added.
+          into: the table that says whether it was measured; the first by default.
+        """
+        into = into or next(iter(self.keys))
+        todo = [row for row in todo if not self.has(into, row)]
+        for number, row in enumerate(todo, 1):
+            named = ", ".join(str(row[key]) for key in self.keys[into])
+            log.info("%s, %d of %d: %s", into, number, len(todo), named)
+            measured = measure(row)
+            for name, rows in measured.items():
+                self.put(name, row, rows)
+            for name, (table, summarise) in self.summaries.items():
+                if table in measured:
+                    self.write(name, summarise(self.tables[table]))

@@ -1,0 +1,124 @@
+"""Real clips that stand beside rollouts: which ones, their pace, floor and paths."""
+
+import numpy as np
+import pytest
+from builders import packed_from, straight_motion
+
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.experiments import real_clips
+from f3amd_lib.experiments.real_clips import path_statistics
+from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
+
+TRAIN, VALIDATION, TEST = 0, 1, 2
+WINDOW = 8
+
+
+def walk(step, num_frames=60):
+    """A stiff figure at `step` metres a frame along +Z."""
+    return straight_motion(num_frames, (0.0, 0.0, step))
+
+
+@pytest.fixture
+def packed():
+    """Calm walks 1.2 m/s and has a run in the test split; of proud only fast test clips exist."""
+    made = packed_from(
+        [
+            (walk(0.04), 0, TRAIN),
+            (walk(0.04), 0, TRAIN),
+            (walk(0.12), 0, TRAIN),
+            (walk(0.03), 1, TRAIN),
+            (walk(0.042), 0, TEST),
+            (walk(0.12), 0, TEST),
+            (walk(0.09), 1, TEST),
+            (walk(0.15), 1, TEST),
+            (walk(0.04, 9), 0, TEST),
+            (walk(0.045), 0, VALIDATION),
+        ]
+    )
+    made.floor_shift[:] = np.linspace(0.01, 0.10, 10)
+    return made
+
+
+def test_pace_and_floor_come_from_training_clips(packed):
+    assert real_clips.style_pace(packed, "calm") == pytest.approx(1.2, rel=1e-3)
+    assert real_clips.style_pace(packed, "proud") == pytest.approx(0.9, rel=1e-3)
+    assert real_clips.style_floor(packed, "calm") == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="unknown style 'clam'"):
+        real_clips.style_pace(packed, "clam")
+
+
+def test_standing_frames_do_not_slow_the_pace():
+    clips = [(walk(0.04), 0, TRAIN), (walk(0.0, 200), 0, TRAIN), (walk(0.0), 1, TRAIN)]
+    packed = packed_from(clips)
+    assert real_clips.style_pace(packed, "calm") == pytest.approx(1.2, rel=1e-3)
+    assert real_clips.style_pace(packed, "proud") == 0.1
+
+
+def test_sideways_and_backward_steps_are_counted():
+    yaw = np.repeat([0.0, 0.5 * np.pi, np.pi, 0.25], 25)
+    path = RootPath(np.arange(101)[:, None] * [0.0, 0.04], np.append(yaw, 0.25))
+    assert real_clips.sideways_share(path) == 0.5
+    assert real_clips.sideways_share(RootPath(np.zeros((9, 2)), np.zeros(9))) == 0.0
+
+
+def test_a_path_can_be_walked_facing_ahead():
+    path = named_path("complex", 900, seed=0)
+    ahead = real_clips.facing_ahead(path)
+    np.testing.assert_array_equal(ahead.position, path.position)
+    assert real_clips.sideways_share(path) > 0.1
+    assert real_clips.sideways_share(ahead) == 0.0
+    assert np.abs(np.diff(ahead.yaw)).max() < np.deg2rad(10)  # nobody spins
+
+
+def test_reference_clips_are_held_out_and_walk_at_the_pace(packed):
+    # Clip 5 runs, clip 8 is too short; of style 1 both are too fast, the nearer one stands in.
+    assert real_clips.reference_clips(packed, ["calm"], window=WINDOW) == [4]
+    assert real_clips.reference_clips(packed, ["proud", "calm"], window=WINDOW) == [6, 4]
+    assert real_clips.reference_clips(packed, ["calm"], window=WINDOW, fastest=4.0) == [4, 5]
+    assert real_clips.reference_clips(packed, ["calm"], window=4) == [4, 8]
+    assert real_clips.reference_clips(packed, ["calm"], window=WINDOW, split="validation") == [9]
+
+
+def test_reference_clips_say_what_is_missing(packed):
+    with pytest.raises(ValueError, match="no validation clip of proud"):
+        real_clips.reference_clips(packed, ["proud"], window=WINDOW, split="validation")
+    with pytest.raises(ValueError, match="unknown split 'tset'"):
+        real_clips.reference_clips(packed, ["calm"], window=WINDOW, split="tset")
+
+
+def test_own_path_keeps_a_line_and_loses_the_sway():
+    motion = walk(0.04, 90)
+    line = path_from_motion(motion).position
+    np.testing.assert_allclose(real_clips.own_path(motion).position, line, atol=1e-9)
+    swayed = motion.root_position.copy()
+    swayed[:, 0] += 0.02 * np.sin(2 * np.pi * np.arange(90) / 20.5)
+    smooth = real_clips.own_path(motion.replace(root_position=swayed)).position
+    assert np.abs(smooth - line)[20:-20].max() < 0.004
+    tiny = motion.slice(0, 3)
+    np.testing.assert_array_equal(real_clips.own_path(tiny).position, line[:3])
+
+
+def test_a_clip_is_followed_from_its_own_first_frames(packed):
+    whole = packed.motion(4)
+    history, path, real = real_clips.follow_clip(packed, 4, num_history=5, num_frames=20)
+    np.testing.assert_allclose(history[0], world_frames(whole)[:5], atol=1e-6)
+    assert path.num_frames == real.num_frames == 20
+    np.testing.assert_array_equal(real.root_position, whole.root_position[5:25])
+    np.testing.assert_array_equal(path.position, real_clips.own_path(whole).position[5:25])
+    with pytest.raises(ValueError, match=f"{whole.num_frames} frames, 1005 are needed"):
+        real_clips.follow_clip(packed, 4, num_history=5, num_frames=1000)
+
+
+def test_path_statistics_of_a_line_and_of_a_circle():
+    line = path_statistics([named_path("straight", 300, speed=1.5, ramp_seconds=0.0)])
+    assert line["speed_m_s"] == pytest.approx(1.5, rel=1e-3)
+    assert line["turn_deg_s"] == pytest.approx(0.0, abs=1e-6)
+    assert line["standing_share"] == 0.0
+    angle = np.arange(600) / 30.0 * np.deg2rad(36.0)
+    circle = 2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    turning = path_statistics([RootPath(circle, np.zeros(600))])
+    assert turning["turn_deg_s"] == pytest.approx(36.0, rel=1e-3)
+    # It faces +Z all the way round: three quarters of the way go more than 45 degrees off.
+    assert turning["sideways_share"] == pytest.approx(0.75, abs=0.02)
+    still = RootPath(np.zeros((90, 2)), np.zeros(90))
+    assert path_statistics([still, RootPath(circle, angle)])["standing_share"] > 0.1

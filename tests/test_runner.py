@@ -1,0 +1,74 @@
+"""Records that grow row by row: what is there is kept, what has changed is measured again."""
+
+import logging
+
+import pandas as pd
+import pytest
+
+from f3amd_lib.experiments.runner import Records
+from f3amd_lib.ground.records import read_table, run_record
+
+KEYS = ["model", "steps"]
+
+
+def row(model, steps, weights="aa"):
+    return {"model": model, "steps": steps, "weights": weights}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Measure rows into a folder; answers with the rows that were measured now."""
+
+    def measure(todo, *, again=(), seed=0, fails=()):
+        measured = []
+
+        def one(wanted):
+            if wanted["model"] in fails:
+                raise RuntimeError("stopped")
+            measured.append((wanted["model"], wanted["steps"]))
+            rows = pd.DataFrame({"seed": [0, 1], "value": [1.0, 2.0]})
+            return {"figures": rows} | ({"rounds": rows} if wanted["steps"] else {})
+
+        record = run_record(profile="smoke", dataset="synthetic", seed=seed)
+        total = {"summary": ("figures", lambda rows: rows.groupby(KEYS, sort=False, as_index=False)[["value"]].sum())}
+        records = Records(tmp_path, record, {"figures": KEYS, "rounds": KEYS}, again=again, summaries=total)
+        records.measure(todo, one)
+        return measured, records
+
+    return measure
+
+
+def test_rows_are_measured_once_and_kept(run, caplog):
+    todo = [row("real", 0, ""), row("a", 8), row("a", 1)]
+    with caplog.at_level(logging.INFO, "f3amd"):
+        measured, records = run(todo)
+    assert measured == [("real", 0), ("a", 8), ("a", 1)]
+    assert "figures, 2 of 3: a, 8" in caplog.messages
+    table, record = read_table(records.path("figures"))
+    assert list(table) == ["seed", "value", "model", "steps", "weights"] and len(table) == 6
+    assert record["weights_digests"] == {"real": [""], "a": ["aa"]}
+    assert len(read_table(records.path("rounds"))[0]) == 4
+    assert read_table(records.path("summary"))[0]["value"].tolist() == [3.0, 3.0, 3.0]
+    before = records.path("figures").read_bytes()
+    assert run(todo)[0] == [] and records.path("figures").read_bytes() == before
+
+
+def test_what_changed_or_is_asked_for_is_measured_again_in_its_place(run):
+    todo = [row("a", 8), row("b", 8)]
+    run(todo)
+    measured, records = run([row("a", 8, "cc"), row("b", 8)])
+    assert measured == [("a", 8)]
+    table, record = read_table(records.path("figures"))
+    assert list(dict.fromkeys(zip(table["model"], table["weights"], strict=True))) == [("b", "aa"), ("a", "cc")]
+    assert record["weights_digests"] == {"b": ["aa"], "a": ["cc"]}
+    assert run([row("a", 8, "cc"), row("b", 8)], again=["b"])[0] == [("b", 8)]
+    assert len(read_table(records.path("figures"))[0]) == 4
+
+
+def test_a_stopped_run_goes_on_and_other_settings_start_anew(run, tmp_path):
+    todo = [row("a", 8), row("b", 8)]
+    with pytest.raises(RuntimeError, match="stopped"):
+        run(todo, fails=["b"])
+    assert run(todo)[0] == [("b", 8)]
+    assert run(todo, seed=1)[0] == [("a", 8), ("b", 8)]
+    assert (tmp_path / "figures.old1.csv").exists()
