@@ -34,10 +34,10 @@ $(INSTALLED): requirements.lock pyproject.toml scripts/bootstrap.sh
 install: $(INSTALLED) ## Build .venv and nothing else
 
 figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DATA/PROFILE
-	$(PYTHON) -m f3amd_lib.reproduce --data $(DATA) --profile $(PROFILE)
+	$(PYTHON) -m f3amd_lib figures --data $(DATA) --profile $(PROFILE)
 
 smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
-	$(PYTHON) -m f3amd_lib.reproduce --data $(DATA) --profile smoke
+	$(PYTHON) -m f3amd_lib figures --data $(DATA) --profile smoke
 
 # Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
@@ -47,7 +47,7 @@ SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
-	  $(PYTHON) -m f3amd_lib.experiments.measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
+	  $(PYTHON) -m f3amd_lib measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
 
 bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=options; bench-tools adds peers)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \

@@ -66,7 +66,7 @@ default_role = "py:obj"
 add_module_names = False
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_mock_imports = [  # optional: their absence does not empty a page
-    name for name in ("iree", "onnx", "onnxruntime", "torch") if not importlib.util.find_spec(name)
+    name for name in ("iree", "onnxruntime", "torch") if not importlib.util.find_spec(name)
 ]
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"

@@ -1,156 +1,246 @@
-"""Command line: `python -m f3amd_lib rollout --style ... --path figure-eight --out out/`.
+"""The command `f3amd`, such as `f3amd rollout --style proud --path figure-eight --out out/`.
 
-data      open a data set, build its packed cache, say what is in it
-presets   list the models
-train     train a model (goes on where an earlier run stopped)
-rollout   animate one character: BVH, film strip PNG, GIF and player page
-crowd     animate any number of characters, streamed to a folder
-export    make a round that runs without the model code: StableHLO, jax.export, IREE
-bench     time synthesis and training, write records, compare with what is asked
+A function a command: its parameters are the options, its docstring is their help. What needs JAX is
+imported inside, so that `f3amd --help` is quick.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import logging
 import os
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, UseAppendAction
 
 log = logging.getLogger("f3amd")
-
-
-def _profile(arguments, **overrides):
-    from f3amd_lib.ground.profiles import load_profile
-
-    given = {name: value for name, value in overrides.items() if value is not None}
-    return load_profile(arguments.profile, arguments.data, **given)
-
-
-def _data(arguments) -> None:
-    import numpy as np
-
-    from f3amd_lib.data.sources import SPLITS
-    from f3amd_lib.training.pipeline import prepare
-
-    prepared = prepare(_profile(arguments), path=arguments.source)
-    packed = prepared.packed
-    log.info("data set     %s", packed.dataset)
-    log.info("terms        %s", packed.licence)
-    log.info("credit       %s", packed.credit)
-    log.info("clips        %d (%d left out)", packed.num_clips, len(packed.skipped))
-    log.info("frames       %d at 30 fps", packed.num_frames)
-    log.info("joints       %d", packed.skeleton.num_joints)
-    log.info("styles       %s", ", ".join(packed.styles))
-    counts = np.bincount(np.asarray(packed.clip_split), minlength=3)
-    log.info("split        %s", ", ".join(f"{n} {s}" for n, s in zip(counts, SPLITS, strict=True)))
-
-
-def _presets(arguments) -> None:
-    from f3amd_lib.ground.tables import markdown_table
-    from f3amd_lib.networks import zoo
-
-    table = zoo.table(channels=arguments.channels, num_styles=arguments.styles)
-    log.info("%s", markdown_table(table))
-
 
 UNFINISHED = 3
 """Exit status of `train` where the minutes were over first; a later call goes on."""
 
+Repeatable = UseAppendAction[tuple[str, ...]]
+Required = Annotated[str, tyro.conf.arg(metavar="NAME")]
 
-def _train(arguments) -> int:
+
+@dataclass(frozen=True)
+class Data:
+    """Motion, and how much is done with it.
+
+    Attributes:
+      data: synthetic, bandai, 100style or folder.
+      profile: smoke, laptop or gpu.
+      source: folder or archive, for data sets that need one.
+    """
+
+    data: str = "synthetic"
+    profile: str = "laptop"
+    source: str | None = None
+
+    def open(self, **overrides):
+        """Return the data set, prepared, and the profile with those values replaced that are given."""
+        from f3amd_lib.ground.profiles import load_profile
+        from f3amd_lib.training.pipeline import prepare
+
+        given = {name: value for name, value in overrides.items() if value is not None}
+        profile = load_profile(self.profile, self.data, **given)
+        return prepare(profile, path=self.source), profile
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model, and how it is sampled.
+
+    Attributes:
+      steps: denoising steps a round.
+      sampler: ddim, ddpm, euler or heun; by default the model's own.
+      data: use the model of this data set.
+      weights: a weights file, instead of the data set's own.
+      overwrite: replace what lies there.
+    """
+
+    steps: int = 8
+    sampler: str | None = None
+    data: str = "synthetic"
+    weights: Path | None = None
+    overwrite: bool = False
+
+    def load(self):
+        """Load the model, and say what it is."""
+        from f3amd_lib.training.checkpoints import load_model
+        from f3amd_lib.training.pipeline import find_model
+
+        trained = load_model(self.weights or find_model(self.data))
+        log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
+        log.info("terms        %s", trained.record.get("dataset_licence"))
+        return trained
+
+    def generator(self):
+        """Return what animates characters with the model."""
+        from f3amd_lib.generation.rollout import MotionGenerator
+
+        return MotionGenerator(self.load(), self.steps, sampler=self.sampler)
+
+    def check_free(self, *targets: Path) -> None:
+        """Raise ValueError if one of the files is there and may not be replaced."""
+        taken = [str(target) for target in targets if target.exists()]
+        if taken and not self.overwrite:
+            raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
+
+
+def data(motion: Data) -> None:
+    """Open a data set, build its packed cache, say what is in it."""
+    import numpy as np
+
+    from f3amd_lib.data.sources import SPLITS
+
+    packed = motion.open()[0].packed
+    counts = np.bincount(np.asarray(packed.clip_split), minlength=3)
+    facts = {
+        "data set": packed.dataset,
+        "terms": packed.licence,
+        "credit": packed.credit,
+        "clips": f"{packed.num_clips} ({len(packed.skipped)} left out)",
+        "frames": f"{packed.num_frames} at 30 fps",
+        "joints": packed.skeleton.num_joints,
+        "styles": ", ".join(packed.styles),
+        "split": ", ".join(f"{count} {split}" for count, split in zip(counts, SPLITS, strict=True)),
+    }
+    for name, fact in facts.items():
+        log.info("%-12s %s", name, fact)
+
+
+def presets(channels: int = 141, styles: int = 100) -> None:
+    """List the models with their sizes.
+
+    Args:
+      channels: features a frame, 6 J + 3.
+      styles: how many.
+    """
+    from f3amd_lib.ground.tables import markdown_table
+    from f3amd_lib.networks import zoo
+
+    log.info("%s", markdown_table(zoo.table(channels=channels, num_styles=styles)))
+
+
+def train(
+    motion: Data,
+    preset: Repeatable = (),
+    minutes: float | None = None,
+    steps: int | None = None,
+    batch_size: int | None = None,
+    window: int | None = None,
+    seed: int | None = None,
+    out: Path | None = None,
+    all_devices: bool = False,
+    processes: int | None = None,
+    process: int | None = None,
+    coordinator: str | None = None,
+    cluster: bool = False,
+) -> int:
+    """Train a model; a killed run goes on where it stopped.
+
+    Args:
+      preset: such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order.
+      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
+      steps: optimiser steps; by default the profile's.
+      batch_size: windows a step.
+      window: future frames, 32 or 64.
+      seed: of weights, batches and noise.
+      out: folder for the model instead of runs/DATA/PROFILE/models.
+      all_devices: share each batch among the devices JAX sees.
+      processes: train in so many processes together.
+      process: number of this one, from 0.
+      coordinator: HOST:PORT of process 0.
+      cluster: train in all processes of a job of Slurm, Open MPI or Kubernetes together.
+    """
     from f3amd_lib.experiments.family import train_family
     from f3amd_lib.training import parallel
-    from f3amd_lib.training.pipeline import model_files, prepare
+    from f3amd_lib.training.pipeline import model_files
 
-    together = (arguments.coordinator, arguments.processes, arguments.process)
-    several = arguments.cluster or any(value is not None for value in together)
-    if arguments.cluster and any(value is not None for value in together):
+    together = (coordinator, processes, process)
+    named = any(value is not None for value in together)
+    if cluster and named:
         raise ValueError("--cluster finds the processes itself: leave the three others out")
-    if several:
+    if cluster or named:
         parallel.join_processes(*together)
-    profile = _profile(
-        arguments,
-        train_steps=arguments.steps,
-        batch_size=arguments.batch_size,
-        seed=arguments.seed,
-        window=arguments.window,
-    )
+    prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed, window=window)
     runs = train_family(
-        prepare(profile, path=arguments.source),
+        prepared,
         profile,
-        arguments.preset or [profile.preset],
-        folder=arguments.out,
-        budget_s=None if arguments.minutes is None else 60.0 * arguments.minutes,
-        mesh=parallel.all_devices() if several or arguments.all_devices else None,
+        list(preset) or [profile.preset],
+        folder=out,
+        budget_s=None if minutes is None else 60.0 * minutes,
+        mesh=parallel.all_devices() if cluster or named or all_devices else None,
     )
     status = 0
-    for preset, state in runs:
-        files = model_files(profile, preset, folder=arguments.out)
-        log.info("%-12s %s", state, files.state if state == "unfinished" else files.model)
+    for name, state in runs:
+        files = model_files(profile, name, folder=out)
+        log.info("%-12s %s", name, files.state if state == "unfinished" else files.model)
         status = UNFINISHED if state == "unfinished" else status
     return status
 
 
-def _path(text: str, num_frames: int, speed: float, seed: int):
-    from f3amd_lib.motion.root_paths import named_path, read_path_csv
+def rollout(
+    style: Required,
+    model: Model,
+    path: str = "figure-eight",
+    seed: int = 0,
+    seconds: float = 20.0,
+    speed: float = 1.2,
+    blend: int = 4,
+    slide: bool = False,
+    raw: bool = False,
+    out: Path = Path("out"),
+) -> None:
+    """Animate one character: BVH, film strip, GIF (its first 12 s), player.
 
-    if text.lower().endswith(".csv"):
-        return read_path_csv(text)
-    return named_path(text, num_frames, speed=speed, seed=seed)
-
-
-def _trained(arguments):
-    """Load the model that a command asks for, and say what it is."""
-    from f3amd_lib.training.checkpoints import load_model
-    from f3amd_lib.training.pipeline import find_model
-
-    weights = Path(arguments.weights) if arguments.weights else find_model(arguments.data)
-    trained = load_model(weights)
-    log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
-    log.info("terms        %s", trained.record.get("dataset_licence"))
-    return trained
-
-
-def _rollout(arguments) -> None:
+    Args:
+      style: one that the model knows.
+      path: a named path, or a CSV file.
+      seed: of path and noise.
+      seconds: length of a named path; a CSV has its own.
+      speed: of a named path, m/s; a CSV has its own.
+      blend: so many frames after each window boundary.
+      slide: do not hold feet where they stand.
+      raw: as the network made it: no blending, no held feet.
+      out: folder to write to.
+    """
     from f3amd_lib.drawing.pictures import film_strip, write_gif
     from f3amd_lib.drawing.style import save_figure
-    from f3amd_lib.generation.rollout import MotionGenerator
     from f3amd_lib.motion.bvh import write_bvh
+    from f3amd_lib.motion.root_paths import named_path, read_path_csv
     from f3amd_lib.serving.player import rollout_scene, write_player
 
-    trained = _trained(arguments)
-    num_frames = _num_frames(arguments.seconds)
-    path = _path(arguments.path, num_frames, arguments.speed, arguments.seed)
-    out = Path(arguments.out)
-    name = f"{arguments.style}_{Path(arguments.path).stem}_seed{arguments.seed}"
+    name = f"{style}_{Path(path).stem}_seed{seed}"
     targets = [out / f"{name}{ending}" for ending in (".bvh", ".png", ".gif", ".html")]
-    taken = [str(target) for target in targets if target.exists()]
-    if taken and not arguments.overwrite:
-        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
-    generator = MotionGenerator(trained, arguments.steps, sampler=arguments.sampler)
-    rollout = generator.rollout(
-        path,
-        arguments.style,
-        seed=arguments.seed,
-        blend_frames=0 if arguments.raw else arguments.blend,
-        lock_feet=not (arguments.raw or arguments.slide) and _has_legs(trained.skeleton),
+    model.check_free(*targets)
+    if path.lower().endswith(".csv"):
+        line = read_path_csv(path)
+    else:
+        line = named_path(path, _num_frames(seconds), speed=speed, seed=seed)
+    generator = model.generator()
+    trained = generator.trained
+    made = generator.rollout(
+        line,
+        style,
+        seed=seed,
+        blend_frames=0 if raw else blend,
+        lock_feet=not (raw or slide) and _has_legs(trained.skeleton),
     )
-    log.info("afterwards   %s", rollout.changes or "nothing: as the network made it")
-    motion = rollout.motion()
+    log.info("afterwards   %s", made.changes or "nothing: as the network made it")
+    motion, title = made.motion(), f"{trained.name}, {style}"
     out.mkdir(parents=True, exist_ok=True)
-    write_bvh(targets[0], motion, overwrite=arguments.overwrite)
-    title = f"{trained.name}, {arguments.style}"
-    save_figure(film_strip(motion, paths=path, titles=[title]), targets[1])
-    write_gif(targets[2], motion, target_paths=path, titles=[title], max_seconds=12.0)
-    write_player(
-        targets[3],
-        rollout_scene(rollout, title),
-        credit=trained.record.get("dataset_credit") or "",
-        strip=False,  # the film strip is written above
-    )
+    write_bvh(targets[0], motion, overwrite=model.overwrite)
+    save_figure(film_strip(motion, paths=line, titles=[title]), targets[1])
+    write_gif(targets[2], motion, target_paths=line, titles=[title], max_seconds=12.0)
+    credit = trained.record.get("dataset_credit") or ""
+    write_player(targets[3], rollout_scene(made, title), credit=credit, strip=False)
     for target in targets:
         log.info("wrote        %s", target)
 
@@ -174,38 +264,57 @@ def _num_frames(seconds: float) -> int:
     return max(2, round(seconds * 30))
 
 
-def _crowd(arguments) -> None:
-    from f3amd_lib.generation.crowd import generate_crowd
-    from f3amd_lib.generation.rollout import MotionGenerator
+def crowd(
+    model: Model,
+    characters: int = 1024,
+    seconds: float = 32 / 30,
+    style: Repeatable = (),
+    seed: int = 0,
+    chunk: int | None = None,
+    plan: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="[METRES]")] = None,
+    pictures: bool = False,
+    out: Path = Path("out/crowd"),
+) -> None:
+    """Animate any number of characters, streamed to a folder; goes on where it was stopped.
 
-    num_frames, out = _num_frames(arguments.seconds), Path(arguments.out)
-    pictures = []
-    if arguments.pictures:
-        pictures = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")]
-    taken = [str(picture) for picture in pictures if picture.exists()]
-    if taken and not arguments.overwrite:
-        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
-    generator = MotionGenerator(_trained(arguments), arguments.steps, sampler=arguments.sampler)
+    Args:
+      characters: how many.
+      seconds: of each character.
+      style: taken in turn; repeatable; by default all.
+      seed: of paths and noise.
+      chunk: characters at once.
+      plan: paths that keep this far apart at every frame, 0.8 without a number.
+      pictures: draw OUT.png and the player page OUT.html as well.
+      out: folder to write to.
+    """
+    from f3amd_lib.generation.crowd import generate_crowd
+    from f3amd_lib.generation.crowd_planning import MIN_DISTANCE
+
+    if plan is not None and len(plan) > 1:
+        raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
+    drawn = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")] if pictures else []
+    num_frames = _num_frames(seconds)
+    model.check_free(*drawn)
+    generator = model.generator()
     started = time.perf_counter()
-    crowd = generate_crowd(
+    made = generate_crowd(
         generator,
-        arguments.characters,
+        characters,
         num_frames,
         out,
-        styles=arguments.style,
-        min_distance=arguments.plan,
-        seed=arguments.seed,
-        chunk=arguments.chunk,
-        overwrite=arguments.overwrite,
+        styles=list(style) or None,
+        min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0],
+        seed=seed,
+        chunk=chunk,
+        overwrite=model.overwrite,
         progress=True,
     )
-    seconds = time.perf_counter() - started
-    log.info("wrote        %s: %d characters of %d frames", out, len(crowd), crowd.num_frames)
-    log.info("took         %.0f s", seconds)
+    log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
+    log.info("took         %.0f s", time.perf_counter() - started)
     if pictures:
-        _crowd_pictures(crowd, *pictures)
-        for path in pictures:
-            log.info("wrote        %s", path)
+        _crowd_pictures(made, *drawn)
+    for file in drawn:
+        log.info("wrote        %s", file)
 
 
 def _crowd_pictures(crowd, still: Path, page: Path) -> None:
@@ -214,164 +323,175 @@ def _crowd_pictures(crowd, still: Path, page: Path) -> None:
     from f3amd_lib.drawing.style import save_figure
     from f3amd_lib.serving.player import Character, Scene, write_player
 
-    few, model = min(100, len(crowd)), crowd.settings["model"]
-    motions = [crowd.motion(k) for k in range(few)]
+    made_by = crowd.settings["model"]
+    motions = [crowd.motion(k) for k in range(min(100, len(crowd)))]
     colors = draw.crowd_colors([motion.name for motion in motions])
-    picture = draw.CrowdPicture(motions, colors, model["name"])
-    figure = draw.crowd_figure([picture], crowd.num_frames // 2, columns=1)
+    picture = draw.CrowdPicture(motions, colors, made_by["name"])
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
-    credit = ", ".join(filter(None, (model["dataset_credit"], model["dataset_licence"])))
-    scene = Scene(characters, title=model["name"])
-    write_player(page, scene, strip=False, credit=credit)
-    save_figure(figure, still)
+    credit = ", ".join(filter(None, (made_by["dataset_credit"], made_by["dataset_licence"])))
+    write_player(page, Scene(characters, title=made_by["name"]), strip=False, credit=credit)
+    save_figure(draw.crowd_figure([picture], crowd.num_frames // 2, columns=1), still)
 
 
-def _export(arguments) -> None:
+def export(model: Model, characters: int = 1, target: Repeatable = (), out: Path = Path("out/round")) -> None:
+    """Make a round that runs without the model code: StableHLO, jax.export, IREE.
+
+    Args:
+      characters: of one call.
+      target: llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable; by default this processor.
+      out: folder to write to.
+    """
     from f3amd_lib.serving.export import export_model
 
-    targets = arguments.target
-    if targets is None:  # nobody asked for one: compile for this processor where that can be done
-        targets = ("llvm-cpu",) if importlib.util.find_spec("iree") else ()
-        if not targets:
-            log.info("not compiled for this processor, since IREE is missing: make bench-tools")
+    if not target and importlib.util.find_spec("iree"):
+        target = ("llvm-cpu",)
+    elif not target:
+        log.info("not compiled for this processor, since IREE is missing: make bench-tools")
     folder = export_model(
-        _trained(arguments),
-        arguments.out,
-        num_steps=arguments.steps,
-        batch=arguments.characters,
-        sampler=arguments.sampler,
-        targets=targets,
-        overwrite=arguments.overwrite,
+        model.load(),
+        out,
+        num_steps=model.steps,
+        batch=characters,
+        sampler=model.sampler,
+        targets=target,
+        overwrite=model.overwrite,
     )
-    for file in sorted(Path(folder).iterdir()):
+    for file in sorted(folder.iterdir()):
         log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)
 
 
-def _bench(arguments) -> int:
-    """Run the benchmarks in a process whose environment tells XLA how to be fast."""
-    import subprocess
+def bench(
+    motion: Data,
+    suite: Repeatable = (),
+    characters: UseAppendAction[tuple[int, ...]] = (),
+    again: bool = False,
+    training: bool = False,
+    parts: bool = False,
+) -> None:
+    """Time synthesis and training, write records, compare with what is asked.
 
+    Args:
+      suite: smoke, bars, main, family, windows, curve or gpu; repeatable; by default the profile's.
+      characters: these numbers only; repeatable.
+      again: time anew what is in the table.
+      training: time training steps (Table 2).
+      parts: time a round without each part.
+    """
     from f3amd_lib.benchmarking.machine import fast_xla_flags
 
-    environment = dict(os.environ)
-    if "XLA_FLAGS" not in environment:
-        environment["XLA_FLAGS"] = fast_xla_flags()
-    command = [sys.executable, "-m", "f3amd_lib.benchmarking", *arguments.words[1:]]
-    return subprocess.run(command, env=environment, check=False).returncode
+    # JAX reads them when it first looks for devices, which is later than this.
+    if "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = fast_xla_flags()
+    from f3amd_lib.benchmarking import measurements, speed_tables, synthesis
+    from f3amd_lib.ground.records import read_table
+    from f3amd_lib.ground.tables import markdown_table
+
+    suites = synthesis.check_suites(suite)
+    prepared, profile = motion.open()
+    if suites or not (training or parts):
+        path = measurements.measure_synthesis_time(
+            prepared, profile, suites, characters=characters or None, again=again
+        )
+        every = path.with_name("synthesis_ways.csv")
+        bars = speed_tables.speed_bars(read_table(every)[0], suite="bars" if suites == ["bars"] else "main")
+        log.info("\n%s\n", markdown_table(bars, digits=3))
+        log.info("all          %s\nfastest      %s", every, path)
+    if parts:
+        log.info("parts        %s", measurements.measure_round_parts(prepared, profile))
+    if training:
+        log.info("training     %s", measurements.measure_training_time(prepared, profile))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="f3amd", description=__doc__.split("\n")[0])
-    commands = parser.add_subparsers(dest="command", required=True)
+def measure(names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = ()) -> None:
+    """Measure what notebooks only draw; tables go to <results>/records/.
 
-    def add(name, action, text):
-        command = commands.add_parser(name, help=text, description=text)
-        command.set_defaults(action=action)
-        return command
+    Args:
+      names: learning, quality, walking and so on; all if none.
+      model: this preset; repeatable.
+    """
+    from f3amd_lib.experiments.measure import MEASUREMENTS
+    from f3amd_lib.ground.names import nearest_hint
+    from f3amd_lib.networks import zoo
 
-    def with_data(command):
-        from f3amd_lib.ground.profiles import DATASETS, PROFILES
-
-        command.add_argument("--data", default="synthetic", choices=DATASETS)
-        command.add_argument("--profile", default="laptop", choices=PROFILES)
-        command.add_argument("--source", help="folder or archive, for data sets that need one")
-
-    with_data(add("data", _data, "open a data set, build its cache, say what is in it"))
-
-    presets = add("presets", _presets, "list the models with their sizes")
-    presets.add_argument("--channels", type=int, default=141, help="features a frame, 6 J + 3")
-    presets.add_argument("--styles", type=int, default=100)
-
-    train = add("train", _train, "train a model; a killed run goes on where it stopped")
-    with_data(train)
-    train.add_argument(
-        "--preset",
-        action="append",
-        help="such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order",
-    )
-    train.add_argument(
-        "--minutes", type=float, help="stop then, with a checkpoint that a later call goes on from, and exit status 3"
-    )
-    train.add_argument("--all-devices", action="store_true", help="share each batch among the devices JAX sees")
-    train.add_argument("--processes", type=int, help="train in so many processes together")
-    train.add_argument("--process", type=int, help="number of this one, from 0")
-    train.add_argument("--coordinator", metavar="HOST:PORT", help="of process 0")
-    train.add_argument(
-        "--cluster",
-        action="store_true",
-        help="train in all processes of a job of Slurm, Open MPI or Kubernetes together",
-    )
-    train.add_argument("--steps", type=int, help="optimiser steps; by default the profile's")
-    train.add_argument("--batch-size", type=int, help="windows a step")
-    train.add_argument("--window", type=int, help="future frames, 32 or 64")
-    train.add_argument("--seed", type=int)
-    train.add_argument("--out", help="folder for the model instead of runs/DATA/PROFILE/models")
-
-    def with_model(command):
-        command.add_argument("--steps", type=int, default=8, help="denoising steps a round")
-        command.add_argument("--sampler", help="ddim, ddpm, euler, heun; by default the model's own")
-        command.add_argument("--data", default="synthetic", help="use the model of this data set")
-        command.add_argument("--weights", help="a weights file, instead of the data set's own")
-        command.add_argument("--overwrite", action="store_true", help="replace what lies there")
-
-    from f3amd_lib.generation.crowd_planning import MIN_DISTANCE
-
-    crowd = add("crowd", _crowd, "animate any number of characters; goes on where it was stopped")
-    with_model(crowd)
-    crowd.add_argument("--characters", type=int, default=1024)
-    crowd.add_argument("--seconds", type=float, default=32 / 30, help="of each character")
-    crowd.add_argument("--style", action="append", help="taken in turn; repeatable; default: all")
-    crowd.add_argument("--seed", type=int, default=0)
-    crowd.add_argument("--chunk", type=int, help="characters at once")
-    crowd.add_argument(
-        "--plan",
-        type=float,
-        nargs="?",
-        const=MIN_DISTANCE,
-        metavar="METRES",
-        help=f"paths that keep this far apart at every frame ({MIN_DISTANCE} without a number)",
-    )
-    crowd.add_argument("--pictures", action="store_true", help="draw OUT.png and the player page OUT.html as well")
-    crowd.add_argument("--out", default="out/crowd", help="folder to write to")
-
-    export = add("export", _export, "make a round that runs without the model code")
-    with_model(export)
-    export.add_argument("--characters", type=int, default=1, help="of one call")
-    export.add_argument("--target", action="append", help="llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable")
-    export.add_argument("--out", default="out/round", help="folder to write to")
-
-    bench = add("bench", _bench, "time synthesis and training (bench --help tells more)")
-    bench.add_argument("words", nargs=argparse.REMAINDER, help="options of the benchmarks")
-
-    rollout = add("rollout", _rollout, "animate one character: BVH, film strip, GIF (its first 12 s), player")
-    rollout.add_argument("--style", required=True)
-    rollout.add_argument("--path", default="figure-eight", help="a named path, or a CSV file")
-    rollout.add_argument("--seed", type=int, default=0)
-    rollout.add_argument("--seconds", type=float, default=20.0, help="length of a named path; a CSV has its own")
-    rollout.add_argument("--speed", type=float, default=1.2, help="of a named path, m/s; a CSV has its own")
-    with_model(rollout)
-    rollout.add_argument("--blend", type=int, default=4, metavar="N", help="blend N frames after each window boundary")
-    rollout.add_argument("--slide", action="store_true", help="do not hold feet where they stand")
-    rollout.add_argument("--raw", action="store_true", help="as the network made it: no blending, no held feet")
-    rollout.add_argument("--out", default="out", help="folder to write to")
-    return parser
+    for name in names:
+        if name not in MEASUREMENTS:
+            raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
+    models = [zoo.find_preset(name).name for name in model] or None
+    prepared, profile = motion.open()
+    for name in names or MEASUREMENTS:
+        log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models))
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run a command; errors of the user's making end with one line and status 2."""
+def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> int:
+    """Run the numbered notebooks in order; results go under paper_figures/.
+
+    Args:
+      data: synthetic, bandai, 100style or folder.
+      profile: smoke, laptop or gpu.
+      only: number of a notebook; repeatable.
+      set: NAME=VALUE, a parameter of every notebook that runs; repeatable.
+    """
+    from f3amd_lib import reproduce
+    from f3amd_lib.ground.profiles import results_dir
+
+    parameters = dict(map(reproduce.parse_assignment, set))
+    logging.getLogger("papermill").setLevel(logging.WARNING)  # at INFO it names each notebook twice
+    reproduce.set_folders(profile)
+    try:
+        summary = reproduce.reproduce(data, profile, only=only, parameters=parameters, say=log.info)
+    except reproduce.NotebookFailed as error:
+        print(f"Stopped: {error}", file=sys.stderr)
+        return 1
+    minutes = summary["seconds"].sum() / 60
+    log.info(
+        "%d notebooks finished in %.1f minutes (data %s, profile %s). To open first:",
+        len(summary), minutes, data, profile,
+    )  # fmt: skip
+    for line in reproduce.what_to_open(results_dir(data, profile)):
+        log.info("  %s", line)
+    return 0
+
+
+def claims(accept: bool = False) -> int:
+    """Judge the paper's claims from records; writes paper_figures/claims.md.
+
+    Args:
+      accept: take changed verdicts for right and write them down.
+    """
+    from f3amd_lib.reports import claims as ledger
+
+    return ledger.main(["--accept"] if accept else [])
+
+
+def cards() -> int:
+    """Write the cards of shipped weights, their checksums and the table of README."""
+    from f3amd_lib.reports import model_cards
+
+    return model_cards.main()
+
+
+COMMANDS = (data, presets, train, rollout, crowd, export, bench, measure, figures, claims, cards)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; what the user has to mend ends with one line and status 2."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     for noisy in ("jax", "absl", "matplotlib", "PIL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     os.environ.setdefault("MPLBACKEND", "Agg")
-    words = sys.argv[1:] if argv is None else argv
-    if words[:1] == ["bench"]:  # its options are those of another program
-        words = ["bench", "--", *words[1:]]
-    arguments = _parser().parse_args(words)
+    words = sys.argv[1:] if argv is None else list(argv)
     try:
-        return arguments.action(arguments) or 0
+        status = tyro.extras.subcommand_cli_from_dict(
+            {command.__name__: command for command in COMMANDS},
+            prog="f3amd",
+            description="Fast Fourier autoregressive motion diffusion: data, training, motion, measurements, figures.",
+            args=words,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        )
     except (ValueError, OSError, ArithmeticError, ImportError) as error:
-        print(f"f3amd {arguments.command}: {error}", file=sys.stderr)
+        print(f"f3amd {words[0]}: {error}", file=sys.stderr)
         return 2
+    return status or 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The main job: run the numbered notebooks in order and leave their results where they belong.
 
-    python -m f3amd_lib.reproduce --data synthetic --profile laptop
-    python -m f3amd_lib.reproduce --data bandai --profile laptop --only 04 --set train_steps=4000
+    f3amd figures --data synthetic --profile laptop
+    f3amd figures --data bandai --profile laptop --only 04 --set train_steps=4000
 
 Executed copies and logs go to the ignored `runs/<data set>/<profile>/notebooks/`, where a new run
 replaces the last one's. Results of `laptop` and `gpu` go to `paper_figures/`, those of `smoke` to
@@ -10,12 +10,9 @@ replaces the last one's. Results of `laptop` and `gpu` go to `paper_figures/`, t
 
 from __future__ import annotations
 
-import argparse
 import ast
-import contextlib
-import logging
+import collections
 import os
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -27,6 +24,7 @@ from nbclient.exceptions import DeadKernelError
 from papermill.exceptions import PapermillExecutionError
 from tqdm import tqdm
 
+from f3amd_lib.benchmarking.machine import describe_machine
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE
 from f3amd_lib.ground import profiles
@@ -113,12 +111,12 @@ def written_since(folder: Path, start: float) -> dict[str, int]:
       "figures", "tables", ... -> number of files, only where there are some; records beside tables
       do not count.
     """
-    counts = {}
-    for path in Path(folder).rglob("*"):
-        if path.suffix not in (".json", ".md") and path.is_file() and path.stat().st_mtime >= start:
-            kind = path.relative_to(folder).parts[0]
-            counts[kind] = counts.get(kind, 0) + 1
-    return counts
+    written = (
+        path
+        for path in Path(folder).rglob("*")
+        if path.suffix not in (".json", ".md") and path.is_file() and path.stat().st_mtime >= start
+    )
+    return dict(collections.Counter(path.relative_to(folder).parts[0] for path in written))
 
 
 def _news(path: Path, seconds: float, wrote: Mapping[str, int], left: float | None) -> str:
@@ -144,15 +142,14 @@ def _usual_seconds(results: Path) -> dict[str, float]:
 def what_to_open(results: Path) -> list[str]:
     """Return the files of a run that are worth opening first, as lines "what: path"."""
     worth = {
-        "a walk to look at": "media/00_first_walk.gif",
-        "and the longer one of notebook 05": "media/05_rollout.gif",
-        "a crowd to turn around, in a browser": "media/14_crowd.html",
-        "film strips": "figures/05_film_strip.png",
-        "do they walk, in numbers": "tables/05_walks.csv",
+        "a walk to look at": results / "media/00_first_walk.gif",
+        "and the longer one of notebook 05": results / "media/05_rollout.gif",
+        "a crowd to turn around, in a browser": results / "media/14_crowd.html",
+        "film strips": results / "figures/05_film_strip.png",
+        "do they walk, in numbers": results / "tables/05_walks.csv",
+        "each claim of the paper with a verdict": profiles.repository_root() / "paper_figures/claims.md",
     }
-    found = {what: results / name for what, name in worth.items()}
-    found["each claim of the paper with a verdict"] = profiles.repository_root() / "paper_figures" / "claims.md"
-    return [f"{what}: {_short(path)}" for what, path in found.items() if path.is_file()]
+    return [f"{what}: {_short(path)}" for what, path in worth.items() if path.is_file()]
 
 
 def reproduce(
@@ -191,44 +188,36 @@ def reproduce(
     selected = select_notebooks(available, only)
     check_parameters(selected, parameters)
 
-    own_folder = runs_dir(dataset, profile)
+    own_folder, results = runs_dir(dataset, profile), results_dir(dataset, profile)
     executed_folder = own_folder / "notebooks"
     executed_folder.mkdir(parents=True, exist_ok=True)
-    record_extras = {"parameters": parameters, "notebooks": [path.name for path in selected], **_machine()}
-    rows = []
-    failure = None
-    with _results_root(profile):
-        results = results_dir(dataset, profile)
-        # Bars are for people: a log file gets the lines of `say` instead.
-        usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
-        for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
-            began, start = time.time(), time.monotonic()
-            try:
-                _execute(path, executed_folder / path.name, parameters)
-            except NotebookFailed as error:
-                failure = error
-            seconds = time.monotonic() - start
-            rows.append(
-                {
-                    "notebook": path.name,
-                    "seconds": round(seconds, 1),
-                    "cells": _count_code_cells(path),
-                    "finished": failure is None,
-                }
-            )
-            if failure:
-                break
-            if path.name in usual:
-                took, usually = took + seconds, usually + usual[path.name]
-            rest = sum(usual.get(later.name, 0.0) for later in selected[number + 1 :])
-            left = rest * took / usually
-            say(_news(path, seconds, written_since(results, began), left))
+    rows, failure = [], None
+    usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
+    # Bars are for people: a log file gets the lines of `say` instead.
+    for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
+        began, start = time.time(), time.monotonic()
+        try:
+            _execute(path, executed_folder / path.name, parameters)
+        except NotebookFailed as error:
+            failure = error
+        seconds = time.monotonic() - start
+        cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
+        rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": failure is None})
+        if failure:
+            break
+        if path.name in usual:
+            took, usually = took + seconds, usually + usual[path.name]
+        rest = sum(usual.get(later.name, 0.0) for later in selected[number + 1 :])
+        say(_news(path, seconds, written_since(results, began), rest * took / usually))
 
     summary = pd.DataFrame(rows)
     complete = failure is None and len(selected) == len(available)
     # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
     # its memory from the notebooks.
-    record = run_record(profile=profile, dataset=dataset, seed=parameters.get("seed", defaults.seed), **record_extras)
+    record = run_record(
+        profile=profile, dataset=dataset, seed=parameters.get("seed", defaults.seed), parameters=parameters,
+        notebooks=[path.name for path in selected], machine=describe_machine(),
+    )  # fmt: skip
     write_table((results / "tables" if complete else own_folder) / "run_summary.csv", summary, record)
     if failure:
         raise failure
@@ -252,19 +241,17 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
         )
     except PapermillExecutionError as error:
         cell = f"cell In [{error.exec_count}], {_first_line(error.source)!r}"
-        cause = f"{error.ename}: {error.evalue}"
-        log.write_text(str(error), encoding="utf-8")
-        raise NotebookFailed(_failure(path, cell, cause, copy, log)) from None
+        cause, trace = f"{error.ename}: {error.evalue}", str(error)
     except DeadKernelError as error:
         # The kernel was killed (by the system, when memory runs out) and left no traceback.
-        cell = _last_started_cell(copy)
-        cause = f"{error} (was the machine out of memory?)"
-        log.write_text(f"{cell}\n{cause}\n", encoding="utf-8")
-        raise NotebookFailed(_failure(path, cell, cause, copy, log)) from None
-
-
-def _failure(path: Path, cell: str, cause: str, copy: Path, log: Path) -> str:
-    return f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n  executed so far: {_short(copy)}"
+        cell, cause = _last_started_cell(copy), f"{error} (was the machine out of memory?)"
+        trace = f"{cell}\n{cause}\n"
+    else:
+        return
+    log.write_text(trace, encoding="utf-8")
+    raise NotebookFailed(
+        f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n  executed so far: {_short(copy)}"
+    )
 
 
 def _last_started_cell(copy: Path) -> str:
@@ -283,115 +270,35 @@ def _first_line(source: str) -> str:
 
 def _short(path: Path) -> str:
     """Return a path as it is typed at the repository's root."""
-    with contextlib.suppress(ValueError):
-        path = path.relative_to(profiles.repository_root())
-    return str(path)
+    root = profiles.repository_root()
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
-def _count_code_cells(path: Path) -> int:
-    return sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
+def parse_assignment(text: str) -> tuple[str, object]:
+    """Split "name=value"; a value that is no Python literal is a string.
 
-
-@contextlib.contextmanager
-def _results_root(profile: str):
-    """Send the notebooks' results to the committed folder for as long as they run.
-
-    `smoke` is a check, not a result, so it stays in `runs/`. A variable that is set already wins.
+    Raises:
+      ValueError: for another form, or a name that has an option of its own.
     """
-    name = profiles.RESULTS_DIR_VARIABLE
-    if profile == "smoke" or os.environ.get(name):
-        yield
-        return
-    before = os.environ.get(name)
-    os.environ[name] = str(profiles.repository_root() / "paper_figures")
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
-
-
-def _machine() -> dict:
-    """Return what a wall time is read against; empty without the `bench` extra."""
-    try:
-        import psutil
-    except ImportError:
-        return {}
-    return {
-        "physical_cores": psutil.cpu_count(logical=False),
-        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
-    }
-
-
-def _assignment(text: str) -> tuple[str, object]:
-    """Split "name=value"; a value that is no Python literal is a string."""
     name, equals, value = text.partition("=")
     if not (equals and name.isidentifier()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+        raise ValueError(f"--set {text!r} is not NAME=VALUE")
     if name in ("profile", "data"):
-        raise argparse.ArgumentTypeError(f"use --{name} for {name!r}")
+        raise ValueError(f"use --{name} for {name!r}")
     try:
         return name, ast.literal_eval(value)
     except (ValueError, SyntaxError):
         return name, value
 
 
-def _say(line: str) -> None:
-    """Write a line at once, also where nobody sits at a terminal."""
-    tqdm.write(line)
-    sys.stdout.flush()
+def set_folders(profile: str) -> None:
+    """Tell the notebooks, which run in a folder of their own, where data lie and results go.
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; see the module's first lines.
-
-    Args:
-      arguments: words after the program's name; those of the process by default.
-
-    Returns:
-      Exit status: 0 if every notebook finished, 1 if one failed, 2 for a name that does not exist.
+    Results go to the committed `paper_figures/`, but those of `smoke`, a check, stay in `runs/`.
+    Where a variable is set already, it wins.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m f3amd_lib.reproduce",
-        description="Run the numbered notebooks in order; results go under paper_figures/.",
-    )
-    parser.add_argument("--data", default="synthetic", help=f"{', '.join(profiles.DATASETS)}")
-    parser.add_argument("--profile", default="laptop", help=f"{', '.join(profiles.PROFILES)}")
-    parser.add_argument("--only", action="append", default=[], metavar="NUMBER", help="this notebook; repeatable")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        type=_assignment,
-        metavar="NAME=VALUE",
-        help="a parameter of every notebook that runs; repeatable",
-    )
-    options = parser.parse_args(arguments)
-    # Notebooks run in their own folder, where a relative path would lead elsewhere.
+    if profile != "smoke" and not os.environ.get(profiles.RESULTS_DIR_VARIABLE):
+        os.environ[profiles.RESULTS_DIR_VARIABLE] = str(profiles.repository_root() / "paper_figures")
     for variable in (profiles.RESULTS_DIR_VARIABLE, DATA_DIR_VARIABLE, CACHE_DIR_VARIABLE):
         if os.environ.get(variable):
             os.environ[variable] = str(Path(os.environ[variable]).resolve())
-    # Papermill names each notebook twice at INFO; warnings are news.
-    logging.getLogger("papermill").setLevel(logging.WARNING)
-    try:
-        summary = reproduce(options.data, options.profile, only=options.only, parameters=dict(options.set), say=_say)
-    except ValueError as error:
-        tqdm.write(f"Stopped: {error}", file=sys.stderr)
-        return 2
-    except NotebookFailed as error:
-        tqdm.write(f"Stopped: {error}", file=sys.stderr)
-        return 1
-    _say(
-        f"{len(summary)} notebooks finished in {summary['seconds'].sum() / 60:.1f} minutes "
-        f"(data {options.data}, profile {options.profile}). To open first:"
-    )
-    with _results_root(options.profile):
-        for line in what_to_open(results_dir(options.data, options.profile)):
-            _say(f"  {line}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

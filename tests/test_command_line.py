@@ -2,16 +2,19 @@
 
 import importlib.util
 import json
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from builders import WINDOW, tiny_trained
 
 from f3amd_lib.__main__ import main
-from f3amd_lib.benchmarking.__main__ import main as bench
+from f3amd_lib.benchmarking import machine, measurements
 from f3amd_lib.generation.crowd import read_crowd
-from f3amd_lib.generation.crowd_planning import closest_approach
+from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, closest_approach
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model
 
@@ -83,6 +86,14 @@ def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsy
     assert "player-data" in (tmp_path / "crowd.html").read_text(encoding="utf-8")
 
 
+def test_a_plan_without_a_number_keeps_the_usual_distance(weights, tmp_path):
+    words = ["crowd", "--weights", weights, "--steps", "1", "--seconds", "0.2", "--characters", "2"]
+    for name, plan, distance in (("usual", ["--plan"], MIN_DISTANCE), ("free", [], None)):
+        assert main([*words, *plan, "--out", str(tmp_path / name)]) == 0
+        assert read_crowd(tmp_path / name).settings["min_distance"] == distance
+    assert main([*words, "--plan", "1", "2", "--out", str(tmp_path / "two")]) == 2
+
+
 @pytest.mark.parametrize("seconds", ["0", "-5", "nan", "3601"])
 def test_lengths_that_make_no_crowd_are_refused(weights, tmp_path, capsys, seconds):
     out = tmp_path / "crowd"
@@ -132,21 +143,80 @@ def test_export_is_an_artefact_that_loads(weights, tmp_path):
     assert main([*words, "--target", "cuda-sm_90"]) == 2
 
 
-def test_bench_refuses_what_it_does_not_know(capsys):
-    assert bench(["--profile", "smoke", "--suite", "bar"]) == 2
+@pytest.fixture
+def no_fast_flags(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")  # so that what a command sets is taken back
+    monkeypatch.delenv("XLA_FLAGS")
+    monkeypatch.setattr(machine, "fast_xla_flags", lambda: "--fast")
+
+
+def test_bench_refuses_what_it_does_not_know(no_fast_flags, capsys):
+    assert main(["bench", "--profile", "smoke", "--suite", "bar"]) == 2
     assert "unknown suite 'bar'" in capsys.readouterr().err
 
 
-def test_bench_hands_its_options_on(monkeypatch):
-    seen = {}
+def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags, monkeypatch):
+    asked = {}
 
-    def run(command, env, check):
-        seen.update(command=command, flags=env["XLA_FLAGS"])
-        return type("Done", (), {"returncode": 7})
+    def note(prepared, profile, suites, **options):
+        asked.update(options, suites=suites, flags=os.environ["XLA_FLAGS"])
+        raise ValueError("enough")
 
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    monkeypatch.setattr("subprocess.run", run)
-    monkeypatch.setattr("f3amd_lib.benchmarking.machine.fast_xla_flags", lambda: "--fast")
-    assert main(["bench", "--suite", "bars", "--again"]) == 7
-    assert seen["command"][2:] == ["f3amd_lib.benchmarking", "--suite", "bars", "--again"]
-    assert seen["flags"] == "--fast"
+    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path: None)
+    monkeypatch.setattr(measurements, "measure_synthesis_time", note)
+    words = ["bench", "--suite", "bars", "--suite", "main", "--again", "--characters", "8", "--characters", "1"]
+    assert main(words) == 2
+    assert asked == {"suites": ["bars", "main"], "again": True, "characters": (8, 1), "flags": "--fast"}
+    monkeypatch.setenv("XLA_FLAGS", "--mine")
+    assert main(["bench", "--suite", "bars"]) == 2
+    assert asked["flags"] == "--mine"
+
+
+def test_flags_of_bench_are_set_before_jax_looks_for_devices():
+    script = """
+import os, sys
+from f3amd_lib.__main__ import main
+from f3amd_lib.benchmarking import machine
+machine.fast_xla_flags = lambda: "--xla_force_host_platform_device_count=3"
+assert main(["bench", "--profile", "smoke", "--suite", "bar"]) == 2
+import jax
+sys.exit(jax.device_count())
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    assert subprocess.run([sys.executable, "-c", script], env=environment, check=False).returncode == 3
+
+
+@pytest.mark.parametrize(
+    "command", "data presets train rollout crowd export bench measure figures claims cards".split()
+)
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    assert f"f3amd {command}" in capsys.readouterr().out
+
+
+def test_a_misspelt_option_is_refused_with_the_nearest(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["train", "--preste", "CAMDM"])
+    assert caught.value.code == 2
+    assert "--preset" in capsys.readouterr().err
+
+
+def test_help_does_not_wait_for_jax():
+    script = """
+import sys
+from f3amd_lib.__main__ import main
+try:
+    main(["--help"])
+except SystemExit:
+    sys.exit("jax" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", script], stdout=subprocess.DEVNULL, check=False).returncode == 0
+
+
+def test_the_ledger_is_judged_by_its_own_command(monkeypatch):
+    seen = []
+    monkeypatch.setattr("f3amd_lib.reports.claims.main", lambda words: seen.append(words) or 1)
+    assert [main(["claims"]), main(["claims", "--accept"])] == [1, 1]
+    assert seen == [[], ["--accept"]]

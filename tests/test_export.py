@@ -184,7 +184,7 @@ def test_a_program_with_a_loop_is_refused_and_an_unrolled_one_has_none(trained, 
     looped = export_round(trained.network(), SIGMAS, BATCH, unroll=False)
     with pytest.raises(ValueError, match=r"has a loop \(stablehlo\.while\).*unroll=True"):
         compile_iree(looped.stablehlo, "llvm-cpu")
-    assert "stablehlo.while" not in export_module._operations(exported.stablehlo)
+    assert export_module._has_loop(looped.stablehlo) and not export_module._has_loop(exported.stablehlo)
 
 
 def test_a_program_does_not_say_which_files_made_it(exported):
@@ -251,7 +251,7 @@ def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path, file):
     copy = shutil.copytree(jax_folder, tmp_path / "copy")
     content = (copy / file).read_bytes()
     (copy / file).write_bytes(content[:-1])
-    with pytest.raises(ValueError, match=rf"{file}: has \d+ bytes and should have \d+; .*cut"):
+    with pytest.raises(ValueError, match=f"{file}: content does not match its checksum"):
         load_artefact(copy, runtime="jax")
     (copy / file).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     with pytest.raises(ValueError, match=f"{file}: content does not match its checksum"):
@@ -304,7 +304,7 @@ def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
         load_artefact(iree_folder, target="vmvx")
     cut = shutil.copytree(iree_folder, tmp_path / "cut") / "round.llvm-cpu.vmfb"
     cut.write_bytes(cut.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="has 1000 bytes and should have"):
+    with pytest.raises(ValueError, match="does not match its checksum"):
         load_artefact(cut.parent)
 
 
@@ -391,7 +391,7 @@ def test_other_devices_are_compiled_for_without_being_there(exported, target, tm
 @pytest.mark.slow
 @needs_iree
 def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
-    with pytest.raises(ValueError, match=r"IREE .* cannot compile .* for cuda-sm_20: .*Targets"):
+    with pytest.raises(ValueError, match=r"IREE .* cannot compile .* for cuda-sm_20"):
         compile_iree(exported.stablehlo, "cuda-sm_20")
 
 
@@ -401,15 +401,15 @@ def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatc
 
     def run(command, **settings):
         seen.append(command)
-        tiled = any(flag in export_module._DATA_TILING for flag in command)
+        tiled = any(flag in export_module._DATA_TILING for flag in command) or "vmvx" in " ".join(command)
         if not tiled:
             Path(command[command.index("-o") + 1]).write_bytes(b"module")
         return subprocess.CompletedProcess(command, int(tiled), "", "error: large vector sizes")
 
     monkeypatch.setattr(export_module.subprocess, "run", run)
-    monkeypatch.setattr(export_module, "_operations", lambda program: set())
-    assert compile_iree(b"program", "llvm-cpu") == b"module"
-    assert len(seen) == 2
+    monkeypatch.setattr(export_module, "_has_loop", lambda program: False)
+    module, flags = compile_iree(b"program", "llvm-cpu")
+    assert module == b"module" and len(seen) == 2
+    assert not set(flags) & set(export_module._DATA_TILING)
     with pytest.raises(ValueError, match="large vector sizes"):
-        monkeypatch.setattr(export_module, "_attempts", lambda flags: [flags])
-        compile_iree(b"program", "llvm-cpu")
+        compile_iree(b"program", "vmvx")

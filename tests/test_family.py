@@ -101,12 +101,12 @@ def test_other_settings_keep_no_rows(prepared, small, tmp_path, monkeypatch):
     assert set(read_table(path)[0]["model"]) == {"F3AMD-FNO-32-raw"}
 
 
-def test_unknown_names_end_with_status_2(caplog):
-    assert measure.main(["lerning"]) == 2
-    assert "unknown measurement 'lerning'; did you mean 'learning'" in caplog.text
-    assert measure.main(["learning", "--model", "F3AMD-FNO-69"]) == 2
-    assert "did you mean 'F3AMD-FNO-96'" in caplog.text
-    assert measure.main(["--profile", "labtop"]) == 2
+def test_unknown_names_end_with_status_2(capsys):
+    assert main(["measure", "lerning"]) == 2
+    assert "unknown measurement 'lerning'; did you mean 'learning'" in capsys.readouterr().err
+    assert main(["measure", "learning", "--model", "F3AMD-FNO-69"]) == 2
+    assert "did you mean 'F3AMD-FNO-96'" in capsys.readouterr().err
+    assert main(["measure", "--profile", "labtop"]) == 2
 
 
 def leg(prepared, profile, folder, presets=("F3AMD-FNO-32",), **settings):

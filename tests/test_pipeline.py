@@ -142,7 +142,7 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
 def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: tmp_path / profile)
     monkeypatch.setattr(pipeline, "PRETRAINED_DIR", tmp_path / "pretrained")
-    with pytest.raises(ValueError, match="f3amd_lib train --data bandai"):
+    with pytest.raises(ValueError, match="f3amd train --data bandai"):
         pipeline.find_model("bandai")
 
 

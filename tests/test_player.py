@@ -144,15 +144,16 @@ def test_every_bone_is_drawn_once_in_a_limb_of_its_side():
     joints = [point for point in drawn.points if point < SYNTHETIC_SKELETON.num_joints]
     assert joints == list(range(SYNTHETIC_SKELETON.num_joints))
     lines = {}
-    for side, bones in drawn.limbs:
-        for parent, child in bones:
+    for limb in drawn.limbs:
+        side = limb["side"]
+        for parent, child in limb["bones"]:
             assert drawn.points[child] not in lines
             lines[drawn.points[child]] = (drawn.points[parent], side)
     for joint, parent in enumerate(SYNTHETIC_SKELETON.parents):
         if parent >= 0:
             assert lines[joint] == (parent, limb_side(SYNTHETIC_SKELETON.names[joint]))
     # Trunk, two arms, two legs.
-    assert sorted(side for side, _ in drawn.limbs) == ["left"] * 2 + ["middle"] + ["right"] * 2
+    assert sorted(limb["side"] for limb in drawn.limbs) == ["left"] * 2 + ["middle"] + ["right"] * 2
     toes = tuple(drawn.points[toe] for toe in drawn.toes)
     assert toes == SYNTHETIC_SKELETON.toes
     head = SYNTHETIC_SKELETON.index("Head")

@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 
 from f3amd_lib import reproduce
+from f3amd_lib.__main__ import main
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.records import read_table
 
@@ -98,7 +100,7 @@ def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):
     write_notebook(folder, "02_never", PARAMETERS, "open('never.txt', 'w')")
     before = broken.read_bytes()
 
-    status = reproduce.main(["--profile", "smoke"])
+    status = main(["figures", "--profile", "smoke"])
 
     assert status == 1
     message = capsys.readouterr().err
@@ -128,7 +130,7 @@ def test_one_notebook_alone_leaves_the_whole_runs_summary(checkout):
     folder = checkout / "notebooks"
     write_notebook(folder, "00_first", PARAMETERS, "raise RuntimeError('not asked for')")
     write_notebook(folder, "01_second", PARAMETERS, "1 + 1")
-    assert reproduce.main(["--profile", "smoke", "--only", "1"]) == 0
+    assert main(["figures", "--profile", "smoke", "--only", "1"]) == 0
     summary, record = read_table(checkout / "runs" / "synthetic" / "smoke" / "run_summary.csv")
     assert list(summary["notebook"]) == record["notebooks"] == ["01_second.ipynb"]
     assert not list((checkout / "results").rglob("run_summary.csv"))
@@ -148,7 +150,7 @@ def test_unknown_names_are_refused_before_anything_runs(checkout, capsys, argume
     folder = checkout / "notebooks"
     write_notebook(folder, "00_first", PARAMETERS, "open('ran.txt', 'w')")
     write_notebook(folder, "01_second", PARAMETERS)
-    assert reproduce.main(["--profile", "smoke", *arguments]) == 2
+    assert main(["figures", "--profile", "smoke", *arguments]) == 2
     assert complaint in capsys.readouterr().err
     assert not (folder / "ran.txt").exists()
     assert not (checkout / "runs").exists()
@@ -192,11 +194,15 @@ def test_only_real_runs_write_into_the_committed_folder(checkout, monkeypatch, p
         monkeypatch.delenv(name)
     else:
         monkeypatch.setenv(name, str(checkout / already_set))
-    before = os.environ.get(name)
-    with reproduce._results_root(profile):
-        folder = profiles.results_dir("synthetic", profile)
-    assert folder == checkout / expected / "synthetic" / profile
-    assert os.environ.get(name) == before
+    reproduce.set_folders(profile)
+    assert profiles.results_dir("synthetic", profile) == checkout / expected / "synthetic" / profile
+
+
+def test_relative_folders_are_found_from_the_notebooks_folder(checkout, monkeypatch):
+    monkeypatch.chdir(checkout)
+    monkeypatch.setenv(CACHE_DIR_VARIABLE, "cache")
+    reproduce.set_folders("smoke")
+    assert os.environ[CACHE_DIR_VARIABLE] == str(checkout / "cache")
 
 
 @pytest.mark.parametrize(
@@ -209,14 +215,12 @@ def test_only_real_runs_write_into_the_committed_folder(checkout, monkeypatch, p
     ],
 )
 def test_assignments_on_the_command_line(text, expected):
-    assert reproduce._assignment(text) == expected
+    assert reproduce.parse_assignment(text) == expected
 
 
 @pytest.mark.parametrize("text", ["num_steps", "=4", "two words=4", "profile=gpu"])
 def test_broken_assignments_are_refused(text, capsys):
-    with pytest.raises(SystemExit) as caught:
-        reproduce.main(["--set", text])
-    assert caught.value.code == 2
+    assert main(["figures", "--set", text]) == 2
     assert text.partition("=")[0] in capsys.readouterr().err
 
 

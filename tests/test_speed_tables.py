@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from f3amd_lib.benchmarking.speed_tables import (
-    fastest_ways,
+    fastest_implementations,
     speed_bars,
     speedups,
     speedups_by_turns,
@@ -66,7 +66,7 @@ def test_fastest_way_of_each_framework_in_float32():
         ("F3AMD-FNO-96", 1, "jax", "jit", 1, 0.7, "float32"),
     )
     table.index = [0] * len(table)  # as pieces of several runs have
-    found = fastest_ways(table)
+    found = fastest_implementations(table)
     assert list(found["value"]) == [2.0, 4.0, 0.7]
     assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
 
@@ -78,8 +78,8 @@ def test_what_two_suites_have_timed_counts_once():
         ("CAMDM", 8, "jax", "jit", 1, 2.0, "float32"),
     )
     table["suite"] = ["bars", "main", "family"]
-    assert list(fastest_ways(table)["value"]) == [3.0]
-    assert list(fastest_ways(table[table["suite"] != "main"])["value"]) == [2.0]
+    assert list(fastest_implementations(table)["value"]) == [3.0]
+    assert list(fastest_implementations(table[table["suite"] != "main"])["value"]) == [2.0]
 
 
 def test_speedups_take_both_times_from_the_same_turns():

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, network_of, tiny_camdm, tiny_config
 
-from f3amd_lib.benchmarking import measurements, parts, synthesis, ways
-from f3amd_lib.benchmarking.parts import PARTS, time_parts, without
+from f3amd_lib.benchmarking import implementations, measurements, synthesis
+from f3amd_lib.benchmarking.implementations import NotPossible, Task, prepare_round, random_condition
 from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
-from f3amd_lib.benchmarking.ways import NotPossible, Task, prepare_round, random_condition
+from f3amd_lib.benchmarking.time_breakdown import PARTS, time_breakdown, without
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.profiles import load_profile
@@ -32,7 +32,7 @@ def test_operations_of_a_round():
         encode, evaluate = zoo.count_flops(tiny(model))
         asked = task(model, steps=4, characters=3)
         calls = num_evaluations(asked.sampler, 4)
-        assert ways.round_flops(asked) == 3 * (encode + calls * evaluate)
+        assert implementations.round_flops(asked) == 3 * (encode + calls * evaluate)
 
 
 def test_each_model_is_timed_with_its_own_sampler_and_levels():
@@ -52,8 +52,8 @@ def test_jit_runs_the_round(model):
     assert ready.compile_seconds > 0 and ready.bytes_accessed > 0
 
 
-def test_plain_form_runs_the_same_round():
-    results = [np.asarray(prepare_round(way, task()).call()) for way in ("jit", "jit, FFT")]
+def test_fft_form_runs_the_same_round():
+    results = [np.asarray(prepare_round(name, task()).call()) for name in ("jit", "jit, FFT")]
     np.testing.assert_allclose(*results, atol=1e-4)
 
 
@@ -65,9 +65,9 @@ def test_iree_runs_a_round_of_finite_numbers(model):
 
 
 @pytest.mark.needs("torch")
-@pytest.mark.parametrize("way", ["PyTorch", "PyTorch, oneDNN"])
-def test_pytorch_runs_a_round_of_finite_numbers(way):
-    found = np.asarray(prepare_round(way, task("CAMDM")).call())
+@pytest.mark.parametrize("name", ["PyTorch", "PyTorch, oneDNN"])
+def test_pytorch_runs_a_round_of_finite_numbers(name):
+    found = np.asarray(prepare_round(name, task("CAMDM")).call())
     assert found.shape == (2, WINDOW, CHANNELS) and np.isfinite(found).all()
 
 
@@ -84,7 +84,7 @@ def test_what_cannot_be_done_says_why():
 
 def test_a_group_is_timed_and_counted():
     candidates = [Candidate("F3AMD-FNO-96", steps, 2, "jit", WINDOW) for steps in (1, 2)] + [
-        Candidate("CAMDM", 2, 2, way, WINDOW) for way in ("jit", "jit, FFT")
+        Candidate("CAMDM", 2, 2, name, WINDOW) for name in ("jit", "jit, FFT")
     ]
     table, failed = time_group(candidates, tiny, **QUICK)
     assert list(table["steps"]) == [1, 2, 2] and (table["rounds"] >= 2).all()
@@ -93,7 +93,7 @@ def test_a_group_is_timed_and_counted():
     np.testing.assert_allclose(table["gflops"], table["flops"] / table["value"] / 1e6)
     np.testing.assert_allclose(table["share_of_peak"], table["gflops"] / table["peak_gflops"])
     assert table["peak_gflops"].nunique() == 1
-    assert table["flops"].iloc[0] == ways.round_flops(task(steps=1))
+    assert table["flops"].iloc[0] == implementations.round_flops(task(steps=1))
 
 
 def test_groups_are_not_mixed():
@@ -102,13 +102,13 @@ def test_groups_are_not_mixed():
         time_group(mixed, tiny)
 
 
-def test_plans_name_presets_and_ways_that_exist_each_once():
-    for suite in synthesis.SUITES:
+def test_plans_name_presets_and_implementations_that_exist_each_once():
+    for suite in synthesis.suites():
         members = [c for group in plan(suite).values() for c in group]
         assert members and len(members) == len(set(members))
         for candidate in members:
             assert zoo.find_preset(candidate.model).name == candidate.model
-            assert candidate.way in ways.WAYS
+            assert candidate.implementation in implementations.IMPLEMENTATIONS
     with pytest.raises(ValueError, match="unknown suite"):
         plan("bar")
 
@@ -119,16 +119,15 @@ def quick_suite(monkeypatch, tmp_path):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     timed = []
 
-    def two_groups():
-        for count in (1, 2):
-            yield Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW)
-        yield Candidate("CAMDM", 1, 2, "jit, FFT", WINDOW)
+    def two_groups(suite):
+        one, two = (Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW) for count in (1, 2))
+        return {one.group: [one], two.group: [two, Candidate("CAMDM", 1, 2, "jit, FFT", WINDOW)]}
 
     def counted(candidates, build_config, **settings):
         timed.append(candidates[0].characters)
         return time_group(candidates, tiny, **QUICK)
 
-    monkeypatch.setitem(synthesis.SUITES, "smoke", two_groups)
+    monkeypatch.setattr(measurements, "plan", two_groups)
     monkeypatch.setattr(measurements, "time_group", counted)
     return timed
 
@@ -177,9 +176,8 @@ def test_parts_are_left_out():
 
 
 def test_time_of_parts_is_a_share_of_the_whole():
-    table = time_parts(task(steps=1), **QUICK)
+    table = time_breakdown(task(steps=1), **QUICK)
     assert list(table["without"]) == ["nothing", *PARTS]
     whole = table["value"].iloc[0]
     np.testing.assert_allclose(table["saved"].iloc[1:], 1 - table["value"].iloc[1:] / whole)
     assert np.isnan(table["saved"].iloc[0])
-    assert parts.PARTS[-1] == "noise"

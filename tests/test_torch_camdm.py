@@ -2,7 +2,6 @@
 
 import functools
 import importlib
-import itertools
 import shutil
 import sys
 
@@ -13,7 +12,7 @@ import pytest
 from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm, tiny_config
 from flax import nnx
 
-from f3amd_lib.benchmarking.timing import Timing
+from f3amd_lib.benchmarking import implementations
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks import zoo
@@ -21,7 +20,7 @@ from f3amd_lib.networks.conditioning import Condition
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
 torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
-pytestmark = pytest.mark.needs("torch", "onnx", "onnxruntime")
+pytestmark = pytest.mark.needs("torch", "onnxscript", "onnxruntime")
 
 SIGMAS = VariancePreservingCosine(4).grid(4)
 KEY = jax.random.key(3)
@@ -38,16 +37,10 @@ LAYOUTS = {
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch):
     """Threads that wait for one another make small networks slow on a busy machine."""
+    before = torch.get_num_threads()
     monkeypatch.setattr(torch_camdm, "usable_cores", lambda: 1)
-    with torch_camdm.torch_threads(1):
-        yield
-
-
-@pytest.fixture
-def onnx_camdm(monkeypatch):
-    module = importlib.import_module("f3amd_lib.benchmarking.onnx_camdm")
-    monkeypatch.setattr(module, "usable_cores", lambda: 1)
-    return module
+    yield
+    torch.set_num_threads(before)
 
 
 @functools.cache
@@ -72,7 +65,12 @@ def as_tensor(array):
 def in_torch(module, x_noisy, sigma, condition):
     """Encode and denoise in PyTorch."""
     context = module.encode(torch_camdm.torch_condition(condition))
-    return module(as_tensor(x_noisy), sigma, context).numpy()
+    levels = np.broadcast_to(np.asarray(sigma, np.float32), len(x_noisy))
+    scales, features = map(as_tensor, torch_camdm.tell_levels(module.config, levels))
+    with torch.inference_mode():
+        return module.denoise(
+            as_tensor(x_noisy) * scales[:, None, None], module.noise_tokens(features), context
+        ).numpy()
 
 
 def given_noise(batch: int, num_steps: int, config):
@@ -110,26 +108,22 @@ def test_context_is_that_of_jax(layout):
     np.testing.assert_allclose(found.numpy(), network.encode(condition), atol=1e-5)
 
 
-@pytest.mark.parametrize("sampler", torch_camdm.ROUND_SAMPLERS)
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
 @pytest.mark.parametrize("layout", list(LAYOUTS)[:2])
-def test_round_gives_the_numbers_of_jax(layout, sampler, onnx_camdm):
+def test_round_gives_the_numbers_of_jax(layout, sampler):
     network = lively(small(**LAYOUTS[layout]))
     condition = make_condition(3)
     noise, step_noise = given_noise(3, 4, network.config)
     expected = jax_round(network, condition, SIGMAS, sampler)
-    for products in torch_camdm.PRODUCTS:
+    for products, runtime in (("blas", "eager"), ("onednn", "eager"), ("blas", "onnx")):
         module = torch_camdm.torch_camdm(network, products=products)
-        found = torch_camdm.torch_round(module, SIGMAS, sampler)(
+        found = torch_camdm.torch_round(module, SIGMAS, sampler, runtime=runtime)(
             torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise)
         )
         np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
-    run = onnx_camdm.onnx_round(network, SIGMAS, sampler)
-    found = run(Condition(*map(np.asarray, condition)), noise=noise, step_noise=step_noise)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
 
 
-def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round(onnx_camdm):
+def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round():
     preset = zoo.find_preset("CAMDM")
     network = lively(zoo.build_config("CAMDM", channels=135, num_styles=100))
     config, sigmas = network.config, preset.diffusion.grid(2)
@@ -138,15 +132,13 @@ def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round(onnx_camdm):
     )
     noise, step_noise = given_noise(1, 2, config)
     expected = jax_round(network, condition, sigmas, preset.diffusion.sampler)
-    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), sigmas)
-    found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
-    np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
-    run = onnx_camdm.onnx_round(network, sigmas)
-    found = run(Condition(*map(np.asarray, condition)), noise=noise, step_noise=step_noise)
-    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+    for runtime in ("eager", "onnx"):
+        run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), sigmas, runtime=runtime)
+        found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
+        np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
 
 
-def test_round_draws_its_start_and_all_steps_but_the_last(onnx_camdm):
+def test_round_draws_its_start_and_all_steps_but_the_last():
     network, shape = lively(small()), (2, WINDOW, CHANNELS)
     condition = torch_camdm.torch_condition(make_condition())
     run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, "ddpm")
@@ -157,12 +149,6 @@ def test_round_draws_its_start_and_all_steps_but_the_last(onnx_camdm):
     steps = torch.cat([steps, torch.full((1, *shape), torch.nan)])
     torch.testing.assert_close(run(condition, noise=noise, step_noise=steps), drawn)
     assert float((run(condition, seeded(2)) - drawn).abs().max()) > 1e-3
-    condition = Condition(*map(np.asarray, make_condition()))
-    run = onnx_camdm.onnx_round(network, SIGMAS, "ddpm")
-    drawn, rng = run(condition, np.random.default_rng(1)), np.random.default_rng(1)
-    noise, *steps = (rng.standard_normal(shape, np.float32) for _ in range(4))
-    steps = np.stack([*steps, np.full(shape, np.nan, np.float32)])
-    np.testing.assert_array_equal(run(condition, noise=noise, step_noise=steps), drawn)
 
 
 def test_given_arrays_stay_as_they_are():
@@ -176,7 +162,7 @@ def test_given_arrays_stay_as_they_are():
     torch.testing.assert_close(run(given, noise=noise, step_noise=step_noise), once)
     context = module.encode(given)
     before = context.clone()
-    module(noise, 1.0, context)
+    module.denoise(noise, module.noise_tokens(torch.ones(2, module.config.latent_width)), context)
     for now, then in ((noise, first[0]), (step_noise, first[1]), (context, before)):
         assert torch.equal(now, then)
     for now, then in zip(given, condition, strict=True):
@@ -214,9 +200,9 @@ def eager_compiler(monkeypatch):
 
 def test_compiled_round_takes_more_batch_sizes_than_pytorch_may_allow(eager_compiler):
     module = torch_camdm.torch_camdm(lively(tiny_camdm()))
-    quick = torch_camdm.torch_round(module, SIGMAS, compiled=True)
     plain = torch_camdm.torch_round(module, SIGMAS)
     with torch._dynamo.config.patch(recompile_limit=1):
+        quick = torch_camdm.torch_round(module, SIGMAS, runtime="compiled")
         for batch in (1, 2, 3):
             condition = torch_camdm.torch_condition(make_condition(batch))
             found, expected = (run(condition, torch.Generator().manual_seed(batch)) for run in (quick, plain))
@@ -229,9 +215,10 @@ def test_compiler_that_fails_says_why(monkeypatch):
 
     torch._dynamo.reset()
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=refuse))
-    run = torch_camdm.torch_round(torch_camdm.torch_camdm(lively(small())), SIGMAS, compiled=True)
-    with pytest.raises(RuntimeError, match=r"torch.compile does not work here: .*no C\+\+ compi"):
-        run(torch_camdm.torch_condition(make_condition()))
+    task = implementations.Task("CAMDM", small(), 1, 2)
+    with pytest.raises(implementations.NotPossible, match=r"there is no C\+\+ compiler") as caught:
+        implementations.prepare_round("PyTorch, compiled", task)
+    assert "debug" not in str(caught.value).lower()
 
 
 @pytest.mark.slow
@@ -239,93 +226,55 @@ def test_compiler_that_fails_says_why(monkeypatch):
 def test_compiled_code_gives_the_numbers_of_jax():
     network, condition = lively(small()), make_condition()
     noise, step_noise = given_noise(2, 4, network.config)
-    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, compiled=True)
+    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, runtime="compiled")
     found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
     expected = jax_round(network, condition, SIGMAS, "ddpm")
     np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
 
 
-def test_number_of_threads_is_lent_and_given_back(monkeypatch):
-    before, seen = torch.get_num_threads(), []
-    monkeypatch.setattr(torch_camdm, "usable_cores", lambda: 5)
-    with torch_camdm.torch_threads() as threads:
-        assert threads == torch.get_num_threads() == 5
-        with pytest.raises(RuntimeError, match="halt"), torch_camdm.torch_threads(1):
-            assert torch.get_num_threads() == 1
-            raise RuntimeError("halt")
-        assert torch.get_num_threads() == 5
-    module = torch_camdm.torch_camdm(lively(small()))
-    denoise = module.denoise
-    monkeypatch.setattr(module, "denoise", lambda *given: seen.append(torch.get_num_threads()) or denoise(*given))
-    for threads, expected in ((None, 5), (3, 3)):
-        run = torch_camdm.torch_round(module, SIGMAS[-2:], threads=threads)
-        run(torch_camdm.torch_condition(make_condition()))
-        assert seen.pop() == expected and not seen
-        assert torch.get_num_threads() == before
-
-
-@pytest.mark.parametrize("products", torch_camdm.PRODUCTS)
-def test_probe_multiplies_and_counts(products, monkeypatch):
-    multiply, operations = torch_camdm.torch_matmul_probe(48, products=products, threads=1)
+def test_probe_multiplies_and_counts():
+    multiply, operations = torch_camdm.torch_matmul_probe(48)
     matrix = torch.randn(48, 48, generator=torch.Generator().manual_seed(0)).numpy()
     np.testing.assert_allclose(multiply().numpy(), matrix @ matrix, atol=1e-4)
     assert operations == 2 * 48**3
 
-    def two_seconds(candidates, *, min_rounds):
-        (name,) = candidates
-        candidates[name]()
-        return {name: Timing(2.0, 1.0, 9.0, min_rounds, 9.0)}
 
-    monkeypatch.setattr(torch_camdm, "take_turns", two_seconds)
-    peak = torch_camdm.torch_matmul_peak(1, 48, products=products)
-    assert peak == pytest.approx(2 * 48**3 / 2.0 / 1e9)
+def test_pytorch_computes_on_all_cores_that_it_may_use(monkeypatch):
+    monkeypatch.setattr(torch_camdm, "usable_cores", lambda: 3)
+    torch_camdm.torch_camdm(lively(small()))
+    assert torch.get_num_threads() == 3
 
 
-def test_bad_input_is_refused(onnx_camdm):
+def test_bad_input_is_refused():
     network, stranger = lively(small()), network_of(tiny_config())
     module = torch_camdm.torch_camdm(network)
     make, prepare = torch_camdm.torch_camdm, torch_camdm.torch_round
     for call, message in {
-        lambda: make(stranger): "only CAMDM has a form in PyTorch, got a F3AMD",
+        lambda: make(stranger): "only CAMDM",
         lambda: make(network, products="onedn"): "did you mean 'onednn'",
         lambda: prepare(module, SIGMAS, "ddmp"): "unknown sampler 'ddmp'.*'ddpm'",
+        lambda: prepare(module, SIGMAS, runtime="onx"): "unknown runtime 'onx'.*'onnx'",
         lambda: prepare(module, SIGMAS[:1]): r"at least one step, got shape \(1,\)",
-        lambda: prepare(module, SIGMAS, threads=0): "at least 1 thread, got threads=0",
-        lambda: prepare(make(network, products="onednn"), SIGMAS, compiled=True): "'blas'",
-        lambda: torch_camdm.torch_matmul_probe(0): "size must be at least 1, got 0",
-        lambda: torch_camdm.torch_matmul_probe(products="mkl"): "unknown products 'mkl'",
-        lambda: onnx_camdm.onnx_denoiser(stranger): "only CAMDM has an ONNX form",
-        lambda: onnx_camdm.onnx_encoder(stranger): "only CAMDM has an ONNX form",
-        lambda: onnx_camdm.onnx_round(stranger, SIGMAS): "only CAMDM has an ONNX form",
-        lambda: onnx_camdm.onnx_round(network, SIGMAS, "heun"): "unknown sampler 'heun'",
-        lambda: onnx_camdm.onnx_round(network, SIGMAS, threads=0): "at least 1 thread, got",
     }.items():
         with pytest.raises(ValueError, match=message):
             call()
 
 
-def test_wrong_shapes_are_refused_by_name(onnx_camdm):
+def test_wrong_shapes_are_refused_by_name():
     network = lively(small())
     module, condition = torch_camdm.torch_camdm(network), make_condition()
     given = torch_camdm.torch_condition(condition)
-    with pytest.raises(ValueError, match=rf"\[B, {WINDOW}, {CHANNELS}\]"):
-        module(torch.zeros(2, WINDOW + 1, CHANNELS), 1.0, module.encode(given))
-    arrays = Condition(*map(np.asarray, condition))
-    runs = (
-        (torch_camdm.torch_round(module, SIGMAS), given, torch.zeros),
-        (onnx_camdm.onnx_round(network, SIGMAS), arrays, np.zeros),
-    )
-    for (run, fitting, zeros), name in itertools.product(runs, ("noise", "step_noise")):
+    run = torch_camdm.torch_round(module, SIGMAS)
+    for name in ("noise", "step_noise"):
         with pytest.raises(ValueError, match=f"^{name} must have shape"):
-            run(fitting, **{name: zeros((2, WINDOW, CHANNELS + 1))})
-        with pytest.raises(ValueError, match="condition path must have shape"):
-            run(fitting._replace(path=fitting.path[..., :7]))
+            run(given, **{name: torch.zeros((2, WINDOW, CHANNELS + 1))})
+    with pytest.raises(ValueError, match="condition path must have shape"):
+        run(given._replace(path=given.path[..., :7]))
 
 
-@pytest.mark.parametrize(("missing", "module"), [("torch", "torch_camdm"), ("onnxruntime", "onnx_camdm")])
-def test_what_is_not_installed_is_named_with_its_extra(missing, module, monkeypatch):
-    name = f"f3amd_lib.benchmarking.{module}"
-    monkeypatch.setitem(sys.modules, missing, None)
+def test_what_is_not_installed_is_named_with_its_extra(monkeypatch):
+    name = "f3amd_lib.benchmarking.torch_camdm"
+    monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError, match=r'pip install "f3amd_lib\[bench\]"'):
         importlib.import_module(name)

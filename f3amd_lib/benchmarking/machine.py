@@ -39,6 +39,12 @@ def device_name() -> str:
     return {"cuda": "GPU", "rocm": "GPU"}.get(jax.devices()[0].platform, jax.devices()[0].platform.upper())
 
 
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def _processor() -> str:
     """Return the processor's name, which `platform.processor` leaves out on Linux."""
     try:
@@ -74,7 +80,7 @@ def describe_machine() -> dict:
     clock = psutil.cpu_freq()
     return {
         "processor": _processor(),
-        "cores": len(psutil.Process().cpu_affinity()) if sys.platform == "linux" else os.cpu_count(),
+        "cores": usable_cores(),
         "physical_cores": psutil.cpu_count(logical=False),
         "clock_mhz": round(clock.current) if clock and clock.current else None,
         "clock_max_mhz": round(clock.max) if clock and clock.max else None,
@@ -123,10 +129,7 @@ def fast_xla_flags(num_devices: int | None = None) -> str:
     Args:
       num_devices: CPU devices that JAX shall see; by default one for each core.
     """
-    if num_devices is None:
-        affinity = getattr(os, "sched_getaffinity", None)
-        num_devices = len(affinity(0)) if affinity else os.cpu_count() or 1
-    flags = f"--xla_force_host_platform_device_count={num_devices}"
+    flags = f"--xla_force_host_platform_device_count={num_devices or usable_cores()}"
     for flag in _FAST_FLAGS:
         tried = subprocess.run(
             [sys.executable, "-c", "import jax; jax.devices()"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,12 +11,12 @@ import jax
 import pandas as pd
 from tqdm import tqdm
 
+from f3amd_lib.benchmarking.implementations import Task
 from f3amd_lib.benchmarking.machine import describe_machine, device_name
-from f3amd_lib.benchmarking.parts import time_parts
-from f3amd_lib.benchmarking.speed_tables import fastest_ways
-from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
+from f3amd_lib.benchmarking.speed_tables import fastest_implementations
+from f3amd_lib.benchmarking.synthesis import CANDIDATE_COLUMNS, Candidate, check_suites, plan, time_group
+from f3amd_lib.benchmarking.time_breakdown import time_breakdown
 from f3amd_lib.benchmarking.timing import take_turns
-from f3amd_lib.benchmarking.ways import Task
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
 from f3amd_lib.networks import zoo
@@ -34,15 +35,8 @@ _FEWEST_ROUNDS = 3
 """For the slowest rounds, half a minute each."""
 
 _TRAINED = ("F3AMD-FNO-96", "F3AMD-Transformer-64", "CAMDM", "F3AMD-FNO-32", "F3AMD-FNO-128")
-_CANDIDATE = {
-    "model": "model", "steps": "steps", "way": "way", "window_frames": "window",
-    "characters": "characters", "precision": "precision",
-}  # fmt: skip
-"""Columns of a row -> attributes of the `Candidate` that it is about."""
-
-_BATCH = {"smoke": 8, "laptop": 64, "gpu": 512}
-_TRAINING_STEPS = {"smoke": (4, 2), "laptop": (200, 10), "gpu": (200, 20)}
-"""Steps to time, and steps in one program."""
+_TRAINING = {"smoke": (4, 2, 8), "laptop": (200, 10, 64), "gpu": (200, 20, 512)}
+"""Training steps to time, steps in one program, windows in a batch."""
 
 
 def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra) -> dict:
@@ -76,50 +70,47 @@ def measure_synthesis_time(
     characters: Iterable[int] | None = None,
     again: bool = False,
 ) -> Path:
-    """Time rounds of the family in every way there is (see `benchmarking.synthesis`).
+    """Time rounds of the family in every implementation there is (see `benchmarking.synthesis`).
 
     Args:
       prepared: its channels and styles are the networks'.
       profile: names the results' folder and, without `suites`, what is timed.
-      suites: keys of `synthesis.SUITES`.
+      suites: keys of `synthesis.suites`.
       characters: time groups of these numbers of characters only.
       again: time groups anew that an earlier run with the same settings has timed.
 
     Returns:
-      The table `records/synthesis_time.csv`, the fastest way of each framework. Beside it lies
-      `synthesis_ways.csv` with every way; it is written after every group, so that a stopped run
+      The table `records/synthesis_time.csv`, the fastest implementation of each framework. Beside it
+      lies `synthesis_ways.csv` with every one; it is written after every group, so that a stopped run
       goes on where it was.
 
     Raises:
       ValueError: for an unknown suite.
     """
-    suites = list(suites) if suites else DEFAULT_SUITES[profile.name]
+    suites = check_suites(suites or DEFAULT_SUITES[profile.name])
     wanted = None if characters is None else set(characters)
-    todo = [
-        (suite, *group)
-        for suite in suites
-        for group in plan(suite).items()
-        if wanted is None or group[1][0].characters in wanted
-    ]
     folder = results_dir(profile.dataset, profile.name) / "records"
     turns = {"fewest_rounds": _FEWEST_ROUNDS, **_TURNS.get(profile.name, {})}
     path = folder / "synthesis_ways.csv"
     record = _record(prepared, profile, "synthesis_time", turns=turns)
     kept = kept_rows(path, record)
     failed = {} if kept is None else read_table(path)[1].get("not_possible", {})
+    keys = ["suite", *CANDIDATE_COLUMNS]
+    done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
 
-    def is_known(suite: str, candidate: Candidate) -> bool:
-        if again or kept is None:
-            return False
-        told = [suite, *(getattr(candidate, name) for name in _CANDIDATE.values())]
-        here = (kept[["suite", *_CANDIDATE]] == told).all(axis=1)
-        return str(candidate) in failed or bool(here.any())
+    def is_done(suite: str, candidate: Candidate) -> bool:
+        return (suite, *dataclasses.astuple(candidate)) in done or (str(candidate) in failed and not again)
 
+    todo = [
+        (suite, candidates)
+        for suite in suites
+        for candidates in plan(suite).values()
+        if wanted is None or candidates[0].characters in wanted
+        if not all(is_done(suite, candidate) for candidate in candidates)
+    ]
     with tqdm(todo, unit="group") as bar:
-        for suite, group, candidates in bar:
-            bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *group))
-            if all(is_known(suite, candidate) for candidate in candidates):
-                continue
+        for suite, candidates in bar:
+            bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *candidates[0].group))
             circumstances = _circumstances()
             rows, not_possible = time_group(
                 candidates, lambda model, window: prepared.model_config(model, window=window), progress=True, **turns
@@ -129,18 +120,16 @@ def measure_synthesis_time(
             failed |= not_possible
             if rows.empty:
                 continue
-            rows = rows.assign(suite=suite, **circumstances)
             # New rows replace those of the same suite and candidates.
-            kept = rows if kept is None else pd.concat([kept, rows])
-            kept = kept.drop_duplicates(["suite", *_CANDIDATE], keep="last")
+            kept = pd.concat([kept, rows.assign(suite=suite, **circumstances)]).drop_duplicates(keys, keep="last")
             record |= {"not_possible": failed}
             write_table(path, kept, record)
-            write_table(folder / "synthesis_time.csv", fastest_ways(kept), record)
+            write_table(folder / "synthesis_time.csv", fastest_implementations(kept), record)
     return folder / "synthesis_time.csv"
 
 
 def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterable[int] = (1, 32)) -> Path:
-    """Time F3AMD-FNO-96 with 1 step whole and without each of its parts (see `parts`).
+    """Time F3AMD-FNO-96 with 1 step whole and without each of its parts (see `time_breakdown`).
 
     Args:
       prepared: its channels and styles are the network's.
@@ -151,12 +140,9 @@ def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterab
       The table `records/round_parts.csv`.
     """
     model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
-    config = prepared.model_config(model)
-    rows = [time_parts(Task(model, config, 1, characters), progress=True, **turns) for characters in counts]
-    path = results_dir(profile.dataset, profile.name) / "records" / "round_parts.csv"
-    record = _record(prepared, profile, "round_parts", **_circumstances())
-    write_table(path, pd.concat(rows), record)
-    return path
+    tasks = [Task(model, prepared.model_config(model), 1, characters) for characters in counts]
+    table = pd.concat(time_breakdown(task, progress=True, **turns) for task in tasks)
+    return _write(prepared, profile, "round_parts", table)
 
 
 def measure_training_time(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -172,8 +158,7 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
       and peak_memory_mib as the compiler plans it.
     """
     names = [zoo.find_preset(name).name for name in models or _TRAINED]
-    steps, chunk = _TRAINING_STEPS[profile.name]
-    batch_size = _BATCH[profile.name]
+    steps, chunk, batch_size = _TRAINING[profile.name]
     calls, memory = {}, {}
     for name in tqdm(names, unit="compiled"):
         recipe = short_recipe(name, num_steps=steps, batch_size=batch_size, seed=profile.seed)
@@ -188,10 +173,7 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
             "window_frames": prepared.window,
             "device": device_name(),
             "batch_size": batch_size,
-            "unit": "s/step",
-            "value": timing.median / chunk,
-            "low": timing.low / chunk,
-            "high": timing.high / chunk,
+            **timing.columns("s/step", 1.0 / chunk),
             "steps_timed": timing.rounds * chunk,
             "compile_seconds": round(timing.first, 1),
             "epoch_windows": windows,
@@ -200,9 +182,13 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
         }
         for name, timing in timings.items()
     ]
-    path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
-    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk, **_circumstances())
-    write_table(path, pd.DataFrame(rows), record)
+    return _write(prepared, profile, "training_time", pd.DataFrame(rows), steps=steps, chunk=chunk)
+
+
+def _write(prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, **extra) -> Path:
+    """Write a table of times with its record, and return its path."""
+    path = results_dir(profile.dataset, profile.name) / "records" / f"{name}.csv"
+    write_table(path, table, _record(prepared, profile, name, **extra, **_circumstances()))
     return path
 
 

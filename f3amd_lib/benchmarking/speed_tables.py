@@ -2,101 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
 
 import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.papers import load_paper_table
 
-_FAST = ("jit", "jit, all devices", "IREE")
+_OURS = ("jit", "jit, all devices", "IREE")
 _TORCH = ("PyTorch", "PyTorch, oneDNN", "PyTorch, compiled")
+_ONE, _EIGHT = ("F3AMD-FNO-96", 1, _OURS), ("F3AMD-FNO-96", 8, _OURS)
+_CAMDM, _CAMDM_TORCH = ("CAMDM", 8, _OURS), ("CAMDM", 8, _TORCH)
+_SHARE = "share of the matrix product's speed"
+
+_BARS = (
+    (f"FNO-96, 1 step: {_SHARE}", 32, ">=", 0.65, _ONE),
+    (f"FNO-96, 8 steps: {_SHARE}", 32, ">=", 0.65, _EIGHT),
+    (f"CAMDM, 8 steps: {_SHARE}", 32, ">=", 0.65, _CAMDM),
+    (f"CAMDM, 8 steps, PyTorch: {_SHARE}", 32, ">=", 0.6, _CAMDM_TORCH),
+    ("time of CAMDM, 8 steps, over FNO-96, 1 step", 32, ">=", 55, _CAMDM, _ONE),
+    ("time of CAMDM, 8 steps, over FNO-96, 8 steps", 32, ">=", 7, _CAMDM, _EIGHT),
+    ("time of CAMDM in PyTorch, 8 steps, over FNO-96, 1 step", 32, "reported", None, _CAMDM_TORCH, _ONE),
+    ("time of FNO-96, 1 step, over its plain form under jit", 1, "<=", 0.35, _ONE, ("F3AMD-FNO-96", 1, ("jit, FFT",))),
+)
+"""What, characters, what is asked, and (model, steps, implementations) of one system or of two."""
 
 
-def _best(table: pd.DataFrame, model: str, steps: int, characters: int, ways) -> pd.Series | None:
-    """Return the fastest row of a model among some ways, 32 frames and float32; None if none."""
-    mine = table[
+def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, implementations) -> pd.Series | None:
+    """Return the fastest row of a system at 32 frames in float32; None if there is none."""
+    rows = table[
         (table["model"] == model)
         & (table["steps"] == steps)
         & (table["characters"] == characters)
         & (table["window_frames"] == 32)
         & (table["precision"] == "float32")
-        & table["way"].isin(ways)
+        & table["way"].isin(implementations)
     ]
-    return None if mine.empty else mine.loc[mine["value"].idxmin()]
+    return None if rows.empty else rows.loc[rows["value"].idxmin()]
 
 
-def speed_bars(ways: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
+def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
     """Compare what was measured on a CPU with what the library asks of itself.
 
     Shares are of the machine's own matrix product, timed by turns with the rounds. Each system has
-    its fastest way, in float32.
+    its fastest implementation, in float32.
 
     Args:
-      ways: the table `synthesis_ways`.
+      times: the table `synthesis_ways`.
       suite: "main" or "bars", one of both, so that all comes from the same turns.
 
     Returns:
       Columns what, characters, asked, measured, way, met ("yes", "no" or "not measured").
     """
-    ways = ways[ways["suite"] == suite]
-    one, eight, camdm = ("F3AMD-FNO-96", 1), ("F3AMD-FNO-96", 8), ("CAMDM", 8)
+    times = times[times["suite"] == suite]
     rows = []
-
-    def add(what, characters, asked, measured, way, met):
-        met = "not measured" if measured is None else "yes" if met(measured) else "no"
+    for what, characters, sign, bound, *systems in _BARS:
+        fastest = [_fastest(times, characters, *system) for system in systems]
+        measured, way, met = None, "", "not measured"
+        if all(row is not None for row in fastest):
+            way = " / ".join(row["way"] for row in fastest)
+            measured = fastest[0]["share_of_peak"]
+            if len(fastest) == 2:
+                measured = fastest[0]["value"] / fastest[1]["value"]
+            holds = {">=": operator.ge, "<=": operator.le, "reported": lambda one, other: True}[sign]
+            met = "yes" if holds(measured, bound) else "no"
+        asked = sign if bound is None else f"{sign} {bound}"
         rows.append(
-            {"what": what, "characters": characters, "asked": asked, "measured": measured,
-             "way": way, "met": met}
-        )  # fmt: skip
-
-    def share(system, label, ways_taken, least):
-        row = _best(ways, *system, 32, ways_taken)
-        found, way = (None, "") if row is None else (row["share_of_peak"], row["way"])
-        add(f"{label}: share of the matrix product's speed", 32, f">= {least}", found, way,
-            lambda value: value >= least)  # fmt: skip
-
-    def quotient(slow, fast, characters, what, asked, slow_ways, fast_ways, met):
-        first, second = (
-            _best(ways, *system, characters, chosen) for system, chosen in ((slow, slow_ways), (fast, fast_ways))
+            {"what": what, "characters": characters, "asked": asked, "measured": measured, "way": way, "met": met}
         )
-        if first is None or second is None:
-            add(what, characters, asked, None, "", met)
-            return
-        way = f"{first['way']} / {second['way']}"
-        add(what, characters, asked, first["value"] / second["value"], way, met)
-
-    share(one, "FNO-96, 1 step", _FAST, 0.65)
-    share(eight, "FNO-96, 8 steps", _FAST, 0.65)
-    share(camdm, "CAMDM, 8 steps", _FAST, 0.65)
-    share(camdm, "CAMDM, 8 steps, PyTorch", _TORCH, 0.6)
-    for fast, label, least in ((one, "1 step", 55), (eight, "8 steps", 7)):
-        quotient(camdm, fast, 32, f"time of CAMDM, 8 steps, over FNO-96, {label}", f">= {least}",
-                 _FAST, _FAST, lambda value, least=least: value >= least)  # fmt: skip
-    quotient(camdm, one, 32, "time of CAMDM in PyTorch, 8 steps, over FNO-96, 1 step", "reported",
-             _TORCH, _FAST, lambda value: True)  # fmt: skip
-    quotient(one, one, 1, "time of FNO-96, 1 step, over its plain form under jit", "<= 0.35",
-             _FAST, ("jit, FFT",), lambda value: value <= 0.35)  # fmt: skip
     return pd.DataFrame(rows)
 
 
-def fastest_ways(table: pd.DataFrame, precision: Mapping[str, str] | None = None) -> pd.DataFrame:
-    """Keep the fastest way of each framework, for tables that have one number a cell.
+def fastest_implementations(table: pd.DataFrame) -> pd.DataFrame:
+    """Keep the fastest implementation of each framework, for tables that have one number a cell.
 
-    The plain form is left out: it is there to be compared with, not to be used.
+    Rows are those in float32 on a CPU, and on a GPU in tf32, which JAX takes by itself. The FFT form
+    is left out: it is there to be compared with, not to be used.
 
     Args:
       table: `synthesis_ways`. What several suites have timed counts as it is in the first of them,
         "main" before the others and "bars" last, so that neighbours in a table come from the same
         turns where that can be.
-      precision: device -> the precision to keep; by default float32 on a CPU, and on a GPU tf32,
-        which JAX takes by itself.
 
     Returns:
       The rows, one for each model, window, steps, framework, device and number of characters.
     """
-    precision = precision or {"CPU": "float32", "GPU": "tf32"}
-    wanted = table["device"].map(precision).fillna("float32")
+    wanted = table["device"].map({"GPU": "tf32"}).fillna("float32")
     kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
     keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
     turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
@@ -109,18 +100,18 @@ def fastest_ways(table: pd.DataFrame, precision: Mapping[str, str] | None = None
     return fastest.iloc[sorting].reset_index(drop=True)
 
 
-def speedups_by_turns(ways: pd.DataFrame) -> pd.DataFrame:
+def speedups_by_turns(times: pd.DataFrame) -> pd.DataFrame:
     """Return the speedups over CAMDM of our own rounds, both from the same turns.
 
     Args:
-      ways: `synthesis_ways`; JAX's rows count.
+      times: `synthesis_ways`; JAX's rows count.
 
     Returns:
-      As `speedups`; what two suites have timed counts once, as in `fastest_ways`.
+      As `speedups`; what two suites have timed counts once, as in `fastest_implementations`.
     """
-    suites = sorted(set(ways["suite"]), key=lambda name: (name == "bars", name != "main"))
-    mine = ways[ways["framework"] == "jax"]
-    tables = [speedups(fastest_ways(mine[mine["suite"] == suite])) for suite in suites]
+    suites = sorted(set(times["suite"]), key=lambda name: (name == "bars", name != "main"))
+    times = times[times["framework"] == "jax"]
+    tables = [speedups(fastest_implementations(times[times["suite"] == suite])) for suite in suites]
     keys = ["model", "window_frames", "steps", "device", "characters"]
     return pd.concat(tables).drop_duplicates(keys).reset_index(drop=True)
 
@@ -129,7 +120,7 @@ def times_beside_paper(table: pd.DataFrame, number: int, device: str) -> pd.Data
     """Lay our synthesis times beside a table of the paper.
 
     Args:
-      table: `synthesis_time`, the fastest way of each framework.
+      table: `synthesis_time`, the fastest implementation of each framework.
       number: of the paper's table: 1, 4 or 7.
       device: "CPU" or "GPU", for both sides. The paper's machines are others than ours.
 

@@ -31,6 +31,10 @@ class Timing:
     rounds: int
     first: float
 
+    def columns(self, unit: str, scale: float) -> dict:
+        """Return unit, value, low and high as a table has them; `scale` units are a second."""
+        return {"unit": unit, "value": scale * self.median, "low": scale * self.low, "high": scale * self.high}
+
 
 def take_turns(
     candidates: Mapping[str, Callable[[], object]],
@@ -88,13 +92,5 @@ def take_turns(
                 if enough and len(rounds) >= min(fewest_rounds, min_rounds):
                     del waiting[name]
                     bar.update()
-    return {
-        name: Timing(
-            median=float(np.median(rounds)),
-            low=float(np.quantile(rounds, 0.05)),
-            high=float(np.quantile(rounds, 0.95)),
-            rounds=len(rounds),
-            first=first[name],
-        )
-        for name, rounds in seconds.items()
-    }
+    quantiles = {name: map(float, np.quantile(rounds, (0.5, 0.05, 0.95))) for name, rounds in seconds.items()}
+    return {name: Timing(*quantiles[name], len(rounds), first[name]) for name, rounds in seconds.items()}

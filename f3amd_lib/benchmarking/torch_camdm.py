@@ -10,15 +10,12 @@ computes. PyTorch is part of the extra "bench"; nothing else in the library need
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.benchmarking.machine import usable_cores
 from f3amd_lib.diffusion.samplers import ddim_step, ddpm_step
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.networks.attention import position_code
@@ -40,41 +37,9 @@ PRODUCTS = ("blas", "onednn")
 x86 that is MKL, which need not be at its best on a processor of another make. "onednn" packs the
 kernels once and does bias, residual and GELU within the product."""
 
-ROUND_SAMPLERS = ("ddim", "ddpm")
-"""Those of `diffusion.samplers` that a round outside of JAX can walk with."""
-
 _LAYER_NORM_EPSILON = 1e-5
 _MAX_COMPILED = 64
-
-
-def usable_cores() -> int:
-    """Return how many cores this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def torch_threads(threads: int | None = None) -> Iterator[int]:
-    """Let PyTorch compute with so many threads inside a `with` block, as before after it.
-
-    Args:
-      threads: by default as many as there are usable cores.
-
-    Yields:
-      The number of threads.
-
-    Raises:
-      ValueError: for less than one thread.
-    """
-    threads = usable_cores() if threads is None else threads
-    if threads < 1:
-        raise ValueError(f"PyTorch needs at least 1 thread, got threads={threads}")
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield threads
-    finally:
-        torch.set_num_threads(before)
+_OPSET = 23  # the first with attention as one operator
 
 
 def _tensor(parameter) -> torch.Tensor:
@@ -163,7 +128,7 @@ class _Block(nn.Module):
 
 
 class TorchCAMDM(nn.Module):
-    """CAMDM in PyTorch: `encode` once a round, then called as denoiser (see `torch_camdm`).
+    """CAMDM in PyTorch: `encode` once a round, then `denoise` at each step (see `torch_camdm`).
 
     Attributes:
       config: of the JAX network.
@@ -214,7 +179,7 @@ class TorchCAMDM(nn.Module):
 
     @torch.inference_mode()
     def noise_tokens(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the tokens of noise levels, [N, D], from what `prepare_steps` tells of them."""
+        """Return the tokens of noise levels, [N, D], from their features."""
         hidden = functional.silu(self.noise_first(features), inplace=True)
         return self.noise_second(hidden).add_(self.code[0])
 
@@ -241,30 +206,11 @@ class TorchCAMDM(nn.Module):
         answered = z.view(batch, num_tokens, width)[:, -window:]
         return self.output(answered.reshape(-1, width)).view(batch, window, channels)
 
-    @torch.inference_mode()
-    def forward(self, x_noisy, sigma, context):
-        """Estimate the clean features, as the JAX network is called.
-
-        Args:
-          x_noisy: variance-exploding state, [B, T, C].
-          sigma: noise level, [B] or scalar, > 0.
-          context: from `encode`.
-
-        Returns:
-          x0_hat, [B, T, C].
-
-        Raises:
-          ValueError: if x_noisy does not fit the config.
-        """
-        self.config.check_state(x_noisy)
-        sigmas = np.broadcast_to(np.asarray(sigma, np.float32), len(x_noisy))
-        scales, features = _told(self.config, sigmas)
-        tokens = self.noise_tokens(torch.from_numpy(features))
-        return self.denoise(x_noisy * torch.from_numpy(scales)[:, None, None], tokens, context)
-
 
 def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     """Return CAMDM in PyTorch with a copy of a network's weights, float32, without dropout.
+
+    PyTorch gets as many threads as there are usable cores.
 
     Args:
       network: CAMDM of any config.
@@ -279,6 +225,7 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
         raise ValueError(f"unknown products {products!r}{nearest_hint(products, PRODUCTS)}")
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
+    torch.set_num_threads(usable_cores())
     return TorchCAMDM(network, products).eval()
 
 
@@ -288,7 +235,7 @@ def torch_condition(condition: Condition) -> Condition:
     return Condition(*(torch.from_numpy(part) for part in copied))
 
 
-def _told(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
+def tell_levels(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
     """Return c_in and the features of noise levels [N]: ([N], [N, D]), float32."""
     sigmas = np.asarray(sigmas, np.float32)
     scales = scaled_input(config, np.ones((len(sigmas), 1, 1), np.float32), sigmas)[:, 0, 0]
@@ -301,198 +248,109 @@ def _told(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
     return scales, np.array(features, np.float32)
 
 
-class Steps(NamedTuple):
-    """What a round of N steps needs to know of its noise levels, prepared once.
-
-    Attributes:
-      sampler: of `ROUND_SAMPLERS`.
-      sigmas: [N + 1], float32.
-      scales: c_in at each evaluation, [N], float32.
-      features: what the network is told of each level, [N, D], float32.
-    """
-
-    sampler: str
-    sigmas: np.ndarray
-    scales: np.ndarray
-    features: np.ndarray
+def _compiled(module: TorchCAMDM) -> Callable:
+    # Every module and batch size is a variant of the same lines of code; eight are allowed.
+    torch._dynamo.config.recompile_limit = _MAX_COMPILED
+    return torch.compile(module.denoise, fullgraph=True, dynamic=False)
 
 
-def prepare_steps(config: CAMDMConfig, sigmas, sampler: str) -> Steps:
-    """Work out what does not depend on condition, noise or weights.
+def _in_onnx(module: TorchCAMDM) -> Callable:
+    """Return the denoiser run by ONNX Runtime; PyTorch exports it at the first call of each batch size."""
+    import onnxruntime
 
-    Args:
-      config: of the network.
-      sigmas: [N + 1], falling, from a noise schedule's `grid`.
-      sampler: of `ROUND_SAMPLERS`.
+    class Denoiser(nn.Module):
+        def forward(self, x_scaled, noise_token, context):
+            return module.denoise(x_scaled, noise_token, context)
 
-    Raises:
-      ValueError: for another sampler, or sigmas that make no step.
-    """
-    if sampler not in ROUND_SAMPLERS:
-        raise ValueError(f"unknown sampler {sampler!r} outside of JAX{nearest_hint(sampler, ROUND_SAMPLERS)}")
-    sigmas = np.array(sigmas, np.float32)
-    if sigmas.ndim != 1 or len(sigmas) < 2:
-        raise ValueError(
-            f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}; "
-            "take them from a noise schedule's grid"
-        )
-    return Steps(sampler, sigmas, *_told(config, sigmas[:-1]))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = usable_cores(), 3
+    names, sessions = ["x_scaled", "noise_token", "context"], {}
 
+    def denoise(*given):
+        shapes = tuple(array.shape for array in given)
+        if shapes not in sessions:
+            with torch.inference_mode(False):
+                like = tuple(torch.zeros(shape) for shape in shapes)
+                program = torch.onnx.export(
+                    Denoiser().eval(), like, input_names=names, opset_version=_OPSET, verbose=False
+                )
+            model = program.model_proto.SerializeToString()
+            sessions[shapes] = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        fed = {name: array.numpy() for name, array in zip(names, given, strict=True)}
+        return torch.from_numpy(sessions[shapes].run(None, fed)[0])
 
-def walk(steps: Steps, denoise: Callable, shape: tuple, draw: Callable, noise, step_noise):
-    """Walk down the noise levels with arrays of any framework.
-
-    Args:
-      steps: from `prepare_steps`.
-      denoise: `denoise(x_scaled, number of the step) -> x0_hat`.
-      shape: of a state, [B, T, C].
-      draw: `draw() -> standard normal numbers` of this shape. The step to sigma = 0 asks for none.
-      noise: numbers to start from, of this shape, or None to draw them.
-      step_noise: numbers for DDPM's steps, [N, B, T, C], or None to draw them.
-
-    Returns:
-      State at sigmas[-1].
-
-    Raises:
-      ValueError: for given noise of a wrong shape.
-    """
-    _check_shape("noise", noise, shape)
-    _check_shape("step_noise", step_noise, (len(steps.scales), *shape))
-    x_noisy = steps.sigmas[0] * (draw() if noise is None else noise)
-    for number, scale in enumerate(steps.scales):
-        sigma, sigma_next = steps.sigmas[number : number + 2]
-        x0_hat = denoise(scale * x_noisy, number)
-        if sigma_next == 0.0:
-            x_noisy = x0_hat
-        elif steps.sampler == "ddim":
-            x_noisy = ddim_step(x_noisy, x0_hat, sigma, sigma_next)
-        else:
-            fresh = draw() if step_noise is None else step_noise[number]
-            x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
-    return x_noisy
+    return denoise
 
 
-def _check_shape(name: str, given, shape: tuple) -> None:
-    if given is not None and tuple(given.shape) != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {tuple(given.shape)}")
-
-
-def _compiled(function):
-    """Return a function compiled by `torch.compile`; its first call compiles or says why not."""
-    fast = torch.compile(function, fullgraph=True, dynamic=False)
-    known = set()
-
-    def run(*arguments):
-        shape = arguments[0].shape
-        if shape in known:
-            return fast(*arguments)
-        try:
-            # Every module and batch size is a variant of the same lines of code; eight are allowed.
-            with torch._dynamo.config.patch(recompile_limit=_MAX_COMPILED):
-                answer = fast(*arguments)
-        except Exception as error:
-            # The first line may only tell who spoke; advice on debugging comes after the second.
-            told = [line for line in str(error).splitlines() if line.strip()][:2]
-            raise RuntimeError(f"torch.compile does not work here: {type(error).__name__}: {' '.join(told)}") from error
-        known.add(shape)
-        return answer
-
-    return run
+RUNTIMES = {"eager": lambda module: module.denoise, "compiled": _compiled, "onnx": _in_onnx}
+"""Name -> function that makes a module's denoiser ready."""
 
 
 def torch_round(
-    module: TorchCAMDM, sigmas, sampler: str = "ddpm", *, compiled: bool = False, threads: int | None = None
+    module: TorchCAMDM, sigmas, sampler: str = "ddpm", *, runtime: str = "eager"
 ) -> Callable[..., torch.Tensor]:
     """Make a round ready: noise, one encoding and the walk, as `generation.rounds.sample_round`.
 
     Args:
       module: from `torch_camdm`.
       sigmas: [N + 1], falling, from a noise schedule's `grid`.
-      sampler: of `ROUND_SAMPLERS`.
-      compiled: by `torch.compile`, which needs a C++ compiler. Each batch size compiles at its
-        first call.
-      threads: of PyTorch during a call; by default as many as there are usable cores. After a call
-        PyTorch has as many as before.
+      sampler: "ddim" or "ddpm".
+      runtime: of the denoiser: "eager"; "compiled" by `torch.compile`, which needs a C++ compiler
+        and compiles at the first call of each batch size; "onnx", exported to ONNX and run by ONNX
+        Runtime, while the condition is encoded by PyTorch.
 
     Returns:
       `run(condition, generator=None, *, noise=None, step_noise=None) -> [B, T, C]`. The condition
       is one of `torch_condition`; the generator is PyTorch's. In place of drawn numbers `noise`
       [B, T, C] starts the walk and `step_noise` [N, B, T, C] is added by DDPM's steps. It raises
-      ValueError for shapes that do not fit, and RuntimeError where `torch.compile` does not work,
-      with the reason.
+      ValueError for shapes that do not fit, and RuntimeError where `torch.compile` does not work.
 
     Raises:
-      ValueError: for an unknown sampler, sigmas that make no step, less than one thread, or a
-        module with products of oneDNN to be compiled: compiled code chooses its own.
+      ImportError: if ONNX Runtime is asked for and not installed.
+      ValueError: for an unknown sampler or runtime, or sigmas that make no step.
     """
-    if compiled and module.products != "blas":
-        raise ValueError(
-            f"torch.compile chooses its products itself, got a module with {module.products!r}: "
-            "make one with products='blas'"
-        )
-    config, steps = module.config, prepare_steps(module.config, sigmas, sampler)
-    features = torch.from_numpy(steps.features)
-    with torch_threads(threads) as threads:
-        denoise = _compiled(module.denoise) if compiled else module.denoise
+    for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
+        if given not in known:
+            raise ValueError(f"unknown {what} {given!r} of PyTorch{nearest_hint(given, known)}")
+    config, sigmas = module.config, np.array(sigmas, np.float32)
+    if sigmas.ndim != 1 or len(sigmas) < 2:
+        raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")
+    scales, features = tell_levels(config, sigmas[:-1])
+    denoise = RUNTIMES[runtime](module)
 
     @torch.inference_mode()
     def run(condition, generator=None, *, noise=None, step_noise=None):
         shape = (len(condition.history), config.window, config.channels)
+        for name, given, wanted in (("noise", noise, shape), ("step_noise", step_noise, (len(scales), *shape))):
+            if given is not None and given.shape != wanted:
+                raise ValueError(f"{name} must have shape {wanted}, got {tuple(given.shape)}")
         draw = lambda: torch.randn(shape, generator=generator)
-        with torch_threads(threads):
-            context, tokens = module.encode(condition), module.noise_tokens(features)
-            step = lambda x_scaled, number: denoise(x_scaled, tokens[number, None], context)
-            return walk(steps, step, shape, draw, noise, step_noise)
+        context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features))
+        x_noisy = sigmas[0] * (draw() if noise is None else noise)
+        for number, scale in enumerate(scales):
+            sigma, sigma_next = sigmas[number : number + 2]
+            x0_hat = denoise(scale * x_noisy, tokens[number, None], context)
+            if sigma_next == 0.0:
+                x_noisy = x0_hat
+            elif sampler == "ddim":
+                x_noisy = ddim_step(x_noisy, x0_hat, sigma, sigma_next)
+            else:
+                fresh = draw() if step_noise is None else step_noise[number]
+                x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
+        return x_noisy
 
     return run
 
 
-def torch_matmul_probe(
-    size: int = 2048, *, products: str = "blas", threads: int | None = None
-) -> tuple[Callable[[], object], int]:
-    """Return a product of two square matrices to time: what PyTorch can do here at best.
+def torch_matmul_probe(size: int = 2048) -> tuple[Callable[[], object], int]:
+    """Return a product of two square matrices to time, by BLAS: what PyTorch can do here at best.
 
     Args:
       size: rows of a matrix.
-      products: of `PRODUCTS`.
-      threads: by default as many as there are usable cores.
 
     Returns:
       (function that multiplies, its operations 2 size^3).
-
-    Raises:
-      ValueError: for a size or threads below 1, or unknown products.
     """
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
-    if products not in PRODUCTS:
-        raise ValueError(f"unknown products {products!r}{nearest_hint(products, PRODUCTS)}")
-    generator = torch.Generator().manual_seed(0)
-    matrix = torch.randn(size, size, generator=generator)
-    layer = _PackedLinear(matrix, torch.zeros(size)) if products == "onednn" else None
-    with torch_threads(threads) as threads:
-        pass
-
-    @torch.inference_mode()
-    def multiply():
-        with torch_threads(threads):
-            return torch.mm(matrix, matrix) if layer is None else layer(matrix)
-
-    return multiply, 2 * size**3
-
-
-def torch_matmul_peak(
-    threads: int | None = None, size: int = 2048, *, products: str = "blas", rounds: int = 20
-) -> float:
-    """Measure PyTorch's own float32 matrix products, in GFLOP/s.
-
-    Args:
-      threads, size, products: as for `torch_matmul_probe`.
-      rounds: how often to multiply; the median counts.
-
-    Raises:
-      ValueError: for a size, threads or rounds below 1, or unknown products.
-    """
-    multiply, operations = torch_matmul_probe(size, products=products, threads=threads)
-    timing = take_turns({"product": multiply}, min_rounds=rounds)["product"]
-    return operations / timing.median / 1e9
+    torch.set_num_threads(usable_cores())
+    matrix = torch.randn(size, size, generator=torch.Generator().manual_seed(0))
+    return lambda: torch.mm(matrix, matrix), 2 * size**3

@@ -1,4 +1,4 @@
-"""Measure what takes too long for a notebook: `python -m f3amd_lib.experiments.measure learning`.
+"""Measure what takes too long for a notebook: `f3amd measure learning`.
 
 A measurement writes a tidy table with its run record under `<results>/records/`, after every row,
 so that a run that was stopped goes on where it was (see `runner`). Notebooks only read these tables.
@@ -14,10 +14,8 @@ Each returns the path of its table.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -43,15 +41,14 @@ from f3amd_lib.experiments.real_clips import reference_clips, style_floor
 from f3amd_lib.experiments.recipes import RECIPE_STEPS, RECIPES, train_recipe
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.profiles import DATASETS, PROFILES, Profile, load_profile, results_dir, runs_dir
+from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import zoo
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
-from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model, prepare
+from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 
 log = logging.getLogger("f3amd")
 
@@ -91,7 +88,7 @@ def _models_with_weights(profile: Profile) -> list[str]:
     if not names:
         raise ValueError(
             f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one "
-            f"(`python -m f3amd_lib train --data {profile.dataset} --profile {profile.name}`) or "
+            f"(`f3amd train --data {profile.dataset} --profile {profile.name}`) or "
             "name one with --model"
         )
     return names
@@ -459,43 +456,3 @@ MEASUREMENTS: dict[str, Callable] = {
     "sensitivity": measure_sensitivity,
 }
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; see the module's first lines.
-
-    Args:
-      arguments: words after the program's name; those of the process by default.
-
-    Returns:
-      Exit status: 0 if all was measured, 2 for a name that does not exist.
-    """
-    parser = argparse.ArgumentParser(
-        prog="python -m f3amd_lib.experiments.measure",
-        description="Measure what notebooks only draw; tables go to <results>/records/.",
-    )
-    parser.add_argument("names", nargs="*", metavar="MEASUREMENT", help=f"{', '.join(MEASUREMENTS)}; all if none")
-    parser.add_argument("--data", default="synthetic", help=", ".join(DATASETS))
-    parser.add_argument("--profile", default="laptop", help=", ".join(PROFILES))
-    parser.add_argument("--source", help="folder or archive of the data set, where it needs one")
-    parser.add_argument("--model", action="append", default=[], metavar="NAME", help="this preset; repeatable")
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    try:
-        profile = load_profile(options.profile, options.data)
-        for name in options.names:
-            if name not in MEASUREMENTS:
-                raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
-        models = [zoo.find_preset(name).name for name in options.model] or None
-        prepared = prepare(profile, path=options.source)
-        for name in options.names or MEASUREMENTS:
-            path = MEASUREMENTS[name](prepared, profile, models)
-            log.info("%-12s %s", name, path)
-    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
-        log.error("Stopped: %s", error)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -62,6 +62,7 @@ class Artefact:
       runtime: "iree" or "jax".
       styles: style names in the order of the one-hot vector; empty if it was not exported from a
         trained model.
+      input_shapes: shape of every input by name, in the order of a call.
     """
 
     def __init__(self, manifest: dict, runtime: str, program: _Program, features: dict | None):
@@ -70,12 +71,7 @@ class Artefact:
         self.styles: tuple[str, ...] = tuple(features["styles"]) if features else ()
         self._features = features
         self._program = program
-        self._shapes = {item["name"]: tuple(item["shape"]) for item in manifest["inputs"]}
-
-    @property
-    def input_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every input by name, in the order of a call."""
-        return dict(self._shapes)
+        self.input_shapes = {item["name"]: tuple(item["shape"]) for item in manifest["inputs"]}
 
     def put(self, array) -> OnDevice:
         """Move an array to the runtime's device as float32, so that calls need not copy it.
@@ -109,18 +105,16 @@ class Artefact:
         Raises:
           ValueError: for a wrong shape, or step noise where none is wanted or the other way round.
         """
-        given = (history, path, style, noise)
-        given += () if step_noise is None else (step_noise,)
-        if len(given) != len(self._shapes):
+        given = [history, path, style, noise] + ([] if step_noise is None else [step_noise])
+        if len(given) != len(self.input_shapes):
             wanted = "needs" if step_noise is None else "takes no"
             raise ValueError(f"this artefact samples with {self.manifest['sampler']!r} and {wanted} step_noise")
         values = []
-        for (name, shape), item in zip(self._shapes.items(), given, strict=True):
-            if type(item) is not OnDevice:
-                item = np.asarray(item)
-            if item.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {item.shape}")
-            values.append(item.value if type(item) is OnDevice else self.put(item).value)
+        for (name, shape), item in zip(self.input_shapes.items(), given, strict=True):
+            placed = item if isinstance(item, OnDevice) else self.put(item)
+            if placed.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {placed.shape}")
+            values.append(placed.value)
         return self._program.run(*values)
 
     def normalise(self, features) -> np.ndarray:
@@ -154,13 +148,8 @@ class Artefact:
 
     def _scales(self) -> dict[str, np.ndarray]:
         if self._features is None:
-            raise ValueError(
-                f"this artefact of {self.manifest['model']} holds neither the scales of its "
-                "features nor style names: it was exported from a bare network, not from a trained "
-                "model"
-            )
-        scales = self._features["normaliser"]
-        return {name: np.asarray(value, np.float32) for name, value in scales.items()}
+            raise ValueError("no scales of features nor style names here: exported from a bare network")
+        return {name: np.asarray(value, np.float32) for name, value in self._features["normaliser"].items()}
 
 
 def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu", driver: str | None = None) -> Artefact:
@@ -183,13 +172,8 @@ def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu", dr
     if runtime not in RUNTIMES:
         raise ValueError(f"unknown runtime {runtime!r} (one of {', '.join(RUNTIMES)})")
     manifest = read_manifest(folder)
-    features = None
-    if FEATURES in manifest["files"]:
-        features = json.loads(_read(folder, FEATURES, manifest))
-    if runtime == "jax":
-        program = _load_jax(folder, manifest)
-    else:
-        program = _load_iree(folder, manifest, target, driver)
+    features = json.loads(_read(folder, FEATURES, manifest)) if FEATURES in manifest["files"] else None
+    program = _load_jax(folder, manifest) if runtime == "jax" else _load_iree(folder, manifest, target, driver)
     return Artefact(manifest, runtime, program, features)
 
 
@@ -222,16 +206,11 @@ def manifest_digest(manifest: dict) -> str:
 
 def _read(folder: Path, name: str, manifest: dict) -> bytes:
     """Return a file of an artefact; ValueError unless it is the one that was written."""
-    path, expected = folder / name, manifest["files"][name]
+    path = folder / name
     if not path.is_file():
         raise ValueError(f"{path}: no such file, but {MANIFEST} speaks of it; restore a whole copy")
     content = path.read_bytes()
-    if len(content) != expected["bytes"]:
-        raise ValueError(
-            f"{path}: has {len(content)} bytes and should have {expected['bytes']}; it was cut "
-            "short or altered, restore a whole copy"
-        )
-    if hashlib.sha256(content).hexdigest() != expected["sha256"]:
+    if hashlib.sha256(content).hexdigest() != manifest["files"][name]["sha256"]:
         raise ValueError(f"{path}: content does not match its checksum; restore a whole copy")
     return content
 
@@ -263,32 +242,26 @@ def _load_iree(folder: Path, manifest: dict, target: str, driver: str | None) ->
         known = ", ".join(targets) or "none: compile some, or pass runtime='jax'"
         raise ValueError(f"{folder}: holds no program for target {target!r} (there are {known})")
     compiled = targets[target]
-    runtime = _import_iree(compiled["iree_version"])
-    made_by, here = compiled["iree_version"], iree_version()
-    if made_by != here:
+    made_by = compiled["iree_version"]
+    try:
+        from iree import runtime
+    except ImportError as error:
+        raise ImportError(
+            f"runtime 'iree' needs IREE's runtime ({error}): make bench-tools, or pip install \"f3amd_lib[bench]\", "
+            f"or iree-base-runtime=={made_by} alone"
+        ) from None
+    if made_by != iree_version():
         raise ValueError(
-            f"{folder}: target {target} was compiled by IREE {made_by}, and this is IREE {here}: "
+            f"{folder}: target {target} was compiled by IREE {made_by}, and this is IREE {iree_version()}: "
             f"install iree-base-runtime=={made_by}, compile it again, or pass runtime='jax'"
         )
-    _check_cpu(folder, target, compiled)
+    _check_cpu(folder, target, compiled.get("cpu"))
     content = _read(folder, compiled["file"], manifest)
     config = runtime.Config(device=_iree_device(driver or compiled["driver"]))
     module = runtime.VmModule.copy_buffer(config.vm_instance, content)
     invoke = runtime.load_vm_module(module, config)[compiled["entry"]]
     put = functools.partial(runtime.asdevicearray, config.device)
     return _Program(put, lambda *values: invoke(*values).to_host())
-
-
-def _import_iree(version: str):
-    try:
-        import iree.runtime
-    except ImportError as error:
-        raise ImportError(
-            f"runtime 'iree' needs IREE's runtime ({error}): "
-            f'make bench-tools, or pip install "f3amd_lib[bench]", or '
-            f"iree-base-runtime=={version} alone"
-        ) from None
-    return iree.runtime
 
 
 def iree_version() -> str:
@@ -314,13 +287,11 @@ def _iree_device(driver: str):
         raise ValueError(f"IREE's driver {driver!r} finds no device here: {error}") from None
 
 
-def _check_cpu(folder: Path, target: str, compiled: dict) -> None:
+def _check_cpu(folder: Path, target: str, wanted: dict | None) -> None:
     """Raise ValueError if a program uses instructions that this CPU lacks, which would kill it."""
-    wanted = compiled.get("cpu")
     if wanted is None:
         return
-    machine = platform.machine()
-    missing = sorted(set(wanted["features"]) - set(cpu_features()))
+    machine, missing = platform.machine(), sorted(set(wanted["features"]) - set(cpu_features()))
     if machine != wanted["machine"] or missing:
         lacks = f"lacks {', '.join(missing)}" if missing else f"is {machine}"
         raise ValueError(

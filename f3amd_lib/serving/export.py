@@ -16,10 +16,8 @@ import dataclasses
 import hashlib
 import importlib.util
 import json
-import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -79,18 +77,23 @@ class Target:
 # Matrices in tiles of the CPU's own size, weights packed so at compile time.
 _DATA_TILING = ("--iree-opt-data-tiling", "--iree-dispatch-creation-data-tiling")
 
-TARGETS: dict[str, Target] = {
+TARGETS = {
     "llvm-cpu": Target(
         "llvm-cpu", "local-task", ("--iree-llvmcpu-target-cpu=host", "--iree-opt-level=O3", *_DATA_TILING)
     ),
     "vmvx": Target("vmvx", "local-task"),
     "vulkan-spirv": Target("vulkan-spirv", "vulkan", ("--iree-opt-level=O3",)),
-    **{
-        f"cuda-sm_{number}": Target("cuda", "cuda", (f"--iree-cuda-target=sm_{number}", "--iree-opt-level=O3"))
-        for number in (80, 86, 89)
-    },
 }
-"""Targets by name: the CPU of this machine, IREE's portable bytecode, Vulkan, and NVIDIA GPUs."""
+"""Targets by name: the CPU of this machine, IREE's portable bytecode, Vulkan. "cuda-sm_NN" is a
+generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
+
+
+def _find_target(name: str) -> Target:
+    if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
+        return Target("cuda", "cuda", (f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"))
+    if name not in TARGETS:
+        raise ValueError(f"unknown target {name!r}{nearest_hint(name, [*TARGETS, 'cuda-sm_80'])}")
+    return TARGETS[name]
 
 
 @dataclass(frozen=True)
@@ -220,30 +223,22 @@ def _without_places(program: bytes) -> bytes:
         return stablehlo.serialize_portable_artifact(module, version)
 
 
-def _operations(program: bytes) -> set[str]:
-    """Return the names of all operations in a program."""
-    names = set()
-
-    def visit(operation):
-        names.add(operation.name)
-        return ir.WalkResult.ADVANCE
-
+def _has_loop(program: bytes) -> bool:
     with _parsed(program) as module:
-        module.operation.walk(visit)
-    return names
+        return "stablehlo.while" in module.operation.get_asm(large_elements_limit=8)
 
 
-def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
+def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, tuple[str, ...]]:
     """Compile a program with IREE.
 
     Args:
       program: a portable StableHLO artefact, such as `ExportedRound.stablehlo`.
-      target: a name of `TARGETS`, or "cuda-sm_NN" for another generation of NVIDIA GPUs, which this
+      target: a name of `TARGETS`, or "cuda-sm_NN" for a generation of NVIDIA GPUs, which this
         release of IREE may or may not know. None needs the device to be there, except that
         "llvm-cpu" compiles for the CPU that it runs on.
 
     Returns:
-      The compiled module (IREE's "vmfb").
+      (the compiled module, IREE's "vmfb"; the flags that it was compiled with).
 
     Raises:
       ImportError: if IREE's compiler is not installed, saying how to install it.
@@ -251,13 +246,8 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> bytes:
         program with a loop for a target that runs on the CPU: IREE's local-task driver was seen to
         return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
     """
-    return _compile(program, target)[0]
-
-
-def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
-    """Do the work of `compile_iree`; also return the flags that it compiled with."""
     settings = _find_target(target)
-    if settings.driver == "local-task" and "stablehlo.while" in _operations(program):
+    if settings.driver == "local-task" and _has_loop(program):
         raise ValueError(
             f"the program has a loop (stablehlo.while), and on {target} IREE's local-task driver "
             "returns NaN or garbage from such programs now and then: export it with unroll=True, "
@@ -265,10 +255,12 @@ def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
         )
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
+    # Tiles are faster, but some programs do not compile in them.
+    untiled = tuple(flag for flag in settings.flags if flag not in _DATA_TILING)
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
-        for flags in _attempts(settings.flags):
+        for flags in dict.fromkeys((settings.flags, untiled)):
             # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
             # process that holds both dies when it ends.
             command = [
@@ -283,26 +275,7 @@ def _compile(program: bytes, target: str) -> tuple[bytes, tuple[str, ...]]:
             if done.returncode == 0:
                 return compiled.read_bytes(), flags
     found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
-    raise ValueError(
-        f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}. "
-        f"Targets known to work are {', '.join(TARGETS)}"
-    )
-
-
-def _attempts(flags: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return flags to try in turn: tiles are faster, but some programs do not compile in them."""
-    plain = tuple(flag for flag in flags if flag not in _DATA_TILING)
-    return [flags] if plain == flags else [flags, plain]
-
-
-def _find_target(name: str) -> Target:
-    if name in TARGETS:
-        return TARGETS[name]
-    if re.fullmatch(r"cuda-sm_\d+a?", name):
-        like = TARGETS["cuda-sm_80"]
-        flags = tuple(flag.replace("sm_80", name.removeprefix("cuda-")) for flag in like.flags)
-        return dataclasses.replace(like, flags=flags)
-    raise ValueError(f"unknown target {name!r}{nearest_hint(name, TARGETS)}")
+    raise ValueError(f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}")
 
 
 def save_artefact(
@@ -342,17 +315,22 @@ def save_artefact(
     files = {STABLEHLO: exported.stablehlo, JAX_EXPORT: bytes(exported.exported.serialize())}
     compiled = {}
     for target in dict.fromkeys(targets):
-        file = f"round.{target}.vmfb"
-        start = time.perf_counter()
-        files[file], flags = _compile(exported.stablehlo, target)
-        compiled[target] = _describe_target(target, file, flags, time.perf_counter() - start)
-    if trained is not None:
-        features = {
-            "normaliser": {
-                part: np.asarray(values, np.float32).tolist() for part, values in trained.normaliser._asdict().items()
-            },
-            "styles": list(trained.styles),
+        file, settings, started = f"round.{target}.vmfb", _find_target(target), time.perf_counter()
+        files[file], flags = compile_iree(exported.stablehlo, target)
+        host = {"machine": platform.machine(), "features": list(cpu_features())}
+        compiled[target] = {
+            "file": file,
+            "entry": _ENTRY,
+            "driver": settings.driver,
+            "iree_version": iree_version(),
+            "flags": list(flags),
+            "compile_seconds": round(time.perf_counter() - started, 1),
+            "cpu": host if settings.backend == "llvm-cpu" else None,
         }
+    if trained is not None:
+        scales = trained.normaliser._asdict()
+        scales = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
+        features = {"normaliser": scales, "styles": list(trained.styles)}
         files[FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
     manifest = _manifest(exported, name, files, compiled, trained)
     files[MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
@@ -360,20 +338,6 @@ def save_artefact(
         for file, content in files.items():
             (temporary / file).write_bytes(content)
     return folder
-
-
-def _describe_target(target: str, file: str, flags: tuple[str, ...], seconds: float) -> dict:
-    settings = _find_target(target)
-    host = {"machine": platform.machine(), "features": list(cpu_features())}
-    return {
-        "file": file,
-        "entry": _ENTRY,
-        "driver": settings.driver,
-        "iree_version": iree_version(),
-        "flags": list(flags),
-        "compile_seconds": round(seconds, 1),
-        "cpu": host if settings.backend == "llvm-cpu" else None,
-    }
 
 
 def _manifest(
@@ -414,34 +378,24 @@ def _check_free(folder: Path, overwrite: bool) -> None:
     ours = {MANIFEST, *read_manifest(folder)["files"]}
     others = sorted({item.name for item in folder.iterdir()} - ours)
     if others:
-        raise ValueError(
-            f"{folder}: holds {others[0]}, which is no part of the artefact, and is not "
-            "overwritten; move it away or choose another name"
-        )
+        raise ValueError(f"{folder}: holds {others[0]}, which is no part of the artefact; it is not overwritten")
 
 
 @contextlib.contextmanager
 def _whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that takes the place of `folder` at the end, if the block ends well.
-
-    What was there before is deleted only once the new one has its name.
-    """
+    """Yield a temporary folder that takes the place of `folder` at the end, if the block ends well."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    earlier = folder.with_name(f".{folder.name}.{os.getpid()}.old")
-    try:
-        temporary.mkdir()
-        yield temporary
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        new, earlier = Path(temporary) / "new", Path(temporary) / "earlier"
+        new.mkdir()
+        yield new
         if folder.exists():
             folder.rename(earlier)
         try:
-            temporary.rename(folder)
+            new.rename(folder)
         except OSError:
             earlier.rename(folder)
             raise
-        shutil.rmtree(earlier, ignore_errors=True)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def export_model(
@@ -455,7 +409,7 @@ def export_model(
     targets: Iterable[str] = ("llvm-cpu",),
     overwrite: bool = False,
 ) -> Path:
-    """Export a trained model: what `python -m f3amd_lib export` does.
+    """Export a trained model: what `f3amd export` does.
 
     Args:
       trained: the model.

@@ -151,27 +151,20 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
     """
     scenes = _as_scenes(scenes)
     first = scenes[0].characters[0].motion
-    skeletons: list[Skeleton] = []
     drawn: list[_Drawn] = []
     tracks: list[bytes] = []
     described = []
     for scene in scenes:
-        characters = []
+        boundaries = _checked_boundaries(scene, first.num_frames)
+        described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
         for character in scene.characters:
-            motion = character.motion
             _check_in_step(character, first)
-            number = next((k for k, one in enumerate(skeletons) if _draws_alike(one, motion.skeleton)), None)
-            if number is None:
-                number = len(skeletons)
-                skeletons.append(motion.skeleton)
-                drawn.append(_what_is_drawn(motion.skeleton))
-            about, pieces = _encode_character(character, drawn[number])
-            characters.append({"skeleton": number, **about})
+            how = _what_is_drawn(character.motion.skeleton)
+            if how not in drawn:
+                drawn.append(how)
+            about, pieces = _encode_character(character, how)
+            described[-1]["characters"].append({"skeleton": drawn.index(how), **about})
             tracks.extend(pieces)
-        described.append(
-            {"title": scene.title, "boundaries": _checked_boundaries(scene, first.num_frames), "characters": characters}
-        )
-    packed = zlib.compress(b"".join(tracks), 9)
     data = {
         "version": 1,
         "fps": float(first.fps),
@@ -179,19 +172,19 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         "autoplay": bool(autoplay),
         "follow": all(len(scene.characters) == 1 for scene in scenes) if follow is None else follow,
         "around": _first_azimuth(first),
-        "skeletons": [one.as_dict() for one in drawn],
+        "skeletons": [dataclasses.asdict(one) | {"points": len(one.points)} for one in drawn],
         "scenes": described,
-        "tracks": base64.b64encode(packed).decode("ascii"),
+        "tracks": base64.b64encode(zlib.compress(b"".join(tracks), 9)).decode("ascii"),
     }
     named = title or ", ".join(scene.title for scene in scenes if scene.title) or "Motion"
     return string.Template(_read("player.html")).substitute(
         title=html.escape(named),
-        heading=f"<h1>{html.escape(title)}</h1>" if title else "",
+        heading=_element("h1", title),
         colors=_color_rules(),
         style=_read("player.css"),
         panels="\n".join(_panel(scene, first) for scene in scenes),
         legend=_legend(described),
-        credit=f'<p class="credit">{html.escape(credit)}</p>' if credit else "",
+        credit=_element('p class="credit"', credit),
         # "</script>" in a title would end the block that holds it.
         data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         script=_read("player.js"),
@@ -217,9 +210,9 @@ def write_player(path, scenes, *, strip: bool = True, overwrite: bool = True, **
     if path.suffix != ".html":
         raise ValueError(f"{path}: players are written as .html")
     targets = [path, path.with_suffix(".png")] if strip else [path]
-    taken = [str(target) for target in targets if target.exists()]
+    taken = ", ".join(str(target) for target in targets if target.exists())
     if taken and not overwrite:
-        raise ValueError(f"{', '.join(taken)}: exists already; pass overwrite=True or another path")
+        raise ValueError(f"{taken}: exists already; pass overwrite=True or another path")
     page = player_page(scenes, **options)
     figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -325,24 +318,24 @@ def _as_scenes(scenes) -> list[Scene]:
     """Bring whatever `player_page` takes into scenes of characters."""
     if isinstance(scenes, (Scene, Character, Motion)):
         scenes = [scenes]
-    whole = []
-    for place, scene in enumerate(scenes):
-        if isinstance(scene, (Character, Motion)):
-            character = _as_character(scene, f"scene {place}")
-            scene = Scene([character], title=character.name)
-        if not isinstance(scene, Scene):
-            raise ValueError(f"scene {place} is a {type(scene).__name__}; give a Scene, Character or Motion")
-        characters = scene.characters
-        if isinstance(characters, (Character, Motion)):
-            characters = [characters]
-        label = f"scene {place} ({scene.title})" if scene.title else f"scene {place}"
-        characters = [_as_character(one, f"{label}, character {k}") for k, one in enumerate(characters)]
-        if not characters:
-            raise ValueError(f"{label} has no character")
-        whole.append(dataclasses.replace(scene, characters=characters))
+    whole = [_as_scene(scene, f"scene {place}") for place, scene in enumerate(scenes)]
     if not whole:
         raise ValueError("a player needs at least one scene")
     return whole
+
+
+def _as_scene(given, label: str) -> Scene:
+    if not isinstance(given, Scene):
+        character = _as_character(given, label)
+        return Scene([character], title=character.name)
+    label = f"{label} ({given.title})" if given.title else label
+    characters = given.characters
+    if isinstance(characters, (Character, Motion)):
+        characters = [characters]
+    if not characters:
+        raise ValueError(f"{label} has no character")
+    characters = [_as_character(one, f"{label}, character {k}") for k, one in enumerate(characters)]
+    return dataclasses.replace(given, characters=characters)
 
 
 def _as_character(given, label: str) -> Character:
@@ -350,39 +343,28 @@ def _as_character(given, label: str) -> Character:
     if isinstance(given, Motion):
         given = Character(given)
     if not isinstance(given, Character) or not isinstance(given.motion, Motion):
-        raise ValueError(f"{label} is a {type(given).__name__}; give a Character or a Motion")
+        raise ValueError(f"{label} is a {type(given).__name__}; give a Scene, Character or Motion")
     if given.color is not None and not re.fullmatch(r"#[0-9a-fA-F]{6}", given.color):
         raise ValueError(f"{label}: color must be like '#1b4f8f', got {given.color!r}")
     return dataclasses.replace(given, name=given.name or given.motion.name or label)
 
 
 def _check_in_step(character: Character, first: Motion) -> None:
-    motion = character.motion
+    motion, there = character.motion, "where the player's first motion has"
     if abs(motion.fps - first.fps) > 1e-6:
-        raise ValueError(
-            f"{character.name}: {motion.fps:g} frames a second, where the player's first motion "
-            f"has {first.fps:g}; use skeleton.resample"
-        )
+        raise ValueError(f"{character.name}: {motion.fps:g} frames a second, {there} {first.fps:g}; resample it")
     if motion.num_frames != first.num_frames:
-        raise ValueError(
-            f"{character.name}: {motion.num_frames} frames, where the player's first motion has "
-            f"{first.num_frames}; cut them to one length with Motion.slice"
-        )
+        raise ValueError(f"{character.name}: {motion.num_frames} frames, {there} {first.num_frames}; use Motion.slice")
 
 
 def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
-    boundaries = [int(frame) for frame in scene.boundaries]
-    wrong = [
-        given
-        for given, frame in zip(scene.boundaries, boundaries, strict=True)
-        if given != frame or not 0 < frame < num_frames
-    ]
-    if wrong:
-        raise ValueError(
-            f"boundary {wrong[0]} of scene {scene.title!r} is no frame between 1 and "
-            f"{num_frames - 1}, where a new window could begin"
-        )
-    return sorted(set(boundaries))
+    for frame in scene.boundaries:
+        if frame not in range(1, num_frames):
+            raise ValueError(
+                f"boundary {frame} of scene {scene.title!r} is no frame between 1 and {num_frames - 1}, "
+                "where a new window could begin"
+            )
+    return sorted({int(frame) for frame in scene.boundaries})
 
 
 # ------------------------------------------------------------------------------ what is drawn of it
@@ -393,27 +375,9 @@ class _Drawn:
     """Points of a skeleton that the player draws, and how; indices below are places in `points`."""
 
     points: tuple[int, ...]  # of joints, then end sites
-    limbs: tuple[tuple[str, tuple[tuple[int, int], ...]], ...]  # side, (parent, child) pairs
+    limbs: list[dict]  # side and bones, (parent, child) pairs
     head: tuple[int, int] | None  # head and neck
     toes: tuple[int, int] | None
-
-    def as_dict(self) -> dict:
-        return {
-            "points": len(self.points),
-            "limbs": [{"side": side, "bones": bones} for side, bones in self.limbs],
-            "head": self.head,
-            "toes": self.toes,
-        }
-
-
-def _draws_alike(one: Skeleton, other: Skeleton) -> bool:
-    """Whether two skeletons have the same points and lines; bone lengths lie in the tracks."""
-    return (
-        one.names == other.names
-        and one.parents == other.parents
-        and bones_of(one) == bones_of(other)
-        and len(one.end_sites) == len(other.end_sites)
-    )
 
 
 def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
@@ -423,21 +387,17 @@ def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
     bone above it. Sorting a handful of limbs does for the eye what sorting all bones would, in a
     fraction of the strokes.
     """
-    bones = bones_of(skeleton)
     limb_of: dict[int, int] = {}  # the limb whose bone ends in this point
-    limbs: list[tuple[str, list[tuple[int, int]]]] = []
+    limbs: list[dict] = []
     middle = None  # the trunk is one limb, though hips and shoulders part it
-    for parent, child, side in sorted(bones, key=lambda bone: bone[1]):
-        above = limb_of.get(parent)
-        if side == "middle" and middle is not None:
-            number = middle
-        elif above is not None and limbs[above][0] == side:
-            number = above
-        else:
+    for parent, child, side in sorted(bones_of(skeleton), key=lambda bone: bone[1]):
+        number = middle if side == "middle" else limb_of.get(parent)
+        if number is None or limbs[number]["side"] != side:
             number = len(limbs)
-            limbs.append((side, []))
-            middle = number if side == "middle" else middle
-        limbs[number][1].append((parent, child))
+            limbs.append({"side": side, "bones": []})
+        if side == "middle":
+            middle = number
+        limbs[number]["bones"].append((parent, child))
         limb_of[child] = number
     heads = [k for k, name in enumerate(skeleton.names) if is_head(name)]
     head = (heads[0], skeleton.parents[heads[0]]) if heads and heads[0] > 0 else None
@@ -445,16 +405,11 @@ def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
         toes = skeleton.toes
     except ValueError:  # a rig that we do not know has no contacts to show
         toes = None
-    needed = {point for _, chain in limbs for bone in chain for point in bone}
-    needed |= {0, *(head or ()), *(toes or ())}
-    points = tuple(sorted(needed))
-    place = {point: k for k, point in enumerate(points)}
-    return _Drawn(
-        points=points,
-        limbs=tuple((side, tuple((place[parent], place[child]) for parent, child in chain)) for side, chain in limbs),
-        head=None if head is None else (place[head[0]], place[head[1]]),
-        toes=None if toes is None else (place[toes[0]], place[toes[1]]),
-    )
+    needed = {point for limb in limbs for bone in limb["bones"] for point in bone}
+    points = tuple(sorted(needed | {0, *(head or ()), *(toes or ())}))
+    places = lambda pair: None if pair is None else (points.index(pair[0]), points.index(pair[1]))
+    limbs = [{"side": limb["side"], "bones": [places(bone) for bone in limb["bones"]]} for limb in limbs]
+    return _Drawn(points, limbs, places(head), places(toes))
 
 
 def _first_azimuth(motion: Motion) -> float:
@@ -486,12 +441,12 @@ def _encode_character(character: Character, drawn: _Drawn) -> tuple[dict, list[b
     pieces = [_track(root, "<i4"), _track(joints, "<i2")]
 
     contacts = character.contacts
-    if contacts is not None and drawn.toes is None:
-        raise ValueError(f"{label}: contacts are given, but this skeleton's toes are not known")
     if contacts is None and drawn.toes is not None:
         contacts = motion.contacts
     if contacts is not None:
         contacts = np.asarray(contacts)
+        if drawn.toes is None:
+            raise ValueError(f"{label}: contacts are given, but this skeleton's toes are not known")
         if contacts.shape != (num_frames, 2):
             raise ValueError(f"{label}: contacts must be [{num_frames}, 2] (left, right), got {contacts.shape}")
         if not np.isin(contacts, (0, 1)).all():
@@ -549,17 +504,20 @@ def _color_rules() -> str:
 
 def _panel(scene: Scene, first: Motion) -> str:
     count = len(scene.characters)
-    joints = scene.characters[0].motion.skeleton.num_joints
     shown = (
         f"{scene.title or 'Motion'}: {count} {'character' if count == 1 else 'characters'} of "
-        f"{joints} joints, {first.num_frames / first.fps:.1f} seconds"
+        f"{scene.characters[0].motion.skeleton.num_joints} joints, {first.num_frames / first.fps:.1f} seconds"
     )
-    title = f"<strong>{html.escape(scene.title)}</strong>" if scene.title else ""
-    note = f"<span>{html.escape(scene.note)}</span>" if scene.note else ""
+    title = _element("strong", scene.title)
     return (
-        f'<figure class="panel"><figcaption>{title}{note}</figcaption>'
+        f'<figure class="panel"><figcaption>{title}{_element("span", scene.note)}</figcaption>'
         f'<canvas role="img" aria-label="{html.escape(shown, quote=True)}"></canvas></figure>'
     )
+
+
+def _element(opening: str, text: str) -> str:
+    """Put text into an element, such as 'p class="credit"'; nothing if there is no text."""
+    return f"<{opening}>{html.escape(text)}</{opening.split()[0]}>" if text else ""
 
 
 def _legend(scenes: list[dict]) -> str:

@@ -476,7 +476,7 @@ def find_model(dataset: str) -> Path:
             else:
                 return path
     raise ValueError(
-        f"no trained model for data set {dataset!r}: run `python -m f3amd_lib train --data "
+        f"no trained model for data set {dataset!r}: run `f3amd train --data "
         f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
     )
 

@@ -49,8 +49,8 @@ def framework_convolution(z, kernel, bias):
     )  # fmt: skip
 
 
-class _PlainBlock(nnx.Module):
-    """An `FNOBlock` in the plain form, with the weights of another."""
+class _FFTBlock(nnx.Module):
+    """An `FNOBlock` by fast Fourier transforms, with the weights of another."""
 
     def __init__(self, block: FNOBlock):
         self.spectral, self.local_first = block.spectral, block.local_first
@@ -64,8 +64,8 @@ class _PlainBlock(nnx.Module):
         return fourier_transform_convolution(z, *weights) + local
 
 
-def plain_form(network: F3AMD) -> F3AMD:
-    """Return a copy of a network whose Fourier blocks are computed in the plain way.
+def fft_reference(network: F3AMD) -> F3AMD:
+    """Return a copy of a network whose Fourier blocks are computed by fast Fourier transforms.
 
     Args:
       network: with FNO blocks of the variant "fourier".
@@ -78,9 +78,9 @@ def plain_form(network: F3AMD) -> F3AMD:
     """
     config = network.config
     if getattr(config, "base_block", None) != "fno" or config.spectral_variant != "fourier":
-        raise ValueError("only networks of Fourier blocks have a plain form")
-    plain = nnx.clone(network)
-    plain.blocks = nnx.List([_PlainBlock(block) for block in plain.blocks])
+        raise ValueError("only networks of Fourier blocks have this form")
+    reference = nnx.clone(network)
+    reference.blocks = nnx.List([_FFTBlock(block) for block in reference.blocks])
     if config.encoder_decoder == "fno":
-        plain.encoder, plain.decoder = _PlainBlock(plain.encoder), _PlainBlock(plain.decoder)
-    return plain
+        reference.encoder, reference.decoder = _FFTBlock(reference.encoder), _FFTBlock(reference.decoder)
+    return reference

@@ -1,6 +1,6 @@
-"""Ways to run one round: jit, jit over all devices, the plain form, IREE, and PyTorch's.
+"""Implementations of a round: jit, jit over all devices, by FFT, IREE, PyTorch and ONNX Runtime.
 
-Whatever the way, a timed call does what `decisions` of the companion count as synthesis: it draws
+In each of them a timed call does what `decisions` of the companion count as synthesis: it draws
 noise, encodes the condition and walks all steps. Compilation, kinematics and transfers of the
 condition are outside.
 """
@@ -18,24 +18,23 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision
-from f3amd_lib.benchmarking.plain import plain_form
+from f3amd_lib.benchmarking.fft_reference import fft_reference
+from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision, matmul_probe
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.networks import zoo
-from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
 from f3amd_lib.networks.config import NetworkConfig, cast_network
 
 
 class NotPossible(RuntimeError):
-    """A way that does not work here; the message says why."""
+    """An implementation that does not work here; the message says why."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is asked for, in whichever way it is done.
+    """What is asked for, in whichever implementation.
 
     Attributes:
       model: a preset's name.
@@ -107,69 +106,54 @@ def _network(task: Task):
     return cast_network(network, PRECISIONS[task.precision][1])
 
 
-def _compiled(task: Task, run, condition) -> Round:
-    """Compile run(condition, key) ahead of time."""
+def compile_round(task: Task, run: Callable, sharding=None) -> Round:
+    """Compile `run(condition, key)` ahead of time in the task's precision, for a random condition."""
     dtype = PRECISIONS[task.precision][1]
-    condition = jax.tree.map(lambda leaf: leaf.astype(dtype), condition)
-    key = jax.random.key(0)
+    condition = jax.device_put(random_condition(task.config, task.characters), sharding)
+    given = jax.tree.map(lambda leaf: leaf.astype(dtype), condition), jax.random.key(0)
     started = time.perf_counter()
     with matmul_precision(task.precision):
-        compiled = jax.jit(run).lower(condition, key).compile()
+        compiled = jax.jit(run).lower(*given).compile()
     seconds = time.perf_counter() - started
-    costs = compiled.cost_analysis() or {}
-    accessed = costs.get("bytes accessed")
-    return Round(
-        lambda: compiled(condition, key).block_until_ready(), seconds, None if accessed is None else int(accessed)
-    )
+    accessed = (compiled.cost_analysis() or {}).get("bytes accessed")
+    call = lambda: compiled(*given).block_until_ready()
+    return Round(call, seconds, None if accessed is None else int(accessed))
 
 
 def _jit(task: Task, form=lambda network: network) -> Round:
     network, sigmas = form(_network(task)), task.sigmas
     run = lambda condition, key: sample_round(network, condition, sigmas, key, sampler=task.sampler)
-    condition = jax.device_put(random_condition(task.config, task.characters))
-    return _compiled(task, run, condition)
-
-
-def _plain_jit(task: Task) -> Round:
-    try:
-        return _jit(task, plain_form)
-    except ValueError as error:
-        raise NotPossible(str(error)) from error
+    return compile_round(task, run)
 
 
 def _all_devices(task: Task) -> Round:
     devices = jax.local_devices()
     if len(devices) < 2:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
-    if task.characters % len(devices):
-        raise NotPossible(f"{task.characters} characters on {len(devices)} devices do not divide")
     mesh = Mesh(np.array(devices), ("characters",))
     network, sigmas = _network(task), task.sigmas
     run = lambda condition, key: sample_round_on_devices(
         network, condition, sigmas, key, mesh=mesh, sampler=task.sampler
     )
-    rows = NamedSharding(mesh, PartitionSpec("characters"))
-    condition = jax.device_put(random_condition(task.config, task.characters), rows)
-    return _compiled(task, run, condition)
+    return compile_round(task, run, NamedSharding(mesh, PartitionSpec("characters")))
+
+
+def _check_outside_of_jax(task: Task, framework: str) -> None:
+    if device_name() != "CPU" or task.precision != "float32":
+        raise NotPossible(f"{framework} is timed on a CPU in float32 only")
 
 
 def _iree(task: Task) -> Round:
     """Compile ahead of time for this CPU; noise is drawn by numpy, inside the timed call."""
-    if device_name() != "CPU" or task.precision != "float32":
-        raise NotPossible("IREE is timed on a CPU in float32 only")
-    try:
-        from f3amd_lib.serving.artefact import load_artefact
-        from f3amd_lib.serving.export import export_round, save_artefact
+    _check_outside_of_jax(task, "IREE")
+    from f3amd_lib.serving.artefact import load_artefact
+    from f3amd_lib.serving.export import export_round, save_artefact
 
-        started = time.perf_counter()
-        exported = export_round(_network(task), task.sigmas, task.characters, task.sampler)
-        with tempfile.TemporaryDirectory() as folder:
-            saved = Path(folder) / "artefact"
-            save_artefact(saved, exported, name=task.model)
-            artefact = load_artefact(saved)
-        seconds = time.perf_counter() - started
-    except ImportError as error:
-        raise NotPossible(str(error)) from error
+    started = time.perf_counter()
+    exported = export_round(_network(task), task.sigmas, task.characters, task.sampler)
+    with tempfile.TemporaryDirectory() as folder:
+        artefact = load_artefact(save_artefact(Path(folder) / "artefact", exported, name=task.model))
+    seconds = time.perf_counter() - started
     given = [artefact.put(part) for part in random_condition(task.config, task.characters)]
     shapes = [shape for name, shape in exported.inputs.items() if name.endswith("noise")]
     rng = np.random.default_rng(0)
@@ -177,85 +161,61 @@ def _iree(task: Task) -> Round:
     return Round(lambda: artefact(*given, *map(draw, shapes)), seconds)
 
 
-def _check_baseline(task: Task, framework: str) -> None:
-    if not isinstance(task.config, CAMDMConfig):
-        raise NotPossible(f"only CAMDM is written for {framework}")
-    if device_name() != "CPU" or task.precision != "float32":
-        raise NotPossible(f"{framework} is timed on a CPU in float32 only")
+def _torch(task: Task, *, runtime: str = "eager", products: str = "blas") -> Round:
+    _check_outside_of_jax(task, "PyTorch")
+    from f3amd_lib.benchmarking import torch_camdm
 
-
-def _torch(task: Task, *, compiled: bool = False, products: str = "blas") -> Round:
-    _check_baseline(task, "PyTorch")
-    try:
-        from f3amd_lib.benchmarking import torch_camdm
-    except ImportError as error:
-        raise NotPossible(str(error)) from error
-    module = torch_camdm.torch_camdm(_network(task), products=products)
-    run = torch_camdm.torch_round(module, task.sigmas, task.sampler, compiled=compiled)
-    condition = torch_camdm.torch_condition(random_condition(task.config, task.characters))
     started = time.perf_counter()
-    try:
-        run(condition)
-    except RuntimeError as error:
-        raise NotPossible(str(error)) from error
+    module = torch_camdm.torch_camdm(_network(task), products=products)
+    run = torch_camdm.torch_round(module, task.sigmas, task.sampler, runtime=runtime)
+    condition = torch_camdm.torch_condition(random_condition(task.config, task.characters))
+    run(condition)
     return Round(lambda: run(condition), time.perf_counter() - started)
 
 
-def _onnx(task: Task) -> Round:
-    _check_baseline(task, "ONNX Runtime")
-    try:
-        from f3amd_lib.benchmarking.onnx_camdm import onnx_round
-    except ImportError as error:
-        raise NotPossible(str(error)) from error
-    started = time.perf_counter()
-    run = onnx_round(_network(task), task.sigmas, task.sampler)
-    seconds = time.perf_counter() - started
-    condition = random_condition(task.config, task.characters)
-    rng = np.random.default_rng(0)
-    return Round(lambda: run(condition, rng), seconds)
-
-
-WAYS: dict[str, tuple[str, Callable[[Task], Round]]] = {
+IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Task], Round]]] = {
     "jit": ("jax", _jit),
     "jit, all devices": ("jax", _all_devices),
-    "jit, FFT": ("jax", _plain_jit),
+    "jit, FFT": ("jax", partial(_jit, form=fft_reference)),
     "IREE": ("iree", _iree),
     "PyTorch": ("torch", _torch),
     "PyTorch, oneDNN": ("torch", partial(_torch, products="onednn")),
-    "PyTorch, compiled": ("torch", partial(_torch, compiled=True)),
-    "ONNX Runtime": ("onnx", _onnx),
+    "PyTorch, compiled": ("torch", partial(_torch, runtime="compiled")),
+    "ONNX Runtime": ("onnx", partial(_torch, runtime="onnx")),
 }
-"""Way -> (framework, function that makes a task's round ready or raises `NotPossible`)."""
+"""Implementation -> (framework, function that makes a task's round ready)."""
 
 
-def prepare_round(way: str, task: Task) -> Round:
-    """Make a round ready to run in a way.
+def prepare_round(implementation: str, task: Task) -> Round:
+    """Make a round ready to run.
 
     Args:
-      way: of `WAYS`.
+      implementation: of `IMPLEMENTATIONS`.
       task: what is asked for.
 
     Raises:
-      ValueError: for an unknown way.
-      NotPossible: if this way does not work for the task or on this machine.
+      ValueError: for an unknown implementation.
+      NotPossible: if it does not work for the task or on this machine.
     """
-    if way not in WAYS:
-        raise ValueError(f"unknown way {way!r}{nearest_hint(way, WAYS)}")
-    return WAYS[way][1](task)
+    if implementation not in IMPLEMENTATIONS:
+        raise ValueError(f"unknown implementation {implementation!r}{nearest_hint(implementation, IMPLEMENTATIONS)}")
+    try:
+        return IMPLEMENTATIONS[implementation][1](task)
+    except (ImportError, ValueError, RuntimeError) as error:
+        # The first line may only tell who spoke; advice on debugging comes after the second.
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        raise NotPossible(" ".join(lines[:2])) from error
 
 
 def framework_probe(framework: str, precision: str):
-    """Return a framework's own matrix product to time, or None where JAX's stands for it.
+    """Return a framework's own matrix product to time: (function that multiplies, its operations).
 
     Args:
-      framework: as in `WAYS`.
+      framework: "jax" or "torch", the latter in float32.
       precision: of `machine.PRECISIONS`.
-
-    Returns:
-      (function that multiplies and waits, its operations), or None.
     """
-    if framework != "torch" or precision != "float32":
-        return None
+    if framework == "jax":
+        return matmul_probe(precision)
     from f3amd_lib.benchmarking.torch_camdm import torch_matmul_probe
 
     return torch_matmul_probe()

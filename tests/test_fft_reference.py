@@ -1,4 +1,4 @@
-"""Two ways to compute a Fourier block give the same numbers."""
+"""Two forms of a Fourier block give the same numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm, tiny_config
 
-from f3amd_lib.benchmarking.plain import fourier_transform_convolution, framework_convolution, plain_form
+from f3amd_lib.benchmarking.fft_reference import fft_reference, fourier_transform_convolution, framework_convolution
 from f3amd_lib.networks.spectral import spectral_convolution
 
 
@@ -30,14 +30,14 @@ def test_eq03_framework_convolution_sees_the_neighbours():
 
 
 @pytest.mark.parametrize("encoder_decoder", ["fno", "linear"])
-def test_plain_network_gives_the_same_answers(encoder_decoder):
+def test_the_network_by_fft_gives_the_same_answers(encoder_decoder):
     network = network_of(tiny_config(encoder_decoder=encoder_decoder))
-    plain = plain_form(network)
+    reference = fft_reference(network)
     given, x_noisy = make_condition(), 5.0 * draw(2, WINDOW, CHANNELS)
     expected = evaluate(network, x_noisy, 5.0, given)
-    np.testing.assert_allclose(evaluate(plain, x_noisy, 5.0, given), expected, atol=1e-5)
+    np.testing.assert_allclose(evaluate(reference, x_noisy, 5.0, given), expected, atol=1e-5)
     program = lambda form: str(jax.make_jaxpr(lambda x: form(x, 5.0, form.encode(given)))(x_noisy))
-    assert "fft" in program(plain) and "conv_general" in program(plain)
+    assert "fft" in program(reference) and "conv_general" in program(reference)
     assert "fft" not in program(network) and "conv_general" not in program(network)
 
 
@@ -46,6 +46,6 @@ def test_plain_network_gives_the_same_answers(encoder_decoder):
     [tiny_camdm(), tiny_config(base_block="transformer"), tiny_config(spectral_variant="cosine")],
     ids=["CAMDM", "Transformer", "DCT"],
 )
-def test_networks_without_fourier_blocks_have_no_plain_form(config):
+def test_networks_without_fourier_blocks_have_no_fft_reference(config):
     with pytest.raises(ValueError, match="Fourier blocks"):
-        plain_form(network_of(config))
+        fft_reference(network_of(config))

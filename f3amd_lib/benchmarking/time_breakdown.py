@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 from flax import nnx
 
+from f3amd_lib.benchmarking.implementations import Task, compile_round
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
-from f3amd_lib.benchmarking.ways import Task, random_condition
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks import zoo
 from f3amd_lib.networks.f3amd import F3AMD
@@ -83,7 +83,7 @@ def without(network: F3AMD, part: str) -> F3AMD:
     return left
 
 
-def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
+def time_breakdown(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
     """Time a round whole and without each of its parts, by turns.
 
     Args:
@@ -96,39 +96,29 @@ def time_parts(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
       value, low and high in ms, rounds, and saved: the share of the whole round's time.
     """
     network = zoo.build_from_config(task.config, jax.random.key(0))
-    condition = jax.device_put(random_condition(task.config, task.characters))
-    shape = (task.characters, task.config.window, task.config.channels)
-    noise = jax.random.normal(jax.random.key(1), shape)
-    networks = {"nothing": network} | {part: without(network, part) for part in PARTS[:-1]}
+    noise = jax.random.normal(jax.random.key(1), (task.characters, task.config.window, task.config.channels))
 
-    def compiled(model, *noise):
-        def run(condition, key, *noise):
-            given = {"noise": noise[0]} if noise else {}
-            return sample_round(model, condition, task.sigmas, key, sampler=task.sampler, **given)
+    def call(network, noise=None):
+        run = lambda condition, key: sample_round(
+            network, condition, task.sigmas, key, noise=noise, sampler=task.sampler
+        )
+        return compile_round(task, run).call
 
-        key = jax.random.key(0)
-        program = jax.jit(run).lower(condition, key, *noise).compile()
-        return lambda: program(condition, key, *noise).block_until_ready()
-
-    calls = {part: compiled(model) for part, model in networks.items()}
-    calls["noise"] = compiled(network, noise)
+    calls = {"nothing": call(network)} | {part: call(without(network, part)) for part in PARTS[:-1]}
+    calls["noise"] = call(network, noise)
     timings = take_turns(calls, progress=progress, **turns)
     whole = timings["nothing"].median
-    return pd.DataFrame(
-        [
-            {
-                "model": task.model,
-                "steps": task.steps,
-                "characters": task.characters,
-                "device": device_name(),
-                "without": part,
-                "unit": "ms",
-                "value": 1e3 * timing.median,
-                "low": 1e3 * timing.low,
-                "high": 1e3 * timing.high,
-                "rounds": timing.rounds,
-                "saved": np.nan if part == "nothing" else 1.0 - timing.median / whole,
-            }
-            for part, timing in timings.items()
-        ]
-    )
+    rows = [
+        {
+            "model": task.model,
+            "steps": task.steps,
+            "characters": task.characters,
+            "device": device_name(),
+            "without": part,
+            **timing.columns("ms", 1e3),
+            "rounds": timing.rounds,
+            "saved": np.nan if part == "nothing" else 1.0 - timing.median / whole,
+        }
+        for part, timing in timings.items()
+    ]
+    return pd.DataFrame(rows)
