@@ -527,14 +527,14 @@ def _open_100style(path) -> Dataset:
 
 def _read_table(archive: _Archive, table: str) -> tuple[str, list[dict[str, str]]]:
     """Return where a table of 100STYLE lies, for messages, and its rows."""
-    found = [name for name in archive.names() if PurePosixPath(name).name == table]
-    if len(found) != 1:
-        how = f"is there {len(found)} times ({', '.join(found)})" if found else "is missing"
+    places = [name for name in archive.names() if PurePosixPath(name).name == table]
+    if len(places) != 1:
+        how = f"is there {len(places)} times ({', '.join(places)})" if places else "is missing"
         what = f"the folder or zip must hold one copy of the data set, with its tables ({_100STYLE_URL})"
         raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what}")
-    label = archive.label(found[0])
+    label = archive.label(places[0])
     try:
-        text = archive.read(found[0]).decode("utf-8-sig")
+        text = archive.read(places[0]).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{label}: is not UTF-8 text; fetch it again") from error
     return label, list(csv.DictReader(io.StringIO(text, newline="")))

@@ -45,7 +45,7 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
 
 PATHS = tuple(name for name in NAMES if name != "complex")
-"""Names that the paths of a crowd are drawn from unless told: those that face where they go."""
+"""Names that the paths of a crowd are drawn from by default: those that face where they go."""
 
 FORMAT = "f3amd-crowd-1"
 

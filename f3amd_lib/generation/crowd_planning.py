@@ -197,9 +197,9 @@ def _conflicts(position: np.ndarray, min_distance: float, every: int = 1):
     height = np.broadcast_to(2.0 * min_distance * looked_at[None, :], (count, len(looked_at)))
     points = np.concatenate([position[:, looked_at], height[..., None]], axis=-1)
     tree = cKDTree(points.reshape(-1, 3), balanced_tree=False, compact_nodes=False)
-    found = tree.query_pairs(min_distance, output_type="ndarray")
-    one, other = np.sort(found // len(looked_at), axis=1).T
-    frames = looked_at[found[:, 0] % len(looked_at)]
+    close = tree.query_pairs(min_distance, output_type="ndarray")
+    one, other = np.sort(close // len(looked_at), axis=1).T
+    frames = looked_at[close[:, 0] % len(looked_at)]
     distances = np.linalg.norm(position[one, frames] - position[other, frames], axis=-1)
     # The closest frame of each pair: sort by pair, then distance, then keep the first.
     order = np.lexsort((frames, distances, other, one))

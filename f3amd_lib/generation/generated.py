@@ -42,7 +42,7 @@ class Rollout:
         return ", ".join(done + ["feet locked"] * self.feet_locked)
 
     def motion(self, character: int = 0, *, with_history: bool = False) -> Motion:
-        """Return one character's motion, from the first generated frame unless told."""
+        """Return one character's motion, from the first generated frame or from its history on."""
         frames = self.frames[character]
         if with_history:
             frames = np.concatenate([self.history[character], frames])
