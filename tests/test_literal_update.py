@@ -8,21 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
+from helpers.seed_histories import seed_condition, walk_seed_histories
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.experiments import literal_update, measure
 from f3amd_lib.experiments.denoising import held_out_batch
-from f3amd_lib.experiments.literal_update import (
-    UPDATES,
-    WINDOW_METRICS,
-    WindowWalks,
-    opening_condition,
-    walk_openings,
-    walk_windows,
-    window_figures,
-)
+from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, WindowWalks, walk_windows, window_figures
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw
@@ -202,35 +195,35 @@ def test_the_measurement_goes_on_and_notices_other_weights(measurement):
     assert len(read_table(path)[0]) == 5
 
 
-def test_openings_go_straight_on_at_their_own_pace():
+def test_seed_histories_go_straight_on_at_their_own_pace():
     trained = tiny_trained()
-    condition = opening_condition(trained)
+    condition = seed_condition(trained)
     normaliser = trained.normaliser
     assert condition.style.shape == (len(trained.styles),) * 2
     for row, style in enumerate(trained.styles):
-        opening = trained.start_poses[style][0]
+        history = trained.start_poses[style][0]
         shown = normaliser.denormalise(condition.history[row])
-        np.testing.assert_allclose(shown, opening, atol=1e-5)
+        np.testing.assert_allclose(shown, history, atol=1e-5)
         assert int(np.argmax(condition.style[row])) == trained.style_index(style)
-        # Displacements along +Z, by the mean step of the opening, and no turn.
+        # Displacements along +Z, by the mean step of the history, and no turn.
         path = np.asarray(condition.path[row])
-        pace = np.linalg.norm((opening[-1] - opening[0])[[0, 2]]) / (len(opening) - 1)
+        pace = np.linalg.norm((history[-1] - history[0])[[0, 2]]) / (len(history) - 1)
         ahead = path[:, 1] * float(normaliser.path_scale)
         np.testing.assert_allclose(ahead, pace * np.arange(1, WINDOW + 1), rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(path[:, 0], 0.0, atol=1e-7)
         np.testing.assert_allclose(path[:, 2:], rotation_6d_from_yaw(np.zeros(WINDOW)), atol=1e-7)
 
 
-def test_walks_from_openings_need_no_data_and_have_no_error():
+def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     trained = tiny_trained()
-    walks = walk_openings(trained, (8, 4), num_seeds=2, seed=1)
+    walks = walk_seed_histories(trained, (8, 4), num_seeds=2, seed=1)
     assert walks.real is None
     assert walks.made["literal", 8].shape[:3] == (2, len(trained.styles), WINDOW)
     table = window_figures(walks)
     assert set(table["metric"]) == set(WINDOW_METRICS) - {"joint_error"}
     assert set(table["update"]) == set(UPDATES)
-    # The condition is what `opening_condition` says, the noise that of the seed's first key.
-    network, condition = trained.network(), opening_condition(trained)
+    # The condition is what `seed_condition` says, the noise that of the seed's first key.
+    network, condition = trained.network(), seed_condition(trained)
     noise = jax.random.normal(jax.random.split(jax.random.key(1), 2)[0], (len(trained.styles),
                               WINDOW, trained.config.channels))  # fmt: skip
     x = jax.jit(
@@ -243,4 +236,4 @@ def test_walks_from_openings_need_no_data_and_have_no_error():
     joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
     np.testing.assert_allclose(walks.made["rescaled", 8][0], joints, atol=1e-4)
     with pytest.raises(ValueError, match="num_seeds must be at least 2"):
-        walk_openings(trained, num_seeds=1)
+        walk_seed_histories(trained, num_seeds=1)

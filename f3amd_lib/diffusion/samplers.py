@@ -101,6 +101,7 @@ def ddpm_posterior(alpha_bar, alpha_bar_next):
     """Return what DDPM's ancestral step draws from: z at `alpha_bar_next`, given z and x0.
 
     Of the two variances that DDPM allows this is the smaller, which is exact once x0 is known.
+    The root of alpha_bar / alpha_bar_next, the paper's alpha_t, stands in the coefficient on z.
 
     Args:
       alpha_bar: current signal power, in (0, 1), broadcasting. The two levels need not be

@@ -69,18 +69,8 @@ def x0_error_by_sigma(
         error = jnp.sqrt(jnp.mean((x0_hat - x0) ** 2))
         return error, _joint_error(trained, x0_hat, batch)
 
-    rows = []
-    for sigma in sigmas:
-        error, joints = measure(jnp.float32(sigma))
-        rows.append(
-            {
-                "sigma": float(sigma),
-                "x0_error": float(error),
-                "joint_error_cm": float(joints),
-                "input_error": float(sigma),
-            }
-        )
-    return pd.DataFrame(rows)
+    rows = [(float(sigma), *map(float, measure(jnp.float32(sigma))), float(sigma)) for sigma in sigmas]
+    return pd.DataFrame(rows, columns=["sigma", "x0_error", "joint_error_cm", "input_error"])
 
 
 def window_quality(generator: MotionGenerator, windows: WindowSet, *, num_samples: int = 512, seed: int = 0) -> dict:
@@ -135,7 +125,7 @@ def noise_use(generator: MotionGenerator, windows: WindowSet, *, low_sigma: floa
 
     Returns:
       x0_error_ratio: x0 error at `low_sigma` over that at sigma_max; near 1 the input is ignored. A
-        network that is told the number of a step is asked at its lowest level, if that is higher;
+        network that takes the number of a step is asked at its lowest level, if that is higher;
         one with a single level has no such ratio, NaN.
       seed_spread_cm: see `seed_spread`; near 0 every seed gives the same motion.
     """

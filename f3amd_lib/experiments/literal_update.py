@@ -4,8 +4,8 @@ Appendix F prints a DDIM step that takes a variance-exploding state and returns 
 rescale it before the next step gives plain DDIM ("rescaled"); to leave it as it is gives another
 walk ("literal", see `samplers.ddim_step_literal`). Which of the two a table was measured with can
 only show where a network uses its noise. These functions look at single windows, all from the same
-noise: after held-out motion, or after the openings that weights carry with them, for which no data
-are needed. Long rollouts choose the update by the name of its sampler, `UPDATES[...]`.
+noise: after held-out motion (`walk_windows`), or under any conditions (`walk_conditions`). Long
+rollouts choose the update by the name of its sampler, `UPDATES[...]`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.data.features import frame_positions, path_condition
+from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
 from f3amd_lib.experiments.denoising import held_out_batch
-from f3amd_lib.generation.rollout import pose_speed
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.networks.conditioning import Condition
@@ -89,60 +87,31 @@ def walk_windows(
     batch = held_out_batch(windows, trained, num_windows)
     _, condition = network_inputs(batch, trained.normaliser)
     real = np.asarray(frame_positions(trained.skeleton, batch.future))
-    return WindowWalks(real, _walk(trained, condition, steps, spacing, num_seeds, seed))
+    walked = walk_conditions(trained, condition, steps, spacing=spacing, num_seeds=num_seeds, seed=seed)
+    return WindowWalks(real, walked)
 
 
-def opening_condition(trained: TrainedModel) -> Condition:
-    """Return one condition for each style: its first stored opening, and straight on at its pace.
-
-    Weights carry a few captured openings of each style, so that this needs no motion data.
-
-    Args:
-      trained: the model.
-
-    Returns:
-      Condition of as many rows as there are styles, in the order of `trained.styles`, in network
-      units.
-    """
-    history = np.stack([trained.start_poses[style][0] for style in trained.styles])
-    # Openings end at the origin and face +Z.
-    ahead = pose_speed(history)[:, None] * np.arange(1, trained.config.window + 1)
-    position = np.stack([0.0 * ahead, ahead], axis=-1)
-    path = path_condition(position, 0.0 * ahead).astype(np.float32)
-    return Condition(
-        history=trained.normaliser.normalise(jnp.asarray(history)),
-        path=trained.normaliser.normalise_path(jnp.asarray(path)),
-        style=jnp.eye(len(trained.styles), dtype=jnp.float32),
-    )
-
-
-def walk_openings(
+def walk_conditions(
     trained: TrainedModel,
+    condition: Condition,
     steps: Sequence[int] = (8, 4, 2, 1),
     *,
     spacing: str = "endpoints",
     num_seeds: int = 8,
     seed: int = 0,
-) -> WindowWalks:
-    """Sample the window after a stored opening of each style, as `walk_windows` does.
+) -> dict[tuple[str, int], np.ndarray]:
+    """Sample windows under given conditions with both updates, as `walk_windows` does.
 
     Args:
       trained, steps, spacing, num_seeds, seed: as for `walk_windows`.
+      condition: B rows, in network units.
 
     Returns:
-      The walks; nothing real stands beside them.
+      `WindowWalks.made`.
 
     Raises:
-      ValueError: for fewer than 2 seeds.
+      ValueError: for fewer than 2 seeds, which have no spread.
     """
-    condition = opening_condition(trained)
-    return WindowWalks(None, _walk(trained, condition, steps, spacing, num_seeds, seed))
-
-
-def _walk(
-    trained: TrainedModel, condition: Condition, steps: Sequence[int], spacing: str, num_seeds: int, seed: int
-) -> dict[tuple[str, int], np.ndarray]:
-    """Walk both updates from the same noise; returns `WindowWalks.made`."""
     if num_seeds < 2:
         raise ValueError(f"num_seeds must be at least 2 for a spread over seeds, got {num_seeds}")
     network = trained.network()
@@ -172,7 +141,7 @@ def window_figures(walks: WindowWalks) -> pd.DataFrame:
     """Measure what walks from the same noise made.
 
     Args:
-      walks: from `walk_windows` or `walk_openings`.
+      walks: from `walk_windows`, or of `walk_conditions`.
 
     Returns:
       Columns update, steps, metric, unit, value, means over windows and seeds; update "real" with

@@ -30,7 +30,6 @@ from f3amd_lib.data.features import frame_positions, frame_yaw, num_channels
 from f3amd_lib.data.windows import WindowSet, gather_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.experiments.denoising import held_out_batch
-from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.distributions import diversity_variance, mean_and_interval
@@ -157,17 +156,12 @@ def continuation_spread(
       of the distances to the neighbours, in cm).
 
     Raises:
-      ValueError: for an unknown name in `given`, fewer than 2 neighbours, or a pool without any.
+      ValueError: if no window has two neighbours in the pool.
 
     Source: ours. Neighbours differ a little in their conditions, which makes the value larger than
     the spread under one condition, the less so the smaller the distances are; neighbours from one
     clip share a walker's habits, which makes it smaller.
     """
-    for name in given:
-        if name not in GIVEN:
-            raise ValueError(f"unknown condition {name!r}{nearest_hint(name, GIVEN)}")
-    if num_neighbours < 2:
-        raise ValueError(f"a spread needs at least 2 neighbours, got {num_neighbours}")
     rng = np.random.default_rng(seed)
     count = min(num_windows, windows.num_windows)
     chosen = np.linspace(0, windows.num_windows - 1, count).astype(np.int32)
@@ -181,9 +175,9 @@ def continuation_spread(
             continue
         there = _conditions(skeleton, pool, candidates)
         starts = np.asarray(pool.starts)[candidates]
-        mine = np.flatnonzero(styles == style)
-        squares = {k: cdist(asked[k][mine], there[k], "sqeuclidean") for k in there}
-        for row, query in enumerate(mine):
+        of_style = np.flatnonzero(styles == style)
+        squares = {k: cdist(asked[k][of_style], there[k], "sqeuclidean") for k in there}
+        for row, query in enumerate(of_style):
             usable = np.arange(len(candidates))
             if pool is windows:
                 own = int(np.asarray(windows.starts)[chosen[query]])
@@ -232,7 +226,7 @@ def continuation_spread(
 def answer_spread(
     trained: TrainedModel, windows: WindowSet, sigmas, *, num_windows: int = 128, num_draws: int = 8, seed: int = 0
 ) -> pd.DataFrame:
-    """Measure how a model's clean estimates scatter and err, at each noise level.
+    """Measure how a model's clean estimates spread and err, at each noise level.
 
     A clean held-out window x0 and its condition are kept, noise is drawn several times, and the
     estimates x0_hat(x0 + sigma noise) are turned into joints relative to the root.
@@ -240,7 +234,7 @@ def answer_spread(
     Args:
       trained: the model.
       windows: held-out windows; some of them are taken, spread evenly.
-      sigmas: noise levels, [N]. A network that is told the number of a step is asked at those of
+      sigmas: noise levels, [N]. A network that takes the number of a step is asked at those of
         its own levels that lie between the lowest and the highest of them.
       num_windows: how many windows to take.
       num_draws: noise draws for each window and level, at least 2; the same at every level.

@@ -6,12 +6,11 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
-
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal, sample
 from f3amd_lib.diffusion.schedules import VarianceExploding
-from f3amd_lib.exercises.judging import NotAnswered, agree, is_missing
+
+from helpers.exercises.judging import NotAnswered, agree, is_missing, normal_quantiles, sample
 
 _SCHEDULE = VarianceExploding()
 
@@ -43,15 +42,9 @@ def _spread_left(answer) -> str | None:
 
 def _distance_of_updates(width: float) -> float:
     """Return how far apart the updates end on average, 8 steps, one Gaussian around 0.8."""
-    # Evenly spaced quantiles: no sampling error.
-    noise = norm.ppf((np.arange(4000) + 0.5) / 4000)[:, None]
     sigmas, denoise = _SCHEDULE.grid(8), GaussianMixture([0.8], width=width).denoise
-    ends = []
-    for step in (ddim_step, ddim_step_literal):
-        x = sigmas[0] * noise
-        for sigma, sigma_next in zip(sigmas[:-1], sigmas[1:], strict=True):
-            x = step(x, denoise(x, sigma), sigma, sigma_next)
-        ends.append(x)
+    x_init = sigmas[0] * normal_quantiles(4000)[:, None]
+    ends = [sample(name, denoise, x_init, sigmas) for name in ("ddim", "ddim_literal")]
     return float(np.abs(ends[0] - ends[1]).mean())
 
 

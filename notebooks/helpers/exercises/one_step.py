@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import jax
 import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import norm
-
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import ddim_step
+from f3amd_lib.diffusion.samplers import sample_ddim
 from f3amd_lib.diffusion.schedules import VarianceExploding
-from f3amd_lib.exercises.judging import agree
-from f3amd_lib.training.fork import Fork, crossing, outcome_shares
+from scipy.optimize import brentq
+
+from helpers.bimodal_paths import BimodalPaths, crossing, outcome_shares
+from helpers.exercises.judging import agree, normal_quantiles
 
 
 def _unequal_ways(answer) -> str | None:
     walkers = GaussianMixture([-1, 1], width=0.1, weights=[0.3, 0.7])
     sigma = VarianceExploding().sigma_max
-    noise = norm.ppf((np.arange(2000) + 0.5) / 2000)[:, None]
-    if agree(answer, walkers.denoise(sigma * noise, sigma).mean(), atol=0.02):
+    x_noisy = sigma * normal_quantiles(2000)[:, None]
+    if agree(answer, walkers.denoise(x_noisy, sigma).mean(), atol=0.02):
         return None
     return "one step does not vote: it returns a mean, in which every walker counts"
 
@@ -36,8 +35,8 @@ def _errors_of_two(answer) -> str | None:
 def _share_left_open(sigma: float, half: float, width: float) -> float:
     """Return the deviation left open at sigma over that of the data, ways at -half and half."""
     # By symmetry all clean values may lie in one of the ways.
-    clean = half + width * norm.ppf((np.arange(100) + 0.5) / 100)
-    noisy = clean[:, None] + sigma * norm.ppf((np.arange(1000) + 0.5) / 1000)
+    clean = half + width * normal_quantiles(100)
+    noisy = clean[:, None] + sigma * normal_quantiles(1000)
     answers = GaussianMixture([-half, half], width=width).denoise(noisy[..., None], sigma)[..., 0]
     return float(np.sqrt(np.mean((answers - clean[:, None]) ** 2)) / np.hypot(half, width))
 
@@ -58,22 +57,22 @@ def _four_levels(answer) -> str | None:
         return "four levels are asked for"
     if levels[0] != 128.0 or not (np.diff(levels) < 0).all() or not levels[-1] > 0:
         return "the first level is 128, each of the others is lower than the one before, none is 0"
-    fork, told = Fork(), np.zeros(400, int)
-    denoise = jax.jit(lambda x, sigma: fork.denoise(x, sigma, told))
-    x = levels[0] * jax.random.normal(jax.random.key(0), (len(told), fork.num_frames, 2))
-    for sigma, sigma_next in zip(levels, np.append(levels[1:], np.float32(0.0)), strict=True):
-        x = ddim_step(x, denoise(x, sigma), sigma, sigma_next)
-    share = outcome_shares(fork, x)["wall"]
+    data = BimodalPaths()
+    unknown = np.zeros(400, int)
+    x_init = levels[0] * jax.random.normal(jax.random.key(0), (400, data.num_frames, 2))
+    denoise = lambda x, sigma: data.denoise(x, sigma, unknown)
+    ends = sample_ddim(denoise, x_init, np.append(levels, 0.0))
+    share = outcome_shares(data, ends)["wall"]
     if share < 0.05:
         return None
     return f"with these levels {share:.0%} hit the wall; put them where the side is decided"
 
 
 def _how_right(answer) -> str | None:
-    fork = Fork()
-    left, _ = crossing(fork.mean_paths)
+    data = BimodalPaths()
+    left, _ = crossing(data.mean_paths)
     # The mean path crosses at q left + (1 - q) right, and right = -left.
-    enough = 0.5 * (1.0 + fork.wall / left)
+    enough = 0.5 * (1.0 + data.wall / left)
     if agree(answer, enough, atol=0.01):
         return None
     return "the mean path crosses at q times one side plus 1 - q times the other; where ends the wall?"

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtri
-
 from f3amd_lib.diffusion import samplers, schedules
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.exercises.judging import agree
+
+from helpers.exercises.judging import agree, normal_quantiles, sample
 
 _WIDE = GaussianMixture([-1.0, 1.0], width=0.3)
 _NARROW_PAIR = GaussianMixture([-0.1, 0.1], width=0.1)
@@ -17,17 +14,9 @@ _SIGMA_MAX = schedules.VarianceExploding().sigma_max
 _MOST_STEPS = 20_000
 
 
-def _start(num_points: int = 400) -> np.ndarray:
-    """Return pure noise without chance: the quantiles of sigma_max epsilon, [num_points, 1]."""
-    shares = (np.arange(num_points) + 0.5) / num_points
-    return _SIGMA_MAX * ndtri(shares)[:, None]
-
-
-def _walk(sampler: str, oracle: GaussianMixture, sigmas) -> np.ndarray:
-    """Return where a sampler of the library leads `_start`, in float64."""
-    with jax.enable_x64(True):
-        ends = samplers.sample(sampler, oracle.denoise, jnp.asarray(_start()), sigmas)
-        return np.asarray(ends)
+def _pure_noise() -> np.ndarray:
+    """Return sigma_max epsilon without chance, [400, 1]."""
+    return _SIGMA_MAX * normal_quantiles(400)[:, None]
 
 
 def _error(sampler: str, schedule: schedules.VarianceExploding, num_steps: int) -> float:
@@ -35,13 +24,13 @@ def _error(sampler: str, schedule: schedules.VarianceExploding, num_steps: int) 
 
     The last step of every sampler is the denoiser's answer at sigma_min, and so is the truth's.
     """
-    flown = _WIDE.flow(_start(), schedule.sigma_max, schedule.sigma_min)
+    flown = _WIDE.flow(_pure_noise(), schedule.sigma_max, schedule.sigma_min)
     truth = _WIDE.denoise(flown, schedule.sigma_min)
-    return float(np.abs(_walk(sampler, _WIDE, schedule.grid(num_steps)) - truth).mean())
+    return float(np.abs(sample(sampler, _WIDE.denoise, _pure_noise(), schedule.grid(num_steps)) - truth).mean())
 
 
 def _one_step_spread(answer) -> str | None:
-    ends = _walk("ddim", _NARROW_PAIR, schedules.VarianceExploding().grid(1))
+    ends = sample("ddim", _NARROW_PAIR.denoise, _pure_noise(), schedules.VarianceExploding().grid(1))
     if agree(answer, ends.std(), rtol=0.1):
         return None
     return (

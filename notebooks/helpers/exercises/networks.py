@@ -5,11 +5,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from f3amd_lib.networks.spectral import spectral_convolution
 from flax import nnx
 
-from f3amd_lib.exercises.judging import agree, numbers
-from f3amd_lib.experiments import expressivity
-from f3amd_lib.networks.spectral import spectral_convolution
+from helpers import expressivity
+from helpers.exercises.judging import agree, numbers
 
 
 def _layer_matrix(weights, num_frames: int):

@@ -1,8 +1,12 @@
-"""What the checks of several exercises share: reading an answer and comparing it."""
+"""What the checks of several exercises share: reading an answer, comparing it, exact samples."""
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from f3amd_lib.diffusion import samplers
+from scipy.stats import norm
 
 
 class NotAnswered(ValueError):
@@ -32,20 +36,20 @@ def agree(answer, expected, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
     """Return whether an answer has the shape and, within a tolerance, the values expected.
 
     Args:
-      answer: a number, or a list or array of them.
+      answer: a number, or a list or array of them; refused as by `numbers`.
       expected: likewise.
       rtol, atol: relative and absolute tolerance; an entry may differ by atol + rtol |expected|.
-
-    Raises:
-      NotAnswered: for None or `...`, which a stub's function returns.
-      TypeError, ValueError: if the answer is made of something else than numbers.
     """
-    answer, expected = numbers(answer), np.asarray(expected, dtype=np.float64)
-    if answer.shape != expected.shape:
-        return False
-    return bool(np.all(np.abs(answer - expected) <= atol + rtol * np.abs(expected)))
+    answer = numbers(answer)
+    return answer.shape == np.shape(expected) and np.allclose(answer, expected, rtol, atol)
 
 
-def is_choice(answer, expected: str) -> bool:
-    """Return whether an answer in words is the expected one; case and outer blanks do not count."""
-    return isinstance(answer, str) and answer.strip().lower() == expected.lower()
+def normal_quantiles(count: int) -> np.ndarray:
+    """Return evenly spaced quantiles of the normal distribution, [count]: noise without chance."""
+    return norm.ppf((np.arange(count) + 0.5) / count)
+
+
+def sample(sampler: str, denoise, x_init, sigmas) -> np.ndarray:
+    """Return where a sampler of the library ends, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(samplers.sample(sampler, denoise, jnp.asarray(x_init), sigmas))

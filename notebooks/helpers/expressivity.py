@@ -15,33 +15,25 @@ weights leave.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from flax import nnx
-
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.conditioning import FiLM
 from f3amd_lib.networks.spectral import SpectralConvolution, cosine_basis, fourier_matrices
+from flax import nnx
+from scipy.linalg import toeplitz
 
 BANDS = ("fourier", "fourier beside a line", "cosine")
 """What is cut to its first modes: the Fourier series of a window; the same of what is left beside
 the line from its first to its last frame; its cosine series, with as many numbers."""
 
 CM = 100.0
-
-
-# ------------------------------------------------------------------------------- motion and modes
-
-
-def _check_band(band: str) -> None:
-    if band not in BANDS:
-        raise ValueError(f"unknown band {band!r}{nearest_hint(band, BANDS)}")
 
 
 def kept_projection(num_frames: int, num_kept_modes: int, band: str = "fourier") -> np.ndarray:
@@ -54,19 +46,18 @@ def kept_projection(num_frames: int, num_kept_modes: int, band: str = "fourier")
       band: one of `BANDS`.
 
     Raises:
-      ValueError: for an unknown band, m out of range, or a line through fewer than 2 frames.
+      ValueError: for an unknown band, or m out of range.
     """
-    _check_band(band)
-    analysis, synthesis = fourier_matrices(num_frames, num_kept_modes)
+    if band not in BANDS:
+        raise ValueError(f"unknown band {band!r}: use one of {BANDS}")
     if band == "cosine":
         basis = cosine_basis(num_frames, min(2 * num_kept_modes - 1, num_frames))
         return basis.T @ basis
+    analysis, synthesis = fourier_matrices(num_frames, num_kept_modes)
     rows = 2 * num_kept_modes
     kept = synthesis.reshape(num_frames, rows) @ analysis.reshape(rows, num_frames)
     if band == "fourier":
         return kept
-    if num_frames < 2:
-        raise ValueError(f"a line needs at least 2 frames, got {num_frames}")
     line = np.zeros((num_frames, num_frames))
     line[:, -1] = np.linspace(0.0, 1.0, num_frames)
     line[:, 0] = 1.0 - line[:, -1]
@@ -141,21 +132,23 @@ def motion_spectrum(skeleton: Skeleton, frames, fps: float = 30.0) -> pd.DataFra
       squares of all but the first mode add up to the mean square distance from the window's mean.
     """
     num_frames = frames.shape[-2]
-    rows = []
+    num_modes = num_frames // 2 + 1
+    frequency = fps / num_frames * np.arange(num_modes)
+    cosine = cosine_basis(num_frames)
+    mode_of_row = (np.arange(num_frames) + 1) // 2
+    tables = []
     for group, positions in group_positions(skeleton, frames).items():
         over_frames = np.moveaxis(positions, 1, 0).reshape(num_frames, -1)
-        analysis, synthesis = fourier_matrices(num_frames, num_frames // 2 + 1)
-        modes = np.einsum("tkp,kps,sn->ktn", synthesis, analysis, over_frames, optimize=True)
-        cosine = cosine_basis(num_frames)
-        by_row = (cosine @ over_frames) ** 2
-        mode_of_row = (np.arange(num_frames) + 1) // 2
-        pairs = np.zeros((num_frames // 2 + 1, over_frames.shape[1]))
-        np.add.at(pairs, mode_of_row, by_row)
-        for band, energy in (("fourier", (modes**2).sum(axis=1)), ("cosine", pairs)):
+        fourier = np.abs(np.fft.rfft(over_frames, axis=0)) ** 2 / num_frames
+        fourier[1 : (num_frames + 1) // 2] *= 2.0  # these bins stand for their conjugates, too
+        pairs = np.zeros((num_modes, over_frames.shape[1]))
+        np.add.at(pairs, mode_of_row, (cosine @ over_frames) ** 2)
+        for band, energy in (("fourier", fourier), ("cosine", pairs)):
             # Three coordinates make one distance.
-            square = 3.0 * energy.mean(axis=1) / num_frames
-            rows += [(band, group, fps / num_frames * mode, float(np.sqrt(value))) for mode, value in enumerate(square)]
-    return pd.DataFrame(rows, columns=["band", "group", "frequency_hz", "amplitude_cm"])
+            amplitude = np.sqrt(3.0 * energy.mean(axis=1) / num_frames)
+            columns = {"band": band, "group": group, "frequency_hz": frequency, "amplitude_cm": amplitude}
+            tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
 
 
 def band_limit_errors(skeleton: Skeleton, frames, kept: Sequence[int], bands: Sequence[str] = BANDS) -> pd.DataFrame:
@@ -172,17 +165,14 @@ def band_limit_errors(skeleton: Skeleton, frames, kept: Sequence[int], bands: Se
       the root's in the world, the others' beside the root.
     """
     real = group_positions(skeleton, frames)
-    rows = []
-    for band in bands:
-        for modes in kept:
-            cut = group_positions(skeleton, keep_modes(frames, modes, band))
-            for group, positions in real.items():
-                distance = np.linalg.norm(cut[group] - positions, axis=-1).mean(axis=(0, 2))
-                rows += [(band, modes, group, frame, float(error)) for frame, error in enumerate(distance)]
-    return pd.DataFrame(rows, columns=["band", "num_kept_modes", "group", "frame", "error_cm"])
-
-
-# ---------------------------------------------------------------------------------------- seams
+    tables = []
+    for band, modes in itertools.product(bands, kept):
+        cut = group_positions(skeleton, keep_modes(frames, modes, band))
+        for group, positions in real.items():
+            error = np.linalg.norm(cut[group] - positions, axis=-1).mean(axis=(0, 2))
+            columns = {"band": band, "num_kept_modes": modes, "group": group, "frame": range(len(error))}
+            tables.append(pd.DataFrame(columns | {"error_cm": error}))
+    return pd.concat(tables, ignore_index=True)
 
 
 def ramp_energy(num_frames: int, band: str = "fourier") -> np.ndarray:
@@ -197,40 +187,31 @@ def ramp_energy(num_frames: int, band: str = "fourier") -> np.ndarray:
 
     Returns:
       [T // 2 + 1] or [T]; the sum is that of t^2 over the window.
-
-    Raises:
-      ValueError: for another band.
     """
-    _check_band(band)
+    if band not in ("fourier", "cosine"):
+        raise ValueError(f"the energy of a line is known by 'fourier' or 'cosine' modes, not {band!r}")
     mean_energy = num_frames * ((num_frames - 1) / 2.0) ** 2
     if band == "fourier":
         mode = np.arange(1, num_frames // 2 + 1)
         energy = num_frames / (2.0 * np.sin(np.pi * mode / num_frames) ** 2)
         energy = np.where(2 * mode == num_frames, energy / 2.0, energy)
-    elif band == "cosine":
+    else:
         mode = np.arange(1, num_frames)
         half = np.pi * mode / (2.0 * num_frames)
         energy = np.cos(half) ** 2 / (2.0 * num_frames * np.sin(half) ** 4)
         energy = np.where(mode % 2 == 1, energy, 0.0)
-    else:
-        raise ValueError(f"nothing is left beside a line: use 'fourier' or 'cosine', not {band!r}")
     return np.concatenate([[mean_energy], energy])
 
 
-def toeplitz(taps, num_frames: int) -> np.ndarray:
+def causal_filter(taps, num_frames: int) -> np.ndarray:
     """Return the matrix of a filter that sees zeros before the window, [T, T].
 
     Args:
       taps: weights of the frame itself, the one before it, ..., [L], L <= T.
       num_frames: window length T.
-
-    Raises:
-      ValueError: for more taps than frames.
     """
-    taps = np.asarray(taps, np.float64)
-    if len(taps) > num_frames:
-        raise ValueError(f"a filter of {len(taps)} taps is longer than the window, {num_frames}")
-    return sum(tap * np.eye(num_frames, k=-lag) for lag, tap in enumerate(taps))
+    column = np.pad(np.asarray(taps, np.float64), (0, num_frames - len(taps)))
+    return toeplitz(column, np.zeros(num_frames))
 
 
 def wrapped_share(taps, num_frames: int, local_reach: int | None = None) -> float:
@@ -242,7 +223,7 @@ def wrapped_share(taps, num_frames: int, local_reach: int | None = None) -> floa
     local branch has weights of its own up to its reach, and leaves nothing there.
 
     Args:
-      taps: the filter, [L], L <= T, as in `toeplitz`.
+      taps: the filter, [L], L <= T, as in `causal_filter`.
       num_frames: window length T.
       local_reach: frames that a local branch sees to each side; None without one.
 
@@ -251,15 +232,12 @@ def wrapped_share(taps, num_frames: int, local_reach: int | None = None) -> floa
 
     Source: Eqs 2-4; T. Chan 1988 (the best circulant approximation).
     """
-    energy = np.sum(toeplitz(taps, num_frames) ** 2)
+    energy = np.sum(causal_filter(taps, num_frames) ** 2)
     lag = np.arange(len(taps))
     left = np.asarray(taps, np.float64) ** 2 * lag * (num_frames - lag) / num_frames
     if local_reach is not None:
         left = np.where(np.minimum(lag, num_frames - lag) <= local_reach, 0.0, left)
     return float(left.sum() / energy)
-
-
-# -------------------------------------------------------------------------- filters by condition
 
 
 def film_share(filters, num_channels: int) -> float:
@@ -292,12 +270,6 @@ def additive_share(filters) -> float:
     return float(1.0 - np.sum(filters.mean(axis=0) ** 2) / np.mean(np.sum(filters**2, axis=1)))
 
 
-def _zeroed(build):
-    """Return the module that `build` makes, all its weights zero; nothing is drawn for it."""
-    graph, state = nnx.split(nnx.eval_shape(build))
-    return nnx.merge(graph, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state))
-
-
 def spectral_layer(kernels) -> SpectralConvolution:
     """Return a spectral layer with given kernels.
 
@@ -310,7 +282,7 @@ def spectral_layer(kernels) -> SpectralConvolution:
     kernels = np.asarray(kernels, np.float64)
     width_in, width_out, num_frames = kernels.shape
     weights = np.moveaxis(np.fft.rfft(kernels, axis=-1), -1, 0)
-    layer = _zeroed(lambda: SpectralConvolution(width_in, width_out, len(weights), rngs=nnx.Rngs(0)))
+    layer = SpectralConvolution(width_in, width_out, len(weights), rngs=nnx.Rngs(0))
     layer.weight_real[...] = jnp.asarray(weights.real, jnp.float32)
     layer.weight_imag[...] = jnp.asarray(weights.imag, jnp.float32)
     return layer
@@ -343,7 +315,7 @@ def film_for_filters(filters, num_channels: int | None = None) -> tuple[Spectral
     largest = 1.25 * np.abs(gains).max()
     kernels = np.concatenate([largest * right[:used], largest * right[:used].sum(0)[None]])
     width = used + 1
-    film = _zeroed(lambda: FiLM(width, len(filters), rngs=nnx.Rngs(0)))
+    film = FiLM(width, len(filters), rngs=nnx.Rngs(0))
     gamma = np.pad(np.arctanh(gains / largest), ((0, 0), (0, 1)))
     film.modulation.kernel[...] = jnp.asarray(np.pad(gamma, ((0, 0), (0, width))), jnp.float32)
     signs = np.append(np.ones(used), -1.0)
@@ -372,7 +344,7 @@ def film_delay_line(num_blocks: int, num_frames: int) -> list[tuple[SpectralConv
         delays = np.zeros((2, num_frames))
         delays[0, 0] = 1.0
         delays[1, 2**number % num_frames] = 1.0
-        film = _zeroed(lambda: FiLM(2, num_blocks, rngs=nnx.Rngs(0)))
+        film = FiLM(2, num_blocks, rngs=nnx.Rngs(0))
         modulation = np.zeros((num_blocks, 4))
         # tanh(20) is 1 to rounding: gates of exactly 0 and 2.
         modulation[number, :2] = -20.0, 20.0

@@ -1,0 +1,399 @@
+"""A bimodal toy: walks past a wall, on its left or on its right, and small networks for them.
+
+A window of motion is here a path of a few points on the ground. Every path of the data passes the
+wall on one side, so that the mean of all paths runs into it: a sampler whose one step returns a
+mean must fail, unless the condition gives the side. The data are a Gaussian mixture over whole
+paths, whose denoiser is known exactly (`diffusion.oracles`), and the networks are F3AMD's own
+(`networks.zoo`), only smaller, so that what is trained can be laid beside what is exact.
+
+Paths are [B, T, 2], sideways (positive to the walker's left, as +X is) and ahead, in metres from
+the middle of the wall; their coordinates have a deviation of about 1, so that metres are network
+units as well. A side is a number: 0 unknown, 1 left, 2 right.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pandas as pd
+from f3amd_lib.data.features import path_condition
+from f3amd_lib.diffusion import samplers
+from f3amd_lib.diffusion.oracles import GaussianMixture
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import scaled_input
+from f3amd_lib.networks.spectral import cosine_basis
+from f3amd_lib.networks.zoo import build_config, build_from_config
+from flax import nnx
+
+UNKNOWN, LEFT, RIGHT = range(3)
+
+_HISTORY = 2
+"""History frames of the networks: two points of a straight approach, the same for all."""
+
+
+@functools.partial(jax.tree_util.register_static)
+@dataclass(frozen=True)
+class BimodalPaths:
+    """Paths that pass a wall on either side, equally often, and their exact denoiser.
+
+    Ahead, a path runs from -reach to +reach at a steady pace; sideways it swings out along a
+    squared cosine and back. On top lies a smooth wobble: round Gaussian noise on the first cosine
+    modes of both coordinates.
+
+    Attributes:
+      swing: how far the two mean paths swing to the side, metres, more than `wall`.
+      wall: half the wall's width, metres.
+      reach: half the length of the walk, metres.
+      wobble: deviation of a coordinate from its mean path, root mean square over frames, metres.
+      num_frames: points of a path, T.
+      num_modes: cosine modes that paths are made of, K, from 2 to T.
+    """
+
+    swing: float = 1.4
+    wall: float = 0.5
+    reach: float = 2.0
+    wobble: float = 0.1
+    num_frames: int = 16
+    num_modes: int = 6
+
+    @property
+    def data(self) -> BimodalPaths:
+        """The paths themselves, under the name that `PathNetwork` has for its data."""
+        return self
+
+    @property
+    def basis(self) -> np.ndarray:
+        """Orthonormal cosine modes over frames, [K, T] float64."""
+        return cosine_basis(self.num_frames)[: self.num_modes]
+
+    @functools.cached_property
+    def mixture(self) -> GaussianMixture:
+        """The data as a mixture over cosine coefficients, D = 2 K: left, then right."""
+        time = np.linspace(-1.0, 1.0, self.num_frames)
+        swing = self.swing * np.cos(0.5 * np.pi * time) ** 2
+        drawn = np.stack([np.stack([s * swing, self.reach * time], -1) for s in (1.0, -1.0)])
+        # The basis is orthonormal: noise of one deviation on frames is that noise on coefficients.
+        width = self.wobble * np.sqrt(self.num_frames / self.num_modes)
+        return GaussianMixture(np.einsum("kt,stc->skc", self.basis, drawn).reshape(2, -1), width)
+
+    @property
+    def mean_paths(self) -> np.ndarray:
+        """The mean path on the left and the one on the right, [2, T, 2], metres."""
+        means = self.mixture.means.reshape(2, self.num_modes, 2)
+        return np.einsum("kt,skc->stc", self.basis, means)
+
+    def _paths(self, coefficients):
+        """Turn coefficients [B, 2 K] into paths [B, T, 2]."""
+        modes = coefficients.reshape(-1, self.num_modes, 2)
+        return jnp.einsum("kt,bkc->btc", self.basis, modes)
+
+    def draw(self, key, count: int):
+        """Draw real paths.
+
+        Args:
+          key: JAX random key.
+          count: B.
+
+        Returns:
+          (paths [B, T, 2], side [B], 1 or 2).
+        """
+        key_side, key_wobble = jax.random.split(key)
+        side = jax.random.randint(key_side, (count,), LEFT, RIGHT + 1)
+        means = jnp.asarray(self.mixture.means, jnp.float32)[side - LEFT]
+        wobble = jax.random.normal(key_wobble, means.shape)
+        return self._paths(means + self.mixture.width * wobble), side
+
+    def denoise(self, x_noisy, sigma, side):
+        """Return the exact clean estimate E[x0 | x_noisy, sigma, side].
+
+        Args:
+          x_noisy: paths with noise, [B, T, 2].
+          sigma: noise level, scalar or [B].
+          side: what the condition says of each path's side, [B].
+
+        Returns:
+          [B, T, 2].
+        """
+        flat = jnp.einsum("kt,btc->bkc", self.basis, jnp.asarray(x_noisy))
+        flat = flat.reshape(len(flat), -1)
+        sigma = jnp.broadcast_to(jnp.asarray(sigma, flat.dtype), flat.shape[:1])[:, None]
+        both = self.mixture
+        one_way = [GaussianMixture(mean[None], both.width) for mean in both.means]
+        estimates = jnp.stack([mixture.denoise(flat, sigma) for mixture in (both, *one_way)])
+        # Noise outside of the modes says nothing of the path and is dropped.
+        return self._paths(estimates[jnp.asarray(side), jnp.arange(len(flat))])
+
+    def condition(self, side) -> Condition:
+        """Return what a network is shown: a straight approach, and a path that may give the side.
+
+        Args:
+          side: [B]. An unknown one shows a straight path, which leads through the wall; the others
+            show their mean path.
+
+        Returns:
+          Condition of B rows, with a single style.
+        """
+        ahead = np.linspace(-self.reach, self.reach, self.num_frames)
+        straight = np.stack([0.0 * ahead, ahead], axis=-1)
+        paths = np.concatenate([straight[None], self.mean_paths])
+        paths = path_condition(paths, np.zeros(paths.shape[:2])).astype(np.float32)
+        before = ahead[0] + (ahead[1] - ahead[0]) * np.arange(-_HISTORY, 0)
+        approach = np.stack([0.0 * before, before], axis=-1).astype(np.float32)
+        return Condition(
+            history=jnp.broadcast_to(approach, (len(side), *approach.shape)),
+            path=jnp.asarray(paths)[side],
+            style=jnp.ones((len(side), 1), jnp.float32),
+        )
+
+
+def crossing(paths) -> np.ndarray:
+    """Return where paths cross the line of the wall.
+
+    Args:
+      paths: [B, T, 2], metres.
+
+    Returns:
+      Sideways position of the first crossing from below 0 ahead to 0 or more, [B], metres; NaN for
+      a path that never crosses.
+    """
+    sideways, ahead = np.moveaxis(np.asarray(paths, np.float64), -1, 0)
+    passes = (ahead[:, :-1] < 0.0) & (ahead[:, 1:] >= 0.0)
+    rows, frame = np.arange(len(ahead)), passes.argmax(axis=1)
+    before, after = ahead[rows, frame], ahead[rows, frame + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = -before / (after - before)
+        found = (1.0 - share) * sideways[rows, frame] + share * sideways[rows, frame + 1]
+    return np.where(passes.any(axis=1), found, np.nan)
+
+
+def outcome_shares(data: BimodalPaths, paths) -> dict[str, float]:
+    """Return how paths end: shares that run into the wall, pass it on a side, or never get there.
+
+    Args:
+      data: whose wall.
+      paths: [B, T, 2], metres.
+
+    Returns:
+      "wall", "left", "right" and "short", which add up to 1.
+    """
+    place = crossing(paths)
+    return {
+        "wall": float(np.mean(np.abs(place) < data.wall)),
+        "left": float(np.mean(place >= data.wall)),
+        "right": float(np.mean(place <= -data.wall)),
+        "short": float(np.mean(np.isnan(place))),
+    }
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("params", "input_scaling"), meta_fields=("data", "graph")
+)
+@dataclass(frozen=True, eq=False)
+class PathNetwork:
+    """A small trained F3AMD.
+
+    Attributes:
+      params: weights (the moving average).
+      input_scaling: whether the noisy input is multiplied by c_in (see `scaled_input`). It is a
+        value and no part of the network, so that one compiled program serves with and without.
+      data: what it was trained on.
+      graph: the network without its weights, whose own config scales nothing.
+    """
+
+    params: Any
+    input_scaling: Any
+    data: BimodalPaths
+    graph: Any
+
+    def denoise(self, x_noisy, sigma, side):
+        """Return the network's clean estimate; arguments as for `BimodalPaths.denoise`."""
+        network = nnx.merge(self.graph, self.params)
+        sigma = jnp.broadcast_to(jnp.asarray(sigma, x_noisy.dtype), x_noisy.shape[:1])
+        scaling = dataclasses.replace(network.config, input_scaling=True)
+        scaled = scaled_input(scaling, x_noisy, sigma)
+        shown = jnp.where(self.input_scaling, scaled, x_noisy)
+        return network(shown, sigma, network.encode(self.data.condition(side)))
+
+
+def train_network(
+    data: BimodalPaths,
+    diffusion: NoiseSchedule,
+    *,
+    input_scaling: bool = True,
+    num_steps: int = 1500,
+    batch_size: int = 32,
+    learning_rate: float = 4e-3,
+    latent_width: int = 16,
+    depth: int = 2,
+    seed: int = 0,
+) -> tuple[PathNetwork, np.ndarray]:
+    """Train a small F3AMD on paths drawn afresh at every step, half of them with the side given.
+
+    The loss is the square error of the clean estimate alone (Eq. 11), the rate a short warm-up and
+    a cosine. Networks that differ in noise or input scaling start from the same weights and see the
+    same paths, noise and conditions.
+
+    Args:
+      data: the paths.
+      diffusion: the noise.
+      input_scaling: multiply the noisy input by c_in.
+      num_steps, batch_size, learning_rate: of the optimiser.
+      latent_width, depth: of the network (D and N of sections 4.2 and 4.5).
+      seed: of weights and paths.
+
+    Returns:
+      (network, loss at every step [num_steps]).
+    """
+    config = build_config(
+        "F3AMD-FNO-32", channels=2, num_styles=1, window=data.num_frames, num_history=_HISTORY,
+        latent_width=latent_width, depth=depth, input_scaling=False,
+    )  # fmt: skip
+    key_init, key_sigma, key_batches = jax.random.split(jax.random.key(seed), 3)
+    graph = nnx.graphdef(nnx.eval_shape(lambda: build_from_config(config, key_init)))
+    params = jax.jit(lambda key: nnx.state(build_from_config(config, key)))(key_init)
+    sigmas = diffusion.draw(jax.random.split(key_sigma, 3)[0], (num_steps * batch_size,))
+    batches = _draw_batches(data, sigmas.reshape(num_steps, batch_size), key_batches)
+    network = PathNetwork(params, jnp.asarray(input_scaling), data, graph)
+    network, losses = _train(network, learning_rate, batches)
+    return network, np.asarray(losses)
+
+
+@functools.partial(jax.jit, static_argnames="data")
+def _draw_batches(data: BimodalPaths, sigmas, key):
+    """Draw all that training sees, [num_steps, B, ...]: the toy fits into memory as a whole."""
+    key_path, key_noise, key_known = jax.random.split(key, 3)
+    x0, side = data.draw(key_path, sigmas.size)
+    noise = jax.random.normal(key_noise, x0.shape)
+    x_noisy = samplers.add_noise(x0, sigmas.reshape(-1, 1, 1), noise)
+    side = jnp.where(jax.random.bernoulli(key_known, 0.5, side.shape), side, UNKNOWN)
+    by_step = lambda array: array.reshape(*sigmas.shape, *array.shape[1:])
+    return by_step(x0), by_step(x_noisy), sigmas, by_step(side)
+
+
+@functools.partial(jax.jit, static_argnames="learning_rate")
+def _train(network: PathNetwork, learning_rate: float, batches):
+    num_steps = len(batches[0])
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, learning_rate, max(1, num_steps // 10), num_steps, 0.01 * learning_rate
+    )
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+
+    def loss_of(params, x0, *inputs):
+        x0_hat = dataclasses.replace(network, params=params).denoise(*inputs)
+        return jnp.mean((x0_hat - x0) ** 2)
+
+    def step(state, batch):
+        params, average, moments = state
+        loss, gradient = jax.value_and_grad(loss_of)(params, *batch)
+        updates, moments = optimiser.update(gradient, moments, params)
+        params = optax.apply_updates(params, updates)
+        average = optax.incremental_update(params, average, 0.01)
+        return (params, average, moments), loss
+
+    start = (network.params, network.params, optimiser.init(network.params))
+    (_, average, _), losses = jax.lax.scan(step, start, batches)
+    return dataclasses.replace(network, params=average), losses
+
+
+@jax.jit
+def _denoise(model, x_noisy, sigma, side):
+    return model.denoise(x_noisy, sigma, side)
+
+
+def sample_paths(model: BimodalPaths | PathNetwork, diffusion: NoiseSchedule, num_steps: int, side, key) -> np.ndarray:
+    """Sample paths with the sampler that belongs to a noise schedule.
+
+    The answer is that of `samplers.sample`, but only the denoiser is compiled, once for all numbers
+    of steps: this toy waits for its compiler more than for its steps.
+
+    Args:
+      model: a trained network, or the data themselves, whose denoiser is exact.
+      diffusion: the noise schedule; it says which levels are visited, and by DDIM or DDPM.
+      num_steps: N.
+      side: what the condition says, [B].
+      key: JAX random key; first states are the same for all models and numbers of steps.
+
+    Returns:
+      [B, T, 2], metres.
+    """
+    key_init, key_steps = jax.random.split(key)
+    side = jnp.asarray(side, jnp.int32)
+    sigmas = np.asarray(diffusion.grid(num_steps), np.float32)
+    x = sigmas[0] * jax.random.normal(key_init, (len(side), model.data.num_frames, 2))
+    keys = jax.random.split(key_steps, num_steps)
+    for sigma, sigma_next, key_noise in zip(sigmas[:-1], sigmas[1:], keys, strict=True):
+        x0_hat = _denoise(model, x, sigma, side)
+        if diffusion.sampler == "ddpm":
+            noise = jax.random.normal(key_noise, x.shape)
+            x = samplers.ddpm_step(x, x0_hat, sigma, sigma_next, noise)
+        else:
+            x = samplers.ddim_step(x, x0_hat, sigma, sigma_next)
+    return np.asarray(x)
+
+
+def outcome_table(
+    model: BimodalPaths | PathNetwork,
+    diffusion: NoiseSchedule,
+    steps: Iterable[int] = (1, 2, 4, 8),
+    *,
+    num_samples: int = 400,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Count how sampled paths end, with and without the side in the condition.
+
+    Args:
+      model, diffusion: as for `sample_paths`.
+      steps: numbers of steps N.
+      num_samples: paths without, and as many with the side given, half of them each side.
+      seed: of the noise.
+
+    Returns:
+      Columns steps, told (whether the side was given), wall, left, right, short (shares; see
+      `outcome_shares`), as_told (share that passed on the given side; NaN where none was).
+    """
+    half = num_samples // 2
+    side = np.repeat([UNKNOWN, LEFT, RIGHT], [num_samples, half, num_samples - half])
+    rows = []
+    for num_steps in steps:
+        paths = sample_paths(model, diffusion, num_steps, side, jax.random.key(seed))
+        place = crossing(paths)
+        right_way = np.where(side == LEFT, place, -place)[side != UNKNOWN] >= model.data.wall
+        for given, share in ((False, float("nan")), (True, float(np.mean(right_way)))):
+            shares = outcome_shares(model.data, paths[(side != UNKNOWN) == given])
+            rows.append({"steps": num_steps, "told": given, **shares, "as_told": share})
+    return pd.DataFrame(rows)
+
+
+def error_table(
+    model: BimodalPaths | PathNetwork, sigmas: Iterable[float], *, num_samples: int = 800, seed: int = 0
+) -> pd.DataFrame:
+    """Measure the error of the clean estimate at each noise level, with no side given.
+
+    Args:
+      model: as for `sample_paths`.
+      sigmas: noise levels.
+      num_samples: real paths; they and their noise are the same for all models and levels.
+      seed: of the paths and the noise.
+
+    Returns:
+      Columns sigma and x0_error, root mean square over frames and coordinates, metres. The exact
+      denoiser's is the lowest there is: the spread that noise and condition leave.
+    """
+    key_path, key_noise = jax.random.split(jax.random.key(seed))
+    x0, side = model.data.draw(key_path, num_samples)
+    noise = jax.random.normal(key_noise, x0.shape)
+    rows = []
+    for sigma in np.asarray(list(sigmas), np.float32):
+        x0_hat = _denoise(model, samplers.add_noise(x0, sigma, noise), sigma, UNKNOWN * side)
+        error = float(jnp.sqrt(jnp.mean((x0_hat - x0) ** 2)))
+        rows.append({"sigma": float(sigma), "x0_error": error})
+    return pd.DataFrame(rows)
