@@ -64,15 +64,14 @@ class Records:
         if earlier is not None:
             rows = pd.concat([earlier[~self._same(name, row)], rows])
         self.tables[name] = rows
-        self.write(name, rows)
+        self._write(name, rows, name)
 
-    def write(self, name: str, rows: pd.DataFrame) -> None:
-        """Write a table; its record names the weights that its measurement has used so far."""
+    def _write(self, name: str, rows: pd.DataFrame, source: str) -> None:
+        """Write a table; its record names the weights of the table that it was made from, itself or another."""
         digests = {}
-        for table, keys in self.keys.items():
-            if self.tables[table] is not None and "weights" in self.tables[table]:
-                used = self.tables[table].groupby(keys[0], sort=False)["weights"].unique()
-                digests |= used.map(list).to_dict()
+        if "weights" in self.tables[source]:
+            used = self.tables[source].groupby(self.keys[source][0], sort=False)["weights"].unique()
+            digests = used.map(list).to_dict()
         write_table(self.path(name), rows, self.record | {"weights_digests": digests})
 
     def measure(
@@ -96,4 +95,4 @@ class Records:
                 self.put(name, row, rows)
             for name, (table, summarise) in self.summaries.items():
                 if table in measured:
-                    self.write(name, summarise(self.tables[table]))
+                    self._write(name, summarise(self.tables[table]), table)
