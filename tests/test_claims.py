@@ -632,7 +632,7 @@ ON_GPU = times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))
     [
         ("Q13", {"quality": GOOD + GOOD[:1]}, {}, "two rows of"),
         ("Q13", {"quality": [{**GOOD[0], "model": "FNO-96"}]}, {}, "unknown model 'FNO-96'"),
-        ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, {}, "trajectory_error is in cm, not in m"),
+        ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, {}, "another unit than the paper of .*trajectory_error"),
         ("Q13", {"quality": [{"model": FNO, "value": 1.0}]}, {}, "needs a column 'window_frames'"),
         ("E2", {"synthesis_time": ON_GPU}, {"device_platform": "cpu"}, "knows only a CPU"),
         ("E2", {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]}, {}, "device must be CPU or GPU"),
@@ -667,8 +667,56 @@ def test_unknown_names_and_smoke_runs_are_refused(tmp_path):
         claims.judge_claims(tmp_path, profile="smoke")
     with pytest.raises(ValueError, match="unknown data set 'bandi'; did you mean 'bandai'"):
         claims.judge_claims(tmp_path, dataset="bandi")
-    with pytest.raises(ValueError, match="unknown claim 'E18'"):
+    with pytest.raises(ValueError, match="f3amd/claims.toml: unknown claim 'E18'"):
         claims.find_claim("E18")
+
+
+# ------------------------------------------------------------------------------ the file of claims
+
+STATEMENT = {"says": "FNO is worse", "kind": "worse", "model": FNO, "against": CAMDM, "metric": "FID"}
+FILE = {
+    "groups": {"Q": "Quality"},
+    "thresholds": {"minor": 1.3},
+    "families": {"FNO": {"models": [FNO, "F3AMD-FNO-64"], "required": [FNO]}},
+}
+SPREAD = {"says": "alike", "kind": "metric_spread", "metric": "FID", "within": [0, "minor"]}
+
+
+def read(*statements, ids=("Q1",)):
+    entry = {"text": "worse", "where": "1", "decided_by": "FID", "statement": list(statements)}
+    return claims.read_claims(FILE | {"claim": [{"id": name, **entry} for name in ids]}, "f3amd", "f.toml")
+
+
+def test_a_statement_names_its_kind_models_and_range():
+    (claim,) = read(STATEMENT | {"about": [5, 2]}, SPREAD | {"models": {"family": "FNO", "window": 64}})
+    first, second = (statement.rule.keywords for statement in claim.statements)
+    assert first["model"] == Setting(FNO) and first["bounds"] == pytest.approx((2.25, 2.75))
+    assert second["bounds"] == (0, 1.3) and second["models"].required == (Setting(FNO, window=64),)
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ({key: STATEMENT[key] for key in STATEMENT if key != "kind"}, "has no 'kind'; add it"),
+        (STATEMENT | {"kind": "wors"}, "unknown kind of judgement 'wors'; did you mean 'worse'"),
+        (STATEMENT | {"model": "FNO-96"}, "unknown model 'FNO-96'"),
+        (STATEMENT | {"model": {"model": FNO, "step": 1}}, "unknown key 'step'; did you mean 'steps'"),
+        (STATEMENT | {"within": [0, 1], "alike": 0.1}, "has the ranges within and alike; keep one"),
+        (STATEMENT | {"within": [0, "miner"]}, "unknown threshold 'miner'; did you mean 'minor'"),
+        (STATEMENT | {"device": "GPU"}, "unexpected keyword argument 'device'; worse takes"),
+        ({key: STATEMENT[key] for key in STATEMENT if key != "metric"}, "missing a required argument: 'metric'"),
+        (SPREAD | {"models": {"family": "FN"}}, "unknown family 'FN'"),
+    ],
+)
+def test_a_broken_statement_is_an_error(statement, message):
+    with pytest.raises(ValueError, match=f"f.toml, claim Q1, '{statement['says']}': .*{message}"):
+        read(statement)
+
+
+def test_an_id_is_used_once_and_begins_with_a_group():
+    for ids in (("Q1", "Q1"), ("X1",)):
+        with pytest.raises(ValueError, match="id of its own that begins with one of Q"):
+            read(STATEMENT, ids=ids)
 
 
 # ----------------------------------------------------------------------- the paper's own tables

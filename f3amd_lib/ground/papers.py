@@ -57,6 +57,13 @@ def check_entry(entry: Mapping, where: str, required: Iterable[str], optional: I
             raise ValueError(f"{where}: unknown key {key!r}{nearest_hint(key, known)}")
 
 
+def find_entry(known: Mapping, name, what: str, where: str):
+    """Return a value by its name; ValueError with the nearest name if there is none."""
+    if name not in known:
+        raise ValueError(f"{where}: unknown {what} {name!r}{nearest_hint(name, known)}")
+    return known[name]
+
+
 PAPER_SETTING: str = load_paper_file("paper")["setting"]
 """Label of the F3AMD paper's column: its data and, for times, its hardware and compiler."""
 

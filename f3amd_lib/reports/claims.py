@@ -20,14 +20,13 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
 from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import check_entry, load_paper_file, paper_folders
+from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.reports import judgements as judging
@@ -58,50 +57,37 @@ _SYNTHETIC = "synthetic (procedural, no real motion)"
 
 @dataclass(frozen=True)
 class Statement:
-    """A part of a claim, judged.
+    """A part of a claim, and what some evidence says of it.
 
     Attributes:
       says: the sentence, in our words.
-      verdict: of `VERDICTS`; "" for a remark that decides nothing.
+      rule: its kind of judgement with its parameters, from evidence to verdict and figure.
+      optional: where it was not measured, nobody misses it.
+      remark: it decides nothing.
+      verdict: of `VERDICTS`; "" for a remark, and before it is judged.
       figure: what was found, or why nothing was.
       sources: tables that it rests on.
-      optional: where it was not measured, nobody misses it.
       no_table: it was not measured because a whole table is missing.
     """
 
     says: str
-    verdict: str
-    figure: str
-    sources: tuple[Source, ...] = ()
+    rule: Callable[[Evidence], judging.Finding]
     optional: bool = False
+    remark: bool = False
+    verdict: str = REMARK
+    figure: str = ""
+    sources: tuple[Source, ...] = ()
     no_table: bool = False
 
-
-@dataclass(frozen=True)
-class Rule:
-    """How a statement is judged.
-
-    Attributes:
-      says: the sentence.
-      judge: its kind of judgement with the statement's parameters, from evidence to verdict and figure.
-      optional: see `Statement`.
-      remark: it decides nothing.
-    """
-
-    says: str
-    judge: Callable[[Evidence], judging.Finding]
-    optional: bool
-    remark: bool
-
-    def apply(self, evidence: Evidence) -> Statement:
+    def judge(self, evidence: Evidence) -> Statement:
         """Return the statement as this evidence has it."""
-        evidence.forget_sources()
-        optional = self.optional or self.remark
+        evidence.sources.clear()
         try:
-            verdict, figure = self.judge(evidence)
+            verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
-            return Statement(self.says, UNMEASURED, str(gap), (), optional, isinstance(gap, NoTable))
-        return Statement(self.says, REMARK if self.remark else verdict, figure, tuple(evidence.sources), optional)
+            return replace(self, verdict=UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
+        verdict = REMARK if self.remark else verdict
+        return replace(self, verdict=verdict, figure=figure, sources=tuple(dict.fromkeys(evidence.sources)))
 
 
 @dataclass(frozen=True)
@@ -115,7 +101,7 @@ class Claim:
       text: what is claimed, in our words.
       where: sections and tables of the paper.
       decided_by: the quantity that decides it.
-      rules: of its statements.
+      statements: what it stands for, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
     """
@@ -126,13 +112,13 @@ class Claim:
     text: str
     where: str
     decided_by: str
-    rules: tuple[Rule, ...]
+    statements: tuple[Statement, ...]
     paper_says: str = ""
     computed: bool = False
 
     def judge(self, evidence: Evidence) -> list[Statement]:
         """Return its statements as this evidence has them."""
-        return [rule.apply(evidence) for rule in self.rules]
+        return [statement.judge(evidence) for statement in self.statements]
 
 
 # ------------------------------------------------------------------------------------- the paper's file
@@ -152,27 +138,23 @@ def _read_models(value, families: Mapping, where: str) -> Setting | Family | lis
     if isinstance(value, list):
         return [_read_models(item, families, where) for item in value]
     value = {"model": value} if isinstance(value, str) else value
-    if "family" not in value:
-        check_entry(value, where, ("model",), ("steps", "window"))
-        check_model(value["model"], where)
-        return Setting(**value)
-    check_entry(value, where, ("family",), ("window",))
-    if value["family"] not in families:
-        raise ValueError(f"{where}: unknown family {value['family']!r}{nearest_hint(value['family'], families)}")
-    family = {key: [{"model": model} for model in names] for key, names in families[value["family"]].items()}
-    window = {key: item for key, item in value.items() if key == "window"}
-    return Family(
-        *(tuple(_read_models(model | window, {}, where) for model in family[key]) for key in ("models", "required"))
-    )
+    if "family" in value:
+        check_entry(value, where, ("family",), ("window",))
+        family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
+        chosen = {key: [{"model": model, "window": window} for model in family[key]] for key in ("models", "required")}
+        return Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
+    check_entry(value, where, ("model",), ("steps", "window"))
+    check_model(value["model"], where)
+    return Setting(**value)
 
 
-def _read_rule(entry: Mapping, about: Mapping, where: str) -> Rule:
+def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
+    where = f"{where}, {entry.get('says')!r}"
+    check_entry({key: entry[key] for key in ("says", "kind") if key in entry}, where, ("says", "kind"))
     parameters = dict(entry)
-    says, name = (parameters.pop(key, None) for key in ("says", "kind"))
+    says = parameters.pop("says")
+    kind = find_entry(_KINDS, parameters.pop("kind"), "kind of judgement", where)
     optional, remark = (parameters.pop(key, False) for key in ("optional", "remark"))
-    where = f"{where}, {says!r}"
-    if name not in _KINDS:
-        raise ValueError(f"{where}: unknown kind of judgement {name!r}{nearest_hint(name, _KINDS)}")
     for key in set(_MODELS) & set(parameters):
         parameters[key] = _read_models(parameters[key], about.get("families", {}), where)
     ranges = [key for key in _RANGES if key in parameters]
@@ -180,18 +162,16 @@ def _read_rule(entry: Mapping, about: Mapping, where: str) -> Rule:
         raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
     for key in ranges:
         value = parameters.pop(key)
-        bounds = []
-        for bound in value if isinstance(value, list) else [value]:
-            if isinstance(bound, str) and bound not in about["thresholds"]:
-                raise ValueError(f"{where}: unknown threshold {bound!r}{nearest_hint(bound, about['thresholds'])}")
-            bounds.append(about["thresholds"].get(bound, bound))
+        bounds = [
+            find_entry(about.get("thresholds", {}), bound, "threshold", where) if isinstance(bound, str) else bound
+            for bound in (value if isinstance(value, list) else [value])
+        ]
         parameters["bounds"] = _RANGES[key](*bounds)
-    judge = functools.partial(_KINDS[name], **parameters)
     try:
-        inspect.signature(_KINDS[name]).bind(None, **parameters)
+        inspect.signature(kind).bind(None, **parameters)
     except TypeError as error:
-        raise ValueError(f"{where}: {name}: {error}; it takes {inspect.signature(_KINDS[name])}") from None
-    return Rule(says, judge, optional, remark)
+        raise ValueError(f"{where}: {error}; {kind.__name__} takes {inspect.signature(kind)}") from None
+    return Statement(says, functools.partial(kind, **parameters), optional or remark, remark)
 
 
 def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
@@ -205,6 +185,7 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
     Raises:
       ValueError: for what is missing, unknown or twice; the message says file, claim and statement.
     """
+    check_entry(about, where, ("groups", "claim"), ("thresholds", "families"))
     claims: dict[str, Claim] = {}
     for entry in about["claim"]:
         here = f"{where}, claim {entry.get('id')}"
@@ -212,8 +193,8 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
             raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
         fields = {key: value for key, value in entry.items() if key != "statement"}
-        rules = tuple(_read_rule(statement, about, here) for statement in entry["statement"])
-        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], rules=rules, **fields)
+        statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
+        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
     return list(claims.values())
 
 
@@ -229,10 +210,7 @@ def find_claim(claim_id: str, paper: str = "f3amd") -> Claim:
     Raises:
       ValueError: for an unknown id, with the nearest one.
     """
-    by_id = {claim.id: claim for claim in load_claims(paper)}
-    if claim_id not in by_id:
-        raise ValueError(f"unknown claim {claim_id!r}{nearest_hint(claim_id, by_id)}")
-    return by_id[claim_id]
+    return find_entry({claim.id: claim for claim in load_claims(paper)}, claim_id, "claim", f"{paper}/claims.toml")
 
 
 # ------------------------------------------------------------------------------------------ judging
@@ -294,9 +272,9 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
       The judgement; where nothing was measured, with the reasons of the first data set that has
       at least the table.
     """
-    if claim.computed:
-        return Judgement(claim, _seen(claim.judge(paper_evidence(claim.paper))), (), "computed")
     paper = _seen(claim.judge(paper_evidence(claim.paper)))
+    if claim.computed:
+        return Judgement(claim, paper, (), "computed")
     tried = []
     for dataset, some in evidences.items():
         ours = _merged(claim, some)
@@ -306,10 +284,6 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
     # A row that is missing says more than a missing table.
     says_more = (ours for ours in tried if not all(statement.no_table for statement in ours))
     return Judgement(claim, next(says_more, tried[0]), paper, "")
-
-
-def _names(given) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
 
 
 def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
@@ -328,7 +302,8 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
       ValueError: for unknown names, or records that are broken or lie in the wrong folder.
     """
     root = repository_root() / "paper_figures" if root is None else Path(root)
-    evidences = {data: [recorded_evidence(root, data, name) for name in _names(profile)] for data in _names(dataset)}
+    datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
+    evidences = {data: [recorded_evidence(root, data, name) for name in profiles] for data in datasets}
     return [judge_claim(claim, evidences) for claim in load_claims(paper)]
 
 
@@ -386,24 +361,15 @@ def ledger(judgements: Sequence[Judgement] | None = None) -> pd.DataFrame:
 
 def statement_table(judgement: Judgement) -> pd.DataFrame:
     """Return the statements behind a judgement: statement, ours, the paper's tables."""
-
-    def cell(statement: Statement | None) -> str:
-        if statement is None:
-            return ""
-        if statement.verdict == UNMEASURED:
-            return f"{UNMEASURED} ({statement.figure})"
-        return statement.figure + (f" · {statement.verdict}" if statement.verdict else "")
-
-    ours, paper = ({s.says: s for s in some} for some in (judgement.ours, judgement.paper))
-    rules = [rule for rule in judgement.claim.rules if rule.says in ours or rule.says in paper]
-    return pd.DataFrame(
-        {
-            "statement": f"({rule.says})" if rule.remark else rule.says,
-            "ours": cell(ours.get(rule.says)),
-            "the paper's tables": cell(paper.get(rule.says)),
-        }
-        for rule in rules
-    )
+    rows: dict[str, dict] = {}
+    for statement in judgement.claim.statements:
+        says = f"({statement.says})" if statement.remark else statement.says
+        rows[statement.says] = {"statement": says, "ours": "", "the paper's tables": ""}
+    for column, statements in (("ours", judgement.ours), ("the paper's tables", judgement.paper)):
+        for found in statements:
+            text = f"{found.figure} · {found.verdict}" if found.verdict else found.figure
+            rows[found.says][column] = f"{UNMEASURED} ({found.figure})" if found.verdict == UNMEASURED else text
+    return pd.DataFrame(row for row in rows.values() if row["ours"] or row["the paper's tables"])
 
 
 _HEAD = """# Claims ledger
@@ -451,20 +417,11 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
         count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks
     )
     parts = [head, markdown_table(counts)]
-    figures = frame["paper_verdict"] + ": " + frame["paper_figure"]
-    short = pd.DataFrame(
-        {
-            "": frame["id"],
-            "claim": frame["claim"],
-            "where": frame["where"],
-            "ours": frame["verdict"] + ": " + frame["ours"],
-            "paper says": frame["paper_says"],
-            "the paper's tables": figures.where(frame["paper_verdict"] != UNMEASURED, "no figures"),
-            "data set": frame["dataset"],
-            "hardware": frame["hardware"],
-            "record": frame["record"],
-        }
-    )
+    paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]
+    frame["ours"] = frame["verdict"] + ": " + frame["ours"]
+    frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != UNMEASURED, "no figures")
+    frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
+    short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
     for group in frame["group"].unique():
         parts.append(f"## {group}\n\n{_compact(markdown_table(short[frame['group'] == group]))}")
     parts.append("## Statement by statement\n")
@@ -540,8 +497,8 @@ def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, ac
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if changes and not accept:
         return changes
-    columns = {"verdict": "verdict", "figure": "ours", "paper_verdict": "paper_verdict", "paper_figure": "paper_figure"}
-    verdicts = {row["id"]: {key: row[name] for key, name in columns.items()} for row in frame.to_dict("records")}
+    kept = frame.set_index("id")[["verdict", "ours", "paper_verdict", "paper_figure"]]
+    verdicts = kept.rename(columns={"ours": "figure"}).to_dict("index")
     texts = {
         path: ledger_markdown(judgements),
         path.with_suffix(".json"): json.dumps(verdicts, indent=2, ensure_ascii=False) + "\n",

@@ -149,8 +149,6 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
 `x0_error`) and, where it was repeated, `low` and `high`."""
 
-_VALUE_COLUMN = {"x0_by_sigma": "x0_error"}
-
 NINE_METRICS = {
     row.metric: (row.unit, row.better)
     for row in load_paper_table(3).drop_duplicates("metric")[["metric", "unit", "better"]].itertuples(index=False)
@@ -206,7 +204,7 @@ class Evidence:
 
     Attributes:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
-      sources: the tables that were looked into since `forget_sources`, in that order.
+      sources: the tables that were looked into, in that order and as often; whoever asks clears the list first.
     """
 
     def __init__(self, framework: str, load: Callable):
@@ -218,10 +216,6 @@ class Evidence:
     def called(self, name: str) -> str:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
         return f"{name}.csv has" if self.framework == "jax" else "the paper prints"
-
-    def forget_sources(self) -> None:
-        """Start the list of sources anew."""
-        self.sources = []
 
     def table(self, name: str, device: str | None = None) -> pd.DataFrame:
         """Return a table of `SCHEMAS`, checked, and note it among the sources.
@@ -240,9 +234,7 @@ class Evidence:
             if table.empty:
                 raise NotMeasured(f"{self.called(name)} no rows of a {device}")
         sha256 = record.get("table", {}).get("sha256", "")[:12]
-        source = Source(path, sha256, _hardware(record, device))
-        if source not in self.sources:
-            self.sources.append(source)
+        self.sources.append(Source(path, sha256, _hardware(record, device)))
         return table
 
     def rows(self, name: str, device: str | None = None, **row) -> pd.DataFrame:
@@ -270,9 +262,9 @@ class Evidence:
         if len(found) and value in found:
             bounds = ["value", "low", "high"] if value == "value" else [value]
             return Figure.of(*found.iloc[0][bounds])
-        where = ", ".join([*map(_spoken, row.items()), *([device] if device else [])])
         what = "" if value == "value" else f"{value} of "
-        raise NotMeasured(f"{self.called(name)} no {what}{where}")
+        where = f", {device}" if device else ""
+        raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")
 
     def quality(self, setting: Setting, metric: str) -> Figure:
         """Return a metric of a model."""
@@ -294,59 +286,56 @@ class Evidence:
         return ratio(self.time(slow, device, characters), self.time(fast, device, characters))
 
 
-def _spoken(item: tuple[str, object]) -> str:
-    column, value = item
-    if column in ("model", "metric", "framework", "band"):
-        return str(value)
-    if column == "steps":
-        return f"{value} step{'s' if value > 1 else ''}"
-    if column == "characters":
-        return f"{value:,} character{'s' if value > 1 else ''}"
-    if column == "window_frames":
-        return f"{value} frames"
-    return f"batch {value}" if column == "batch_size" else f"{column} {value}"
+_WORDS = {
+    "steps": "{} step{s}",
+    "characters": "{:,} character{s}",
+    "window_frames": "{} frames",
+    "batch_size": "batch {}",
+}
+
+
+def _row_text(row: Mapping) -> str:
+    words = (_WORDS.get(column, "{}").format(value, s="" if value == 1 else "s") for column, value in row.items())
+    return ", ".join(words)
 
 
 def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
-    kind = str(record.get("device_kind"))
-    on_cpu = device == "CPU" or (device is None and record.get("device_platform") == "cpu")
-    if on_cpu:
+    if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
         return f"CPU, {record.get('cores')} cores"
+    kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
+
+
+def _foreign_unit(name: str, table: pd.DataFrame) -> pd.Series:
+    if name != "quality" or "unit" not in table:
+        return pd.Series(False, index=table.index)
+    wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
+    return wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
 
 
 def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
     """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken."""
-    keys, column = SCHEMAS[name], _VALUE_COLUMN.get(name, "value")
-    for needed in (*keys, column):
+    keys = list(SCHEMAS[name])
+    table = table.rename(columns={"x0_error": "value"})
+    for needed in (*keys, "value"):
         if needed not in table:
-            has = ", ".join(map(str, table.columns))
-            raise ValueError(f"{where}: needs a column {needed!r}, it has {has}")
-    table = table.rename(columns={column: "value"})
+            raise ValueError(f"{where}: needs a column {needed!r}, it has {', '.join(map(str, table.columns))}")
     table = table[table["value"].notna()].copy()
-    for bound in ("low", "high"):
+    for bound in ("low", "high"):  # undefined where nothing was repeated
         if bound not in table:
             table[bound] = float("nan")
-    # Where nothing was repeated the bounds are undefined, which is no fault.
-    astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"])
-    astray |= table["high"] < table["value"]
-    if astray.any():
-        row = ", ".join(str(table.loc[astray, key].iloc[0]) for key in keys)
-        raise ValueError(f"{where}: the figure of {row} is infinite or outside its interval")
-    twice = table.duplicated(list(keys))
-    if twice.any():
-        row = ", ".join(str(table.loc[twice, key].iloc[0]) for key in keys)
-        raise ValueError(f"{where}: has two rows of {row}")
-    if "model" in table:
-        for model in table["model"].unique():
-            check_model(model, where)
-    if name == "quality" and "unit" in table:
-        for metric, unit in zip(table["metric"], table["unit"].fillna(""), strict=True):
-            wanted = NINE_METRICS.get(metric, (unit,))[0]
-            if unit != wanted:
-                raise ValueError(f"{where}: {metric} is in {unit or 'no unit'}, not in {wanted}")
+    astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
+    for fault, rows in (
+        ("a figure that is infinite or outside its interval", astray),
+        ("two rows", table.duplicated(keys)),
+        ("another unit than the paper", _foreign_unit(name, table)),
+    ):
+        if rows.any():
+            raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")
+    for model in table["model"].unique() if "model" in table else ():
+        check_model(model, where)
     if "device" in table and not set(table["device"]) <= {"CPU", "GPU"}:
         raise ValueError(f"{where}: device must be CPU or GPU, got {table['device'].unique()}")
     return table

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student_t
 
+from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.reports.evidence import (
     NINE_METRICS,
     Evidence,
@@ -76,17 +76,17 @@ class Family:
     """Models that are judged together, as far as they were measured.
 
     Attributes:
-      settings: all of them.
+      models: all of them.
       required: those without which nothing is judged.
     """
 
-    settings: tuple[Setting, ...]
+    models: tuple[Setting, ...]
     required: tuple[Setting, ...]
 
     def measured(self, look: Callable[[Setting], object]) -> list[Setting]:
         """Return those for which `look` finds all it needs; NotMeasured if a required one lacks it."""
         kept = []
-        for setting in self.settings:
+        for setting in self.models:
             try:
                 look(setting)
             except NotMeasured:
@@ -371,17 +371,11 @@ def training_ratio(
     sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
     shared = set.intersection(*sizes)
     if not shared:
-        named = f"{over.model} and {under.model}"
-        raise NotMeasured(f"{evidence.called('training_time')} no batch size of both {named}, GPU")
+        where = f"{evidence.called('training_time')} no batch size of both"
+        raise NotMeasured(f"{where} {over.model} and {under.model}, GPU")
     batch = int(max(shared))
-    found = ratio(
-        *(
-            evidence.figure(
-                "training_time", "GPU", column, model=setting.model, window_frames=over.window, batch_size=batch
-            )
-            for setting in (over, under)
-        )
-    )
+    rows = [{"model": setting.model, "window_frames": over.window, "batch_size": batch} for setting in (over, under)]
+    found = ratio(*(evidence.figure("training_time", "GPU", column, **row) for row in rows))
     return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=batch)
 
 
@@ -534,15 +528,6 @@ def better_at_each_width(evidence: Evidence, better, worse, widths, metric, wind
     return combine(verdicts.values()), ", ".join(texts)
 
 
-def real_motion(evidence: Evidence, metric) -> Finding:
-    """Write a metric of real motion, with the shortest window there is (a remark)."""
-    rows = evidence.rows("quality", model="real", metric=metric).sort_values("window_frames")
-    if rows.empty:
-        raise NotMeasured(f"{evidence.called('quality')} no {metric} of real motion")
-    found = Figure.of(*rows.iloc[0][["value", "low", "high"]])
-    return REMARK, figure_text(found, f" {NINE_METRICS[metric][0]}")
-
-
 def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple[Setting, Setting]]:
     """Return (longer window, usual window) of every model that has both."""
     pair = lambda setting: (Setting(setting.model, window=window), setting)
@@ -601,13 +586,6 @@ def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     return REMARK, ", ".join(texts)
 
 
-def _mean_with_interval(values: np.ndarray) -> Figure:
-    """Return the mean of two values or more with its 95 % interval (Student's t)."""
-    mean = float(values.mean())
-    half = float(student_t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
-    return Figure(mean, mean - half, mean + half)
-
-
 def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
     """Judge, metric by metric, how much worse the last quarter of the rounds is than the first.
 
@@ -621,7 +599,8 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
         quarter = len(values) // 4
         if quarter < 2 or metric not in low_ones:
             continue
-        growth = ratio(_mean_with_interval(values[-quarter:]), _mean_with_interval(values[:quarter]))
+        late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
+        growth = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
         grown = within(growth, bounds)
         verdicts.append(OPEN if grown == HOLDS and growth.low <= 1.0 else grown)
         texts.append(f"{metric} {_change_text(growth)}")
@@ -705,8 +684,8 @@ KINDS = {
     for kind in (
         figure, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above, saving, mean_saving,
         jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
-        worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, real_motion,
-        window_loss, window_gain, steady_over_steps, change_between_steps, drift, better_graded, steady_over_noise,
+        worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
+        window_gain, steady_over_steps, change_between_steps, drift, better_graded, steady_over_noise,
         steadier_over_noise, gradient_growth,
     )
 }  # fmt: skip
