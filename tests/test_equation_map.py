@@ -1,22 +1,26 @@
 """The map from equations to code, and the list of open points."""
 
 import json
+import shutil
 
 import pandas as pd
 import pytest
 
+from f3amd_lib.ground import papers
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.zoo import find_preset
+from f3amd_lib.reports import claims, evidence
 from f3amd_lib.reports.equation_map import (
-    EQUATIONS,
+    _patterns,
+    equation_labels,
     equation_map,
     mentioned_equations,
     notebook_sections,
     running_times,
 )
-from f3amd_lib.reports.readings import READINGS, Reading, readings_table
+from f3amd_lib.reports.readings import fill_reading, readings_table
 
 
 @pytest.mark.parametrize(
@@ -33,6 +37,7 @@ from f3amd_lib.reports.readings import READINGS, Reading, readings_table
         ("alpha_t of Appendix F", {"Appendix F", "alpha_t"}),
         (r"with $\alpha_t = \sqrt{\alpha}$", {"alpha_t"}),
         (r"$\bar\alpha_t$, alpha_bar_t and my_alpha_t", set()),
+        ("noise of F3AMD Eq. 8", {"Eq. 8"}),
     ],
 )
 def test_mentions_are_read(text, expected):
@@ -118,7 +123,7 @@ def whole_map():
 
 def test_every_equation_of_the_paper_has_code(whole_map):
     rows = whole_map
-    assert len(rows) == len(EQUATIONS) == 16
+    assert len(rows) == len(equation_labels()) == 16
     assert rows.loc[rows["functions"] == "", "equation"].tolist() == []
     by_label = rows.set_index("equation")["functions"]
     assert "diffusion/schedules: VarianceExploding.sigma" in by_label["Eq. 9"].split(", ")
@@ -198,14 +203,87 @@ def test_open_points_show_what_a_preset_sets():
     assert table["IRD in its loss"].startswith(f"weight {code.training['loss']['ird']};")
 
 
-@pytest.mark.parametrize("field", ["F3AMDConfig.colour", "CAMDM-code.colour", "CAMDM-9.dropout"])
-def test_an_open_point_cannot_name_a_setting_that_is_not_there(field):
-    with pytest.raises(KeyError):
-        Reading("data", "point", "text", "{}", "reason", field).filling()
+READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}", "why": "so"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"field": "F3AMDConfig.colour"}, "no setting; no 'colour'"),
+        ({"field": "CAMDM-code.colour"}, "no setting; no 'colour'"),
+        ({"field": "CAMDM-9.dropout"}, "no setting"),
+        ({}, "both, a field and"),
+        ({"field": "F3AMDConfig.dropout", "here": "none"}, "both, a field and"),
+        ({"field": "F3AMDConfig.dropout", "reason": "so"}, "unknown key 'reason'"),
+    ],
+)
+def test_a_broken_open_point_is_refused(changes, message):
+    with pytest.raises(ValueError, match=f"f.toml, 'noise': .*{message}"):
+        fill_reading(READING | changes, "f.toml")
+    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml") == str(F3AMDConfig(1, 1).dropout)
 
 
 def test_open_points_are_told_once_with_a_reason():
-    assert len({reading.point for reading in READINGS}) == len(READINGS)
-    for reading in READINGS:
-        assert reading.paper and reading.why
-        assert bool(reading.field) == ("{" in reading.ours), reading.point
+    table = readings_table()
+    assert table["open point"].is_unique and (table[["the paper", "why"]] != "").all(axis=None)
+
+
+# ------------------------------------------------------------------------------- a second paper
+
+
+@pytest.fixture
+def second_paper(tmp_path, monkeypatch):
+    """A folder of papers: a copy of F3AMD's, and one paper with two equations and one claim."""
+    shutil.copytree(papers._FOLDER / "f3amd", tmp_path / "f3amd")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/paper.toml").write_text(
+        'name = "OTHER-2"\nsetting = "a paper"\n'
+        '[[equation]]\nlabel = "Eq. 2"\nsection = "1"\nwhat = "sum"\n'
+        '[[equation]]\nlabel = "Box 1"\nsection = "2"\nwhat = "update"\n'
+    )
+    (tmp_path / "other/claims.toml").write_text(
+        '[groups]\nQ = "Quality"\n[thresholds]\n[[claim]]\nid = "Q1"\ntext = "better"\nwhere = "1"\n'
+        'decided_by = "FID"\n[[claim.statement]]\nsays = "CAMDM is worse"\nkind = "worse"\nmodel = "CAMDM"\n'
+        'against = "F3AMD-FNO-96"\nmetric = "FID"\n'
+    )
+    caches = (papers.load_paper_file, _patterns, claims.load_claims, evidence.paper_evidence)
+    monkeypatch.setattr(papers, "_FOLDER", tmp_path)
+    for cached in caches:
+        cached.cache_clear()
+    yield "other"
+    for cached in caches:
+        cached.cache_clear()
+
+
+def test_a_mention_belongs_to_the_paper_that_it_names(second_paper):
+    text = "Eq. 2 and OTHER-2 Eq. 2, see F3AMD Eqs 3, 4; OTHER-2 Box 1, OTHER-2 Eq. 9"
+    assert mentioned_equations(text) == {"Eq. 2", "Eq. 3", "Eq. 4"}
+    assert mentioned_equations(text, second_paper) == {"Eq. 2", "Box 1"}
+    assert mentioned_equations("Eq. 2", second_paper) == set()
+
+
+def test_a_second_paper_has_its_own_map_and_claims(second_paper, tmp_path):
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_sum.py").write_text(
+        "def test_other_eq02_sums():\n    pass\n\n\ndef test_eq03_blocks():\n    pass\n"
+    )
+    tests = equation_map(root=tmp_path, paper=second_paper).set_index("equation")["tests"]
+    assert tests.to_dict() == {"Eq. 2": "test_sum: test_other_eq02_sums", "Box 1": ""}
+    tests = equation_map(root=tmp_path).set_index("equation")["tests"]
+    assert tests["Eq. 3"] == "test_sum: test_eq03_blocks" and tests["Eq. 2"] == ""
+    (judgement,) = claims.judge_claims(tmp_path, paper=second_paper)
+    assert judgement.verdict == judgement.paper_verdict == "not measured"
+    page = claims.ledger_markdown([judgement])
+    assert "1 claims of the OTHER-2 paper" in page and "## Quality" in page
+
+
+def test_a_broken_folder_of_a_paper_is_refused(second_paper, tmp_path):
+    with pytest.raises(ValueError, match="unknown paper 'othr'; did you mean 'other'"):
+        papers.load_paper_file("paper", "othr")
+    with pytest.raises(ValueError, match="readings.toml: is missing"):
+        readings_table(paper=second_paper)
+    with pytest.raises(ValueError, match="the OTHER-2 paper has no tables, not 1"):
+        papers.load_paper_table(1, second_paper)
+    (tmp_path / "other/readings.toml").write_text("reading = [")
+    with pytest.raises(ValueError, match="readings.toml: is no TOML"):
+        readings_table(paper=second_paper)

@@ -1,41 +1,82 @@
-"""The numbers that the paper prints, table by table, to stand beside ours."""
+"""What a paper says, as data: a folder of `papers/` for each, with its tables, equations, claims and open points."""
 
 from __future__ import annotations
 
 import functools
+import tomllib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pandas as pd
 
-_FOLDER = Path(__file__).parents[1] / "papers/f3amd/numbers"
+from f3amd_lib.ground.names import nearest_hint
 
-PAPER_SETTING = "paper (100STYLE, RTX A6000 / Threadripper 3970X, IREE)"
-"""Label of the paper's column: its data and, for times, its hardware and compiler."""
-
-PAPER_TABLES = {
-    1: ("f3amd_table01_synthesis_time_ms.csv", "Synthesis time a round, 8 steps, ms"),
-    2: ("f3amd_table02_training_time_min.csv", "Training time an epoch, min"),
-    3: ("f3amd_table03_quality.csv", "Motion quality, 8 steps"),
-    4: ("f3amd_table04_synthesis_time_by_steps_ms.csv", "Synthesis time by steps, ms"),
-    5: ("f3amd_table05_quality_by_steps.csv", "Motion quality by steps"),
-    6: ("f3amd_table06_camdm_jax_vs_pytorch_quality.csv", "CAMDM in JAX and PyTorch: quality"),
-    7: ("f3amd_table07_camdm_jax_vs_pytorch_time_ms.csv", "CAMDM in JAX and PyTorch: time, ms"),
-    8: ("f3amd_table08_fno_variants.csv", "Variants of the FNO block"),
-    9: ("f3amd_table09_encoder_decoder.csv", "FNO or linear encoder and decoder"),
-    10: ("f3amd_table10_frequency_modes.csv", "Number of kept frequency bins"),
-    11: ("f3amd_table11_conditioning.csv", "Kinds of conditioning"),
-    12: ("f3amd_table12_camdm96.csv", "CAMDM at latent dimension 96"),
-}
-"""Table number -> (file, title in our words)."""
-
-_TIME_TABLES = (1, 4, 7)
+_FOLDER = Path(__file__).parents[1] / "papers"
 
 
-def load_paper_table(number: int) -> pd.DataFrame:
-    """Return one table of the F3AMD paper in tidy form.
+def paper_folders() -> list[str]:
+    """Return the names of all papers, as their folders are called."""
+    return sorted(path.parent.name for path in _FOLDER.glob("*/paper.toml"))
+
+
+@functools.cache
+def load_paper_file(name: str, paper: str = "f3amd") -> dict:
+    """Return a file of a paper's folder; callers must not change it.
 
     Args:
-      number: 1 to 12, the table's number in the paper.
+      name: "paper", "claims" or "readings".
+      paper: its folder, one of `paper_folders`.
+
+    Raises:
+      ValueError: for an unknown paper, a missing file, or one that is no TOML.
+    """
+    if paper not in paper_folders():
+        raise ValueError(f"unknown paper {paper!r}{nearest_hint(paper, paper_folders())}")
+    path = _FOLDER / paper / f"{name}.toml"
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: is missing; write it as {_FOLDER / 'f3amd' / path.name} is written") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: is no TOML: {error}") from error
+
+
+def check_entry(entry: Mapping, where: str, required: Iterable[str], optional: Iterable[str] = ()) -> None:
+    """Raise ValueError for a key that an entry of a paper's file lacks, or that is unknown there.
+
+    Args:
+      entry: the table as read.
+      where: file and entry, for the message.
+      required, optional: its keys.
+    """
+    for key in required:
+        if key not in entry:
+            raise ValueError(f"{where}: has no {key!r}; add it")
+    for key in entry:
+        if key not in (known := [*required, *optional]):
+            raise ValueError(f"{where}: unknown key {key!r}{nearest_hint(key, known)}")
+
+
+def find_entry(known: Mapping, name, what: str, where: str):
+    """Return a value by its name; ValueError with the nearest name if there is none."""
+    if name not in known:
+        raise ValueError(f"{where}: unknown {what} {name!r}{nearest_hint(name, known)}")
+    return known[name]
+
+
+PAPER_SETTING: str = load_paper_file("paper")["setting"]
+"""Label of the F3AMD paper's column: its data and, for times, its hardware and compiler."""
+
+PAPER_TABLES = {entry["number"]: (entry["file"], entry["title"]) for entry in load_paper_file("paper")["table"]}
+"""Table number of the F3AMD paper -> (file, title in our words)."""
+
+
+def load_paper_table(number: int, paper: str = "f3amd") -> pd.DataFrame:
+    """Return one table of a paper in tidy form.
+
+    Args:
+      number: the table's number in the paper.
+      paper: its folder.
 
     Returns:
       A new DataFrame with the columns model, window_frames, steps and either device, characters
@@ -44,26 +85,27 @@ def load_paper_table(number: int) -> pd.DataFrame:
 
     Raises:
       ValueError: if there is no such table.
-
-    Source: F3AMD paper, Tables 1 to 12.
     """
-    if number not in PAPER_TABLES:
-        raise ValueError(f"the F3AMD paper has Tables 1 to 12, not {number!r}")
-    frame = _read(number).copy()
-    frame.attrs = {"table": number, "title": PAPER_TABLES[number][1], "setting": PAPER_SETTING}
+    about = load_paper_file("paper", paper)
+    entries = {entry["number"]: entry for entry in about.get("table", ())}
+    if number not in entries:
+        known = f"Tables {min(entries)} to {max(entries)}" if entries else "no tables"
+        raise ValueError(f"the {about['name']} paper has {known}, not {number!r}")
+    frame = _read_table(number, paper).copy()
+    frame.attrs = {"table": number, "title": entries[number]["title"], "setting": about["setting"]}
     return frame
 
 
 @functools.cache
-def _read(number: int) -> pd.DataFrame:
-    frame = pd.read_csv(_FOLDER / PAPER_TABLES[number][0], dtype=str, keep_default_na=False)
+def _read_table(number: int, paper: str) -> pd.DataFrame:
+    entry = next(entry for entry in load_paper_file("paper", paper)["table"] if entry["number"] == number)
+    frame = pd.read_csv(_FOLDER / paper / "numbers" / entry["file"], dtype=str, keep_default_na=False)
     frame = frame.rename(columns={"value": "printed"})
     for column in ("window_frames", "steps", "characters"):
         if column in frame:
             frame[column] = frame[column].astype(int)
-    if number in _TIME_TABLES:
-        position = frame.columns.get_loc("printed")
-        for name, text in (("better", "down"), ("unit", "ms"), ("metric", "synthesis_time")):
-            frame.insert(position, name, text)
+    for column in ("metric", "unit", "better"):
+        if column in entry:
+            frame.insert(frame.columns.get_loc("printed"), column, entry[column])
     frame["value"] = pd.to_numeric(frame["printed"], errors="coerce")
     return frame

@@ -1,9 +1,10 @@
-"""The claims ledger: what the paper says, judged from records: `python -m f3amd_lib.reports.claims`.
+"""The claims ledger: what a paper says, judged from records: `python -m f3amd_lib.reports.claims`.
 
-Every claim is a value: its sentence in our words, its place in the paper, what decides it, and the
-rule as code (`reports.ledger`). A verdict follows from recorded figures alone, and from none of ours
-to none of the paper's: models of our own (`-plus`, `-raw`, ...) decide nothing. The same rule is
-applied to the paper's own tables, which do not always say what its text says.
+Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
+paper, what decides it, and the statements it stands for, each with its kind of judgement. A verdict
+follows from recorded figures alone, and from none of ours to none of the paper's: models of our own
+(`-plus`, `-raw`, ...) decide nothing. The same statements are judged from the paper's own tables,
+which do not always say what its text says.
 
 The verdicts are committed. When a new measurement changes one, a test fails until somebody has
 looked at it and accepts the change on purpose (`--accept`).
@@ -12,34 +13,35 @@ looked at it and accepts the change on purpose (`--accept`).
 from __future__ import annotations
 
 import argparse
+import functools
+import inspect
 import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
 from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import PAPER_SETTING
+from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.tables import markdown_table
-from f3amd_lib.reports.ledger import efficiency, quality, theory
-from f3amd_lib.reports.ledger.evidence import Evidence, paper_evidence, recorded_evidence
-from f3amd_lib.reports.ledger.verdicts import (
-    FAILS,
-    HOLDS,
-    IN_PART,
-    OPEN,
-    REMARK,
-    UNMEASURED,
-    VERDICTS,
-    Statement,
-    combine,
+from f3amd_lib.reports import judgements as judging
+from f3amd_lib.reports import theory
+from f3amd_lib.reports.evidence import (
+    Evidence,
+    NoTable,
+    NotMeasured,
+    Setting,
+    Source,
+    check_model,
+    paper_evidence,
+    recorded_evidence,
 )
+from f3amd_lib.reports.judgements import FAILS, HOLDS, IN_PART, OPEN, REMARK, UNMEASURED, VERDICTS, Family, combine
 
 log = logging.getLogger("f3amd")
 
@@ -49,307 +51,166 @@ DATASET_ORDER = ("bandai", "synthetic")
 PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
-GROUPS = {"E": "Efficiency", "Q": "Motion quality", "T": "Theory"}
-"""First letter of a claim's id -> what the claim is about."""
-
-_RULES = efficiency.RULES | quality.RULES | theory.RULES
 _MARKS = {HOLDS: "✓", IN_PART: "±", FAILS: "✗", OPEN: "≈", REMARK: "·"}
 _SYNTHETIC = "synthetic (procedural, no real motion)"
 
 
 @dataclass(frozen=True)
-class Claim:
-    """A claim of the paper.
+class Statement:
+    """A part of a claim, and what some evidence says of it.
 
     Attributes:
-      id: E for efficiency, Q for motion quality, T for theory, and a number.
-      text: what is claimed, in our words.
-      where: sections and tables of the paper.
-      decided_by: the quantity that decides it. SYN is the time of a round, ms.
-      paper_says: the paper's figure, if it names one.
+      says: the sentence, in our words.
+      rule: its kind of judgement with its parameters, from evidence to verdict and figure.
+      optional: where it was not measured, nobody misses it.
+      remark: it decides nothing.
+      verdict: of `VERDICTS`; "" for a remark, and before it is judged.
+      figure: what was found, or why nothing was.
+      sources: tables that it rests on.
+      no_table: it was not measured because a whole table is missing.
     """
 
+    says: str
+    rule: Callable[[Evidence], judging.Finding]
+    optional: bool = False
+    remark: bool = False
+    verdict: str = REMARK
+    figure: str = ""
+    sources: tuple[Source, ...] = ()
+    no_table: bool = False
+
+    def judge(self, evidence: Evidence) -> Statement:
+        """Return the statement as this evidence has it."""
+        evidence.sources.clear()
+        try:
+            verdict, figure = self.rule(evidence)
+        except NotMeasured as gap:
+            return replace(self, verdict=UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
+        verdict = REMARK if self.remark else verdict
+        return replace(self, verdict=verdict, figure=figure, sources=tuple(dict.fromkeys(evidence.sources)))
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of a paper.
+
+    Attributes:
+      paper: its folder.
+      group: what the claim is about.
+      id: first letter of the group, and a number.
+      text: what is claimed, in our words.
+      where: sections and tables of the paper.
+      decided_by: the quantity that decides it.
+      statements: what it stands for, not judged yet.
+      paper_says: the paper's figure, if it names one.
+      computed: the library decides it by computing, without records.
+    """
+
+    paper: str
+    group: str
     id: str
     text: str
     where: str
     decided_by: str
+    statements: tuple[Statement, ...]
     paper_says: str = ""
+    computed: bool = False
 
-    @property
-    def group(self) -> str:
-        """What the claim is about."""
-        return GROUPS[self.id[0]]
-
-    @property
-    def rule(self) -> Callable[[Evidence], Iterator[Statement]]:
-        """The rule that judges it, from evidence to statements."""
-        return _RULES[self.id]
-
-    @property
-    def computed(self) -> bool:
-        """Whether the library decides it by computing, without records."""
-        return self.id in theory.COMPUTED
+    def judge(self, evidence: Evidence) -> list[Statement]:
+        """Return its statements as this evidence has them."""
+        return [statement.judge(evidence) for statement in self.statements]
 
 
-CLAIMS = (
-    Claim(
-        "E1",
-        "F3AMD-FNO is 4 to 8 times as fast as CAMDM on a GPU as characters grow",
-        "5.1, Table 1",
-        "SYN CAMDM / SYN FNO-D at 16 to 1,024 characters; 32 frames, 8 steps",
-        "4 to 8x",
-    ),
-    Claim(
-        "E2",
-        "F3AMD-Transformer is roughly 2.5 to 3.5 times as fast as CAMDM on a GPU",
-        "5.1, Table 1",
-        "SYN CAMDM / SYN Transformer-D; 32 frames, 8 steps",
-        "2.5 to 3.5x",
-    ),
-    Claim(
-        "E3",
-        "With 64 frames FNO is 3 to 5 and Transformer 2 to 3 times as fast, with many characters",
-        "5.1, Table 1",
-        "SYN CAMDM / SYN F3AMD on a GPU; 64 frames, 8 steps",
-        "3 to 5x; 2 to 3x",
-    ),
-    Claim(
-        "E4",
-        "On a CPU FNO is 5 to 8 times as fast at 4 to 8 characters and 3 to 4 times at 16 to 32, "
-        "Transformer 2 to 3 times",
-        "5.1, Table 1",
-        "SYN CAMDM / SYN F3AMD on a CPU; 32 frames, 8 steps",
-        "5 to 8x; 3 to 4x; 2 to 3x",
-    ),
-    Claim(
-        "E5",
-        "For crowds FNO-96 is 10 to 22 % faster than Transformer-64, on GPU and CPU",
-        "5.2",
-        "1 - SYN FNO-96 / SYN Transformer-64",
-        "10 to 22 %",
-    ),
-    Claim(
-        "E6",
-        "An epoch of FNO takes about 5 min where CAMDM takes 12.5, and 6 against 20.6 with 64 frames",
-        "5.1, Table 2",
-        "ratio of training times at equal batch and data, GPU",
-        "2.5x; 3.4x",
-    ),
-    Claim(
-        "E7",
-        "1 step in place of 8 makes FNO-96 6.4 times as fast on a CPU with 1 character and 3.4 "
-        "times with 32, on a GPU 2.9 times with 1 and 6.5 times with 1,024",
-        "5.3, Table 4",
-        "SYN 8 steps / SYN 1 step",
-        "6.4x; 3.4x; 2.9x; 6.5x",
-    ),
-    Claim(
-        "E8",
-        "FNO-96 with 1 step is about 4 times as fast as CAMDM with 8 at 16 characters, 25 times "
-        "at 1,024 (GPU), and 10 to 20 times on a CPU",
-        "5.3, Figure 4",
-        "SYN CAMDM, 8 steps / SYN FNO-96, 1 step",
-        "4x; 25x; 10 to 20x",
-    ),
-    Claim(
-        "E9",
-        "Keeping 4 of 17 modes saves 3 to 4 % of the time with few characters, about 8 % with "
-        "some, 15 to 16 % with many",
-        "App. E",
-        "1 - SYN m = 4 / SYN m = 17",
-        "3 to 4 %; 8 %; 15 to 16 %",
-    ),
-    Claim(
-        "E10",
-        "At 1,024 characters FiLM is 2 times as fast as concatenation, 32 % faster than "
-        "cross-attention, 9 % faster than AdaLN-zero",
-        "App. E, Table 11",
-        "SYN variant / SYN FiLM, GPU",
-        "2x; 1.32x; 1.09x",
-    ),
-    Claim(
-        "E11",
-        "CAMDM takes the same time in JAX and in PyTorch on a GPU; on a CPU PyTorch is 2 to 5 times as fast",
-        "App. D, Table 7",
-        "SYN JAX / SYN PyTorch",
-        "alike; 2 to 5x",
-    ),
-    Claim(
-        "E12",
-        "FNO-96 with 1 step is over 20 times as fast as the JAX CAMDM with 8, on GPU and CPU: "
-        "about 4 times by the architecture, about 5 times by the steps",
-        "1, 5",
-        "the ratio and its two factors in a large crowd",
-        "20x = 4x · 5x",
-    ),
-    Claim(
-        "E13",
-        "F3AMD-FNO converges in as many epochs as CAMDM, or fewer",
-        "5.1",
-        "held-out loss and metrics against epochs",
-    ),
-    Claim(
-        "E14",
-        "Under ten characters FNO and Transformer have similar latency",
-        "5.1",
-        "SYN Transformer-D / SYN FNO-D at 1 to 8 characters, GPU",
-        "similar",
-    ),
-    Claim(
-        "E15",
-        "Latency falls almost linearly with the number of steps, closer to linear with more characters",
-        "6",
-        "exponent of SYN against steps, fitted per number of characters (FNO-96)",
-        "almost linear",
-    ),
-    Claim(
-        "E16",
-        "Low latent dimensions make training and inference 2 to 3 times as fast, and take less memory",
-        "6",
-        "SYN, training time and peak memory of FNO-128 over FNO-32",
-        "2 to 3x",
-    ),
-    Claim(
-        "E17",
-        "Far fewer modes than T / 2 save a further 10 to 15 % with many characters",
-        "6",
-        "1 - SYN m = 4 / SYN m = 17, as in E9 (whose figure differs)",
-        "10 to 15 %",
-    ),
-    Claim(
-        "Q1",
-        "EMD is similar for all models with 32 frames",
-        "5.2, Table 3",
-        "largest over least EMD of the models",
-        "spread about 5 %",
-    ),
-    Claim(
-        "Q2",
-        "FNO has the better IRD, Transformer the better FID and style coverage",
-        "5.2, Table 3",
-        "sign of the differences, per latent dimension",
-    ),
-    Claim(
-        "Q3",
-        "CAMDM has the best FID, but a worse IRD than FNO-96",
-        "5.2, Table 3",
-        "sign of the differences",
-        "0.143; 3.834 against 1.795 cm",
-    ),
-    Claim(
-        "Q4",
-        "With 64 frames F3AMD degrades a little and CAMDM fails",
-        "5.2, Table 3",
-        "metrics with 64 frames against 32",
-        "minor; not reported",
-    ),
-    Claim(
-        "Q5",
-        "FNO-96 stays close in every metric at 8, 4, 2 and 1 steps",
-        "5.3, Table 5",
-        "relative change over the steps, with its interval",
-        "close",
-    ),
-    Claim(
-        "Q6",
-        "CAMDM needs 4 steps: 2 degrade it and 1 breaks it",
-        "6, Table 5",
-        "the same metrics at 8, 4, 2 and 1 steps",
-    ),
-    Claim(
-        "Q7",
-        "CAMDM trained with VE and sampled with DDIM works in one step, about 5 times as fast as with 8",
-        "6",
-        "metrics and SYN of CAMDM-VE with 1 step against CAMDM with 8",
-        "5x",
-    ),
-    Claim(
-        "Q8",
-        "A linear encoder and decoder lose style coverage and diversity",
-        "App. E, Table 9",
-        "those two metrics of FNO-96",
-        "94.0 -> 87.4 %; 29.7 -> 16.1 cm",
-    ),
-    Claim("Q9", "m = 1 is poor; all larger m are alike", "App. E, Table 10", "metrics over m"),
-    Claim(
-        "Q10",
-        "Cosine transform, weighted and reduced-rank FNO are alike overall",
-        "App. E, Table 8",
-        "metrics of the variants of FNO-96",
-        "alike",
-    ),
-    Claim(
-        "Q11",
-        "FiLM, concatenation, AdaLN-zero and cross-attention are alike in quality",
-        "App. E, Table 11",
-        "metrics of the variants of FNO-96",
-        "alike",
-    ),
-    Claim(
-        "Q12",
-        "CAMDM collapses at latent dimension 96",
-        "6, Table 12",
-        "style coverage and EMD of CAMDM-96 against FNO-96",
-        "coverage 2 %; EMD doubles",
-    ),
-    Claim(
-        "Q13",
-        "The IRD loss lowers the discontinuity between windows",
-        "4.1",
-        "IRD of FNO-96 trained with and without the term",
-    ),
-    Claim(
-        "Q14",
-        "One-step sampling keeps diversity through noise, though it may lower it",
-        "6",
-        "diversity over seeds under one fixed condition, at 1 and 8 steps",
-    ),
-    Claim("Q15", "FNO may lose fine motion of the feet", "6", "spectrum of the feet against real motion, per model"),
-    Claim("Q16", "Long rollouts drift", "6", "metrics against the number of the round"),
-    Claim(
-        "Q17",
-        "CAMDM in JAX has lower trajectory and direction errors than in PyTorch, which is smoother with a higher IRD",
-        "App. D, Table 6",
-        "those four metrics, with the weights that CAMDM's authors published",
-        "0.039 against 0.178 m",
-    ),
-    Claim(
-        "Q18",
-        "EMD agrees with perceived quality better than FID",
-        "4.4",
-        "order of graded corruptions by both (perception itself is not measured)",
-    ),
-    Claim("T1", "A VE state becomes a VP state by alpha_bar = 1 / (1 + sigma²)", "App. F", "identity, to rounding"),
-    Claim(
-        "T2",
-        "The DDIM update with that alpha_bar is a valid deterministic sampler for a network trained with VE",
-        "App. F",
-        "equality with the Euler step in sigma, and where samples of an exact denoiser end",
-    ),
-    Claim(
-        "T3", "Attention costs O(T D² + T² D), an FNO O(T log T D + m D²)", "6", "operations counted over T, D and m"
-    ),
-    Claim(
-        "T4",
-        "Training with VE gives consistent denoising over noise levels, so that DDIM can take one step",
-        "2.1, 6",
-        "x0 error against sigma, VE and VP models",
-    ),
-    Claim("T5", "A loss that is not scaled biases training towards high noise", "6", "gradient norm against sigma"),
-)
-"""The 40 claims, in the paper's order within each group."""
+# ------------------------------------------------------------------------------------- the paper's file
+
+_KINDS = judging.KINDS | theory.KINDS
+_MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
+_RANGES = {
+    "within": lambda low, high: (low, high),
+    "stated": judging.stated_range,
+    "about": judging.stated_factor,
+    "alike": judging.equal_range,
+    "saving": judging.stated_saving,
+}
 
 
-def find_claim(claim_id: str) -> Claim:
+def _read_models(value, families: Mapping, where: str) -> Setting | Family | list[Setting]:
+    if isinstance(value, list):
+        return [_read_models(item, families, where) for item in value]
+    value = {"model": value} if isinstance(value, str) else value
+    if "family" in value:
+        check_entry(value, where, ("family",), ("window",))
+        family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
+        chosen = {key: [{"model": model, "window": window} for model in family[key]] for key in ("models", "required")}
+        return Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
+    check_entry(value, where, ("model",), ("steps", "window"))
+    check_model(value["model"], where)
+    return Setting(**value)
+
+
+def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
+    where = f"{where}, {entry.get('says')!r}"
+    check_entry({key: entry[key] for key in ("says", "kind") if key in entry}, where, ("says", "kind"))
+    parameters = dict(entry)
+    says = parameters.pop("says")
+    kind = find_entry(_KINDS, parameters.pop("kind"), "kind of judgement", where)
+    optional, remark = (parameters.pop(key, False) for key in ("optional", "remark"))
+    for key in set(_MODELS) & set(parameters):
+        parameters[key] = _read_models(parameters[key], about.get("families", {}), where)
+    ranges = [key for key in _RANGES if key in parameters]
+    if len(ranges) > 1:
+        raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
+    for key in ranges:
+        value = parameters.pop(key)
+        bounds = [
+            find_entry(about.get("thresholds", {}), bound, "threshold", where) if isinstance(bound, str) else bound
+            for bound in (value if isinstance(value, list) else [value])
+        ]
+        parameters["bounds"] = _RANGES[key](*bounds)
+    try:
+        inspect.signature(kind).bind(None, **parameters)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}; {kind.__name__} takes {inspect.signature(kind)}") from None
+    return Statement(says, functools.partial(kind, **parameters), optional or remark, remark)
+
+
+def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
+    """Return the claims of a file, checked.
+
+    Args:
+      about: the file as read: groups, thresholds, families and claims.
+      paper: the paper's folder.
+      where: the file, for messages.
+
+    Raises:
+      ValueError: for what is missing, unknown or twice; the message says file, claim and statement.
+    """
+    check_entry(about, where, ("groups", "claim"), ("thresholds", "families"))
+    claims: dict[str, Claim] = {}
+    for entry in about["claim"]:
+        here = f"{where}, claim {entry.get('id')}"
+        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed"))
+        if entry["id"] in claims or entry["id"][0] not in about["groups"]:
+            raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
+        fields = {key: value for key, value in entry.items() if key != "statement"}
+        statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
+        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
+    return list(claims.values())
+
+
+@functools.cache
+def load_claims(paper: str = "f3amd") -> list[Claim]:
+    """Return the claims of a paper, in the order of its file; ValueError as `read_claims`."""
+    return read_claims(load_paper_file("claims", paper), paper, f"{paper}/claims.toml")
+
+
+def find_claim(claim_id: str, paper: str = "f3amd") -> Claim:
     """Return a claim by its id.
 
     Raises:
       ValueError: for an unknown id, with the nearest one.
     """
-    by_id = {claim.id: claim for claim in CLAIMS}
-    if claim_id not in by_id:
-        raise ValueError(f"unknown claim {claim_id!r}{nearest_hint(claim_id, by_id)}")
-    return by_id[claim_id]
+    return find_entry({claim.id: claim for claim in load_claims(paper)}, claim_id, "claim", f"{paper}/claims.toml")
 
 
 # ------------------------------------------------------------------------------------------ judging
@@ -387,11 +248,11 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     return tuple(s for s in statements if not (s.optional and s.verdict == UNMEASURED))
 
 
-def _merged(rule: Callable, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
+def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
     """Take each statement from the first evidence that can decide it."""
     merged: dict[str, Statement] = {}
     for evidence in evidences:
-        for statement in rule(evidence):
+        for statement in claim.judge(evidence):
             known = merged.get(statement.says)
             if known is None or (
                 known.verdict == UNMEASURED and (statement.verdict != UNMEASURED or known.no_table > statement.no_table)
@@ -411,12 +272,12 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
       The judgement; where nothing was measured, with the reasons of the first data set that has
       at least the table.
     """
+    paper = _seen(claim.judge(paper_evidence(claim.paper)))
     if claim.computed:
-        return Judgement(claim, _seen(claim.rule(paper_evidence())), (), "computed")
-    paper = _seen(claim.rule(paper_evidence()))
+        return Judgement(claim, paper, (), "computed")
     tried = []
     for dataset, some in evidences.items():
-        ours = _merged(claim.rule, some)
+        ours = _merged(claim, some)
         if combine(statement.verdict for statement in ours) != UNMEASURED:
             return Judgement(claim, ours, paper, dataset)
         tried.append(ours)
@@ -425,54 +286,44 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
     return Judgement(claim, next(says_more, tried[0]), paper, "")
 
 
-def _names(given) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
-
-
-def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER) -> list[Judgement]:
+def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
     """Judge all claims from recorded results.
 
     Args:
       root: folder of results; `paper_figures/` of the checkout by default.
       dataset: whose records decide, or several of which the first that can does.
       profile: of `profiles.PROFILES`, or several, without "smoke".
+      paper: whose claims.
 
     Returns:
-      One judgement a claim, in the order of `CLAIMS`.
+      One judgement a claim, in the order of the paper's file.
 
     Raises:
       ValueError: for unknown names, or records that are broken or lie in the wrong folder.
     """
     root = repository_root() / "paper_figures" if root is None else Path(root)
-    evidences = {data: [recorded_evidence(root, data, name) for name in _names(profile)] for data in _names(dataset)}
-    return [judge_claim(claim, evidences) for claim in CLAIMS]
+    datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
+    evidences = {data: [recorded_evidence(root, data, name) for name in profiles] for data in datasets}
+    return [judge_claim(claim, evidences) for claim in load_claims(paper)]
 
 
 # ------------------------------------------------------------------------------------------ writing
 
 
-def _figures(statements: Iterable[Statement]) -> str:
+def _figures(statements: Sequence[Statement]) -> str:
     """Return all figures in one line, each with a mark for its verdict; or why there are none."""
-    statements = list(statements)
-    measured = [s for s in statements if s.verdict not in (UNMEASURED, REMARK)]
-    if not measured:
-        reasons = dict.fromkeys(s.figure for s in statements if s.verdict == UNMEASURED)
-        first, more = next(iter(reasons), ""), len(reasons) - 1
-        return first + (f"; and {more} more" if more > 0 else "")
-    told = "; ".join(f"{_MARKS[s.verdict]} {s.figure}" for s in measured)
-    gaps = sum(s.verdict == UNMEASURED for s in statements)
-    return told + (f"; {gaps} of {gaps + len(measured)} not measured" if gaps else "")
-
-
-def _sources(judgement: Judgement, part: str) -> str:
-    if not judgement.dataset:  # a remark may have looked into a table, and decided nothing
-        return ""
-    sources = (source for statement in judgement.ours for source in statement.sources)
-    return "; ".join(dict.fromkeys(getattr(s, part) if part else str(s) for s in sources))
+    measured = [f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (UNMEASURED, REMARK)]
+    gaps = [s.figure for s in statements if s.verdict == UNMEASURED]
+    if measured:
+        return "; ".join(measured) + (f"; {len(gaps)} of {len(gaps) + len(measured)} not measured" if gaps else "")
+    first, *others = dict.fromkeys(gaps) or [""]
+    return first + (f"; and {len(others)} more" if others else "")
 
 
 def _row(judgement: Judgement) -> dict:
     claim = judgement.claim
+    # Without a data set a remark may have looked into a table, and decided nothing.
+    sources = [source for statement in judgement.ours for source in statement.sources if judgement.dataset]
     return {
         "id": claim.id,
         "group": claim.group,
@@ -485,19 +336,16 @@ def _row(judgement: Judgement) -> dict:
         "paper_verdict": judgement.paper_verdict,
         "paper_figure": _figures(judgement.paper),
         "dataset": _SYNTHETIC if judgement.dataset == "synthetic" else judgement.dataset,
-        "hardware": "float64" if claim.computed else _sources(judgement, "hardware"),
-        "record": _sources(judgement, ""),
+        "hardware": "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources)),
+        "record": "; ".join(dict.fromkeys(map(str, sources))),
     }
 
 
-def ledger(
-    root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, *, judgements: Sequence[Judgement] | None = None
-) -> pd.DataFrame:
+def ledger(judgements: Sequence[Judgement] | None = None) -> pd.DataFrame:
     """Return the claims ledger as a table.
 
     Args:
-      root, dataset, profile: as for `judge_claims`.
-      judgements: from there, to save judging again.
+      judgements: from `judge_claims`; judged from the committed records by default.
 
     Returns:
       One row a claim: id, group, claim, where, decided_by, verdict, ours (figures with their
@@ -508,39 +356,25 @@ def ledger(
     Raises:
       ValueError: as `judge_claims`.
     """
-    judgements = judge_claims(root, dataset, profile) if judgements is None else judgements
-    return pd.DataFrame([_row(judgement) for judgement in judgements])
+    return pd.DataFrame(map(_row, judge_claims() if judgements is None else judgements))
 
 
 def statement_table(judgement: Judgement) -> pd.DataFrame:
     """Return the statements behind a judgement: statement, ours, the paper's tables."""
-
-    def told(statement: Statement | None) -> str:
-        if statement is None:
-            return ""
-        if statement.verdict == UNMEASURED:
-            return f"{UNMEASURED} ({statement.figure})"
-        return statement.figure + (f" · {statement.verdict}" if statement.verdict else "")
-
-    ours, paper = ({s.says: s for s in some} for some in (judgement.ours, judgement.paper))
-    rows = []
-    longer, shorter = (ours, paper) if len(ours) >= len(paper) else (paper, ours)
-    for says in dict.fromkeys([*longer, *shorter]):
-        known = [some[says] for some in (ours, paper) if says in some]
-        remark = any(statement.verdict == REMARK for statement in known)
-        rows.append(
-            {
-                "statement": f"({says})" if remark else says,
-                "ours": told(ours.get(says)),
-                "the paper's tables": told(paper.get(says)),
-            }
-        )
-    return pd.DataFrame(rows)
+    rows: dict[str, dict] = {}
+    for statement in judgement.claim.statements:
+        says = f"({statement.says})" if statement.remark else statement.says
+        rows[statement.says] = {"statement": says, "ours": "", "the paper's tables": ""}
+    for column, statements in (("ours", judgement.ours), ("the paper's tables", judgement.paper)):
+        for found in statements:
+            text = f"{found.figure} · {found.verdict}" if found.verdict else found.figure
+            rows[found.says][column] = f"{UNMEASURED} ({found.figure})" if found.verdict == UNMEASURED else text
+    return pd.DataFrame(row for row in rows.values() if row["ours"] or row["the paper's tables"])
 
 
-_HEAD = f"""# Claims ledger
+_HEAD = """# Claims ledger
 
-40 claims of the F3AMD paper, each judged by a rule in code (`f3amd_lib/reports/ledger/`) that was
+{count} claims of the {name} paper, each judged by a rule (`f3amd_lib/papers/{paper}/claims.toml`) that was
 written before our numbers were known. This page is generated by
 `python -m f3amd_lib.reports.claims` from committed records; nothing in it was typed.
 
@@ -548,11 +382,11 @@ written before our numbers were known. This page is generated by
   Times on a GPU decide claims about a GPU, times on a CPU those about a CPU. Networks of a record
   under `laptop` were trained for minutes on two cores, those under `gpu` at the paper's length.
 - **the paper's tables**: the same rule on the paper's own figures, which have no intervals:
-  {PAPER_SETTING}.
+  {setting}.
 - A claim **holds in part** where only some of its statements do, or only some were measured, or
   where a gain is larger than stated. A difference that lies inside its interval **cannot be told
   apart**.
-- Marks: {", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)}.
+- Marks: {marks}.
   Statements in brackets are remarks, which decide nothing.
 """
 
@@ -565,41 +399,31 @@ def _compact(table: str) -> str:
 
 
 def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
-    """Render the ledger as Markdown: counts, a table for each group, then every statement.
+    """Render the ledger of one paper as Markdown: counts, a table for each group, then every statement.
 
     Args:
-      judgements: from `judge_claims`; judged from the committed records by default.
+      judgements: from `judge_claims`, at least one; judged from the committed records by default.
     """
     judgements = judge_claims() if judgements is None else judgements
-    frame = ledger(judgements=judgements)
+    frame, paper = ledger(judgements), judgements[0].claim.paper
+    whose = {"ours": "verdict", "the paper's tables": "paper_verdict"}
     counts = pd.DataFrame(
-        {
-            "verdict": verdict,
-            "ours": int((frame["verdict"] == verdict).sum()),
-            "the paper's tables": int((frame["paper_verdict"] == verdict).sum()),
-        }
+        {"verdict": verdict} | {name: int((frame[column] == verdict).sum()) for name, column in whose.items()}
         for verdict in VERDICTS
     )
-    parts = [_HEAD, markdown_table(counts)]
-    for group in GROUPS.values():
-        rows = frame[frame["group"] == group]
-        short = pd.DataFrame(
-            {
-                "": rows["id"],
-                "claim": rows["claim"],
-                "where": rows["where"],
-                "ours": rows["verdict"] + ": " + rows["ours"],
-                "paper says": rows["paper_says"],
-                "the paper's tables": [
-                    "no figures" if verdict == UNMEASURED else f"{verdict}: {figure}"
-                    for verdict, figure in zip(rows["paper_verdict"], rows["paper_figure"], strict=True)
-                ],
-                "data set": rows["dataset"],
-                "hardware": rows["hardware"],
-                "record": rows["record"],
-            }
-        )
-        parts.append(f"## {group}\n\n{_compact(markdown_table(short))}")
+    marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
+    about = load_paper_file("paper", paper)
+    head = _HEAD.format(
+        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks
+    )
+    parts = [head, markdown_table(counts)]
+    paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]
+    frame["ours"] = frame["verdict"] + ": " + frame["ours"]
+    frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != UNMEASURED, "no figures")
+    frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
+    short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
+    for group in frame["group"].unique():
+        parts.append(f"## {group}\n\n{_compact(markdown_table(short[frame['group'] == group]))}")
     parts.append("## Statement by statement\n")
     for judgement in judgements:
         claim = judgement.claim
@@ -610,8 +434,10 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
     return "\n".join(parts)
 
 
-def _verdict_file(path: Path) -> Path:
-    return path.with_suffix(".json")
+def ledger_path(paper: str = "f3amd") -> Path:
+    """Return where a paper's ledger is committed; its accepted verdicts lie beside it as JSON."""
+    name = "claims.md" if paper == "f3amd" else f"claims_{paper}.md"
+    return repository_root() / "paper_figures" / name
 
 
 def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
@@ -623,7 +449,7 @@ def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
     Returns:
       Claim id -> verdict, figure, paper_verdict, paper_figure; empty if nothing was accepted yet.
     """
-    path = _verdict_file(repository_root() / "paper_figures" / "claims.md" if path is None else path)
+    path = (ledger_path() if path is None else Path(path)).with_suffix(".json")
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
@@ -663,26 +489,19 @@ def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, ac
     Raises:
       ValueError: if the name does not end in .md.
     """
-    path = repository_root() / "paper_figures" / "claims.md" if path is None else Path(path)
+    path = ledger_path() if path is None else Path(path)
     if path.suffix != ".md":
         raise ValueError(f"{path}: the ledger's name must end in .md")
     judgements = judge_claims() if judgements is None else judgements
-    frame = ledger(judgements=judgements)
+    frame = ledger(judgements)
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if changes and not accept:
         return changes
-    verdicts = {
-        row["id"]: {
-            "verdict": row["verdict"],
-            "figure": row["ours"],
-            "paper_verdict": row["paper_verdict"],
-            "paper_figure": row["paper_figure"],
-        }
-        for row in frame.to_dict("records")
-    }
+    kept = frame.set_index("id")[["verdict", "ours", "paper_verdict", "paper_figure"]]
+    verdicts = kept.rename(columns={"ours": "figure"}).to_dict("index")
     texts = {
         path: ledger_markdown(judgements),
-        _verdict_file(path): json.dumps(verdicts, indent=2, ensure_ascii=False) + "\n",
+        path.with_suffix(".json"): json.dumps(verdicts, indent=2, ensure_ascii=False) + "\n",
     }
     for place, text in texts.items():
         with whole_file(place, overwrite=True) as temporary:
@@ -698,17 +517,19 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns:
       Exit status: 0 if the ledger was written, 1 if a verdict changed and was not accepted, 2 for
-      records that are broken.
+      records, or a paper's file, that are broken.
     """
     parser = argparse.ArgumentParser(
         prog="python -m f3amd_lib.reports.claims",
-        description="Judge the paper's claims from records; writes paper_figures/claims.md.",
+        description="Judge a paper's claims from records; writes paper_figures/claims.md.",
     )
     parser.add_argument("--accept", action="store_true", help="take changed verdicts for right and write them down")
+    parser.add_argument("--paper", choices=paper_folders(), default="f3amd", help="whose claims (default: f3amd)")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    path = ledger_path(options.paper)
     try:
-        changes = write_ledger(accept=options.accept)
+        changes = write_ledger(path, judge_claims(paper=options.paper), accept=options.accept)
     except ValueError as error:
         log.error("Stopped: %s", error)
         return 2
@@ -717,7 +538,7 @@ def main(arguments: list[str] | None = None) -> int:
     if changes and not options.accept:
         log.error("Nothing was written. If these are right: --accept")
         return 1
-    log.info("paper_figures/claims.md is up to date")
+    log.info("%s is up to date", path.relative_to(repository_root()))
     return 0
 
 

@@ -1,7 +1,8 @@
 """From equation to code: a table that is read off the code itself, so that it cannot go stale.
 
-Docstrings of the library say which equation of the paper a function implements ("Eq. 9",
-"Eqs 2-4", "Appendix F"). This module collects them, together with the tests and the sections of
+Docstrings of the library say which equation of a paper a function implements: "F3AMD Eq. 9", "F3AMD
+Eqs 2-4", or without a name, which means F3AMD ("Eq. 9", "Appendix F"). A paper's name and its
+equations stand in its `paper.toml`. This module collects them, together with the tests and the sections of
 notebooks that mention the same equation, and the figures that these sections draw. Nothing is
 imported for it: source files are parsed. How long a notebook runs is read off the records of
 complete runs.
@@ -10,6 +11,7 @@ complete runs.
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import re
 from dataclasses import dataclass
@@ -17,71 +19,50 @@ from pathlib import Path
 
 import pandas as pd
 
+from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 
+_DEFAULT = "f3amd"  # whose equations are meant where no paper is named
 
-@dataclass(frozen=True)
-class Equation:
-    """An equation of the paper.
-
-    Attributes:
-      label: "Eq. 9", "Appendix F" for the unnumbered update, "alpha_t" for what that appendix
-        defines beside it.
-      section: where the paper has it.
-      what: what it says, in our words.
-    """
-
-    label: str
-    section: str
-    what: str
-
-
-EQUATIONS = (
-    Equation("Eq. 1", "3.1", "the network predicts clean motion from noisy motion"),
-    Equation("Eq. 2", "3.4.2", "spectral branch: weights on Fourier modes"),
-    Equation("Eq. 3", "3.4.2", "local branch: two convolutions over time"),
-    Equation("Eq. 4", "3.4.2", "FNO block: the sum of both"),
-    Equation("Eq. 5", "3.4.3", "FiLM: scale and shift from the condition"),
-    Equation("Eq. 6", "3.4.3", "FiLM: the bounded gate"),
-    Equation("Eq. 7", "3.4.3", "FiLM: output layer"),
-    Equation("Eq. 8", "3.5", "variance-exploding noise"),
-    Equation("Eq. 9", "3.5", "noise level against schedule time"),
-    Equation("Eq. 10", "4.1, 4.4", "inter-round discontinuity, loss and metric"),
-    Equation("Eq. 11", "App. B", "sample loss"),
-    Equation("Eq. 12", "App. B", "joint position loss"),
-    Equation("Eq. 13", "App. B", "velocity loss"),
-    Equation("Eq. 14", "App. B", "weighted sum of the losses"),
-    Equation("Appendix F", "App. F", "DDIM update through alpha_bar"),
-    Equation("alpha_t", "App. F", "root of the signal kept by one step; the update never uses it"),
-)
-"""All equations of the paper that carry a number, and the two of Appendix F, which carry none."""
-
-# In LaTeX the last one is \alpha_t, which \bar\alpha_t holds too and does not mean.
-_MENTION = re.compile(
-    r"\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|\b(Appendix F)\b"
-    r"|(?<!\\bar\\)(?<!\w)(alpha_t)(?!\w)"
-)
+# A mark without a number may stand in LaTeX, where \bar\alpha_t holds alpha_t too and does not mean it.
+_MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|(?<!\\bar\\)(?<!\w)({marks})(?!\w))"
+_TEST_NAME = r"test_(?:({papers})_)?(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|({marks}))_"
 _DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
-_TEST_NAME = re.compile(r"^test_(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|(appendix_f))(?=_)")
 
 
-def mentioned_equations(text: str) -> set[str]:
-    """Return the labels of the paper's equations that a text mentions.
+def equation_labels(paper: str = _DEFAULT) -> list[str]:
+    """Return the labels of a paper's equations: "Eq. 9", or a mark of its own such as "Appendix F"."""
+    return [entry["label"] for entry in load_paper_file("paper", paper).get("equation", ())]
 
-    "Eqs 2-4" stands for three. An equation of another paper is left out: it follows "et al." in
-    the same clause ("Zhou et al. 2019, Eq. 15").
+
+@functools.cache
+def _patterns(paper: str) -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]:
+    """Return the patterns of mentions and test names, papers by name, and marks by how a test spells them."""
+    names = {load_paper_file("paper", folder)["name"]: folder for folder in paper_folders()}
+    marks = {label.lower().replace(" ", "_"): label for label in equation_labels(paper) if "Eq." not in label}
+    either = lambda words: "|".join(map(re.escape, words)) or "(?!)"
+    mention = re.compile(_MENTION.format(papers=either(names), marks=either(marks.values())))
+    test_name = re.compile(_TEST_NAME.format(papers=either(names.values()), marks=either(marks)))
+    return mention, test_name, names, marks
+
+
+def mentioned_equations(text: str, paper: str = _DEFAULT) -> set[str]:
+    """Return the labels of a paper's equations that a text mentions.
+
+    "Eqs 2-4" stands for three, of the paper named before it ("F3AMD Eqs 2-4") or of F3AMD. An
+    equation of a paper that has no folder here is left out: it follows "et al." in the same clause
+    ("Zhou et al. 2019, Eq. 15").
     """
+    pattern, _, names, _ = _patterns(paper)
     found = set()
     for clause in re.split(r"[;()]|\.\s*\n", text):
-        for match in _MENTION.finditer(clause):
-            if "et al." in clause[: match.start()]:
+        for match in pattern.finditer(clause):
+            name, numbers, mark = match.groups()
+            if "et al." in clause[: match.start()] or names.get(name, _DEFAULT) != paper:
                 continue
-            if match.group(2) or match.group(3):
-                found.add(match.group(2) or match.group(3))
-            else:
-                found |= {f"Eq. {number}" for number in _numbers(match.group(1))}
-    return found & {equation.label for equation in EQUATIONS}
+            found |= {mark} if mark else {f"Eq. {number}" for number in _numbers(numbers)}
+    return found & set(equation_labels(paper))
 
 
 def _numbers(text: str) -> set[int]:
@@ -94,31 +75,33 @@ def _numbers(text: str) -> set[int]:
     return numbers
 
 
-def equation_map(*, root=None) -> pd.DataFrame:
-    """Collect where each equation of the paper lives.
+def equation_map(*, root=None, paper: str = _DEFAULT) -> pd.DataFrame:
+    """Collect where each equation of a paper lives.
 
     Args:
       root: a checkout with `f3amd_lib`, `tests` and `notebooks`; by default the one in use. A
         folder that is absent (an installed package has no tests) gives empty cells.
+      paper: its folder in `f3amd_lib/papers`.
 
     Returns:
-      One row per entry of `EQUATIONS`: equation, section (of the paper), what, functions, tests,
+      One row per equation of its `paper.toml`: equation, section (of the paper), what, functions, tests,
       notebooks, cells (numbers of the notebooks' sections that speak of it: "2.3" is in notebook
       02), figures (files that these sections draw). The last five hold names joined by ", ", ""
       where there are none.
     """
     root = Path(root) if root is not None else repository_root()
     kinds = ("functions", "tests", "notebooks", "cells", "figures")
-    places = {equation.label: {kind: [] for kind in kinds} for equation in EQUATIONS}
+    equations = load_paper_file("paper", paper).get("equation", ())
+    places = {entry["label"]: {kind: [] for kind in kinds} for entry in equations}
     for path in sorted((root / "f3amd_lib").rglob("*.py")):
         module = path.relative_to(root / "f3amd_lib").with_suffix("").as_posix()
-        if module.startswith("report/"):  # what draws and lists implements nothing
+        if module.startswith("reports/"):  # what draws and lists implements nothing
             continue
         for name, text in _documented(path):
-            for label in mentioned_equations(text):
+            for label in mentioned_equations(text, paper):
                 places[label]["functions"].append(f"{module}: {name}")
     for path in sorted((root / "tests").glob("test_*.py")):
-        for name, labels in _tests(path):
+        for name, labels in _tests(path, paper):
             for label in labels:
                 places[label]["tests"].append(f"{path.stem}: {name}")
     for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb")):
@@ -126,17 +109,17 @@ def equation_map(*, root=None) -> pd.DataFrame:
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
         text = _notebook_text(path)
-        for label in mentioned_equations(text) | _displayed([text]):
+        for label in mentioned_equations(text, paper) | _displayed([text], paper):
             places[label]["notebooks"].append(path.stem)
-        for section in notebook_sections(path):
+        for section in notebook_sections(path, paper):
             for label in section.equations if section.number else ():
                 places[label]["cells"].append(section.number)
                 places[label]["figures"] += section.figures
     return pd.DataFrame(
         [
-            {"equation": item.label, "section": item.section, "what": item.what}
-            | {kind: ", ".join(names) for kind, names in places[item.label].items()}
-            for item in EQUATIONS
+            {"equation": entry["label"], "section": entry["section"], "what": entry["what"]}
+            | {kind: ", ".join(names) for kind, names in places[entry["label"]].items()}
+            for entry in equations
         ]
     )
 
@@ -155,18 +138,18 @@ def _documented(path: Path):
     yield from visit(ast.parse(path.read_text(encoding="utf-8")).body, "")
 
 
-def _tests(path: Path):
+def _tests(path: Path, paper: str):
     """Yield (name, labels) of tests that carry an equation in their name or docstring."""
+    _, pattern, _, marks = _patterns(paper)
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-            labels = mentioned_equations(ast.get_docstring(node) or "")
-            named = _TEST_NAME.match(node.name)
-            if named and named.group(3):
-                labels |= {"Appendix F"}
-            elif named:
-                first, last = int(named.group(1)), int(named.group(2) or named.group(1))
-                labels |= {f"Eq. {number}" for number in range(first, last + 1)}
-            yield node.name, labels & {equation.label for equation in EQUATIONS}
+            labels = mentioned_equations(ast.get_docstring(node) or "", paper)
+            named = pattern.match(node.name)
+            if named and (named[1] or _DEFAULT) == paper:
+                first, last = named[2], named[3] or named[2]
+                numbers = range(int(first), int(last) + 1) if first else ()
+                labels |= {marks[named[4]]} if named[4] else {f"Eq. {number}" for number in numbers}
+            yield node.name, labels & set(equation_labels(paper))
 
 
 @dataclass(frozen=True)
@@ -190,12 +173,13 @@ class Section:
         return found[0] if found else ""
 
 
-def notebook_sections(path) -> list[Section]:
+def notebook_sections(path, paper: str = _DEFAULT) -> list[Section]:
     """Read the sections of a notebook in their order.
 
     Args:
       path: of the notebook. What stands before its first heading of the second level is its title
         page and in no section; deeper headings stay in the section they stand in.
+      paper: whose equations are looked for.
 
     Returns:
       One entry per heading of the second level ("## ...").
@@ -214,17 +198,18 @@ def notebook_sections(path) -> list[Section]:
         for heading, text in zip(parts[::2], parts[1::2], strict=True):
             texts.append((heading.strip(), [heading, text], []))
     return [
-        Section(heading, frozenset(mentioned_equations("\n\n".join(text)) | _displayed(text)),
-                tuple(figures))
+        Section(
+            heading, frozenset(mentioned_equations("\n\n".join(text), paper) | _displayed(text, paper)), tuple(figures)
+        )
         for heading, text, figures in texts
-    ]  # fmt: skip
+    ]
 
 
-def _displayed(texts: list[str]) -> set[str]:
-    """Return the labels of displayed equations that carry the number, "\\qquad (11)$$"."""
+def _displayed(texts: list[str], paper: str) -> set[str]:
+    """Return the labels of displayed equations that carry the number, "\\qquad (11)$$": F3AMD's."""
     numbers = {match for text in texts for match in _DISPLAYED.findall(text)}
     found = {f"Eq. {part.strip()}" for number in numbers for part in number.split(",")}
-    return found & {equation.label for equation in EQUATIONS}
+    return found & set(equation_labels(paper)) if paper == _DEFAULT else set()
 
 
 def _kept_figures(source: str) -> list[str]:

@@ -8,7 +8,7 @@ nothing about its origin, or something else than the folder it lies in, is an er
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import PAPER_SETTING, load_paper_table
+from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import zoo
@@ -59,6 +59,10 @@ class Figure:
         if not (np.isfinite(value) and low <= value <= high):
             raise ValueError(f"a figure needs low <= value <= high, got {low}, {value}, {high}")
         return Figure(value, low, high)
+
+    def map(self, function: Callable[[float], float]) -> Figure:
+        """Return the figure under a rising function."""
+        return Figure(*(function(bound) for bound in (self.value, self.low, self.high)))
 
 
 def _combine_logs(figures: Sequence[Figure], weights) -> Figure:
@@ -126,7 +130,7 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
     """
     spread = np.log(x) - np.mean(np.log(x))
     fitted = _combine_logs(figures, spread / np.sum(spread**2))
-    return Figure(*(float(np.log(bound)) for bound in (fitted.value, fitted.low, fitted.high)))
+    return fitted.map(lambda bound: float(np.log(bound)))
 
 
 # ------------------------------------------------------------------------------------------- tables
@@ -144,8 +148,6 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 }
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
 `x0_error`) and, where it was repeated, `low` and `high`."""
-
-_VALUE_COLUMN = {"x0_by_sigma": "x0_error"}
 
 NINE_METRICS = {
     row.metric: (row.unit, row.better)
@@ -167,6 +169,11 @@ class Setting:
     model: str
     steps: int = 8
     window: int = 32
+
+    @property
+    def columns(self) -> dict:
+        """Its row in a table of `SCHEMAS`."""
+        return {"model": self.model, "window_frames": self.window, "steps": self.steps}
 
     def __str__(self) -> str:
         steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
@@ -193,17 +200,15 @@ class Source:
 
 
 class Evidence:
-    """Figures of one data set and profile, or of the paper, looked up by what they are about.
+    """Figures of one data set and profile, or of a paper, looked up by what they are about.
 
     Attributes:
-      dataset: what the figures were measured on.
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
-      sources: the tables that were looked into since `forget_sources`, in that order.
+      sources: the tables that were looked into, in that order and as often; whoever asks clears the list first.
     """
 
-    def __init__(self, dataset: str, framework: str, load):
+    def __init__(self, framework: str, load: Callable):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
-        self.dataset = dataset
         self.framework = framework
         self.sources: list[Source] = []
         self._load = functools.cache(load)
@@ -211,10 +216,6 @@ class Evidence:
     def called(self, name: str) -> str:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
         return f"{name}.csv has" if self.framework == "jax" else "the paper prints"
-
-    def forget_sources(self) -> None:
-        """Start the list of sources anew."""
-        self.sources = []
 
     def table(self, name: str, device: str | None = None) -> pd.DataFrame:
         """Return a table of `SCHEMAS`, checked, and note it among the sources.
@@ -233,9 +234,14 @@ class Evidence:
             if table.empty:
                 raise NotMeasured(f"{self.called(name)} no rows of a {device}")
         sha256 = record.get("table", {}).get("sha256", "")[:12]
-        source = Source(path, sha256, _hardware(record, device))
-        if source not in self.sources:
-            self.sources.append(source)
+        self.sources.append(Source(path, sha256, _hardware(record, device)))
+        return table
+
+    def rows(self, name: str, device: str | None = None, **row) -> pd.DataFrame:
+        """Return those rows of a table that have these values in these columns; maybe none."""
+        table = self.table(name, device)
+        for column, wanted in row.items():
+            table = table[table[column] == wanted]
         return table
 
     def figure(self, name: str, device: str | None = None, value: str = "value", **row) -> Figure:
@@ -250,144 +256,99 @@ class Evidence:
         Raises:
           NotMeasured: if there is no such row; the message says which.
         """
-        table = self.table(name, device)
-        chosen = table
-        for column, wanted in row.items():
-            chosen = chosen[chosen[column] == wanted]
-        if len(chosen) and value in chosen and pd.notna(chosen.iloc[0][value]):
-            found = chosen.iloc[0]
-            if value != "value":
-                return Figure.of(found[value])
-            return Figure.of(found["value"], found["low"], found["high"])
-        where = ", ".join([*map(_spoken, row.items()), *([device] if device else [])])
+        found = self.rows(name, device, **row)
+        if value in found:
+            found = found[found[value].notna()]
+        if len(found) and value in found:
+            bounds = ["value", "low", "high"] if value == "value" else [value]
+            return Figure.of(*found.iloc[0][bounds])
         what = "" if value == "value" else f"{value} of "
-        raise NotMeasured(f"{self.called(name)} no {what}{where}")
+        where = f", {device}" if device else ""
+        raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")
 
     def quality(self, setting: Setting, metric: str) -> Figure:
         """Return a metric of a model."""
-        return self.figure(
-            "quality", model=setting.model, window_frames=setting.window, steps=setting.steps, metric=metric
-        )
-
-    def real(self, metric: str) -> Figure | None:
-        """Return a metric of real motion, where the records have it; windows as in the paper."""
-        table = self.table("quality")
-        chosen = table[(table["model"] == "real") & (table["metric"] == metric)]
-        chosen = chosen.sort_values("window_frames")
-        if chosen.empty:
-            return None
-        return Figure.of(*chosen.iloc[0][["value", "low", "high"]])
+        return self.figure("quality", **setting.columns, metric=metric)
 
     def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
         """Return the time of a round in ms; by default in the framework of this evidence."""
-        return self.figure(
-            "synthesis_time",
-            device,
-            model=setting.model,
-            window_frames=setting.window,
-            steps=setting.steps,
-            framework=framework or self.framework,
-            characters=characters,
-        )
+        framework = framework or self.framework
+        row = setting.columns | {"framework": framework, "characters": characters}
+        return self.figure("synthesis_time", device, **row)
 
-    def counts(self, setting: Setting, device: str, framework: str | None = None) -> list[int]:
-        """Return the numbers of characters that a model was timed with, rising; may be empty."""
-        table = self.table("synthesis_time", device)
-        wanted = {
-            "model": setting.model,
-            "window_frames": setting.window,
-            "steps": setting.steps,
-            "framework": framework or self.framework,
-        }
-        for column, value in wanted.items():
-            table = table[table[column] == value]
-        return sorted(int(count) for count in table["characters"])
+    def counts(self, setting: Setting, device: str, framework: str | None = None) -> set[int]:
+        """Return the numbers of characters that a model was timed with; maybe none."""
+        rows = self.rows("synthesis_time", device, **setting.columns, framework=framework or self.framework)
+        return {int(count) for count in rows["characters"]}
 
     def speedup(self, slow: Setting, fast: Setting, device: str, characters: int) -> Figure:
         """Return how many times as fast `fast` is."""
         return ratio(self.time(slow, device, characters), self.time(fast, device, characters))
 
-    def training(self, model: str, batch_size: int, window: int = 32, value: str = "value"):
-        """Return seconds a training step on a GPU, or another column of that row."""
-        return self.figure("training_time", "GPU", value, model=model, window_frames=window, batch_size=batch_size)
 
-    def shared_batch(self, models: Sequence[str], window: int = 32) -> int:
-        """Return the largest batch that all models were trained with on a GPU."""
-        table = self.table("training_time", "GPU")
-        table = table[table["window_frames"] == window]
-        sizes = [set(table.loc[table["model"] == model, "batch_size"]) for model in models]
-        shared = set.intersection(*sizes)
-        if not shared:
-            named = " and ".join(models)
-            raise NotMeasured(f"{self.called('training_time')} no batch size of both {named}, GPU")
-        return int(max(shared))
+_WORDS = {
+    "steps": "{} step{s}",
+    "characters": "{:,} character{s}",
+    "window_frames": "{} frames",
+    "batch_size": "batch {}",
+}
 
 
-def _spoken(item: tuple[str, object]) -> str:
-    column, value = item
-    if column in ("model", "metric", "framework", "band"):
-        return str(value)
-    if column == "steps":
-        return f"{value} step{'s' if value > 1 else ''}"
-    if column == "characters":
-        return f"{value:,} character{'s' if value > 1 else ''}"
-    if column == "window_frames":
-        return f"{value} frames"
-    return f"batch {value}" if column == "batch_size" else f"{column} {value}"
+def _row_text(row: Mapping) -> str:
+    words = (_WORDS.get(column, "{}").format(value, s="" if value == 1 else "s") for column, value in row.items())
+    return ", ".join(words)
 
 
 def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
-    kind = str(record.get("device_kind"))
-    on_cpu = device == "CPU" or (device is None and record.get("device_platform") == "cpu")
-    if on_cpu:
+    if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
         return f"CPU, {record.get('cores')} cores"
+    kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
+
+
+def _foreign_unit(name: str, table: pd.DataFrame) -> pd.Series:
+    if name != "quality" or "unit" not in table:
+        return pd.Series(False, index=table.index)
+    wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
+    return wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
 
 
 def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
     """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken."""
-    keys, column = SCHEMAS[name], _VALUE_COLUMN.get(name, "value")
-    for needed in (*keys, column):
+    keys = list(SCHEMAS[name])
+    table = table.rename(columns={"x0_error": "value"})
+    for needed in (*keys, "value"):
         if needed not in table:
-            has = ", ".join(map(str, table.columns))
-            raise ValueError(f"{where}: needs a column {needed!r}, it has {has}")
-    table = table.rename(columns={column: "value"})
+            raise ValueError(f"{where}: needs a column {needed!r}, it has {', '.join(map(str, table.columns))}")
     table = table[table["value"].notna()].copy()
-    for bound in ("low", "high"):
+    for bound in ("low", "high"):  # undefined where nothing was repeated
         if bound not in table:
             table[bound] = float("nan")
-    # Where nothing was repeated the bounds are undefined, which is no fault.
-    astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"])
-    astray |= table["high"] < table["value"]
-    if astray.any():
-        row = ", ".join(str(table.loc[astray, key].iloc[0]) for key in keys)
-        raise ValueError(f"{where}: the figure of {row} is infinite or outside its interval")
-    twice = table.duplicated(list(keys))
-    if twice.any():
-        row = ", ".join(str(table.loc[twice, key].iloc[0]) for key in keys)
-        raise ValueError(f"{where}: has two rows of {row}")
-    if "model" in table:
-        for model in table["model"].unique():
-            if model not in REFERENCE_ROWS and not _is_preset(model):
-                hint = nearest_hint(model, [*zoo.PRESETS, *REFERENCE_ROWS])
-                raise ValueError(f"{where}: unknown model {model!r}{hint}")
-    if name == "quality" and "unit" in table:
-        for metric, unit in zip(table["metric"], table["unit"].fillna(""), strict=True):
-            wanted = NINE_METRICS.get(metric, (unit,))[0]
-            if unit != wanted:
-                raise ValueError(f"{where}: {metric} is in {unit or 'no unit'}, not in {wanted}")
+    astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
+    for fault, rows in (
+        ("a figure that is infinite or outside its interval", astray),
+        ("two rows", table.duplicated(keys)),
+        ("another unit than the paper", _foreign_unit(name, table)),
+    ):
+        if rows.any():
+            raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")
+    for model in table["model"].unique() if "model" in table else ():
+        check_model(model, where)
     if "device" in table and not set(table["device"]) <= {"CPU", "GPU"}:
         raise ValueError(f"{where}: device must be CPU or GPU, got {table['device'].unique()}")
     return table
 
 
-def _is_preset(model: str) -> bool:
+def check_model(model: str, where: str) -> None:
+    """Raise ValueError for a name that is neither a preset's own nor one of `REFERENCE_ROWS`."""
     try:
-        return zoo.find_preset(model).name == model
+        known = model in REFERENCE_ROWS or zoo.find_preset(model).name == model
     except ValueError:
-        return False
+        known = False
+    if not known:
+        raise ValueError(f"{where}: unknown model {model!r}{nearest_hint(model, [*zoo.PRESETS, *REFERENCE_ROWS])}")
 
 
 def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
@@ -427,43 +388,36 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
                 raise ValueError(f"{path}: has rows of a GPU, but its record knows only a CPU")
         return table, record, path.relative_to(root).as_posix()
 
-    return Evidence(dataset, "jax", load)
+    return Evidence("jax", load)
 
 
 @functools.cache
-def paper_evidence() -> Evidence:
-    """Return the paper's own tables in the form of our records, without intervals."""
-    parts: dict[str, list[pd.DataFrame]] = {"quality": [], "synthesis_time": []}
-    for number in (3, 5, 6, 8, 9, 10, 11, 12, 1, 4, 7):
-        table = load_paper_table(number)
-        timed = table["metric"].str.startswith("synthesis_time")
-        parts["quality"].append(_by_preset(table[~timed], PUBLISHED_CAMDM))
-        times = _by_preset(table[timed], "CAMDM-code")
-        if number == 11:  # the one column of times there: 1,024 characters on the GPU
-            times = times.assign(device="GPU", characters=1024)
-        in_torch = table.loc[timed, "model"].str.contains("PyTorch")
-        parts["synthesis_time"].append(times.assign(framework=np.where(in_torch, "torch", "iree")))
-    minutes = _by_preset(load_paper_table(2), "")
-    # Only ratios are taken of it, at equal batch and data: an epoch serves as well as a step.
-    parts["training_time"] = [minutes.assign(device="GPU", batch_size=512)]
-    tables = {name: _without_copies(name, pd.concat(some)) for name, some in parts.items()}
+def paper_evidence(paper: str = "f3amd") -> Evidence:
+    """Return a paper's own tables in the form of our records, without intervals.
+
+    Raises:
+      ValueError: if two tables print different figures of one row.
+    """
+    about = load_paper_file("paper", paper)
+    parts: dict[str, list[pd.DataFrame]] = {}
+    for entry in about.get("table", ()):
+        printed = load_paper_table(entry["number"], paper)
+        labels, known = printed["model"], entry.get("models", {})
+        names = {label: known.get(label) or zoo.find_preset(label).name for label in labels.unique()}
+        framework = np.where(labels.str.contains("PyTorch"), "torch", "iree")
+        printed = printed.assign(model=labels.map(names), framework=framework, **entry.get("columns", {}))
+        name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")
+        for which, rows in printed.groupby(name):
+            parts.setdefault(which, []).append(rows)
+    tables = {}
+    for name, some in parts.items():
+        # A row that several tables print is one row.
+        rows = pd.concat(some)[[*SCHEMAS[name], "unit", "value"]].drop_duplicates([*SCHEMAS[name], "value"])
+        tables[name] = _checked(name, rows, f"the paper's {name}")
 
     def load(name: str):
         if name not in tables:
             raise NoTable("the paper has no table of it")
-        return tables[name], {"paper_setting": PAPER_SETTING}, "the paper's tables"
+        return tables[name], {"paper_setting": about["setting"]}, "the paper's tables"
 
-    return Evidence("100STYLE", "iree", load)
-
-
-def _by_preset(table: pd.DataFrame, pytorch: str) -> pd.DataFrame:
-    names = {label: pytorch if "PyTorch" in label else zoo.find_preset(label).name for label in table["model"].unique()}
-    return table.assign(model=table["model"].map(names))
-
-
-def _without_copies(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Drop rows that the paper prints in several tables; ValueError if they disagree."""
-    keys = list(SCHEMAS[name])
-    columns = [column for column in (*keys, "unit", "value") if column in table]
-    table = table[columns].drop_duplicates([*keys, "value"])
-    return _checked(name, table, f"the paper's {name}")
+    return Evidence("iree", load)

@@ -1,0 +1,692 @@
+"""Verdicts, and the kinds of judgement that a paper's `claims.toml` names.
+
+A claim is a list of statements: small sentences that are true or false of `Evidence` (our records,
+or the paper's own tables). What the claim is worth follows from them (`combine`). Three things
+decide a statement:
+
+- **A stated figure or range** ("3 to 4 times", `within`). The figure itself supports it; only a
+  figure whose whole interval lies outside contradicts it; in between nothing can be told. A gain
+  that is larger than stated is there, but was stated wrongly: the statement holds in part.
+- **Better or worse** (`ordered`). The interval of the ratio must leave out 1. Otherwise the two
+  cannot be told apart.
+- **Alike.** A range around 1.
+
+The thresholds, here and in `claims.toml`, were chosen before our numbers were known, and are the
+same for all claims and for the paper's own tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.measures.distributions import mean_and_interval
+from f3amd_lib.reports.evidence import (
+    NINE_METRICS,
+    Evidence,
+    Figure,
+    NotMeasured,
+    Setting,
+    difference,
+    mean_figure,
+    power_law,
+    ratio,
+)
+
+HOLDS = "holds"
+IN_PART = "holds in part"
+FAILS = "does not hold"
+OPEN = "cannot be told apart"
+UNMEASURED = "not measured"
+VERDICTS = (HOLDS, IN_PART, FAILS, OPEN, UNMEASURED)
+"""What can be said of a claim, or of a statement."""
+
+REMARK = ""
+"""In place of a verdict: a figure that stands beside the others and decides nothing."""
+
+Finding = tuple[str, str]
+"""Verdict and text of what was found."""
+
+TOLERANCE = 0.10
+"""Slack of a stated factor. The paper gives its factors with one or two digits and a "~"."""
+
+SAVING_SLACK = 2.0
+"""Slack of a stated share of time saved, %. Medians of repeated runs differ by a percent or two."""
+
+CONVERGED = 0.05
+"""A metric has converged in the first epoch that comes this close to its best."""
+
+STILL_BETTER = 0.9
+"""If that epoch lies in the last tenth of a run, the run was too short to tell."""
+
+GRADED = 0.05
+"""Least lead of one metric over another in the share of pairs that it puts in the right order."""
+
+LEAST_METRICS = 5
+"""Of the nine of Table 3, so many must be there before "every metric" means something."""
+
+EVERYTHING = (0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Models that are judged together, as far as they were measured.
+
+    Attributes:
+      models: all of them.
+      required: those without which nothing is judged.
+    """
+
+    models: tuple[Setting, ...]
+    required: tuple[Setting, ...]
+
+    def measured(self, look: Callable[[Setting], object]) -> list[Setting]:
+        """Return those for which `look` finds all it needs; NotMeasured if a required one lacks it."""
+        kept = []
+        for setting in self.models:
+            try:
+                look(setting)
+            except NotMeasured:
+                if setting in self.required:
+                    raise
+                continue
+            kept.append(setting)
+        return kept
+
+
+# ------------------------------------------------------------------------------ verdicts and ranges
+
+
+def combine(verdicts: Iterable[str]) -> str:
+    """Return the verdict on a whole from those on its parts.
+
+    All parts hold: it holds. Some do, and others do not or were not measured: it holds in part.
+    None does, and one was contradicted: it does not hold. Otherwise nothing can be told apart, or
+    nothing was measured.
+    """
+    found = set(verdicts) - {REMARK}
+    if not found - {UNMEASURED}:
+        return UNMEASURED
+    if found == {HOLDS}:
+        return HOLDS
+    if found & {HOLDS, IN_PART}:
+        return IN_PART
+    return FAILS if FAILS in found else OPEN
+
+
+def every(verdicts: Iterable[str]) -> str:
+    """Return the verdict on "each of them": one that fails is enough."""
+    found = set(verdicts)
+    return next(verdict for verdict in (FAILS, OPEN, IN_PART, HOLDS) if verdict in found)
+
+
+def any_of(verdicts: Iterable[str]) -> str:
+    """Return the verdict on "one of them": one that holds is enough."""
+    found = set(verdicts)
+    return next(verdict for verdict in (HOLDS, OPEN, FAILS) if verdict in found)
+
+
+def within(figure: Figure, bounds: tuple[float, float], *, gain: bool = False) -> str:
+    """Judge whether a figure lies in a range.
+
+    Args:
+      figure: what was found.
+      bounds: least and largest value.
+      gain: beyond the largest value lies more of a good thing.
+
+    Returns:
+      A verdict.
+    """
+    low, high = bounds
+    if figure.high < low:
+        return FAILS
+    if figure.low > high:
+        return IN_PART if gain else FAILS
+    return HOLDS if low <= figure.value <= high else OPEN
+
+
+def ordered(harm: Figure) -> str:
+    """Judge whether something is worse, from a ratio that is above 1 where it is."""
+    if harm.low > 1.0:
+        return HOLDS
+    return FAILS if harm.high < 1.0 else OPEN
+
+
+def _compared(figure: Figure, bounds: tuple[float, float] | None, *, gain: bool = False) -> str:
+    return ordered(figure) if bounds is None else within(figure, bounds, gain=gain)
+
+
+def _ranged(figures: Sequence[Figure], bounds: tuple[float, float], unit: str, *, gain: bool = True) -> Finding:
+    """Judge whether figures lie in a range, each of them a part of the whole; say how many do."""
+    verdicts = [within(figure, bounds, gain=gain) for figure in figures]
+    text, inside = range_text(figures, unit), verdicts.count(HOLDS)
+    if len(figures) > 1 and inside < len(figures):
+        text += f", {inside} of {len(figures)} in the range"
+    return combine(verdicts), text
+
+
+def stated_range(low: float, high: float) -> tuple[float, float]:
+    """Return the bounds of a range of factors as the paper states it, with some slack."""
+    return low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)
+
+
+def stated_saving(low: float, high: float) -> tuple[float, float]:
+    """Return the bounds of a range of time saved, %, as the paper states it, with some slack."""
+    return low - SAVING_SLACK, high + SAVING_SLACK
+
+
+def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
+    """Return the bounds of "about figure / over times", a factor above 1."""
+    factor = figure / over
+    # A gain of 9 % with a slack of 10 % would be no gain: half of it must be left.
+    slack = min(TOLERANCE * factor, (factor - 1.0) / 2.0)
+    return factor - slack, factor + slack
+
+
+def equal_range(slack: float) -> tuple[float, float]:
+    """Return the bounds of ratios that count as 1, as far below as above."""
+    return 1.0 / (1.0 + slack), 1.0 + slack
+
+
+# -------------------------------------------------------------------------------------- words
+
+
+def number_text(value: float) -> str:
+    """Write a number with three digits, or all those before the point."""
+    if not np.isfinite(value):
+        return "∞"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def figure_text(figure: Figure, unit: str = "") -> str:
+    """Write a figure, with its interval where it has one."""
+    text = f"{number_text(figure.value)}{unit}"
+    if figure.low == figure.high:
+        return text
+    return f"{text} ({number_text(figure.low)} to {number_text(figure.high)})"
+
+
+def range_text(figures: Sequence[Figure], unit: str = "") -> str:
+    """Write the least and the largest of some figures; a single one with its interval."""
+    if len(figures) == 1:
+        return figure_text(figures[0], unit)
+    values = [figure.value for figure in figures]
+    return f"{number_text(min(values))} to {number_text(max(values))}{unit}"
+
+
+def _list_text(items: Iterable) -> str:
+    return ", ".join(f"{item:,}" if isinstance(item, int) else str(item) for item in items)
+
+
+def _change_text(figure: Figure) -> str:
+    if figure.value >= 2.0:
+        return f"{number_text(figure.value)}x"
+    return f"{100.0 * (figure.value - 1.0):+.3g} %"
+
+
+def _in_percent(figure: Figure) -> Figure:
+    return figure.map(lambda bound: 100.0 * (bound - 1.0))
+
+
+# ------------------------------------------------------------------------------- any single figure
+
+
+def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None, unit="", text="{}") -> Finding:
+    """Judge one figure of a table, or its ratio to the row that differs from it as `ratio_to` says."""
+    found = evidence.figure(table, **row)
+    if ratio_to is not None:
+        found = ratio(found, evidence.figure(table, **(row | ratio_to)))
+    return _compared(found, bounds), text.format(figure_text(found, unit))
+
+
+# ------------------------------------------------------------------------------------------- times
+
+
+def _timed(evidence: Evidence, fast: Setting | Family, device: str, characters) -> list[Setting]:
+    if isinstance(fast, Setting):
+        return [fast]
+    return fast.measured(lambda setting: [evidence.time(setting, device, count) for count in characters])
+
+
+def speedup(
+    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}"
+) -> Finding:
+    """Judge how many times as fast one model, or each of a family, is at some numbers of characters."""
+    models = _timed(evidence, fast, device, characters)
+    figures = [evidence.speedup(slow, model, device, count) for model in models for count in characters]
+    verdict, found = _ranged(figures, bounds, unit, gain=gain)
+    return verdict, text.format(found)
+
+
+def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds) -> Finding:
+    """Judge the gain in a large crowd (device -> characters), on every device that was timed."""
+    figures, gap = {}, None
+    for device, count in crowds.items():
+        try:
+            figures[f"{device}, {count:,}"] = evidence.speedup(slow, fast, device, count)
+        except NotMeasured as error:
+            gap = gap or error
+    if not figures:
+        raise gap
+    verdict = every(within(gain, bounds, gain=True) for gain in figures.values())
+    return verdict, ", ".join(f"{figure_text(gain)}x ({at})" for at, gain in figures.items())
+
+
+def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Finding:
+    """Judge whether the gain of a family is larger with the second number of characters."""
+    few, many = characters
+    growth = [
+        ratio(evidence.speedup(slow, model, device, many), evidence.speedup(slow, model, device, few))
+        for model in _timed(evidence, fast, device, characters)
+    ]
+    return combine(map(ordered, growth)), f"{range_text(growth)} times the gain"
+
+
+def speedup_at_each(evidence: Evidence, slow, fast, device, characters) -> Finding:
+    """Write the gain at each number of characters (a remark)."""
+    gains = {count: evidence.speedup(slow, fast, device, count) for count in characters}
+    return REMARK, " and ".join(f"{figure_text(gain)}x at {count:,}" for count, gain in gains.items())
+
+
+def speedup_above(evidence: Evidence, slow, fast, device, factor) -> Finding:
+    """Write at which numbers of characters a gain is passed (a remark)."""
+    shared = sorted(evidence.counts(slow, device) & evidence.counts(fast, device))
+    counts = [count for count in shared if evidence.speedup(slow, fast, device, count).value > factor]
+    return REMARK, f"above {factor:g} at {_list_text(counts)}" if counts else f"nowhere above {factor:g}"
+
+
+def _saving(gain: Figure) -> Figure:
+    return gain.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
+
+
+def saving(evidence: Evidence, slow, fast, device, characters, bounds) -> Finding:
+    """Judge the time saved, %, at every number of characters."""
+    figures = [_saving(evidence.speedup(slow, fast, device, count)) for count in characters]
+    return _ranged(figures, bounds, " %")
+
+
+def mean_saving(evidence: Evidence, slow, fast, device, characters, bounds) -> Finding:
+    """Judge the time saved, %, on average over the numbers of characters that were timed."""
+    shared = sorted(evidence.counts(slow, device) & evidence.counts(fast, device) & set(characters))
+    # Without any, the reason is that of the first.
+    mean = mean_figure([evidence.speedup(slow, fast, device, count) for count in shared or characters[:1]])
+    found = _saving(mean)
+    return within(found, bounds, gain=True), f"{figure_text(found)} % at {_list_text(shared)}"
+
+
+def _jax_over_torch(evidence: Evidence, model: Setting, released: Setting, device, characters) -> dict[int, Figure]:
+    """Return time in JAX over time in PyTorch, which has the same network or the released one."""
+    peer = model if evidence.counts(model, device, "torch") else released
+    known = evidence.counts(model, device) & evidence.counts(peer, device, "torch")
+    return {
+        count: ratio(evidence.time(model, device, count), evidence.time(peer, device, count, "torch"))
+        for count in sorted(known & set(characters)) or characters[:1]
+    }
+
+
+def jax_over_torch(evidence: Evidence, model, released, device, characters, bounds=EVERYTHING, gain=False) -> Finding:
+    """Judge the time in JAX over that in PyTorch at each number of characters."""
+    figures = list(_jax_over_torch(evidence, model, released, device, characters).values())
+    verdict, text = _ranged(figures, bounds, "", gain=gain)
+    return verdict, f"JAX / PyTorch {text}"
+
+
+def speedup_over_torch(evidence: Evidence, slow, released, fast, device, characters) -> Finding:
+    """Write how many times as fast a model in JAX is as another one in PyTorch (a remark)."""
+    over_torch = _jax_over_torch(evidence, slow, released, device, characters)
+    gains = {count: ratio(evidence.speedup(slow, fast, device, count), found) for count, found in over_torch.items()}
+    slower = [count for count, gain in gains.items() if gain.value < 1.0]
+    return REMARK, f"{range_text(list(gains.values()))}x" + (f", slower at {_list_text(slower)}" if slower else "")
+
+
+def _exponent(evidence: Evidence, model: str, device: str, count: int) -> Figure:
+    """Return p of time ~ steps^p."""
+    steps = (8, 4, 2, 1)
+    return power_law(steps, [evidence.time(Setting(model, n), device, count) for n in steps])
+
+
+def step_exponent(evidence: Evidence, model, device, characters, bounds) -> Finding:
+    """Judge the exponent of time against the number of steps."""
+    found = _exponent(evidence, model.model, device, characters)
+    return within(found, bounds), f"exponent {figure_text(found)}"
+
+
+def step_exponent_growth(evidence: Evidence, model, device, characters) -> Finding:
+    """Judge whether that exponent is larger with the second number of characters."""
+    few, many = characters
+    low, high = (_exponent(evidence, model.model, device, count) for count in characters)
+    rise = difference(high, low)
+    verdict = HOLDS if rise.low > 0 else FAILS if rise.high < 0 else OPEN
+    return verdict, f"exponent {figure_text(low)} at {few}, {figure_text(high)} at {many:,}"
+
+
+def training_ratio(
+    evidence: Evidence, over, under, bounds=None, column="value", text="{figure}x at batch {batch}"
+) -> Finding:
+    """Judge the training time (or another column) of one model over another's, at the largest shared batch."""
+    rows = evidence.rows("training_time", "GPU", window_frames=over.window)
+    sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
+    shared = set.intersection(*sizes)
+    if not shared:
+        where = f"{evidence.called('training_time')} no batch size of both"
+        raise NotMeasured(f"{where} {over.model} and {under.model}, GPU")
+    batch = int(max(shared))
+    rows = [{"model": setting.model, "window_frames": over.window, "batch_size": batch} for setting in (over, under)]
+    found = ratio(*(evidence.figure("training_time", "GPU", column, **row) for row in rows))
+    return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=batch)
+
+
+def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
+    """Return the first epoch that comes close to the best one; NotMeasured if it may yet fall."""
+    curve = curve[curve["metric"] == metric].sort_values("epoch")
+    values = curve["value"].to_numpy(np.float64)
+    if NINE_METRICS.get(metric, ("", "down"))[1] == "up":
+        close = values >= values.max() * (1.0 - CONVERGED)
+    else:
+        close = values <= values.min() * (1.0 + CONVERGED)
+    reached = float(curve["epoch"].iloc[int(np.argmax(close))])
+    last = float(curve["epoch"].iloc[-1])
+    if reached > STILL_BETTER * last:
+        raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:g}")
+    return reached
+
+
+def convergence(evidence: Evidence, model, against) -> Finding:
+    """Judge, metric by metric, whether a model converges in no more epochs than another."""
+    curves = {setting.model: evidence.rows("quality_by_epoch", model=setting.model) for setting in (model, against)}
+    for name, curve in curves.items():
+        if curve.empty:
+            raise NotMeasured(f"quality_by_epoch.csv has no {name}")
+    ours, theirs = ([*curve["metric"].unique()] for curve in curves.values())
+    verdicts, texts = [], []
+    for metric in (name for name in ours if name in theirs):
+        epoch, other = (_converged_epoch(curve, metric, name) for name, curve in curves.items())
+        verdicts.append(HOLDS if epoch <= (1.0 + TOLERANCE) * other else FAILS)
+        texts.append(f"{metric} {epoch:g} against {other:g}")
+    if not verdicts:
+        raise NotMeasured("quality_by_epoch.csv has no metric of both models")
+    return combine(verdicts), ", ".join(texts)
+
+
+# ----------------------------------------------------------------------------------------- quality
+
+
+def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
+    """Return how many times worse a metric is; above 1 where `model` is the worse one."""
+    found, before = evidence.quality(model, metric), evidence.quality(against, metric)
+    return ratio(before, found) if NINE_METRICS[metric][1] == "up" else ratio(found, before)
+
+
+def _has(evidence: Evidence, settings: Iterable[Setting], metric: str) -> bool:
+    try:
+        for setting in settings:
+            evidence.quality(setting, metric)
+    except NotMeasured:
+        return False
+    return True
+
+
+def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> list[str]:
+    """Return those of the nine metrics that all settings have."""
+    kept = [metric for metric in NINE_METRICS if _has(evidence, settings, metric)]
+    if len(kept) < LEAST_METRICS:
+        for setting in settings:  # the reason is that of the first gap
+            for metric in NINE_METRICS:
+                evidence.quality(setting, metric)
+    return kept
+
+
+def _spread(evidence: Evidence, settings: Sequence[Setting], metric: str) -> tuple[Figure, Setting, Setting]:
+    """Return largest over least value of a metric, and whose they are."""
+    value = lambda setting: evidence.quality(setting, metric).value
+    largest, least = max(settings, key=value), min(settings, key=value)
+    return ratio(evidence.quality(largest, metric), evidence.quality(least, metric)), largest, least
+
+
+def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
+    """Judge whether a model is worse than another in one metric, or by a factor in a range."""
+    harm = _harm(evidence, model, against, metric)
+    values = " against ".join(figure_text(evidence.quality(setting, metric)) for setting in (model, against))
+    text = f"{values} {NINE_METRICS[metric][0]}".rstrip()
+    return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
+
+
+def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) -> Finding:
+    """Judge whether each, or any, of some metrics is worse by a factor in a range."""
+    harms = {metric: _harm(evidence, model, against, metric) for metric in metrics}
+    verdict = {"each": every, "any": any_of}[quantifier](within(harm, bounds) for harm in harms.values())
+    return verdict, ", ".join(f"{metric} {_change_text(harm)} worse" for metric, harm in harms.items())
+
+
+def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
+    """Judge, metric by metric, whether a model is worse than another."""
+    metrics = _shared_metrics(evidence, [model, against])
+    verdicts = [ordered(_harm(evidence, model, against, metric)) for metric in metrics]
+    better = [metric for metric, verdict in zip(metrics, verdicts, strict=True) if verdict == FAILS]
+    text = f"worse in {verdicts.count(HOLDS)} of {len(verdicts)}"
+    return combine(verdicts), text + (f", better in {_list_text(better)}" if better else "")
+
+
+def worst_in(evidence: Evidence, model, models) -> Finding:
+    """Write in which metrics a model is the last of several (a remark)."""
+    last = [
+        metric
+        for metric in _shared_metrics(evidence, [model, *models])
+        if all(_harm(evidence, model, other, metric).value > 1.0 for other in models)
+    ]
+    return REMARK, _list_text(last) if last else "in no metric"
+
+
+def alike(evidence: Evidence, models, bounds) -> Finding:
+    """Judge, metric by metric, whether the largest value of several models over the least lies in a range."""
+    verdicts, texts = [], []
+    for metric in _shared_metrics(evidence, models):
+        spread, largest, least = _spread(evidence, models, metric)
+        verdicts.append(within(spread, bounds))
+        if verdicts[-1] != HOLDS:
+            texts.append(f"{metric} {number_text(spread.value)}x ({largest.model} over {least.model})")
+    text = f"alike in {verdicts.count(HOLDS)} of {len(verdicts)}"
+    return combine(verdicts), text + (f"; apart: {', '.join(texts)}" if texts else "")
+
+
+def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
+    """Judge the largest value of one metric over the least, of a family."""
+    models = models.measured(lambda setting: evidence.quality(setting, metric))
+    spread, largest, least = _spread(evidence, models, metric)
+    text = f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least.model} to {largest.model})"
+    return within(spread, bounds), text
+
+
+def best_of(evidence: Evidence, model, models, metric) -> Finding:
+    """Judge whether a model has the best value of a metric in its family."""
+    others = [other for other in models.measured(lambda setting: evidence.quality(setting, metric)) if other != model]
+    harms = {other.model: _harm(evidence, other, model, metric) for other in others}
+    nearest = min(harms, key=lambda name: harms[name].value)
+    return every(
+        map(ordered, harms.values())
+    ), f"next is {nearest} with {figure_text(harms[nearest])} times its {metric}"
+
+
+def better_at_each_width(evidence: Evidence, better, worse, widths, metric, window=32) -> Finding:
+    """Judge, width by width (the one that must be there first), whether one kind of network beats another."""
+    verdicts = {}
+    for width in sorted(widths):
+        pair = [Setting(f"{kind}-{width}", window=window) for kind in (worse, better)]
+        if _has(evidence, pair, metric):
+            verdicts[width] = ordered(_harm(evidence, *pair, metric))
+    if not verdicts:
+        for kind in (better, worse):
+            evidence.quality(Setting(f"{kind}-{widths[0]}", window=window), metric)
+        raise NotMeasured(f"{evidence.called('quality')} no width of both families with {metric}")
+    texts = []
+    for verdict, word in ((HOLDS, "yes at"), (FAILS, "no at"), (OPEN, "open at")):
+        if chosen := [width for width, found in verdicts.items() if found == verdict]:
+            texts.append(f"{word} D = {_list_text(chosen)}")
+    return combine(verdicts.values()), ", ".join(texts)
+
+
+def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple[Setting, Setting]]:
+    """Return (longer window, usual window) of every model that has both."""
+    pair = lambda setting: (Setting(setting.model, window=window), setting)
+    known = models.measured(lambda setting: [evidence.quality(one, "FID") for one in pair(setting)])
+    return [pair(setting) for setting in known]
+
+
+def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
+    """Judge, metric by metric, whether no model of a family is much worse with longer windows."""
+    pairs = _window_pairs(evidence, models, window)
+    metrics = _shared_metrics(evidence, [setting for pair in pairs for setting in pair])
+    verdicts, texts = [], []
+    for metric in metrics:
+        harms = {longer.model: _harm(evidence, longer, usual, metric) for longer, usual in pairs}
+        verdicts.append(every(within(harm, bounds) for harm in harms.values()))
+        worst = max(harms, key=lambda model: harms[model].value)
+        if verdicts[-1] != HOLDS:
+            texts.append(f"{metric} {_change_text(harms[worst])} ({worst})")
+    return combine(verdicts), f"worse: {', '.join(texts)}" if texts else f"{len(metrics)} metrics"
+
+
+def window_gain(evidence: Evidence, models, window, metric) -> Finding:
+    """Write how many models are better with longer windows (a remark)."""
+    pairs = _window_pairs(evidence, models, window)
+    better = sum(_harm(evidence, *pair, metric).value < 1.0 for pair in pairs)
+    return REMARK, f"in {better} of {len(pairs)} models"
+
+
+def steady_over_steps(evidence: Evidence, model, steps, bounds) -> Finding:
+    """Judge, metric by metric, whether fewer steps give what the model's own number of steps gives."""
+    fewer = [Setting(model.model, count) for count in steps]
+    metrics = _shared_metrics(evidence, [model, *fewer])
+    changes = {
+        (metric, setting): ratio(evidence.quality(setting, metric), evidence.quality(model, metric))
+        for metric in metrics
+        for setting in fewer
+    }
+    verdicts = [every(within(changes[metric, setting], bounds) for setting in fewer) for metric in metrics]
+    metric, setting = max(changes, key=lambda key: abs(np.log(changes[key].value)))
+    largest = f"{metric} {figure_text(_in_percent(changes[metric, setting]))} %"
+    at = f"{setting.steps} step{'s' if setting.steps > 1 else ''}"
+    return combine(verdicts), f"{verdicts.count(HOLDS)} of {len(metrics)} metrics; largest change: {largest} at {at}"
+
+
+def change_between_steps(evidence: Evidence, model, steps) -> Finding:
+    """Write the largest change of a metric from each number of steps to the next (a remark)."""
+    settings = [Setting(model.model, count) for count in steps]
+    metrics = _shared_metrics(evidence, settings)
+    texts = []
+    for first, second in zip(settings, settings[1:], strict=False):
+        largest = max(
+            abs(evidence.quality(second, metric).value / evidence.quality(first, metric).value - 1.0)
+            for metric in metrics
+        )
+        texts.append(f"{first.steps} to {second.steps} {100.0 * largest:.2g} %")
+    return REMARK, ", ".join(texts)
+
+
+def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
+    """Judge, metric by metric, how much worse the last quarter of the rounds is than the first.
+
+    Looked at are `metrics` and those of the nine that are better low. Rounds follow one another, so
+    that these intervals are narrower than those of free repeats.
+    """
+    verdicts, texts = [], []
+    low_ones = {*metrics, *(metric for metric, (_, better) in NINE_METRICS.items() if better == "down")}
+    for metric, rows in evidence.rows("quality_by_round", **model.columns).groupby("metric", sort=False):
+        values = rows.sort_values("round")["value"].to_numpy(np.float64)
+        quarter = len(values) // 4
+        if quarter < 2 or metric not in low_ones:
+            continue
+        late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
+        growth = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
+        grown = within(growth, bounds)
+        verdicts.append(OPEN if grown == HOLDS and growth.low <= 1.0 else grown)
+        texts.append(f"{metric} {_change_text(growth)}")
+    if not verdicts:
+        raise NotMeasured(f"{evidence.called('quality_by_round')} no {model} over 8 rounds or more")
+    return combine(verdicts), ", ".join(texts)
+
+
+def _order_score(rows: pd.DataFrame) -> float:
+    """Return the share of pairs of strengths that a metric puts in order, less that reversed."""
+    rows = rows.sort_values("strength")
+    figures = [Figure.of(*row) for row in rows[["value", "low", "high"]].to_numpy()]
+    signs = [
+        {HOLDS: 1, FAILS: -1, OPEN: 0}[ordered(ratio(stronger, weaker))]
+        for place, weaker in enumerate(figures)
+        for stronger in figures[place + 1 :]
+    ]
+    return float(np.mean(signs))
+
+
+def better_graded(evidence: Evidence, metric, than) -> Finding:
+    """Judge whether one metric puts graded corruptions into their order more often than another."""
+    scores: dict[str, list[float]] = {metric: [], than: []}
+    for name, rows in evidence.table("corruptions").groupby("corruption", sort=False):
+        for which, found in scores.items():
+            chosen = rows[rows["metric"] == which]
+            if len(chosen) < 3:
+                raise NotMeasured(f"corruptions.csv has no three strengths of {name} with {which}")
+            found.append(_order_score(chosen))
+    first, second = (float(np.mean(found)) for found in scores.values())
+    verdict = HOLDS if first - second > GRADED else FAILS if second - first > GRADED else OPEN
+    return verdict, f"ordered pairs: {metric} {100 * first:.0f} %, {than} {100 * second:.0f} %"
+
+
+# ----------------------------------------------------------------------------------------- theory
+
+
+def _x0_errors(evidence: Evidence, model: str) -> pd.DataFrame:
+    curve = evidence.rows("x0_by_sigma", model=model)
+    if len(curve) < 3:
+        raise NotMeasured(f"x0_by_sigma.csv has no three noise levels of {model}")
+    return curve
+
+
+def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
+    """Judge the largest x0 error of a model over the least, of all noise levels."""
+    error = _x0_errors(evidence, model.model)["value"]
+    spread = Figure.of(error.max() / error.min())
+    return within(spread, bounds), f"x0 error differs by {number_text(spread.value)}x"
+
+
+def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
+    """Judge how much more another model's x0 error spreads, over the noise levels that both know."""
+    curves = {setting.model: _x0_errors(evidence, setting.model) for setting in (model, against)}
+    low = max(curve["sigma"].min() for curve in curves.values())
+    high = min(curve["sigma"].max() for curve in curves.values())
+    spreads = []
+    for name, curve in curves.items():
+        shared = curve.loc[curve["sigma"].between(low, high), "value"]
+        if len(shared) < 3:
+            raise NotMeasured(f"x0_by_sigma.csv has no three levels of {name} that both models know")
+        spreads.append(shared.max() / shared.min())
+    more = Figure.of(spreads[1] / spreads[0])
+    return within(more, bounds), " against ".join(f"{number_text(spread)}x" for spread in spreads)
+
+
+def gradient_growth(evidence: Evidence, bounds) -> Finding:
+    """Judge the mean gradient norm at the highest third of noise levels over that at the lowest."""
+    table = evidence.table("gradient_norm").sort_values("sigma")
+    third = len(table) // 3
+    if third < 1:
+        raise NotMeasured("gradient_norm.csv has no three noise levels")
+    norms = table["value"].to_numpy(np.float64)
+    low, high = (float(np.exp(np.log(some).mean())) for some in (norms[:third], norms[-third:]))
+    gain = Figure.of(high / low)
+    return within(gain, bounds), f"{number_text(gain.value)}x from the lowest to the highest third of sigma"
+
+
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        figure, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above, saving, mean_saving,
+        jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
+        worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
+        window_gain, steady_over_steps, change_between_steps, drift, better_graded, steady_over_noise,
+        steadier_over_noise, gradient_growth,
+    )
+}  # fmt: skip
+"""Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""
