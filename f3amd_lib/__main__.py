@@ -61,7 +61,7 @@ UNFINISHED = 3
 
 
 def _train(arguments) -> int:
-    from f3amd_lib.experiments.family import train_family
+    from f3amd_lib.experiments.learning_curves import train_family
     from f3amd_lib.training import parallel
     from f3amd_lib.training.pipeline import model_files, prepare
 

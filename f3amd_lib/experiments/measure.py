@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from f3amd_lib.experiments import literal_update, sensitivity
 from f3amd_lib.experiments.denoising import window_row, x0_error_by_sigma
-from f3amd_lib.experiments.family import SHORT_RUN, learning_curves
+from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.precision import measure_precision
 from f3amd_lib.experiments.protocol import (
@@ -72,7 +72,7 @@ def _models_with_weights(profile: Profile) -> list[str]:
 
 
 def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train every preset for a short while and keep its learning curve (see `experiments.family`).
+    """Train every preset for a short while and keep its learning curve (see `experiments.learning_curves`).
 
     Args:
       prepared: the data.
