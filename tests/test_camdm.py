@@ -155,11 +155,12 @@ def test_config_survives_json():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_heads": 3}, "num_heads must divide the latent width 8"),
+        ({"num_heads": 3}, "num_heads must divide the width 8"),
         ({"dropout": 1.0}, "dropout must be below 1"),
-        ({"noise_levels": (1.0, 0.5)}, "noise_levels must rise"),
+        ({"noise_levels": (1.0, 0.5)}, "noise_levels must be positive, finite numbers that rise"),
         ({"noise_levels": (0.0, 0.5)}, "noise_levels must be positive"),
         ({"noise_levels": 3.0}, "noise_levels must be positive"),
+        ({"noise_levels": (1.0, float("inf"))}, "noise_levels must be positive"),
         ({"split_path": 1}, "split_path must be of type bool"),
     ],
 )

@@ -179,10 +179,10 @@ def test_the_committed_running_times_name_the_notebooks_that_are_there():
 
 def test_open_points_show_the_codes_own_defaults():
     table = readings_table().set_index("open point")["here"]
-    assert table["kernel size k of Eq. 3"] == str(F3AMDConfig(1, 1).kernel_size)
+    assert table["kernel size k of Eq. 3"] == str(F3AMDConfig(channels=1, num_styles=1).kernel_size)
     assert table["scale of the noisy input"].startswith("input_scaling = True")
-    assert table["attention heads"] == str(CAMDMConfig(1, 1).num_heads)
-    assert f"D x {F3AMDConfig(1, 1).spectral_rank} times" in table["“rank = 8”"]
+    assert table["attention heads"] == str(CAMDMConfig(channels=1, num_styles=1).num_heads)
+    assert f"D x {F3AMDConfig(channels=1, num_styles=1).spectral_rank} times" in table["“rank = 8”"]
     assert not table.str.contains("{", regex=False).any()
     assert set(readings_table("data")["topic"]) == {"data"}
     with pytest.raises(ValueError, match="unknown topic"):
