@@ -50,9 +50,9 @@ def _data(arguments) -> None:
 
 def _presets(arguments) -> None:
     from f3amd_lib.ground.tables import markdown_table
-    from f3amd_lib.networks import zoo
+    from f3amd_lib.networks import presets
 
-    table = zoo.table(channels=arguments.channels, num_styles=arguments.styles)
+    table = presets.table(channels=arguments.channels, num_styles=arguments.styles)
     log.info("%s", markdown_table(table))
 
 

@@ -8,7 +8,7 @@ import pytest
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.zoo import find_preset
+from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.reports.equation_map import (
     EQUATIONS,
     equation_map,

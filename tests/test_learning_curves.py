@@ -13,7 +13,7 @@ from f3amd_lib.__main__ import main
 from f3amd_lib.experiments import learning_curves, measure
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training import checkpoints, pipeline
 from f3amd_lib.training.pipeline import PreparedData, profile_recipe
 
@@ -29,8 +29,8 @@ def prepared():
 @pytest.fixture
 def small(monkeypatch):
     """The measurement on networks of one narrow block."""
-    build = zoo.build_config
-    monkeypatch.setattr(zoo, "build_config", lambda *a, **k: build(*a, **k, **{"depth": 1}))
+    build = presets.build_config
+    monkeypatch.setattr(presets, "build_config", lambda *a, **k: build(*a, **k, **{"depth": 1}))
     monkeypatch.setattr(learning_curves, "SHORT_RUN", SHORT)
     monkeypatch.setattr(measure, "SHORT_RUN", SHORT)
 
@@ -72,8 +72,8 @@ def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeyp
     assert path == tmp_path / "synthetic" / "smoke" / "records" / "learning.csv"
     kept, record = read_table(path)
     assert record["measurement"] == "learning" and record["num_steps"] == 4
-    two = {name: zoo.find_preset(name) for name in (first, second)}
-    monkeypatch.setattr(zoo, "PRESETS", two)
+    two = {name: presets.find_preset(name) for name in (first, second)}
+    monkeypatch.setattr(presets, "PRESETS", two)
     asked = []
     curves = learning_curves.learning_curve
 

@@ -43,7 +43,7 @@ from f3amd_lib.ground.records import kept_rows, run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model, prepare
 
@@ -90,8 +90,8 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     )  # fmt: skip
     kept = kept_rows(path, record)
     measured = set() if kept is None else set(kept["model"])
-    todo = [zoo.find_preset(name).name for name in models or ()]
-    todo = todo or [name for name in zoo.PRESETS if name not in measured]
+    todo = [presets.find_preset(name).name for name in models or ()]
+    todo = todo or [name for name in presets.PRESETS if name not in measured]
     for curve in learning_curves(prepared, todo, seed=profile.seed):
         if kept is not None:
             curve = pd.concat([kept[kept["model"] != curve["model"].iloc[0]], curve])
@@ -142,7 +142,7 @@ def measure_quality(prepared: PreparedData, profile: Profile, models: Iterable[s
     paths = {name: folder / f"{name}.csv" for name in ("quality_by_seed", "quality_by_round")}
     kept = {name: kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
-    asked = [zoo.find_preset(name).name for name in models or ()]
+    asked = [presets.find_preset(name).name for name in models or ()]
     chosen = asked or available_models(profile)
     if not chosen:
         log.warning(
@@ -228,7 +228,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
         ]
         return pd.DataFrame(table)
 
-    asked = [zoo.find_preset(name).name for name in models or ()]
+    asked = [presets.find_preset(name).name for name in models or ()]
     todo = [(name, steps) for name in asked or available_models(profile) for steps in (8, 1)]
     tables = []
     if kept is None:
@@ -283,7 +283,7 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     feet = {
         ("real", profile.window, 0): [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
     }
-    asked = [zoo.find_preset(name).name for name in models or available_models(profile)]
+    asked = [presets.find_preset(name).name for name in models or available_models(profile)]
     for model in tqdm(asked, unit="model"):
         trained, _, _ = obtain_model(prepared, profile, preset=model)
         generator = MotionGenerator(trained, profile.num_steps)
@@ -320,7 +320,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     names = ("literal_update_by_seed", "literal_update_windows")
     kept = {name: kept_rows(folder / f"{name}.csv", record) for name in names}
     held_out = prepared.windows(prepared.held_out_split)
-    asked = [zoo.find_preset(name).name for name in models or ()]
+    asked = [presets.find_preset(name).name for name in models or ()]
 
     def keep(name: str, rows: pd.DataFrame, *keys: str) -> None:
         """Put rows in place of those with the same model and keys, and write the table."""
@@ -390,7 +390,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
     paths = {name: folder / f"{name}.csv" for name in ("noise_use", "x0_by_sigma")}
     kept = {name: kept_rows(path, record) for name, path in paths.items()}
     held_out = prepared.windows(prepared.held_out_split)
-    asked = [zoo.find_preset(name).name for name in models or ()]
+    asked = [presets.find_preset(name).name for name in models or ()]
     for model in tqdm(asked or _models_with_weights(profile), unit="model"):
         trained, _, _ = obtain_model(prepared, profile, preset=model)
         weights = weights_digest(trained.params)
@@ -497,7 +497,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name in options.names:
             if name not in MEASUREMENTS:
                 raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
-        models = [zoo.find_preset(name).name for name in options.model] or None
+        models = [presets.find_preset(name).name for name in options.model] or None
         prepared = prepare(profile, path=options.source)
         for name in options.names or MEASUREMENTS:
             path = MEASUREMENTS[name](prepared, profile, models)

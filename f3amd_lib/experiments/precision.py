@@ -15,7 +15,7 @@ from f3amd_lib.experiments.quality import measure_rollout, style_floor
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 
 
@@ -91,7 +91,7 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     """
     packed, seeds = prepared.packed, range(profile.seed, profile.seed + 5)
     styles = list(profile.evaluation_styles or packed.primary_styles[: profile.num_characters])
-    chosen = [zoo.find_preset(name).name for name in models or available_models(profile)]
+    chosen = [presets.find_preset(name).name for name in models or available_models(profile)]
     if not chosen:
         raise ValueError(f"no model of {profile.dataset} has weights: name one, it is then trained")
     tables = []

@@ -16,7 +16,7 @@ import pandas as pd
 
 from f3amd_lib.ground.papers import PAPER_TABLES, load_paper_table
 from f3amd_lib.ground.tables import markdown_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
 """The paper's tables of motion quality, by number."""
@@ -113,7 +113,7 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
       ValueError: for a table that has no quality, an empty label or the paper's, a missing column,
         a figure that is there twice, or a unit that is not the paper's.
 
-    Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `zoo.find_preset`'s.
+    Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `presets.find_preset`'s.
     """
     if table not in QUALITY_TABLES:
         known = ", ".join(map(str, QUALITY_TABLES))
@@ -159,7 +159,7 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
         rows = rows.set_index("metric").loc[list(FIGURES)]
         cells = [(row.printed, row.value, np.nan, np.nan) for row in rows.itertuples()]
         line(model, int(frames), int(steps), PAPER_SOURCE, cells)
-        our_line(zoo.find_preset(model).name, int(frames), int(steps))
+        our_line(presets.find_preset(model).name, int(frames), int(steps))
     return pd.DataFrame([row for rows in lines for row in rows])
 
 

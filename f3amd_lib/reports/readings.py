@@ -14,7 +14,7 @@ import pandas as pd
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.zoo import PRESETS
+from f3amd_lib.networks.presets import PRESETS
 from f3amd_lib.training.loop import TrainingConfig
 
 _CONFIGS = {

@@ -19,7 +19,7 @@ from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import PAPER_SETTING, load_paper_table
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 
 
 class NotMeasured(LookupError):
@@ -371,7 +371,7 @@ def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
     if "model" in table:
         for model in table["model"].unique():
             if model not in REFERENCE_ROWS and not _is_preset(model):
-                hint = nearest_hint(model, [*zoo.PRESETS, *REFERENCE_ROWS])
+                hint = nearest_hint(model, [*presets.PRESETS, *REFERENCE_ROWS])
                 raise ValueError(f"{where}: unknown model {model!r}{hint}")
     if name == "quality" and "unit" in table:
         for metric, unit in zip(table["metric"], table["unit"].fillna(""), strict=True):
@@ -385,7 +385,7 @@ def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
 
 def _is_preset(model: str) -> bool:
     try:
-        return zoo.find_preset(model).name == model
+        return presets.find_preset(model).name == model
     except ValueError:
         return False
 
@@ -457,7 +457,9 @@ def paper_evidence() -> Evidence:
 
 
 def _by_preset(table: pd.DataFrame, pytorch: str) -> pd.DataFrame:
-    names = {label: pytorch if "PyTorch" in label else zoo.find_preset(label).name for label in table["model"].unique()}
+    names = {
+        label: pytorch if "PyTorch" in label else presets.find_preset(label).name for label in table["model"].unique()
+    }
     return table.assign(model=table["model"].map(names))
 
 
