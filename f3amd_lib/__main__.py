@@ -123,9 +123,9 @@ def presets(channels: int = 141, styles: int = 100) -> None:
       styles: how many.
     """
     from f3amd_lib.ground.tables import markdown_table
-    from f3amd_lib.networks import zoo
+    from f3amd_lib.networks import presets
 
-    log.info("%s", markdown_table(zoo.table(channels=channels, num_styles=styles)))
+    log.info("%s", markdown_table(presets.table(channels=channels, num_styles=styles)))
 
 
 def train(
@@ -411,12 +411,12 @@ def measure(names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Rep
     """
     from f3amd_lib.experiments.measure import MEASUREMENTS
     from f3amd_lib.ground.names import nearest_hint
-    from f3amd_lib.networks import zoo
+    from f3amd_lib.networks import presets
 
     for name in names:
         if name not in MEASUREMENTS:
             raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
-    models = [zoo.find_preset(name).name for name in model] or None
+    models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
     for name in names or MEASUREMENTS:
         log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models))

@@ -21,7 +21,7 @@ from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.zoo import build_from_config
+from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import Trainer, TrainingConfig
 

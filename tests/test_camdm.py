@@ -9,7 +9,7 @@ import pytest
 from builders import CHANNELS, HISTORY, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm
 from flax import nnx
 
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.attention import position_code
 from f3amd_lib.networks.camdm import CAMDMConfig, step_features
 from f3amd_lib.networks.conditioning import Condition
@@ -22,13 +22,13 @@ def run(network, x_noisy, sigma, condition=None):
 
 
 def test_released_code_has_this_many_parameters():
-    config = zoo.build_config("CAMDM-code", channels=156, num_styles=100)
-    assert zoo.count_parameters(config) == 3_439_260
+    config = presets.build_config("CAMDM-code", channels=156, num_styles=100)
+    assert presets.count_parameters(config) == 3_439_260
     assert config.num_tokens == 108
 
 
 def test_section_6_the_papers_baseline_reads_76_tokens():
-    config = zoo.build_config("CAMDM", channels=129, num_styles=22)
+    config = presets.build_config("CAMDM", channels=129, num_styles=22)
     # T' = 2 T + T_hist + T_style, and a token for the noise level.
     assert config.num_tokens == 2 * 32 + 10 + 1 + 1 == 76
     assert (config.latent_width, config.depth) == (256, 4)
@@ -155,11 +155,12 @@ def test_config_survives_json():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_heads": 3}, "num_heads must divide the latent width 8"),
+        ({"num_heads": 3}, "num_heads must divide the width 8"),
         ({"dropout": 1.0}, "dropout must be below 1"),
-        ({"noise_levels": (1.0, 0.5)}, "noise_levels must rise"),
+        ({"noise_levels": (1.0, 0.5)}, "noise_levels must be positive, finite numbers that rise"),
         ({"noise_levels": (0.0, 0.5)}, "noise_levels must be positive"),
         ({"noise_levels": 3.0}, "noise_levels must be positive"),
+        ({"noise_levels": (1.0, float("inf"))}, "noise_levels must be positive"),
         ({"split_path": 1}, "split_path must be of type bool"),
     ],
 )

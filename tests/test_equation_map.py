@@ -10,7 +10,7 @@ from f3amd_lib.ground import papers
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.zoo import find_preset
+from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.reports import claims, evidence
 from f3amd_lib.reports.equation_map import (
     _patterns,
@@ -184,10 +184,10 @@ def test_the_committed_running_times_name_the_notebooks_that_are_there():
 
 def test_open_points_show_the_codes_own_defaults():
     table = readings_table().set_index("open point")["here"]
-    assert table["kernel size k of Eq. 3"] == str(F3AMDConfig(1, 1).kernel_size)
+    assert table["kernel size k of Eq. 3"] == str(F3AMDConfig(channels=1, num_styles=1).kernel_size)
     assert table["scale of the noisy input"].startswith("input_scaling = True")
-    assert table["attention heads"] == str(CAMDMConfig(1, 1).num_heads)
-    assert f"D x {F3AMDConfig(1, 1).spectral_rank} times" in table["“rank = 8”"]
+    assert table["attention heads"] == str(CAMDMConfig(channels=1, num_styles=1).num_heads)
+    assert f"D x {F3AMDConfig(channels=1, num_styles=1).spectral_rank} times" in table["“rank = 8”"]
     assert not table.str.contains("{", regex=False).any()
     assert set(readings_table("data")["topic"]) == {"data"}
     with pytest.raises(ValueError, match="unknown topic"):

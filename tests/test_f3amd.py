@@ -52,7 +52,7 @@ def test_config_names_unknown_keys():
         ({"num_kept_modes": 9, "spectral_variant": "cosine"}, "at most 8 for blocks of 8"),
         ({"num_kept_modes": 10, "conditioning": "concatenation"}, "at most 9 for blocks of 16"),
         ({"num_condition_heads": 3}, "num_(condition_)?heads"),
-        ({"num_heads": 3}, "num_heads must divide the latent width 8"),
+        ({"num_heads": 3}, "num_heads must divide the width 8"),
         ({"base_block": "transfomer"}, "'transfomer'; did you mean 'transformer'"),
         ({"conditioning": "adaln-zero"}, "'adaln-zero'; did you mean 'adaln_zero'"),
         ({"encoder_decoder": "cnn"}, "unknown encoder_decoder 'cnn'"),
@@ -65,6 +65,14 @@ def test_config_names_unknown_keys():
 def test_impossible_configs_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         make_network(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "modes"), [({}, 5), ({"spectral_variant": "cosine"}, 8), ({"conditioning": "concatenation"}, 9)]
+)
+def test_section_4_5_all_modes_there_are_unless_told(changes, modes):
+    assert tiny_config(num_kept_modes=0, **changes).num_kept_modes == modes
+    assert tiny_config(num_kept_modes=2, **changes).num_kept_modes == 2
 
 
 def test_network_answers_in_the_shape_of_the_window():

@@ -11,7 +11,7 @@ from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_trained, tin
 from helpers.seed_histories import seed_condition, walk_seed_histories
 
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.diffusion.samplers import SAMPLERS
+from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.experiments import literal_update, measure
 from f3amd_lib.experiments.denoising import held_out_batch
@@ -87,12 +87,10 @@ def test_the_walks_are_those_of_the_samplers_by_name():
     network, grid = trained.network(), trained.diffusion.grid(4)
     noise = jax.random.normal(jax.random.split(jax.random.key(3), 2)[1], x0.shape)
     for update, name in UPDATES.items():
-        sample = SAMPLERS[name]
-        x = jax.jit(
-            lambda noise, condition, sample=sample: sample(
-                lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)), 128.0 * noise, grid
-            )
-        )(noise, condition)
+        walked = lambda noise, condition, name=name: sample(
+            name, lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)), 128.0 * noise, grid
+        )
+        x = jax.jit(walked)(noise, condition)
         joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
         np.testing.assert_allclose(walks.made[update, 4][1], joints, atol=1e-4)
     assert np.abs(walks.made["literal", 4] - walks.made["rescaled", 4]).max() > 1e-3
@@ -227,7 +225,8 @@ def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     noise = jax.random.normal(jax.random.split(jax.random.key(1), 2)[0], (len(trained.styles),
                               WINDOW, trained.config.channels))  # fmt: skip
     x = jax.jit(
-        lambda noise: SAMPLERS["ddim"](
+        lambda noise: sample(
+            "ddim",
             lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)),
             128.0 * noise,
             trained.diffusion.grid(8),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from f3amd_lib.drawing import plots_architecture as draw
-from f3amd_lib.networks.zoo import build_config
+from f3amd_lib.networks.presets import build_config
 
 SIZES = {"channels": 129, "num_styles": 15}
 

@@ -9,14 +9,14 @@ import pytest
 from f3amd_lib.data import sources
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.profiles import Profile, load_profile, results_dir, runs_dir
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 
 
 @pytest.mark.parametrize("name, dataset", list(itertools.product(profiles.PROFILES, profiles.DATASETS)))
 def test_every_pair_gives_a_profile_of_a_known_network(name, dataset):
     profile = load_profile(name, dataset)
     assert (profile.name, profile.dataset) == (name, dataset)
-    assert zoo.find_preset(profile.preset).name == profile.preset
+    assert presets.find_preset(profile.preset).name == profile.preset
     # Defaults must pass what overrides must pass.
     values = dataclasses.asdict(profile)
     del values["name"], values["dataset"]

@@ -30,7 +30,7 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.classifier import train_classifier
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -64,7 +64,7 @@ def classifier(packed):
 
 @pytest.fixture(scope="module")
 def generator(packed, prepared):
-    config = zoo.build_config(
+    config = presets.build_config(
         "F3AMD-FNO-32", channels=num_channels(packed.skeleton), num_styles=2, depth=1, latent_width=8
     )
     network = jax.jit(lambda key: module_state(config, key))(jax.random.key(0))
@@ -85,7 +85,7 @@ def generator(packed, prepared):
 def module_state(config, key):
     from flax import nnx
 
-    return nnx.state(zoo.build_from_config(config, key))
+    return nnx.state(presets.build_from_config(config, key))
 
 
 @pytest.fixture(scope="module")

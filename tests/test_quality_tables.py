@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.reports.quality_tables import (
     FIGURES,
     NOT_MEASURED,
@@ -73,7 +73,7 @@ def test_every_row_of_the_paper_is_there_as_printed_with_ours_below(number):
     for line, cells in papers.groupby("line"):
         ours = rows[rows["line"] == line + 1]
         assert set(ours["source"]) == {LABEL}
-        assert set(ours["model"]) == {zoo.find_preset(cells["model"].iloc[0]).name}
+        assert set(ours["model"]) == {presets.find_preset(cells["model"].iloc[0]).name}
         assert set(ours["steps"]) == set(cells["steps"])
         assert set(ours["window_frames"]) == set(cells["window_frames"])
 

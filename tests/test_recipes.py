@@ -11,7 +11,7 @@ from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.experiments import measure, recipes
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.loop import paper_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -42,7 +42,7 @@ def test_every_recipe_changes_one_thing(prepared):
     warm = recipes.RECIPES["warm-up-and-cosine"].config(100, 8, 0)
     assert (warm.schedule, warm.warmup_steps, warm.learning_rate) == ("warmup_cosine", 10, 2e-3)
     plus = recipes.RECIPES["plus"].config(100, 8, 0)
-    assert plus.own_history_share == zoo.find_preset("F3AMD-FNO-96-plus").training[
+    assert plus.own_history_share == presets.find_preset("F3AMD-FNO-96-plus").training[
         "own_history_share"
     ]  # fmt: skip
 
@@ -55,9 +55,9 @@ def test_unknown_recipe_names_the_nearest():
 @pytest.fixture
 def two_recipes(monkeypatch):
     """Two rows only, on networks of one narrow block."""
-    build = zoo.build_config
+    build = presets.build_config
     monkeypatch.setattr(
-        zoo,
+        presets,
         "build_config",
         lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8, "num_kept_modes": WINDOW // 2 + 1}),
     )

@@ -263,8 +263,8 @@ def test_eq02_factors_are_fewer_numbers():
 
 @pytest.mark.parametrize("rank", [0, 4])
 def test_eq02_rank_out_of_range_is_refused(rank):
-    with pytest.raises(ValueError, match=f"between 1 and 3 for widths 3 and 4, got {rank}"):
-        SpectralConvolution(3, 4, 5, "reduced_rank", rank, rngs=nnx.Rngs(params=0))
+    with pytest.raises(ValueError, match=f"between 1 and 3 for 3 to 4, got {rank}"):
+        SpectralConvolution(3, 4, 5, "reduced_rank", rank=rank, rngs=nnx.Rngs(params=0))
 
 
 def test_unknown_variant_names_the_nearest():
@@ -332,7 +332,7 @@ def test_eq04_block_is_the_sum_of_both_branches(width_in, width_out):
 @pytest.mark.parametrize("variant", SPECTRAL_VARIANTS)
 def test_eq04_block_passes_its_variant_on(variant):
     block = FNOBlock(3, 4, 5, variant=variant, rank=2, initial_gain=0.5, rngs=nnx.Rngs(params=0))
-    alone = SpectralConvolution(3, 4, 5, variant, 2, 0.5, rngs=nnx.Rngs(params=0))
+    alone = SpectralConvolution(3, 4, 5, variant, rank=2, initial_gain=0.5, rngs=nnx.Rngs(params=0))
     z = draw(2, 8, 3)
     np.testing.assert_allclose(block(z), alone(z) + block.local(z), atol=1e-6)
     # A base block takes a dropout key, and this one drops nothing.

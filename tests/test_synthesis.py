@@ -13,7 +13,7 @@ from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
 
 QUICK = {"min_rounds": 3, "min_seconds": 0.0, "fewest_rounds": 2, "warmup": 1}
@@ -29,7 +29,7 @@ def task(model="F3AMD-FNO-96", **changes):
 
 def test_operations_of_a_round():
     for model in ("F3AMD-FNO-96", "CAMDM"):
-        encode, evaluate = zoo.count_flops(tiny(model))
+        encode, evaluate = presets.count_flops(tiny(model))
         asked = task(model, steps=4, characters=3)
         calls = num_evaluations(asked.sampler, 4)
         assert implementations.round_flops(asked) == 3 * (encode + calls * evaluate)
@@ -44,7 +44,7 @@ def test_each_model_is_timed_with_its_own_sampler_and_levels():
 @pytest.mark.parametrize("model", ["F3AMD-FNO-96", "CAMDM"])
 def test_jit_runs_the_round(model):
     asked = task(model)
-    network = zoo.build_from_config(asked.config, jax.random.key(0))
+    network = presets.build_from_config(asked.config, jax.random.key(0))
     given = Condition(*map(jax.numpy.asarray, random_condition(asked.config, 2)))
     expected = sample_round(network, given, asked.sigmas, jax.random.key(0), sampler=asked.sampler)
     ready = prepare_round("jit", asked)
@@ -107,7 +107,7 @@ def test_plans_name_presets_and_implementations_that_exist_each_once():
         members = [c for group in plan(suite).values() for c in group]
         assert members and len(members) == len(set(members))
         for candidate in members:
-            assert zoo.find_preset(candidate.model).name == candidate.model
+            assert presets.find_preset(candidate.model).name == candidate.model
             assert candidate.implementation in implementations.IMPLEMENTATIONS
     with pytest.raises(ValueError, match="unknown suite"):
         plan("bar")

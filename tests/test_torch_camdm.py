@@ -15,7 +15,7 @@ from flax import nnx
 from f3amd_lib.benchmarking import implementations
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.generation.rounds import sample_round
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
@@ -124,8 +124,8 @@ def test_round_gives_the_numbers_of_jax(layout, sampler):
 
 
 def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round():
-    preset = zoo.find_preset("CAMDM")
-    network = lively(zoo.build_config("CAMDM", channels=135, num_styles=100))
+    preset = presets.find_preset("CAMDM")
+    network = lively(presets.build_config("CAMDM", channels=135, num_styles=100))
     config, sigmas = network.config, preset.diffusion.grid(2)
     condition = Condition(
         draw(1, config.num_history, config.channels, seed=1), draw(1, config.window, 8, seed=2), jnp.eye(100)[7:8]
@@ -176,7 +176,7 @@ def test_every_weight_counts_and_is_a_copy():
     base = in_torch(module, x_noisy, 1.0, condition)
     expected = evaluate(network, x_noisy, jnp.float32(1.0), condition)
     parameters = dict(module.named_parameters())
-    assert sum(p.numel() for p in parameters.values()) == zoo.count_parameters(network.config)
+    assert sum(p.numel() for p in parameters.values()) == presets.count_parameters(network.config)
     for name, parameter in parameters.items():
         before = parameter.clone()
         # Not the same everywhere: softmax and norms do not see a shift.

@@ -23,7 +23,7 @@ from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_preci
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
 from f3amd_lib.networks.config import NetworkConfig, cast_network
 
@@ -59,12 +59,12 @@ class Task:
     @property
     def sampler(self) -> str:
         """The sampler that belongs to the model: DDIM for F3AMD, DDPM for CAMDM."""
-        return zoo.find_preset(self.model).diffusion.sampler
+        return presets.find_preset(self.model).diffusion.sampler
 
     @property
     def sigmas(self) -> np.ndarray:
         """Noise levels of the steps, [N + 1]."""
-        return np.asarray(zoo.find_preset(self.model).diffusion.grid(self.steps), np.float32)
+        return np.asarray(presets.find_preset(self.model).diffusion.grid(self.steps), np.float32)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Round:
 
 def round_flops(task: Task) -> int:
     """Return the operations of one round for all characters (see `networks.counting`)."""
-    encode, evaluate = zoo.count_flops(task.config)
+    encode, evaluate = presets.count_flops(task.config)
     return task.characters * (encode + evaluate * num_evaluations(task.sampler, task.steps))
 
 
@@ -102,7 +102,7 @@ def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> C
 
 def _network(task: Task):
     """Return the network with random weights, in the task's precision."""
-    network = zoo.build_from_config(task.config, jax.random.key(0))
+    network = presets.build_from_config(task.config, jax.random.key(0))
     return cast_network(network, PRECISIONS[task.precision][1])
 
 

@@ -19,7 +19,7 @@ from f3amd_lib.benchmarking.time_breakdown import time_breakdown
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.loop import short_recipe
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -157,7 +157,7 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
       The table `records/training_time.csv`: value, low and high in seconds a step, epoch_minutes,
       and peak_memory_mib as the compiler plans it.
     """
-    names = [zoo.find_preset(name).name for name in models or _TRAINED]
+    names = [presets.find_preset(name).name for name in models or _TRAINED]
     steps, chunk, batch_size = _TRAINING[profile.name]
     calls, memory = {}, {}
     for name in tqdm(names, unit="compiled"):

@@ -16,7 +16,7 @@ from f3amd_lib.benchmarking.implementations import Task, compile_round
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.generation.rounds import sample_round
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.f3amd import F3AMD
 from f3amd_lib.networks.spectral import FNOBlock, FrameLayer
 
@@ -95,7 +95,7 @@ def time_breakdown(task: Task, *, progress: bool = False, **turns) -> pd.DataFra
       A row each: model, steps, characters, device, without ("nothing" for the whole round), unit,
       value, low and high in ms, rounds, and saved: the share of the whole round's time.
     """
-    network = zoo.build_from_config(task.config, jax.random.key(0))
+    network = presets.build_from_config(task.config, jax.random.key(0))
     noise = jax.random.normal(jax.random.key(1), (task.characters, task.config.window, task.config.channels))
 
     def call(network, noise=None):

@@ -26,7 +26,7 @@ import pandas as pd
 from f3amd_lib.experiments import literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.denoising import window_row, x0_error_by_sigma
-from f3amd_lib.experiments.family import SHORT_RUN, learning_curves
+from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.protocol import (
     REFERENCE_MODELS,
@@ -46,7 +46,7 @@ from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 
@@ -79,7 +79,7 @@ def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
 
 
 def _names(models: Iterable[str] | None) -> list[str]:
-    return [zoo.find_preset(name).name for name in models or ()]
+    return [presets.find_preset(name).name for name in models or ()]
 
 
 def _models_with_weights(profile: Profile) -> list[str]:
@@ -138,7 +138,7 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     def curve(row: Mapping) -> dict:
         return {"learning": pd.concat(learning_curves(prepared, [row["model"]], seed=profile.seed, progress=False))}
 
-    records.measure([{"model": name} for name in asked or zoo.PRESETS], curve)
+    records.measure([{"model": name} for name in asked or presets.PRESETS], curve)
     return records.path("learning")
 
 

@@ -34,7 +34,7 @@ from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.distributions import diversity_variance, mean_and_interval
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 from f3amd_lib.training.loop import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
@@ -364,7 +364,7 @@ def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable
     Returns:
       The table `records/posterior.csv` (see `posterior_table`), measured anew.
     """
-    names = [zoo.find_preset(name).name for name in models or available_models(profile)]
+    names = [presets.find_preset(name).name for name in models or available_models(profile)]
     settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
     trained = {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
     table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)

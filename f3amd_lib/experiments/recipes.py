@@ -1,13 +1,13 @@
 """Does the network use its noise? Recipes that differ from the paper's in one thing each (ours).
 
 A network that predicts clean motion can lower its loss by answering with the mean of what history,
-path and style allow, and never look at its noisy input; one step then does as well as eight. Every
-row here is `F3AMD-FNO-96` with one change; the last is `F3AMD-FNO-96-plus`, the recipe that grew
-out of such comparisons. All take the same number of steps from the same seed.
+path and style allow, and never look at its noisy input; one step then does as well as eight. The
+rows stand in `papers/f3amd/recipes.toml`; all take the same number of steps from the same seed.
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +17,6 @@ from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.loop import TrainingConfig, paper_recipe
 from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_unlike, train
-
-BASE = "F3AMD-FNO-96"
 
 RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
 """Optimiser steps of every row, by profile."""
@@ -40,7 +38,7 @@ class Recipe:
     name: str
     change: str
     source: str
-    preset: str = BASE
+    preset: str = "F3AMD-FNO-96"
     network: Mapping = field(default_factory=dict)
     training: Mapping = field(default_factory=dict)
 
@@ -50,76 +48,16 @@ class Recipe:
         Args:
           num_steps, batch_size, seed: the same for all rows that are compared.
         """
-        settings = {"num_steps": num_steps, "batch_size": batch_size, "seed": seed}
-        schedule = dict(self.training)
-        if schedule.get("schedule") == "warmup_cosine":
-            schedule["warmup_steps"] = max(1, num_steps // 10)
-        return paper_recipe(self.preset, **{**settings, **schedule})
+        settings = {"batch_size": batch_size, "seed": seed, **self.training}
+        if settings.get("schedule") == "warmup_cosine":
+            settings["warmup_steps"] = max(1, num_steps // 10)
+        return paper_recipe(self.preset, num_steps, **settings)
 
 
-_WARM = {"schedule": "warmup_cosine", "learning_rate": 2e-3, "gradient_clip": 1.0}
+_TABLE = Path(__file__).parents[1] / "papers/f3amd/recipes.toml"
 
 RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe
-    for recipe in (
-        Recipe("paper", "nothing: the paper's text", "section 4.5"),
-        Recipe(
-            "skip-and-output-scaling",
-            "c_skip x + c_out F(c_in x)",
-            "Karras et al. 2022, Table 1",
-            network={"output_scaling": True},
-        ),
-        Recipe(
-            "low-noise-weighting",
-            "loss times 1 + min(1 / sigma^2, 5)",
-            "Karras et al. 2022, Table 1; capped as Hang et al. 2023",
-            training={"noise_weighting": "low_noise"},
-        ),
-        Recipe(
-            "log-normal-noise",
-            "ln sigma drawn from a normal distribution",
-            "Karras et al. 2022, Table 1",
-            training={"noise": "log_normal"},
-        ),
-        Recipe("mixed-noise", "every second sigma log-uniform below 1", "ours", training={"noise": "mixed"}),
-        Recipe(
-            "fitted-sigma-max",
-            "sigma_max 16 instead of 128",
-            "ours, after Song and Ermon 2020: noise no wider than the data's residual needs",
-            training={"diffusion": {"kind": "variance_exploding", "sigma_max": 16.0, "sigma_min": 0.01}},
-        ),
-        Recipe(
-            "wide-decoder",
-            "a decoder of two layers with 192 channels between",
-            "ours",
-            network={"decoder_hidden_width": 192},
-        ),
-        Recipe(
-            "IRD-excess",
-            "the IRD loss asks for the data's step across the seam, not for none",
-            "ours",
-            training={"loss": {"ird_form": "excess"}},
-        ),
-        Recipe(
-            "warm-up-and-cosine",
-            "learning rate 2e-3, warm-up and cosine, gradients clipped at 1",
-            "Loshchilov and Hutter 2017",
-            training=_WARM,
-        ),
-        Recipe(
-            "condition-dropout",
-            "a tenth of the samples see no condition",
-            "Ho and Salimans 2022",
-            training={"condition_dropout": 0.1},
-        ),
-        Recipe(
-            "residual-prior",
-            "a learned Gaussian prior on the residual, per channel and cosine mode",
-            "ours",
-            network={"residual_prior": True},
-        ),
-        Recipe("plus", "all of F3AMD-FNO-96-plus", "ours", preset="F3AMD-FNO-96-plus", training=_WARM),
-    )
+    name: Recipe(name, **row) for name, row in tomllib.loads(_TABLE.read_text(encoding="utf-8")).items()
 }
 """Rows by name, the paper's first."""
 

@@ -9,11 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.ground.names import nearest_hint
-
-# PyTorch's GELU is the exact one; JAX's default is an approximation by tanh.
-_ACTIVATIONS = {"gelu": functools.partial(jax.nn.gelu, approximate=False), "relu": jax.nn.relu}
-
 
 @functools.lru_cache(maxsize=64)
 def position_code(first: int, last: int, width: int, base: float = 1000.0) -> np.ndarray:
@@ -68,11 +63,6 @@ def check_num_heads(width: int, num_heads: int) -> None:
         raise ValueError(f"num_heads must divide the width {width}, got {num_heads}")
 
 
-def split_heads(z, num_heads: int):
-    """Return [B, T, D] as [B, T, heads, D / heads]."""
-    return z.reshape(*z.shape[:-1], num_heads, z.shape[-1] // num_heads)
-
-
 def attention_weights(query, key):
     """Return how much each query takes from each key, softmax(Q K^T / sqrt(width per head)).
 
@@ -107,6 +97,22 @@ def attention(query, key, value, *, dropout_rate: float = 0.0, dropout_key=None)
     return jnp.einsum("bhts,bshd->bthd", weights, value)
 
 
+def attend(query, key, value, num_heads: int, **dropout):
+    """Let several heads attend side by side, each to its own neighbouring channels.
+
+    Args:
+      query: [B, T, D].
+      key, value: [B, S, D].
+      num_heads: must divide D.
+      **dropout: dropout_rate and dropout_key, of `attention`.
+
+    Returns:
+      [B, T, D].
+    """
+    heads = (z.reshape(*z.shape[:-1], num_heads, -1) for z in (query, key, value))
+    return attention(*heads, **dropout).reshape(query.shape)
+
+
 class MultiHeadAttention(nnx.Module):
     """Attention between linear layers, several heads side by side (Vaswani et al. 2017, 3.2.2).
 
@@ -121,33 +127,27 @@ class MultiHeadAttention(nnx.Module):
 
     def __init__(self, width: int, num_heads: int, answering_width: int | None = None, *, rngs: nnx.Rngs):
         check_num_heads(width, num_heads)
-        answering_width = width if answering_width is None else answering_width
+        answering_width = answering_width or width
         self.num_heads = num_heads
         self.query = nnx.Linear(width, width, rngs=rngs)
         self.key = nnx.Linear(answering_width, width, rngs=rngs)
         self.value = nnx.Linear(answering_width, width, rngs=rngs)
         self.output = nnx.Linear(width, width, rngs=rngs)
 
-    def __call__(self, asking, answering=None, *, dropout_rate: float = 0.0, dropout_key=None):
+    def __call__(self, asking, answering=None, **dropout):
         """Let every frame of one sequence ask all frames of another, or of its own.
 
         Args:
           asking: [B, T, D].
           answering: [B, S, answering_width]; `asking` itself by default.
-          dropout_rate, dropout_key: of `attention`.
+          **dropout: dropout_rate and dropout_key, of `attention`.
 
         Returns:
           [B, T, D].
         """
         answering = asking if answering is None else answering
-        answer = attention(
-            split_heads(self.query(asking), self.num_heads),
-            split_heads(self.key(answering), self.num_heads),
-            split_heads(self.value(answering), self.num_heads),
-            dropout_rate=dropout_rate,
-            dropout_key=dropout_key,
-        )
-        return self.output(answer.reshape(asking.shape))
+        key, value = self.key(answering), self.value(answering)
+        return self.output(attend(self.query(asking), key, value, self.num_heads, **dropout))
 
 
 class TransformerBlock(nnx.Module):
@@ -161,27 +161,15 @@ class TransformerBlock(nnx.Module):
       num_heads: must divide D (Appendix A).
       hidden_width: between the two layers.
       dropout: rate after attention, inside and after the two layers, and of the attention weights.
-      activation: "gelu" (exact) or "relu" (Vaswani et al. 2017).
 
     Raises:
-      ValueError: if the number of heads does not divide D, or for an unknown activation.
+      ValueError: if the number of heads does not divide D.
 
     Source: section 3.4.1; Vaswani et al. 2017, section 3.
     """
 
-    def __init__(
-        self,
-        width: int,
-        num_heads: int,
-        hidden_width: int,
-        dropout: float = 0.0,
-        activation: str = "gelu",
-        *,
-        rngs: nnx.Rngs,
-    ):
-        if activation not in _ACTIVATIONS:
-            raise ValueError(f"unknown activation {activation!r}{nearest_hint(activation, _ACTIVATIONS)}")
-        self.dropout, self.activation = dropout, activation
+    def __init__(self, width: int, num_heads: int, hidden_width: int, dropout: float = 0.0, *, rngs: nnx.Rngs):
+        self.dropout = dropout
         self.attention = MultiHeadAttention(width, num_heads, rngs=rngs)
         self.attention_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
         self.hidden = nnx.Linear(width, hidden_width, rngs=rngs)
@@ -202,5 +190,6 @@ class TransformerBlock(nnx.Module):
 
         answer = self.attention(z, dropout_rate=self.dropout, dropout_key=keys[0])
         z = self.attention_norm(z + drop(answer, 1))
-        hidden = drop(_ACTIVATIONS[self.activation](self.hidden(z)), 2)
+        # PyTorch's GELU is the exact one; JAX's default is an approximation by tanh.
+        hidden = drop(jax.nn.gelu(self.hidden(z), approximate=False), 2)
         return self.output_norm(z + drop(self.output(hidden), 3))

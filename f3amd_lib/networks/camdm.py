@@ -18,16 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.networks.attention import TransformerBlock, dropout, position_code
-from f3amd_lib.networks.conditioning import Condition, noise_features
-from f3amd_lib.networks.config import Denoiser, NetworkConfig, scaled_input
+from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, dropout, position_code
+from f3amd_lib.networks.conditioning import Condition, ConditionedConfig, noise_features
+from f3amd_lib.networks.config import Denoiser, scaled_input
 
 POSITION_BASE = 10_000.0
 """Base of the sinusoids, as in Vaswani et al. 2017: sequences are long here."""
 
 
-@dataclass(frozen=True)
-class CAMDMConfig(NetworkConfig):
+@dataclass(frozen=True, kw_only=True)
+class CAMDMConfig(ConditionedConfig):
     """Everything that decides a CAMDM network's shape and formulas.
 
     Attributes:
@@ -37,7 +37,6 @@ class CAMDMConfig(NetworkConfig):
         (2 + 3T + H tokens); else one token a frame, as F3AMD's section 6 counts (2 + 2T + H).
       noise_levels: sigma of the diffusion steps 0 .. K - 1, rising; the network is told the step's
         number. Empty: it is told sigma, as F3AMD is (for training with a continuous schedule).
-      dropout: in training; 0.2 in CAMDM's code, which F3AMD does not mention.
 
     Raises:
       ValueError: for sizes that are not positive, heads that do not divide the width, or levels
@@ -45,7 +44,6 @@ class CAMDMConfig(NetworkConfig):
     """
 
     family: ClassVar[str] = "CAMDM"
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
 
     latent_width: int = 256
     depth: int = 4
@@ -53,16 +51,14 @@ class CAMDMConfig(NetworkConfig):
     feed_forward_factor: int = 4
     split_path: bool = False
     noise_levels: tuple[float, ...] = ()
-    dropout: float = 0.0
 
     def __post_init__(self):
         super().__post_init__()
-        if self.latent_width % self.num_heads:
-            raise ValueError(f"num_heads must divide the latent width {self.latent_width}, got {self.num_heads}")
-        if self.dropout >= 1.0:
-            raise ValueError(f"dropout must be below 1, got {self.dropout}")
-        if np.any(np.diff(self.noise_levels) <= 0):
-            raise ValueError(f"noise_levels must rise, got {self.noise_levels}")
+        check_num_heads(self.latent_width, self.num_heads)
+        levels = np.asarray(self.noise_levels, float)
+        if levels.ndim != 1 or not np.isfinite(levels).all() or np.any(np.diff(levels, prepend=0.0) <= 0):
+            raise ValueError(f"noise_levels must be positive, finite numbers that rise, got {self.noise_levels!r}")
+        object.__setattr__(self, "noise_levels", tuple(levels.tolist()))
 
     @property
     def num_tokens(self) -> int:
@@ -91,23 +87,20 @@ class CAMDM(Denoiser):
         self.noise_first = nnx.Linear(width, width, rngs=rngs)
         self.noise_second = nnx.Linear(width, width, rngs=rngs)
         # A table of one row a style; rows of deviation 1, as torch's embedding starts.
-        self.style = nnx.Linear(
-            config.num_styles, width, use_bias=False, kernel_init=nnx.initializers.normal(1.0), rngs=rngs
-        )
+        rows = nnx.initializers.normal(1.0)
+        self.style = nnx.Linear(config.num_styles, width, use_bias=False, kernel_init=rows, rngs=rngs)
         # Displacement x, z, then yaw in 6D.
         widths = (2, 6) if config.split_path else (8,)
         self.path = nnx.List([nnx.Linear(part, width, rngs=rngs) for part in widths])
         self.history = nnx.Linear(config.channels, width, rngs=rngs)
         self.future = nnx.Linear(config.channels, width, rngs=rngs)
         hidden = config.feed_forward_factor * width
-        self.blocks = nnx.List(
-            [TransformerBlock(width, config.num_heads, hidden, config.dropout, rngs=rngs) for _ in range(config.depth)]
-        )
+        block = lambda: TransformerBlock(width, config.num_heads, hidden, config.dropout, rngs=rngs)
+        self.blocks = nnx.List([block() for _ in range(config.depth)])
         self.output = nnx.Linear(width, config.channels, rngs=rngs)
 
     def _position_code(self, dtype):
-        config = self.config
-        code = position_code(0, config.num_tokens, config.latent_width, base=POSITION_BASE)
+        code = position_code(0, self.config.num_tokens, self.config.latent_width, base=POSITION_BASE)
         return jnp.asarray(code, dtype)
 
     def encode(self, condition: Condition) -> jax.Array:
@@ -126,12 +119,9 @@ class CAMDM(Denoiser):
         config.check_condition(condition)
         path = condition.path
         parts = (path[..., :2], path[..., 2:]) if config.split_path else (path,)
-        tokens = [
-            self.style(condition.style)[:, None, :],
-            *(layer(part) for layer, part in zip(self.path, parts, strict=True)),
-            self.history(condition.history),
-        ]
-        tokens = jnp.concatenate(tokens, axis=1)
+        paths = [layer(part) for layer, part in zip(self.path, parts, strict=True)]
+        style, history = self.style(condition.style)[:, None, :], self.history(condition.history)
+        tokens = jnp.concatenate([style, *paths, history], axis=1)
         return tokens + self._position_code(tokens.dtype)[1 : 1 + tokens.shape[1]]
 
     def _noise_token(self, sigma, dtype):

@@ -6,7 +6,7 @@ enters every backbone block, by FiLM or by one of the three ways that the paper 
 
 from __future__ import annotations
 
-import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -15,7 +15,8 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.networks.attention import MultiHeadAttention, attention, check_num_heads, position_code, split_heads
+from f3amd_lib.networks.attention import MultiHeadAttention, attend, check_num_heads, position_code
+from f3amd_lib.networks.config import NetworkConfig
 
 CONDITIONINGS = ("film", "concatenation", "adaln_zero", "cross_attention")
 """The ways of Table 11 for c to enter a backbone block."""
@@ -38,6 +39,31 @@ class Condition(NamedTuple):
     style: jax.Array
 
 
+@dataclass(frozen=True, kw_only=True)
+class ConditionedConfig(NetworkConfig):
+    """Config of a network that history, path and style guide (F3AMD and CAMDM).
+
+    Attributes:
+      num_styles: S, width of the one-hot style.
+      num_history: H, past frames seen (section 4.5: 10).
+    """
+
+    num_styles: int
+    num_history: int = 10
+
+    def condition_shapes(self, batch: int) -> Condition:
+        """Return the shapes of the condition of some characters."""
+        shapes = (self.num_history, self.channels), (self.window, PATH_CHANNELS), (self.num_styles,)
+        return Condition(*(jax.ShapeDtypeStruct((batch, *shape), jnp.float32) for shape in shapes))
+
+    def check_condition(self, condition: Condition) -> None:
+        """Raise ValueError unless history, path and style fit the config, with as many rows."""
+        expected = self.condition_shapes(condition.history.shape[0])
+        for name, found, wanted in zip(Condition._fields, condition, expected, strict=True):
+            if found.shape != wanted.shape:
+                raise ValueError(f"condition {name} must have shape {wanted.shape}, got {found.shape}")
+
+
 class Context(NamedTuple):
     """An encoded condition: keys and values of the context tokens, [B, H + T + 1, D] each.
 
@@ -46,13 +72,6 @@ class Context(NamedTuple):
 
     keys: jax.Array
     values: jax.Array
-
-
-@functools.lru_cache(maxsize=32)
-def _noise_frequencies(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fixed random frequencies and phases of Karras et al. 2024, from a fixed seed."""
-    generator = np.random.default_rng(2024)
-    return generator.standard_normal(width), generator.uniform(size=width)
 
 
 def noise_features(sigma, width: int):
@@ -67,7 +86,8 @@ def noise_features(sigma, width: int):
 
     Source: phi of Eq. 1; Karras et al. 2024 (EDM2), section B.3.
     """
-    frequency, phase = _noise_frequencies(width)
+    fixed = np.random.default_rng(2024)  # the same frequencies and phases for every network
+    frequency, phase = fixed.standard_normal(width), fixed.uniform(size=width)
     position = 0.25 * jnp.log(sigma)[..., None]
     angle = 2.0 * jnp.pi * (position * jnp.asarray(frequency, position.dtype) + phase)
     return (jnp.sqrt(2.0) * jnp.cos(angle)).astype(position.dtype)
@@ -80,27 +100,24 @@ class ConditionEncoder(nnx.Module):
     embeddings, broadcast over the window, ask them by cross-attention (one head unless told). The
     paper does not mention a position code; without one every frame would ask the same question,
     and c would be constant over the window.
+
+    Args:
+      config: sizes; its latent width is that of tokens and c.
+      num_heads: must divide that width.
+      frames_before: frames before the window that have a c of their own.
+
+    Raises:
+      ValueError: if the number of heads does not divide the width.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        num_styles: int,
-        width: int,
-        window: int,
-        num_history: int,
-        num_heads: int = 1,
-        frames_before: int = 0,
-        *,
-        rngs: nnx.Rngs,
-    ):
+    def __init__(self, config: ConditionedConfig, num_heads: int = 1, frames_before: int = 0, *, rngs: nnx.Rngs):
+        width = config.latent_width
         check_num_heads(width, num_heads)
-        self.width, self.window, self.num_history = width, window, num_history
-        self.frames_before = frames_before
-        self.num_heads = num_heads
-        self.history = nnx.Linear(channels, width, rngs=rngs)
+        self.width, self.window, self.num_history = width, config.window, config.num_history
+        self.frames_before, self.num_heads = frames_before, num_heads
+        self.history = nnx.Linear(config.channels, width, rngs=rngs)
         self.path = nnx.Linear(PATH_CHANNELS, width, rngs=rngs)
-        self.style = nnx.Linear(num_styles, width, rngs=rngs)
+        self.style = nnx.Linear(config.num_styles, width, rngs=rngs)
         self.noise_first = nnx.Linear(width, width, rngs=rngs)
         self.noise_second = nnx.Linear(width, width, rngs=rngs)
         self.query = nnx.Linear(width, width, rngs=rngs)
@@ -113,14 +130,8 @@ class ConditionEncoder(nnx.Module):
         dtype = condition.history.dtype
         past = jnp.asarray(position_code(-self.num_history, 0, self.width), dtype)
         future = jnp.asarray(position_code(0, self.window, self.width), dtype)
-        tokens = jnp.concatenate(
-            [
-                self.history(condition.history) + past,
-                self.path(condition.path) + future,
-                self.style(condition.style)[:, None, :],
-            ],
-            axis=1,
-        )
+        history, path = self.history(condition.history) + past, self.path(condition.path) + future
+        tokens = jnp.concatenate([history, path, self.style(condition.style)[:, None, :]], axis=1)
         return Context(self.key(tokens), self.value(tokens))
 
     def __call__(self, context: Context, sigma):
@@ -137,12 +148,8 @@ class ConditionEncoder(nnx.Module):
         # One noise level for all characters asks one question for all of them.
         asked = noise[..., None, :] + code
         shape = (context.keys.shape[0], self.frames_before + self.window, self.width)
-        answer = attention(
-            split_heads(jnp.broadcast_to(self.query(asked), shape), self.num_heads),
-            split_heads(context.keys, self.num_heads),
-            split_heads(context.values, self.num_heads),
-        )
-        return asked + self.output(answer.reshape(shape))
+        query = jnp.broadcast_to(self.query(asked), shape)
+        return asked + self.output(attend(query, context.keys, context.values, self.num_heads))
 
 
 def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
@@ -237,23 +244,19 @@ def conditioning_layer(
     Args:
       name: one of `CONDITIONINGS`.
       width: D.
-      condition_width: C_cond.
+      condition_width: C_cond; for "concatenation", D as well.
       num_heads: of "cross_attention".
-      zero_output: start as zero, for a block whose input is added to its output.
+      zero_output: start as zero, for a block whose input is added to its output ("adaln_zero" adds
+        its input itself, and starts with nothing to add anyway).
 
     Raises:
-      ValueError: for an unknown name (with the nearest); for "concatenation" of features and a
-        condition of other width; for "adaln_zero" with `zero_output`, as it adds its input itself.
+      ValueError: for an unknown name, with the nearest.
     """
     if name not in CONDITIONINGS:
         raise ValueError(f"unknown conditioning {name!r}{nearest_hint(name, CONDITIONINGS)}")
     if name == "concatenation":
-        if condition_width != width:
-            raise ValueError(f"concatenation needs a condition as wide as the features, {width}, got {condition_width}")
         return Concatenation(width, zero_output=zero_output, rngs=rngs)
     if name == "adaln_zero":
-        if zero_output:
-            raise ValueError("adaln_zero adds its input itself and has no output layer to zero")
         return AdaLNZero(width, condition_width, rngs=rngs)
     if name == "cross_attention":
         return CrossAttention(width, condition_width, num_heads, zero_output=zero_output, rngs=rngs)

@@ -1,4 +1,4 @@
-"""What all networks have in common: checked configs that survive JSON, and one way to be called."""
+"""What all denoisers have in common: checked configs that survive JSON, and one way to be called."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from flax import nnx
 from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 
 _TYPES = {"int": int, "float": float, "bool": bool, "str": str}
-_TUPLE = "tuple[float, ...]"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """What decides the shape of any denoiser of the family.
+    """What decides the shape of a denoiser, of any family.
+
+    A family adds its own fields and checks, and `condition_shapes(batch)`: what `encode` takes, any
+    tree, with a `jax.ShapeDtypeStruct` for each array.
 
     Attributes:
       channels: C, features a frame (6 J + 3).
-      num_styles: S, width of the one-hot style.
       window: T, future frames a round makes (32 or 64).
-      num_history: H, past frames seen (section 4.5: 10).
       latent_width: D (section 4.2).
       depth: N, blocks (section 4.5).
       input_scaling: multiply the noisy input by c_in = 1 / sqrt(sigma^2 + sigma_data^2); the paper
@@ -32,6 +32,7 @@ class NetworkConfig:
         sigma_data = 1 the scaled input is the variance-preserving state.
       normalise: features have mean 0 and deviation 1 per channel; the paper does not say.
       sigma_data: deviation of the clean features in network units.
+      dropout: share of numbers that Transformer blocks drop in training; not in the paper, 0 here.
 
     Raises:
       ValueError: for a value of the wrong type, a size that is not positive, an unknown choice.
@@ -41,45 +42,37 @@ class NetworkConfig:
     choices: ClassVar[dict[str, tuple[str, ...]]] = {}
     """For each field that names a variant: the names there are."""
 
-    may_be_zero: ClassVar[tuple[str, ...]] = ()
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
 
     channels: int
-    num_styles: int
     window: int = 32
-    num_history: int = 10
     latent_width: int = 96
     depth: int = 6
     input_scaling: bool = True
     normalise: bool = True
     sigma_data: float = 1.0
+    dropout: float = 0.0
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            self._check(field.name, str(field.type))
+            if field.type in _TYPES:
+                self._check(field.name, _TYPES[field.type])
         if self.window < 2:
             raise ValueError(f"window must be at least 2 frames, got {self.window}")
+        if self.dropout >= 1.0:
+            raise ValueError(f"dropout must be below 1, got {self.dropout}")
 
-    def _check(self, name: str, kind: str) -> None:
+    def _check(self, name: str, wanted: type) -> None:
         value = getattr(self, name)
-        if kind == _TUPLE:
-            if not isinstance(value, (list, tuple)) or not all(
-                type(item) in (int, float) and 0 < item < math.inf for item in value
-            ):
-                raise ValueError(f"{name} must be positive, finite numbers, got {value!r}")
-            object.__setattr__(self, name, tuple(float(item) for item in value))
-            return
-        wanted = _TYPES[kind]
         if wanted is float and type(value) is int:
             value = float(value)
             object.__setattr__(self, name, value)
         if type(value) is not wanted:
-            raise ValueError(f"{name} must be of type {kind}, got {value!r}")
-        if name in self.choices and value not in self.choices[name]:
+            raise ValueError(f"{name} must be of type {wanted.__name__}, got {value!r}")
+        if value not in self.choices.get(name, (value,)):
             raise ValueError(f"unknown {name} {value!r}{nearest_hint(value, self.choices[name])}")
-        if wanted in (int, float):
-            at_least_zero = name in self.may_be_zero and value == 0
-            if not (0 < value < math.inf or at_least_zero):
-                raise ValueError(f"{name} must be positive and finite, got {value!r}")
+        if wanted in (int, float) and not (0 < value < math.inf or (value == 0 and name in self.may_be_zero)):
+            raise ValueError(f"{name} must be positive and finite, got {value!r}")
 
     def to_dict(self) -> dict:
         """Return the family's name and the fields as JSON-ready values."""
@@ -93,23 +86,10 @@ class NetworkConfig:
         if family != cls.family:
             raise ValueError(f"settings of family {family!r} do not make a {cls.family} network")
         refuse_unknown(values, cls, "model setting")
-        missing = {"channels", "num_styles"} - values.keys()
-        if missing:
+        needed = {field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING}
+        if missing := needed - values.keys():
             raise ValueError(f"model settings lack {', '.join(sorted(missing))}")
         return cls(**values)
-
-    def check_condition(self, condition) -> None:
-        """Raise ValueError unless history, path and style fit the config, with as many rows."""
-        batch = condition.history.shape[0]
-        expected = {
-            "history": (batch, self.num_history, self.channels),
-            "path": (batch, self.window, 8),
-            "style": (batch, self.num_styles),
-        }
-        for name, shape in expected.items():
-            found = getattr(condition, name).shape
-            if found != shape:
-                raise ValueError(f"condition {name} must have shape {shape}, got {found}")
 
     def check_state(self, x_noisy) -> None:
         """Raise ValueError unless a noisy state is [B, T, C] of this config."""
@@ -132,10 +112,11 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
 
 
 class Denoiser(nnx.Module):
-    """What samplers, training and rollout ask of any network of the family.
+    """What samplers, training and rollout ask of any network.
 
     A subclass has `config`, `encode(condition) -> context` (once a round) and `stages`, a generator
-    of (name, value) on the way from the noisy state to x0_hat, which comes last.
+    of (name, value) on the way from the noisy state to x0_hat, which comes last. Condition and
+    context are trees of arrays that the family alone looks into.
     """
 
     def __call__(self, x_noisy, sigma, context, key=None):

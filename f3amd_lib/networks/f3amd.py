@@ -17,27 +17,29 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.networks.attention import TransformerBlock, position_code
+from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, position_code
 from f3amd_lib.networks.conditioning import (
     CONDITIONINGS,
     PATH_CHANNELS,
     Condition,
+    ConditionedConfig,
     ConditionEncoder,
     Context,
     conditioning_layer,
-)
-from f3amd_lib.networks.config import Denoiser, NetworkConfig, scaled_input
+)  # fmt: skip
+from f3amd_lib.networks.config import Denoiser, scaled_input
 from f3amd_lib.networks.spectral import SPECTRAL_VARIANTS, FNOBlock, FrameLayer, cosine_basis, count_modes, frames_first
 
 
-@dataclass(frozen=True)
-class F3AMDConfig(NetworkConfig):
+@dataclass(frozen=True, kw_only=True)
+class F3AMDConfig(ConditionedConfig):
     """Everything that decides an F3AMD network's shape and formulas.
 
     Attributes:
       base_block: "fno" or "transformer" (section 3.4.1).
       num_kept_modes: m, modes kept by the FNO blocks (section 4.5: 17 of 17 RFFT bins, or 33 of 33
-        with 64 frames). Encoder and decoder keep as many of theirs, if they have so many.
+        with 64 frames); 0 stands for all there are. Encoder and decoder keep as many of theirs, if
+        they have so many.
       spectral_variant: transform and weights of the base blocks (Table 8); encoder and decoder stay
         Fourier, since the table speaks of the backbone.
       spectral_rank: rank of "reduced_rank" (Appendix E: 8).
@@ -48,7 +50,6 @@ class F3AMDConfig(NetworkConfig):
       num_condition_heads: heads of the cross-attention to c; not in the paper, 1 here.
       num_heads: attention heads of a Transformer base block (Appendix A).
       feed_forward_factor: its hidden width over D; not in the paper, 4 as in Vaswani et al. 2017.
-      dropout: of Transformer blocks in training; not in the paper, 0 here.
       block_residual: add each block's input to its output (ours; the paper's Figure 2 has none).
       history_anchor: add the last history frame, with a learned weight that starts as a decay over
         the window, so that the network predicts a change (ours).
@@ -78,10 +79,10 @@ class F3AMDConfig(NetworkConfig):
         "encoder_decoder": ("fno", "linear"),
         "conditioning": CONDITIONINGS,
     }
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "decoder_hidden_width")
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "num_kept_modes", "decoder_hidden_width")
 
     base_block: str = "fno"
-    num_kept_modes: int = 17
+    num_kept_modes: int = 0
     spectral_variant: str = "fourier"
     spectral_rank: int = 8
     initial_mode_gain: float = 0.7
@@ -91,7 +92,6 @@ class F3AMDConfig(NetworkConfig):
     num_condition_heads: int = 1
     num_heads: int = 1
     feed_forward_factor: int = 4
-    dropout: float = 0.0
     block_residual: bool = False
     history_anchor: bool = False
     output_scaling: bool = False
@@ -105,15 +105,12 @@ class F3AMDConfig(NetworkConfig):
         if self.history_input and self.conditioning == "concatenation":
             raise ValueError("concatenation lays c before the features: leave history_input off")
         modes = self.count_block_modes()
+        if self.num_kept_modes == 0:
+            object.__setattr__(self, "num_kept_modes", modes)
         if self.num_kept_modes > modes:
-            raise ValueError(
-                f"num_kept_modes must be at most {modes} for blocks of {self.block_frames} "
-                f"frames and spectral_variant {self.spectral_variant!r}, got {self.num_kept_modes}"
-            )
-        if self.latent_width % self.num_heads:
-            raise ValueError(f"num_heads must divide the latent width {self.latent_width}, got {self.num_heads}")
-        if self.dropout >= 1.0:
-            raise ValueError(f"dropout must be below 1, got {self.dropout}")
+            found = f"{self.block_frames} frames, got {self.num_kept_modes}"
+            raise ValueError(f"num_kept_modes must be at most {modes} for blocks of {found}")
+        check_num_heads(self.latent_width, self.num_heads)
         if self.block_residual and self.conditioning == "adaln_zero":
             raise ValueError("adaln_zero is residual already: leave block_residual off")
 
@@ -155,8 +152,8 @@ def _facing_forward(condition: Condition) -> tuple[Condition, jax.Array]:
     scale = jnp.where(known, length, 1.0)
     cosine, sine = jnp.where(known, cosine, 1.0) / scale, jnp.where(known, sine, 0.0) / scale
     zero, one = jnp.zeros_like(cosine), jnp.ones_like(cosine)
-    rows = [[cosine, zero, -sine], [zero, one, zero], [sine, zero, cosine]]
-    matrix = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    rows = [cosine, zero, -sine, zero, one, zero, sine, zero, cosine]
+    matrix = jnp.stack(rows, axis=-1).reshape(-1, 3, 3)
     place = jnp.stack([path[..., 0], jnp.zeros_like(path[..., 0]), path[..., 1]], axis=-1)
     place = _turned(place, matrix)[..., jnp.array([0, 2])]
     path = jnp.concatenate([place, _turned(path[..., 2:], matrix)], axis=-1)
@@ -180,6 +177,11 @@ class EncodedCondition(NamedTuple):
     turn: jax.Array | None
 
 
+def _in_every_channel(values: np.ndarray, channels: int) -> nnx.Param:
+    """Return weights [T, C] that start with the same value [T] in every channel."""
+    return nnx.Param(jnp.asarray(np.repeat(values[:, None], channels, axis=1), jnp.float32))
+
+
 def _applied(layer, turned: bool):
     """Return how a layer is called, on [T, B, D] if turned; a linear one cares for neither."""
     return layer.frames_first if turned and isinstance(layer, FrameLayer) else layer
@@ -191,42 +193,32 @@ class F3AMD(Denoiser):
     def __init__(self, config: F3AMDConfig, *, rngs: nnx.Rngs):
         self.config = config
         width = config.latent_width
-        self.condition = ConditionEncoder(
-            config.channels,
-            config.num_styles,
-            width,
-            config.window,
-            config.num_history,
-            config.num_condition_heads,
-            config.frames_before,
-            rngs=rngs,
-        )
-        depth = range(config.depth)
+        heads = config.num_condition_heads
+        self.condition = ConditionEncoder(config, heads, config.frames_before, rngs=rngs)
         # Beside the features: the path, and whether a frame is given or noisy.
         beside = PATH_CHANNELS + 1 if config.history_input else 0
         self.encoder = self._coder(config.channels + beside, width, rngs)
-        self.blocks = nnx.List([self._base_block(rngs) for _ in depth])
-        self.conditionings = nnx.List([self._conditioning_layer(rngs) for _ in depth])
+        self.blocks = nnx.List([self._base_block(rngs) for _ in range(config.depth)])
+        options = {"num_heads": heads, "zero_output": config.block_residual, "rngs": rngs}
+        way_in = lambda: conditioning_layer(config.conditioning, width, width, **options)
+        self.conditionings = nnx.List([way_in() for _ in range(config.depth)])
         if hidden := config.decoder_hidden_width:
             self.decoder_hidden = self._coder(width, hidden, rngs)
         self.decoder = self._coder(hidden or width, config.channels, rngs)
         if config.history_anchor:
             decay = np.exp(-np.arange(1, config.window + 1) / 10.0)
-            anchor = np.repeat(decay[:, None], config.channels, axis=1)
-            self.anchor = nnx.Param(jnp.asarray(anchor, jnp.float32))
+            self.anchor = _in_every_channel(decay, config.channels)
         if config.residual_prior:
             # Slow modes are free, fast ones nearly fixed; a tenth of the logarithm is stored, so
             # that it learns ten times as fast as a weight.
             log_deviation = np.log(0.1) - 1.5 * np.log1p(np.arange(config.window))
-            start = np.repeat(0.1 * 2.0 * log_deviation[:, None], config.channels, axis=1)
-            self.residual_variance = nnx.Param(jnp.asarray(start, jnp.float32))
+            self.residual_variance = _in_every_channel(0.1 * 2.0 * log_deviation, config.channels)
 
     def _coder(self, width_in: int, width_out: int, rngs: nnx.Rngs):
         config = self.config
         if config.encoder_decoder == "linear":
             return nnx.Linear(width_in, width_out, rngs=rngs)
-        frames = config.window + config.frames_before
-        modes = min(config.num_kept_modes, count_modes("fourier", frames))
+        modes = min(config.num_kept_modes, count_modes("fourier", config.window + config.frames_before))
         return FNOBlock(width_in, width_out, modes, config.kernel_size, rngs=rngs)
 
     def _base_block(self, rngs: nnx.Rngs):
@@ -235,26 +227,9 @@ class F3AMD(Denoiser):
             hidden = config.feed_forward_factor * width
             return TransformerBlock(width, config.num_heads, hidden, config.dropout, rngs=rngs)
         return FNOBlock(
-            width,
-            width,
-            config.num_kept_modes,
-            config.kernel_size,
-            config.spectral_variant,
-            config.spectral_rank,
-            config.initial_mode_gain,
-            rngs=rngs,
-        )
-
-    def _conditioning_layer(self, rngs: nnx.Rngs):
-        config = self.config
-        return conditioning_layer(
-            config.conditioning,
-            config.latent_width,
-            config.latent_width,
-            num_heads=config.num_condition_heads,
-            zero_output=config.block_residual,
-            rngs=rngs,
-        )
+            width, width, config.num_kept_modes, config.kernel_size, variant=config.spectral_variant,
+            rank=config.spectral_rank, initial_gain=config.initial_mode_gain, rngs=rngs,
+        )  # fmt: skip
 
     def encode(self, condition: Condition) -> EncodedCondition:
         """Encode a condition once a round.
@@ -279,10 +254,9 @@ class F3AMD(Denoiser):
         """Lay the history before the scaled noisy window and the path beside it, [B, H + T, .]."""
         past, future = context.history, context.path
         unknown = jnp.zeros((*past.shape[:2], PATH_CHANNELS), z.dtype)
-        given = jnp.ones((*past.shape[:2], 1), z.dtype)
-        noisy = jnp.zeros((*z.shape[:2], 1), z.dtype)
-        before = jnp.concatenate([past, unknown, given], axis=-1)
-        return jnp.concatenate([before, jnp.concatenate([z, future, noisy], axis=-1)], axis=1)
+        given, noisy = jnp.ones((*past.shape[:2], 1), z.dtype), jnp.zeros((*z.shape[:2], 1), z.dtype)
+        before, window = (jnp.concatenate(row, axis=-1) for row in ([past, unknown, given], [z, future, noisy]))
+        return jnp.concatenate([before, window], axis=1)
 
     def stages(self, x_noisy, sigma, context, key=None) -> Iterator[tuple[str, jax.Array]]:
         """Yield the name and value of every station from x_noisy to x0_hat (Figure 2).
@@ -297,6 +271,7 @@ class F3AMD(Denoiser):
         config = self.config
         config.check_state(x_noisy)
         sigma = jnp.asarray(sigma, x_noisy.dtype)
+        level = sigma.reshape(-1, 1, 1)
         c = self.condition(context.tokens, sigma)
         yield "c", c
         if config.facing_frame:
@@ -317,8 +292,7 @@ class F3AMD(Denoiser):
         if config.base_block == "transformer":
             # Attention has no sense of order of its own (section 3.4.1).
             z = z + jnp.asarray(position_code(0, config.block_frames, z.shape[-1]), z.dtype)
-        layers = zip(self.blocks, self.conditionings, strict=True)
-        for number, (block, conditioning) in enumerate(layers):
+        for number, (block, conditioning) in enumerate(zip(self.blocks, self.conditionings, strict=True)):
             base = _applied(block, turned)
             if key is not None and not turned:
                 base = partial(base, key=jax.random.fold_in(key, number))
@@ -333,16 +307,15 @@ class F3AMD(Denoiser):
         x0_hat = turn(_applied(self.decoder, turned)(last))[:, config.frames_before :]
         yield "decoder", x0_hat
         if config.output_scaling:
-            total = sigma.reshape(-1, 1, 1) ** 2 + config.sigma_data**2
-            c_skip = config.sigma_data**2 / total
-            c_out = sigma.reshape(-1, 1, 1) * config.sigma_data / jnp.sqrt(total)
+            total = level**2 + config.sigma_data**2
+            c_skip, c_out = config.sigma_data**2 / total, level * config.sigma_data / jnp.sqrt(total)
             x0_hat = c_skip * x_noisy + c_out * x0_hat
         if config.history_anchor:
             x0_hat = x0_hat + self.anchor[...] * context.history[:, -1:]
         if config.residual_prior:
             basis = jnp.asarray(cosine_basis(config.window), x_noisy.dtype)
             variance = jnp.exp(10.0 * self.residual_variance[...])
-            gain = variance / (variance + sigma.reshape(-1, 1, 1) ** 2)
+            gain = variance / (variance + level**2)
             residual = jnp.einsum("kt,btc->bkc", basis, x_noisy - x0_hat)
             x0_hat = x0_hat + jnp.einsum("kt,bkc->btc", basis, gain * residual)
         if config.facing_frame:

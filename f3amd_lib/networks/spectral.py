@@ -38,13 +38,9 @@ def count_modes(variant: str, num_frames: int) -> int:
     Raises:
       ValueError: for an unknown variant.
     """
-    _check_variant(variant)
-    return num_frames if variant == "cosine" else num_frames // 2 + 1
-
-
-def _check_variant(variant: str) -> None:
     if variant not in SPECTRAL_VARIANTS:
         raise ValueError(f"unknown spectral variant {variant!r}{nearest_hint(variant, SPECTRAL_VARIANTS)}")
+    return num_frames if variant == "cosine" else num_frames // 2 + 1
 
 
 def _check_num_kept_modes(variant: str, num_frames: int, num_kept_modes: int) -> None:
@@ -116,22 +112,6 @@ def _over_frames(matrix, z):
     return (jnp.asarray(matrix, z.dtype) @ z.reshape(len(z), -1)).reshape(-1, *z.shape[1:])
 
 
-def _spectrum(z, modes: int):
-    """Map [T, B, D] to its first Fourier modes, [m, 2, B, D]: real part, then imaginary part."""
-    num_frames, batch, width = z.shape
-    analysis, _ = fourier_matrices(num_frames, modes)
-    flat = _over_frames(analysis.reshape(2 * modes, num_frames), z)
-    return flat.reshape(modes, 2, batch, width)
-
-
-def _signal(spectrum, num_frames: int):
-    """Map Fourier modes [m, 2, B, D] back to [T, B, D]."""
-    modes, _, batch, width = spectrum.shape
-    _, synthesis = fourier_matrices(num_frames, modes)
-    flat = spectrum.reshape(2 * modes, batch, width)
-    return _over_frames(synthesis.reshape(num_frames, 2 * modes), flat)
-
-
 def _complex_product(spectrum, weight_real, weight_imag):
     """Multiply [m, 2, B, D0] by complex weights [m, D0, D1], mode by mode: [m, 2, B, D1]."""
     modes, _, batch, width_in = spectrum.shape
@@ -143,32 +123,31 @@ def _complex_product(spectrum, weight_real, weight_imag):
     return jnp.stack([real, imag], axis=1)
 
 
-def spectral_convolution(z, weight_real, weight_imag, *factors, gain=None):
+def spectral_convolution(z, *weights, gain=None):
     """Return IRFFT(W . RFFT(z)[:m]) over the frame axis (Eq. 2).
 
     Args:
       z: [B, T, D0].
-      weight_real, weight_imag: the complex weights W as two real arrays, [m, D0, D1].
-      *factors: further complex weights, again two real arrays each, that are applied after the
-        first ones: W = U V as U [m, D0, r], then V [m, r, D1].
+      *weights: the complex weights W as two real arrays, [m, D0, D1]; or those of its factors, two
+        real arrays each, the first one first: W = U V as U [m, D0, r], then V [m, r, D1].
       gain: [m], one factor per mode on the spectrum of z; none by default.
 
     Returns:
       [B, T, D1].
     """
-    weights = weight_real, weight_imag, *factors
     return frames_first(_fourier_layer(frames_first(z), *weights, gain=gain))
 
 
-def _fourier_layer(z, weight_real, weight_imag, *factors, gain=None):
+def _fourier_layer(z, *weights, gain=None):
     """Do the work of `spectral_convolution` on z [T, B, D0]."""
-    spectrum = _spectrum(z, len(weight_real))
+    num_frames, modes = len(z), len(weights[0])
+    analysis, synthesis = fourier_matrices(num_frames, modes)
+    spectrum = _over_frames(analysis.reshape(2 * modes, num_frames), z).reshape(modes, 2, *z.shape[1:])
     if gain is not None:
         spectrum = spectrum * gain[:, None, None, None]
-    spectrum = _complex_product(spectrum, weight_real, weight_imag)
-    for real, imag in zip(factors[::2], factors[1::2], strict=True):
+    for real, imag in zip(weights[::2], weights[1::2], strict=True):
         spectrum = _complex_product(spectrum, real, imag)
-    return _signal(spectrum, len(z))
+    return _over_frames(synthesis.reshape(num_frames, 2 * modes), spectrum.reshape(2 * modes, *spectrum.shape[2:]))
 
 
 def cosine_convolution(z, weight):
@@ -225,17 +204,10 @@ class SpectralConvolution(FrameLayer):
     """
 
     def __init__(
-        self,
-        width_in: int,
-        width_out: int,
-        num_kept_modes: int,
-        variant: str = "fourier",
-        rank: int = 8,
-        initial_gain: float = 0.7,
-        *,
-        rngs: nnx.Rngs,
-    ):
-        _check_variant(variant)
+        self, width_in: int, width_out: int, num_kept_modes: int, variant: str = "fourier", *,
+        rank: int = 8, initial_gain: float = 0.7, rngs: nnx.Rngs,
+    ):  # fmt: skip
+        count_modes(variant, 1)  # refuses an unknown one
         self.variant = variant
 
         def draw(rows: int, columns: int, parts: int = 2):
@@ -248,17 +220,12 @@ class SpectralConvolution(FrameLayer):
             self.weight = draw(width_in, width_out, parts=1)
         elif variant == "reduced_rank":
             if not 1 <= rank <= min(width_in, width_out):
-                raise ValueError(
-                    f"rank must be between 1 and {min(width_in, width_out)} for widths "
-                    f"{width_in} and {width_out}, got {rank}"
-                )
-            self.first_real = draw(width_in, rank)
-            self.first_imag = draw(width_in, rank)
-            self.second_real = draw(rank, width_out)
-            self.second_imag = draw(rank, width_out)
+                highest = min(width_in, width_out)
+                raise ValueError(f"rank must be between 1 and {highest} for {width_in} to {width_out}, got {rank}")
+            self.first_real, self.first_imag = draw(width_in, rank), draw(width_in, rank)
+            self.second_real, self.second_imag = draw(rank, width_out), draw(rank, width_out)
         else:
-            self.weight_real = draw(width_in, width_out)
-            self.weight_imag = draw(width_in, width_out)
+            self.weight_real, self.weight_imag = draw(width_in, width_out), draw(width_in, width_out)
         if variant == "weighted":
             self.gain = nnx.Param(jnp.full(num_kept_modes, initial_gain, jnp.float32))
 
@@ -267,9 +234,8 @@ class SpectralConvolution(FrameLayer):
         if self.variant == "cosine":
             return _cosine_layer(z, self.weight[...])
         if self.variant == "reduced_rank":
-            first = self.first_real[...], self.first_imag[...]
-            second = self.second_real[...], self.second_imag[...]
-            return _fourier_layer(z, *first, *second)
+            weights = self.first_real, self.first_imag, self.second_real, self.second_imag
+            return _fourier_layer(z, *(weight[...] for weight in weights))
         gain = self.gain[...] if self.variant == "weighted" else None
         return _fourier_layer(z, self.weight_real[...], self.weight_imag[...], gain=gain)
 
@@ -304,23 +270,15 @@ class FNOBlock(FrameLayer):
 
     Args:
       width_in, width_out: D0 and D1.
-      num_kept_modes, variant, rank, initial_gain: of `SpectralConvolution`.
+      num_kept_modes: m.
       kernel_size: k of Eq. 3.
+      **spectral: variant, rank and initial_gain of `SpectralConvolution`.
     """
 
     def __init__(
-        self,
-        width_in: int,
-        width_out: int,
-        num_kept_modes: int,
-        kernel_size: int = 3,
-        variant: str = "fourier",
-        rank: int = 8,
-        initial_gain: float = 0.7,
-        *,
-        rngs: nnx.Rngs,
+        self, width_in: int, width_out: int, num_kept_modes: int, kernel_size: int = 3, *, rngs: nnx.Rngs, **spectral
     ):
-        self.spectral = SpectralConvolution(width_in, width_out, num_kept_modes, variant, rank, initial_gain, rngs=rngs)
+        self.spectral = SpectralConvolution(width_in, width_out, num_kept_modes, rngs=rngs, **spectral)
         self.local_first = TemporalConvolution(width_in, width_in, kernel_size, rngs=rngs)
         self.local_second = TemporalConvolution(width_in, width_out, kernel_size, rngs=rngs)
 

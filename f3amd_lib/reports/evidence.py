@@ -19,7 +19,7 @@ from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 
 
 class NotMeasured(LookupError):
@@ -344,11 +344,11 @@ def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
 def check_model(model: str, where: str) -> None:
     """Raise ValueError for a name that is neither a preset's own nor one of `REFERENCE_ROWS`."""
     try:
-        known = model in REFERENCE_ROWS or zoo.find_preset(model).name == model
+        known = model in REFERENCE_ROWS or presets.find_preset(model).name == model
     except ValueError:
         known = False
     if not known:
-        raise ValueError(f"{where}: unknown model {model!r}{nearest_hint(model, [*zoo.PRESETS, *REFERENCE_ROWS])}")
+        raise ValueError(f"{where}: unknown model {model!r}{nearest_hint(model, [*presets.PRESETS, *REFERENCE_ROWS])}")
 
 
 def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
@@ -403,7 +403,7 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
     for entry in about.get("table", ()):
         printed = load_paper_table(entry["number"], paper)
         labels, known = printed["model"], entry.get("models", {})
-        names = {label: known.get(label) or zoo.find_preset(label).name for label in labels.unique()}
+        names = {label: known.get(label) or presets.find_preset(label).name for label in labels.unique()}
         framework = np.where(labels.str.contains("PyTorch"), "torch", "iree")
         printed = printed.assign(model=labels.map(names), framework=framework, **entry.get("columns", {}))
         name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")

@@ -18,7 +18,7 @@ from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import PAPER_TABLES, load_paper_table
 from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
 from f3amd_lib.measures.registry import SHOWN
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
 """The paper's tables of motion quality, by number."""
@@ -87,7 +87,7 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
       ValueError: for a table that has no quality, an empty label or the paper's, a missing column,
         a figure that is there twice, or a unit that is not the paper's.
 
-    Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `zoo.find_preset`'s.
+    Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `presets.find_preset`'s.
     """
     if table not in QUALITY_TABLES:
         known = ", ".join(map(str, QUALITY_TABLES))
@@ -131,7 +131,7 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
     for (model, frames, steps), printed in paper.groupby(_KEYS[:3], sort=False):
         figures = printed.set_index("metric")[["printed", "value"]].assign(low=np.nan, high=np.nan).to_dict("index")
         line(model, int(frames), int(steps), PAPER_SOURCE, figures)
-        our_line(zoo.find_preset(model).name, int(frames), int(steps))
+        our_line(presets.find_preset(model).name, int(frames), int(steps))
     return pd.DataFrame(rows)
 
 

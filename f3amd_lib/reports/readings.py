@@ -15,7 +15,7 @@ from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.zoo import PRESETS
+from f3amd_lib.networks.presets import PRESETS
 from f3amd_lib.training.loop import TrainingConfig
 
 _CONFIGS = {

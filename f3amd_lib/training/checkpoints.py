@@ -26,7 +26,7 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.networks.zoo import build_from_config, config_from_dict
+from f3amd_lib.networks.presets import build_from_config, config_from_dict
 
 FORMAT = "f3amd-1"
 

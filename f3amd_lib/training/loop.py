@@ -39,7 +39,7 @@ from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.networks.zoo import build_from_config, find_preset
+from f3amd_lib.networks.presets import build_from_config, find_preset
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 from f3amd_lib.training.losses import LossWeights, loss_terms, total_loss
@@ -169,7 +169,7 @@ def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
     """Return how the paper trains a preset (section 4.5), but for the number of steps.
 
     Args:
-      preset: see `zoo.find_preset`; its own noise, losses and remedies are in it.
+      preset: see `presets.find_preset`; its own noise, losses and remedies are in it.
       num_steps: optimiser steps.
       **settings: fields of `TrainingConfig` to change.
     """

@@ -30,7 +30,7 @@ from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, sta
 from f3amd_lib.ground.files import set_aside
 from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, write_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import OutdatedFile, TrainedModel, describe, load_model, save_model
@@ -87,7 +87,7 @@ class PreparedData:
 
     def model_config(self, preset: str, *, window: int | None = None, **settings):
         """Return a preset's config for this data set's channels and styles, and its window."""
-        return zoo.build_config(
+        return presets.build_config(
             preset,
             channels=num_channels(self.packed.skeleton),
             num_styles=len(self.packed.styles),
@@ -145,7 +145,7 @@ class ModelFiles:
 
 def _preset_name(profile: Profile, preset: str | None) -> str:
     """Return our name, fit for files, of a preset that may be called by the paper's."""
-    return zoo.find_preset(preset or profile.preset).name
+    return presets.find_preset(preset or profile.preset).name
 
 
 def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> ModelFiles:
@@ -427,7 +427,7 @@ def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkCo
 
 
 def available_models(profile: Profile) -> list[str]:
-    """List the presets that have weights, of the user's or shipped ones, in the zoo's order.
+    """List the presets that have weights, of the user's or shipped ones, in the order of `PRESETS`.
 
     Args:
       profile: as for `obtain_model`.
@@ -436,7 +436,7 @@ def available_models(profile: Profile) -> list[str]:
     if profile.name == "laptop":
         folders.append(PRETRAINED_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
-    names = [name + end for end in ("", "-raw", "-plus", "-steady") for name in zoo.PRESETS]
+    names = [name + end for end in ("", *presets.FORMS) for name in presets.PRESETS]
     return [
         name
         for name in dict.fromkeys(names)

@@ -4,7 +4,7 @@ A window of motion is here a path of a few points on the ground. Every path of t
 wall on one side, so that the mean of all paths runs into it: a sampler whose one step returns a
 mean must fail, unless the condition gives the side. The data are a Gaussian mixture over whole
 paths, whose denoiser is known exactly (`diffusion.oracles`), and the networks are F3AMD's own
-(`networks.zoo`), only smaller, so that what is trained can be laid beside what is exact.
+(`networks.presets`), only smaller, so that what is trained can be laid beside what is exact.
 
 Paths are [B, T, 2], sideways (positive to the walker's left, as +X is) and ahead, in metres from
 the middle of the wall; their coordinates have a deviation of about 1, so that metres are network
@@ -30,8 +30,8 @@ from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import scaled_input
+from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import cosine_basis
-from f3amd_lib.networks.zoo import build_config, build_from_config
 from flax import nnx
 
 UNKNOWN, LEFT, RIGHT = range(3)

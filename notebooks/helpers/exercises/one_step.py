@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import sample_ddim
+from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import VarianceExploding
 from scipy.optimize import brentq
 
@@ -61,7 +61,7 @@ def _four_levels(answer) -> str | None:
     unknown = np.zeros(400, int)
     x_init = levels[0] * jax.random.normal(jax.random.key(0), (400, data.num_frames, 2))
     denoise = lambda x, sigma: data.denoise(x, sigma, unknown)
-    ends = sample_ddim(denoise, x_init, np.append(levels, 0.0))
+    ends = sample("ddim", denoise, x_init, np.append(levels, 0.0))
     share = outcome_shares(data, ends)["wall"]
     if share < 0.05:
         return None

@@ -6,8 +6,9 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
+from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal, sample
+from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
 from f3amd_lib.diffusion.schedules import VarianceExploding
 
 from helpers.exercises.judging import NotAnswered, agree, is_missing, normal_quantiles, sample
@@ -69,9 +70,9 @@ def _sample_in_preserving_state(denoise, x_init, sigmas, forget: bool):
 
 
 _STRANGERS = (
-    (functools.partial(sample, "ddim"), True),
-    (functools.partial(sample, "ddim_literal"), False),
-    (functools.partial(sample, "ddim_vp"), True),
+    (functools.partial(samplers.sample, "ddim"), True),
+    (functools.partial(samplers.sample, "ddim_literal"), False),
+    (functools.partial(samplers.sample, "ddim_vp"), True),
     (lambda *given: _sample_in_preserving_state(*given, forget=False), True),
     (lambda *given: _sample_in_preserving_state(*given, forget=True), False),
 )

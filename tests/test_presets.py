@@ -14,12 +14,12 @@ from builders import CHANNELS, network_of, packed_from, same_tree, tiny_config, 
 from flax import nnx
 
 from f3amd_lib.data.windows import build_windows, fit_normaliser
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine, VariancePreservingLinear
 from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
 
-COMMITTED_TABLE = Path(__file__).parent / "zoo_table.csv"
+COMMITTED_TABLE = Path(__file__).parent / "presets_table.csv"
 SIZE = {"channels": CHANNELS, "num_styles": 2}
 
 
@@ -29,36 +29,36 @@ def test_every_row_of_every_table_has_a_preset(number):
     # A row without numbers was trained and found wanting; it needs no 64-frame preset of ours.
     printed = table.dropna(subset=["value"])
     for name, window in {(row.model, row.window_frames) for row in printed.itertuples()}:
-        preset = zoo.find_preset(name)
+        preset = presets.find_preset(name)
         assert window in preset.windows, (name, window)
         assert preset.source != "ours"
-    assert {zoo.find_preset(name).name for name in table["model"]} <= set(zoo.PRESETS)
+    assert {presets.find_preset(name).name for name in table["model"]} <= set(presets.PRESETS)
 
 
 def test_table_is_the_committed_one():
     """A change of sizes or operations must be meant: then write the table anew.
 
-    zoo.table(channels=141, num_styles=100).to_csv("tests/zoo_table.csv", index=False)
+    presets.table(channels=141, num_styles=100).to_csv("tests/presets_table.csv", index=False)
     """
-    table = zoo.table(channels=141, num_styles=100)
+    table = presets.table(channels=141, num_styles=100)
     committed = pd.read_csv(COMMITTED_TABLE)
     pd.testing.assert_frame_equal(table, committed, check_dtype=False)
-    assert len(zoo.PRESETS) >= 30 and set(table["model"]) == set(zoo.PRESETS)
+    assert len(presets.PRESETS) >= 30 and set(table["model"]) == set(presets.PRESETS)
 
 
 @pytest.mark.parametrize(
     ("width", "parameters"), [(32, 745505), (48, 1361889), (64, 1806113), (96, 3501921), (128, 4334241)]
 )
 def test_section_4_5_parameter_counts(width, parameters):
-    config = zoo.build_config(f"F3AMD-FNO-{width}", channels=135, num_styles=100)
-    assert zoo.count_parameters(config) == parameters
+    config = presets.build_config(f"F3AMD-FNO-{width}", channels=135, num_styles=100)
+    assert presets.count_parameters(config) == parameters
 
 
 @pytest.mark.parametrize(("width", "depth"), [(32, 8), (48, 8), (64, 6), (96, 6), (128, 4)])
 @pytest.mark.parametrize("kind", ["FNO", "Transformer"])
 def test_section_4_5_depths_modes_and_appendix_a_heads(kind, width, depth):
     for window, modes in ((32, 17), (64, 33)):
-        config = zoo.build_config(f"F3AMD-{kind}-{width}", **SIZE, window=window)
+        config = presets.build_config(f"F3AMD-{kind}-{width}", **SIZE, window=window)
         assert (config.latent_width, config.depth, config.num_kept_modes) == (width, depth, modes)
         assert (config.num_history, config.window, config.kernel_size) == (10, window, 3)
         assert config.base_block == kind.lower() and config.encoder_decoder == "fno"
@@ -86,8 +86,8 @@ def test_section_4_5_depths_modes_and_appendix_a_heads(kind, width, depth):
     ],
 )
 def test_an_ablation_differs_from_the_baseline_in_this_alone(name, differs):
-    baseline = zoo.build_config("F3AMD-FNO-96", **SIZE).to_dict()
-    variant = zoo.build_config(name, **SIZE).to_dict()
+    baseline = presets.build_config("F3AMD-FNO-96", **SIZE).to_dict()
+    variant = presets.build_config(name, **SIZE).to_dict()
     assert {key: variant[key] for key in variant if variant[key] != baseline[key]} == differs
     assert (variant["spectral_rank"], variant["initial_mode_gain"]) == (8, 0.7)
 
@@ -104,52 +104,109 @@ def test_presets_say_how_they_are_trained():
     assert paper_recipe("CAMDM-code", 10).history_dropout == 0.15
     assert paper_recipe("F3AMD-Transformer-64-plus", 10).loss.ird_form == "excess"
     for levels in (4, 2, 1):
-        config = zoo.build_config(f"CAMDM-K{levels}", **SIZE)
+        config = presets.build_config(f"CAMDM-K{levels}", **SIZE)
         diffusion = paper_recipe(f"CAMDM-K{levels}", 10).diffusion
         assert config.noise_levels == tuple(diffusion.sigmas) and len(diffusion.sigmas) == levels
     for name in ("CAMDM", "CAMDM-VE"):
-        told = bool(zoo.build_config(name, **SIZE).noise_levels)
+        told = bool(presets.build_config(name, **SIZE).noise_levels)
         assert told == (name == "CAMDM")
 
 
 def test_any_f3amd_of_the_paper_also_has_the_forms_of_ours():
-    raw = zoo.build_config("F3AMD-Transformer-64-raw", **SIZE)
+    raw = presets.build_config("F3AMD-Transformer-64-raw", **SIZE)
     assert not raw.input_scaling and not raw.normalise and raw.base_block == "transformer"
-    plus = zoo.build_config("F3AMD-FNO-32-plus", **SIZE)
+    plus = presets.build_config("F3AMD-FNO-32-plus", **SIZE)
     assert plus.residual_prior and plus.history_anchor and plus.block_residual
-    assert zoo.find_preset("F3AMD-FNO-32-plus").source == "ours"
-    steady = zoo.find_preset("F3AMD-FNO-64-steady")
+    assert presets.find_preset("F3AMD-FNO-32-plus").source == "ours"
+    steady = presets.find_preset("F3AMD-FNO-64-steady")
     assert steady.source == "ours"
-    config = zoo.build_config(steady.name, **SIZE)
+    config = presets.build_config(steady.name, **SIZE)
     assert config.facing_frame and config.history_input and config.residual_prior
     assert config.num_kept_modes == (config.window + config.num_history) // 2 + 1
     for wrong in ("CAMDM-plus", "F3AMD-FNO-96-raw-plus", "F3AMD-FNO-96-plus-steady"):
         with pytest.raises(ValueError, match="only the paper's F3AMD"):
-            zoo.find_preset(wrong)
+            presets.find_preset(wrong)
+
+
+def test_every_preset_says_whose_paper_it_is_from():
+    folder = Path(presets.__file__).parents[1] / "papers"
+    assert {preset.paper for preset in presets.PRESETS.values()} == {
+        path.parent.name for path in folder.glob("*/presets.toml")
+    }
+    form = presets.find_preset("F3AMD-FNO-32-plus")
+    assert (form.paper, form.paper_names, form.windows) == ("f3amd", (), (32,))
+
+
+ANOTHER_PAPER = """
+[forms."-slow"]
+source = "ours"
+family = "F3AMD"
+training = { learning_rate = 1e-5 }
+
+[presets.Wide]
+source = "Table 1"
+family = "F3AMD"
+network = { latent_width = 200, num_heads = 2 }
+diffusion = { kind = "variance_preserving_linear", num_levels = 100 }
+training = { noise = "mixed", loss = { ird = 0.0, foot = 2.0 } }
+paper_names = ["W"]
+windows = [32, 64]
+
+[presets.Narrow]
+source = "Table 2"
+like = ["Wide", "-slow"]
+network = { latent_width = 8 }
+training = { loss = { foot = 3.0 } }
+"""
+
+
+def test_another_paper_brings_a_file_of_its_own(tmp_path):
+    path = tmp_path / "another" / "presets.toml"
+    path.parent.mkdir()
+    path.write_text(ANOTHER_PAPER)
+    found, forms = presets.read_presets(path)
+    assert list(found) == ["Wide", "Narrow"] and list(forms) == ["-slow"]
+    wide, narrow = found.values()
+    assert wide.paper == narrow.paper == "another"
+    assert wide.diffusion == narrow.diffusion == VariancePreservingLinear(100)
+    # What a row does not say is that of the rows it is like, but for its names and windows.
+    assert narrow.network == {"latent_width": 8, "num_heads": 2}
+    assert narrow.training == {"noise": "mixed", "loss": {"ird": 0.0, "foot": 3.0}, "learning_rate": 1e-5}
+    assert (wide.paper_names, wide.windows) == (("W",), (32, 64))
+    assert (narrow.paper_names, narrow.windows) == ((), (32,))
+    assert wide.training["loss"] == {"ird": 0.0, "foot": 2.0}
+
+
+@pytest.mark.parametrize("wrong", ["netwrok = {}", 'like = ["Wdie"]', 'diffusion = { kind = "none" }'])
+def test_a_preset_that_makes_no_sense_is_refused(tmp_path, wrong):
+    path = tmp_path / "presets.toml"
+    path.write_text(ANOTHER_PAPER + f'[presets.Wrong]\nsource = "ours"\nfamily = "F3AMD"\n{wrong}\n')
+    with pytest.raises((TypeError, KeyError, ValueError)):
+        presets.read_presets(path)
 
 
 def test_unknown_names_are_refused_with_the_nearest():
     with pytest.raises(ValueError, match="'F3AMD-FNO-69'; did you mean 'F3AMD-FNO-96'"):
-        zoo.build_config("F3AMD-FNO-69", **SIZE)
+        presets.build_config("F3AMD-FNO-69", **SIZE)
     with pytest.raises(ValueError, match="'F3AMD-FNO-69-plus'"):
-        zoo.build_config("F3AMD-FNO-69-plus", **SIZE)
+        presets.build_config("F3AMD-FNO-69-plus", **SIZE)
     with pytest.raises(ValueError, match="'latent_with'; did you mean 'latent_width'"):
-        zoo.build_config("F3AMD-FNO-96", **SIZE, latent_with=8)
+        presets.build_config("F3AMD-FNO-96", **SIZE, latent_with=8)
     with pytest.raises(ValueError, match="'num_kept_modes'"):
-        zoo.build_config("CAMDM", **SIZE, num_kept_modes=8)
+        presets.build_config("CAMDM", **SIZE, num_kept_modes=8)
 
 
 def test_configs_of_every_family_survive_json():
-    for name in zoo.PRESETS:
-        config = zoo.build_config(name, **SIZE)
-        assert zoo.config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    values = zoo.build_config("CAMDM", **SIZE).to_dict()
+    for name in presets.PRESETS:
+        config = presets.build_config(name, **SIZE)
+        assert presets.config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    values = presets.build_config("CAMDM", **SIZE).to_dict()
     with pytest.raises(ValueError, match="unknown model family 'CAMD'; did you mean 'CAMDM'"):
-        zoo.config_from_dict({**values, "family": "CAMD"})
+        presets.config_from_dict({**values, "family": "CAMD"})
     with pytest.raises(ValueError, match="'dept'; did you mean 'depth'"):
-        zoo.config_from_dict({**values, "dept": 2})
+        presets.config_from_dict({**values, "dept": 2})
     with pytest.raises(ValueError, match="unknown model family None"):
-        zoo.config_from_dict({})
+        presets.config_from_dict({})
     with pytest.raises(ValueError, match="'CAMDM' do not make a F3AMD"):
         type(tiny_config()).from_dict(values)
 
@@ -157,15 +214,16 @@ def test_configs_of_every_family_survive_json():
 def test_counted_parameters_are_those_of_the_built_network():
     config = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
     built = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network_of(config))))
-    assert zoo.count_parameters(config) == built
+    assert presets.count_parameters(config) == built
     # The anchor and the prior each add one number per frame and channel.
-    plain = zoo.count_parameters(tiny_config(block_residual=True))
+    plain = presets.count_parameters(tiny_config(block_residual=True))
     assert built - plain == 2 * config.window * CHANNELS
 
 
 def test_counted_operations_of_a_linear_coder_by_hand():
     linear, spectral = (
-        zoo.count_flops(zoo.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind)) for kind in ("linear", "fno")
+        presets.count_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
+        for kind in ("linear", "fno")
     )
     width, frames, modes = 96, 32, 17
     dense = 2 * 2 * frames * CHANNELS * width
@@ -178,9 +236,11 @@ def test_counted_operations_of_a_linear_coder_by_hand():
     assert spectral[1] - linear[1] == blocks - dense
 
 
-def test_zoo_builds_the_same_network_from_the_same_key():
+def test_the_same_key_builds_the_same_network():
     settings = {**SIZE, "latent_width": 8, "depth": 1, "window": 8, "num_kept_modes": 2}
-    first, again, other = (nnx.state(zoo.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2))
+    first, again, other = (
+        nnx.state(presets.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2)
+    )
     assert same_tree(first, again) and not same_tree(first, other)
 
 
@@ -206,12 +266,12 @@ def two_training_steps(config, recipe_json: str):
     return changes, history[-1]
 
 
-@pytest.mark.parametrize("name", zoo.PRESETS)
+@pytest.mark.parametrize("name", presets.PRESETS)
 def test_every_preset_answers_and_takes_a_training_step(name):
     # Compiling is what takes time here, and depth, width, how many heads (if not one) and how many
     # modes there are (if not one) change nothing in kind: presets that differ in size alone share
     # a run. At full size all are traced for the table above.
-    config = zoo.build_config(name, **SIZE, depth=1, latent_width=16)
+    config = presets.build_config(name, **SIZE, depth=1, latent_width=16)
     if getattr(config, "num_heads", 1) > 1:
         config = dataclasses.replace(config, num_heads=2)
     if getattr(config, "num_kept_modes", 1) > 1:

@@ -10,10 +10,10 @@ import pytest
 from builders import HISTORY, WINDOW, packed_from, wandering_motion
 
 from f3amd_lib.__main__ import main
-from f3amd_lib.experiments import family, measure
+from f3amd_lib.experiments import learning_curves, measure
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.networks import zoo
+from f3amd_lib.networks import presets
 from f3amd_lib.training import checkpoints, pipeline
 from f3amd_lib.training.pipeline import PreparedData, profile_recipe
 
@@ -29,14 +29,14 @@ def prepared():
 @pytest.fixture
 def small(monkeypatch):
     """The measurement on networks of one narrow block."""
-    build = zoo.build_config
-    monkeypatch.setattr(zoo, "build_config", lambda *a, **k: build(*a, **k, **{"depth": 1}))
-    monkeypatch.setattr(family, "SHORT_RUN", SHORT)
+    build = presets.build_config
+    monkeypatch.setattr(presets, "build_config", lambda *a, **k: build(*a, **k, **{"depth": 1}))
+    monkeypatch.setattr(learning_curves, "SHORT_RUN", SHORT)
     monkeypatch.setattr(measure, "SHORT_RUN", SHORT)
 
 
 def test_a_learning_curve_starts_before_the_first_step(prepared):
-    curve = family.learning_curve(prepared, "F3AMD-FNO-32", **SHORT)
+    curve = learning_curves.learning_curve(prepared, "F3AMD-FNO-32", **SHORT)
     assert list(curve["step"]) == [0, 1, 2, 3, 4]
     assert math.isnan(curve["loss"][0]) and curve["loss"][1:].notna().all()
     assert curve["held_out_loss"].notna().all()
@@ -49,7 +49,7 @@ def test_the_table_says_what_fell():
         return pd.DataFrame({"model": model, "step": [0, 1, 2], "loss": losses, "held_out_loss": held_out})
 
     nan = float("nan")
-    table = family.learning_table(
+    table = learning_curves.learning_table(
         pd.concat(
             [
                 curve("learns", [nan, 2.0, 1.0], [3.0, 2.0, 1.0]),
@@ -72,16 +72,16 @@ def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeyp
     assert path == tmp_path / "synthetic" / "smoke" / "records" / "learning.csv"
     kept, record = read_table(path)
     assert record["measurement"] == "learning" and record["num_steps"] == 4
-    two = {name: zoo.find_preset(name) for name in (first, second)}
-    monkeypatch.setattr(zoo, "PRESETS", two)
+    two = {name: presets.find_preset(name) for name in (first, second)}
+    monkeypatch.setattr(presets, "PRESETS", two)
     asked = []
-    curves = family.learning_curve
+    curves = learning_curves.learning_curve
 
     def spy(data, preset, **settings):
         asked.append(preset)
         return curves(data, preset, **settings)
 
-    monkeypatch.setattr(family, "learning_curve", spy)
+    monkeypatch.setattr(learning_curves, "learning_curve", spy)
     measure.measure_learning(prepared, profile)
     assert asked == [second]
     both, _ = read_table(path)
@@ -111,7 +111,7 @@ def test_unknown_names_end_with_status_2(capsys):
 
 def leg(prepared, profile, folder, presets=("F3AMD-FNO-32",), **settings):
     return list(
-        family.train_family(
+        learning_curves.train_family(
             prepared, profile, presets, folder=folder, progress=False, **settings
         )
     )  # fmt: skip
@@ -125,9 +125,9 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
     # Time runs out in the first chunk of the first model, which leaves a state to go on from.
     readings = itertools.chain([0.0, 0.5], itertools.repeat(2.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(family.time, "monotonic", lambda: next(readings))
+        patch.setattr(learning_curves.time, "monotonic", lambda: next(readings))
         assert leg(prepared, profile, tmp_path, budget_s=1.0) == [("F3AMD-FNO-32", "unfinished")]
-    files = family.model_files(profile, "F3AMD-FNO-32", folder=tmp_path)
+    files = learning_curves.model_files(profile, "F3AMD-FNO-32", folder=tmp_path)
     assert files.state.exists() and not files.model.exists()
     done = int(checkpoints.load_tree(files.state, state_of(prepared, profile))[0].step)
     assert 0 < done < 4
@@ -164,7 +164,7 @@ def test_an_unknown_preset_stops_before_anything_is_trained(prepared, tmp_path):
 
 def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch, caplog):
     def legs(*states):
-        monkeypatch.setattr(family, "train_family", lambda *a, **k: iter(states))
+        monkeypatch.setattr(learning_curves, "train_family", lambda *a, **k: iter(states))
         return main(["train", "--preset", "F3AMD-FNO-32"])
 
     caplog.set_level("INFO")

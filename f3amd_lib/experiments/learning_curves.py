@@ -78,7 +78,7 @@ def learning_curve(
 
     Args:
       prepared: the data.
-      preset: see `zoo.find_preset`.
+      preset: see `presets.find_preset`.
       seed: of weights and batches.
       progress: show a bar of the steps.
       **settings: fields of `TrainingConfig` in place of `SHORT_RUN`'s.
