@@ -210,15 +210,14 @@ def _crowd(arguments) -> None:
 
 def _crowd_pictures(crowd, still: Path, page: Path) -> None:
     """Draw a crowd half way through, and write a page that plays up to 100 of it."""
-    from f3amd_lib.drawing import plots_crowd as draw
+    from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
     from f3amd_lib.drawing.style import save_figure
     from f3amd_lib.serving.player import Character, Scene, write_player
 
     few, model = min(100, len(crowd)), crowd.settings["model"]
     motions = [crowd.motion(k) for k in range(few)]
-    colors = draw.crowd_colors([motion.name for motion in motions])
-    picture = draw.CrowdPicture(motions, colors, model["name"])
-    figure = draw.crowd_figure([picture], crowd.num_frames // 2, columns=1)
+    colors = crowd_colors([motion.name for motion in motions])
+    figure = crowd_figure({model["name"]: (motions, colors)}, crowd.num_frames // 2)
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
     credit = ", ".join(filter(None, (model["dataset_credit"], model["dataset_licence"])))
     scene = Scene(characters, title=model["name"])
