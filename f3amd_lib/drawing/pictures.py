@@ -148,8 +148,7 @@ def film_strip(
         last = motion.num_frames - 1
         chosen = np.linspace(0, last, count).round().astype(int) if frames is None else np.asarray(frames)
         if chosen.min() < 0 or chosen.max() > last:
-            asked = f"asked for {chosen.min()} to {chosen.max()}"
-            raise ValueError(f"motion {motion.name!r} has frames 0 to {last}; {asked}")
+            raise ValueError(f"{motion.name!r} has frames 0 to {last}; asked for {chosen.min()} to {chosen.max()}")
         _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
