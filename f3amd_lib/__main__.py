@@ -319,18 +319,17 @@ def crowd(
 
 def _crowd_pictures(crowd, still: Path, page: Path) -> None:
     """Draw a crowd half way through, and write a page that plays up to 100 of it."""
-    from f3amd_lib.drawing import plots_crowd as draw
+    from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
     from f3amd_lib.drawing.style import save_figure
     from f3amd_lib.serving.player import Character, Scene, write_player
 
     made_by = crowd.settings["model"]
     motions = [crowd.motion(k) for k in range(min(100, len(crowd)))]
-    colors = draw.crowd_colors([motion.name for motion in motions])
-    picture = draw.CrowdPicture(motions, colors, made_by["name"])
+    colors = crowd_colors([motion.name for motion in motions])
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
     credit = ", ".join(filter(None, (made_by["dataset_credit"], made_by["dataset_licence"])))
     write_player(page, Scene(characters, title=made_by["name"]), strip=False, credit=credit)
-    save_figure(draw.crowd_figure([picture], crowd.num_frames // 2, columns=1), still)
+    save_figure(crowd_figure({made_by["name"]: (motions, colors)}, crowd.num_frames // 2), still)
 
 
 def export(model: Model, characters: int = 1, target: Repeatable = (), out: Path = Path("out/round")) -> None:

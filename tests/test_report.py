@@ -339,15 +339,16 @@ def test_titles_and_labels_of_fixed_aspect_are_not_cut_off(tmp_path):
 
 def test_camera_stands_at_the_right_side():
     """Facing +Z and seen from the right: forward is right on the page, the left hand is far."""
-    right, up, towards = pictures._view(0.0, np.pi / 2, 0.0)
+    view = lambda yaw, elevation=0.0: stick_figures.Camera(yaw, elevation).view
+    right, up, towards = view(-np.pi / 2)
     np.testing.assert_allclose(right, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(towards, [-1, 0, 0], atol=1e-12)
     # From the front, the character's left (+X) is on the viewer's right.
-    np.testing.assert_allclose(pictures._view(0.0, 0.0, 0.0)[0], [1, 0, 0], atol=1e-12)
-    for view in (pictures._view(0.7, 0.4, 0.3), pictures._view(-2.0, 1.0, 0.1)):
-        np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(view) == pytest.approx(1.0)
+    np.testing.assert_allclose(view(0.0)[0], [1, 0, 0], atol=1e-12)
+    for turned in (view(0.3, 0.3), view(-3.0, 0.1)):
+        np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turned) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

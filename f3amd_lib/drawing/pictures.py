@@ -1,17 +1,22 @@
-"""Motion as pictures: film strips for the page, small GIFs for the eye.
+"""Motion as pictures: film strips, rows of poses, crowds for the page; GIFs for the eye.
 
-Both draw stick figures in the same colours (`stick_figures`), with a green dot under a toe that is
-in contact. Of a skeleton whose toes are not known no contacts are shown; one whose hips are not
-known is taken to face +Z, and no facing is drawn.
+All draw the stick figures of `stick_figures`, with a green dot under a toe that is in contact. Of a
+skeleton whose toes are not known no contacts are shown; one whose hips are not known is taken to
+face +Z, and no facing is drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.drawing.stick_figures import (
@@ -19,80 +24,99 @@ from f3amd_lib.drawing.stick_figures import (
     LIMB_COLORS,
     TARGET_COLOR,
     TRAIL_COLOR,
-    bones_of,
+    Camera,
+    body_lines,
     drawn_points,
-    head_center,
     path_on_ground,
 )
-from f3amd_lib.drawing.style import new_figure, plot_style, save_figure
+from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style, save_figure
 from f3amd_lib.motion.skeleton import Motion
 
-_GROUND = "#B8B8B8"
+# ------------------------------------------------------------------------------------ one body
+
+_THIN = {"left": 0.05, "right": 0.05, "middle": 0.05, "head": 0.18}  # metres
+_STOUT = {"left": 0.095, "right": 0.095, "middle": 0.147, "head": 0.22}  # as thick as people
+_COLORS = LIMB_COLORS | {"head": LIMB_COLORS["middle"]}
 
 
-def _view(facing: float, around: float, elevation: float) -> np.ndarray:
-    """Rows right, up and towards the viewer of a camera that stands around a facing direction.
+def _draw_body(
+    axis, skeleton, points, camera: Camera, scale: float, *, left=0.0, touching=(), thick=_THIN, colors=_COLORS, rim=0.0
+) -> None:
+    """Draw a body and its shadow as a camera sees them, far lines first.
 
     Args:
-      facing: yaw that the character faces, radians.
-      around: from straight ahead of it (0) to its right side (pi/2).
-      elevation: how far above the horizon the camera stands.
+      points: [J + tips, 3], metres, a frame of `drawn_points`.
+      scale: of thickness, in 1/72 inch a metre.
+      left: metres to the right on the page.
+      touching: joints that get the dot of a contact.
+      thick, colors: of left and right limbs, trunk and head.
+      rim: of white around every line, in 1/72 inch.
     """
-    yaw = facing - around  # a positive yaw turns left, the camera stands to the right
-    towards = np.array([np.sin(yaw) * np.cos(elevation), np.sin(elevation), np.cos(yaw) * np.cos(elevation)])
-    right = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
-    return np.stack([right, np.cross(towards, right), towards])
+    shift = np.array([left, 0.0])
+    shadow = camera.project(_on_ground(_CIRCLE + points[0, [0, 2]]))
+    axis.fill(*(shadow[:, :2] + shift).T, color="#DFDFDF", linewidth=0, zorder=1)
+    lines, sides = body_lines(skeleton, points)
+    seen = camera.project(lines)
+    towards = seen[:, :, 2].mean(axis=1)
+    order = np.argsort(towards)
+    nearer = np.maximum(1.0 - towards / camera.distance, 0.05)
+    widths = np.array([scale * thick[side] for side in sides]) / nearer
+    ends, look = seen[order, :, :2] + shift, {"capstyle": "round", "zorder": 5, "snap": False}
+    if rim:
+        axis.add_collection(LineCollection(ends, colors="white", linewidths=widths[order] + rim, **look))
+    line_colors = [colors[sides[k]] for k in order]
+    axis.add_collection(LineCollection(ends, colors=line_colors, linewidths=widths[order], **look))
+    if len(touching):
+        dots = camera.project(points[touching])[:, :2] + shift
+        look = {"markersize": 0.09 * scale, "markeredgecolor": "white", "markeredgewidth": 0.01 * scale}
+        axis.plot(*dots.T, "o", color=CONTACT_COLOR, zorder=9, **look)
 
 
-def _as_list(motions) -> list[Motion]:
-    motions = [motions] if isinstance(motions, Motion) else list(motions)
-    if not motions or not all(isinstance(motion, Motion) for motion in motions):
-        raise ValueError("a picture needs a Motion, or a list of at least one")
-    return motions
+_TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+_CIRCLE = 0.27 * np.stack([np.sin(_TURN), np.cos(_TURN)], axis=-1)
 
 
-def _per_motion(value, count: int, what: str) -> list:
-    """One value a motion: repeat a single one, check a list's length."""
-    if value is None or isinstance(value, str) or not isinstance(value, (list, tuple)):
-        return [value] * count
-    if len(value) != count:
-        raise ValueError(f"{len(value)} {what} for {count} motions")
-    return list(value)
+def _on_ground(xz: np.ndarray) -> np.ndarray:
+    return np.stack([xz[..., 0], np.zeros(xz.shape[:-1]), xz[..., 1]], axis=-1)
 
 
 def _facing(motion: Motion) -> np.ndarray | None:
     """Yaw per frame, [T], or None where the skeleton's hips are not known."""
     try:
-        motion.skeleton.role("left_hip"), motion.skeleton.role("right_hip")
+        return motion.yaw
     except ValueError:
         return None
-    return motion.yaw
 
 
-def _toes(motion: Motion) -> tuple[int, ...]:
-    """The left and the right toe joint, or none where they are not known."""
+def _toes_down(motion: Motion, frames) -> list | None:
+    """Toes in contact at each frame that is asked for, or None where toes are not known."""
     try:
-        return motion.skeleton.toes
+        toes = np.array(motion.skeleton.toes)
     except ValueError:
-        return ()
+        return None
+    return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]]
 
 
-def _touching(motion: Motion, frames) -> list[list[int]]:
-    """Toes in contact at each frame that is asked for."""
-    toes = _toes(motion)
-    if not toes:
-        return [[] for _ in frames]
-    return [[toes[foot] for foot in np.flatnonzero(row)] for row in motion.contacts[frames]]
+def _beside_each_other(motions, paths, titles) -> list[tuple]:
+    """(motion, path or None, title) of each; one path or title stands for all."""
+    motions = [motions] if isinstance(motions, Motion) else list(motions)
+    if not motions or not all(isinstance(motion, Motion) for motion in motions):
+        raise ValueError("a picture needs a Motion, or a list of at least one")
+    columns = []
+    for what, value in (("paths", paths), ("titles", titles)):
+        columns.append(list(value) if isinstance(value, (list, tuple)) else [value] * len(motions))
+        if len(columns[-1]) != len(motions):
+            raise ValueError(f"{len(value)} {what} for {len(motions)} motions")
+    named = [motion.name if title is None else title for motion, title in zip(motions, columns[1], strict=True)]
+    return list(zip(motions, columns[0], named, strict=True))
 
 
+# --------------------------------------------------------------------------- film strips and poses
+
+
+@plot_style()
 def film_strip(
-    motions,
-    *,
-    paths=None,
-    titles=None,
-    num_poses: int = 8,
-    frames: Sequence[int] | None = None,
-    around_deg: float = 60.0,
+    motions, *, paths=None, titles=None, num_poses: int = 8, frames: Sequence[int] | None = None, around_deg=60.0
 ):
     """Draw poses side by side and the root's path from above, one row a motion.
 
@@ -109,42 +133,33 @@ def film_strip(
       around_deg: 0 looks at the character from the front, 90 from its right side.
 
     Returns:
-      A matplotlib Figure; `figures.save_figure` writes it, `figures.show_figure` shows it.
+      A matplotlib Figure; `style.save_figure` writes it, `style.show_figure` shows it.
 
     Raises:
       ValueError: for no motion, fewer than one pose, or frames that a motion does not have.
     """
-    motions = _as_list(motions)
-    paths = _per_motion(paths, len(motions), "paths")
-    titles = _per_motion(titles, len(motions), "titles")
-    if frames is None and (int(num_poses) != num_poses or num_poses < 1):
-        raise ValueError(f"num_poses must be 1 or more, got {num_poses}")
-    count = len(frames) if frames is not None else int(num_poses)
+    rows = _beside_each_other(motions, paths, titles)
+    count = num_poses if frames is None else len(frames)
     if count < 1:
-        raise ValueError("frames must name at least one frame")
-
-    slot = 1.15  # metres of page a pose
-    figure, axes = new_figure(
-        0.96 * count + 2.9, 2.45 * len(motions), len(motions), 2, squeeze=False, width_ratios=[0.96 * count, 2.9]
-    )
-    with plot_style():
-        contacts = any(_toes(motion) for motion in motions)
-        for row, motion in enumerate(motions):
-            if frames is None:
-                chosen = np.linspace(0, motion.num_frames - 1, count).round().astype(int)
-            else:
-                chosen = np.asarray(frames, dtype=int)
-                if chosen.min() < 0 or chosen.max() >= motion.num_frames:
-                    raise ValueError(
-                        f"motion {motion.name!r} has frames 0 to {motion.num_frames - 1}; asked "
-                        f"for {chosen.min()} to {chosen.max()}"
-                    )
-            title = titles[row] if titles[row] is not None else motion.name
-            _draw_poses(axes[row, 0], motion, chosen, np.deg2rad(around_deg), slot)
-            if row == 0:
-                _name_colors(axes[row, 0], contacts)
-            axes[row, 0].set_title(title or " ")
-            _draw_plan(axes[row, 1], motion, chosen, paths[row], row == 0)
+        raise ValueError("a film strip needs num_poses of 1 or more, or at least one of frames")
+    widths = [0.96 * count, 2.9]
+    figure, axes = new_figure(sum(widths), 2.45 * len(rows), len(rows), 2, squeeze=False, width_ratios=widths)
+    for (poses, plan), (motion, path, title) in zip(axes, rows, strict=True):
+        last = motion.num_frames - 1
+        chosen = np.linspace(0, last, count).round().astype(int) if frames is None else np.asarray(frames)
+        if chosen.min() < 0 or chosen.max() > last:
+            raise ValueError(f"{motion.name!r} has frames 0 to {last}; asked for {chosen.min()} to {chosen.max()}")
+        _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
+        poses.set_title(title or " ")
+        _draw_plan(plan, motion, chosen, path)
+    keys = [axes[0, 0].plot([], [], color=LIMB_COLORS[s], linewidth=3, label=s)[0] for s in ("left", "right")]
+    if any(_toes_down(motion, [0]) is not None for motion, *_ in rows):
+        keys += axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
+    small = {"fontsize": 8, "handlelength": 1.2, "columnspacing": 1.2, "borderaxespad": 0.2}
+    axes[0, 0].legend(handles=keys, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, **small)
+    axes[0, 1].set_title("from above", fontsize=9, fontweight="normal")
+    if rows[0][1] is not None:
+        axes[0, 1].legend(fontsize=7, loc="best", handlelength=1.6)
     return figure
 
 
@@ -164,152 +179,193 @@ def write_film_strip(path, motions, **options) -> Path:
     return save_figure(film_strip(motions, **options), path)
 
 
-def _draw_poses(axis, motion: Motion, chosen, around: float, slot: float) -> None:
+def _draw_poses(axis, motion: Motion, chosen, around: float) -> None:
+    slot = 1.15  # metres of page a pose
     points = drawn_points(motion, chosen)
-    heads = head_center(motion.skeleton, points)
-    yaw = _facing(motion)
+    yaw, touching = _facing(motion), _toes_down(motion, chosen)
     facing = np.zeros(len(chosen))
     if yaw is not None:
         facing = gaussian_filter1d(np.unwrap(yaw), 0.3 * motion.fps, mode="nearest")[chosen]
-    touching = _touching(motion, chosen)
-    bones = bones_of(motion.skeleton)
-    axis.axhline(0.0, color=_GROUND, linewidth=1.0, zorder=0)
-    top = 1.7
-    for place in range(len(chosen)):
-        view = _view(facing[place], around, np.deg2rad(6.0))
-        base = points[place, 0] * np.array([1.0, 0.0, 1.0])
-        seen = (points[place] - base) @ view.T
-        top = max(top, seen[:, 1].max() + 0.05)
-        left = place * slot
-        shadow = np.linspace(0, 2 * np.pi, 40)
-        axis.fill(left + 0.26 * np.cos(shadow), 0.03 * np.sin(shadow), color="#E9E9E9", zorder=1)
-        for parent, child, side in sorted(bones, key=lambda bone: seen[list(bone[:2]), 2].mean()):
-            ends = seen[[parent, child]]
-            depth = ends[:, 2].mean()
-            axis.plot(
-                left + ends[:, 0],
-                ends[:, 1],
-                color=LIMB_COLORS[side],
-                linewidth=3.0,
-                solid_capstyle="round",
-                zorder=5 + depth,
-            )
-        if heads is not None:
-            center = (heads[place] - base) @ view.T
-            axis.plot(
-                left + center[0], center[1], "o", color=LIMB_COLORS["middle"], markersize=10, zorder=5 + center[2]
-            )
-            top = max(top, center[1] + 0.15)
-        for toe in touching[place]:
-            axis.plot(
-                left + seen[toe, 0],
-                seen[toe, 1],
-                "o",
-                color=CONTACT_COLOR,
-                markersize=5,
-                markeredgecolor="white",
-                markeredgewidth=0.6,
-                zorder=9,
-            )
-        seconds = chosen[place] / motion.fps
-        axis.text(left, -0.14, f"{place + 1}", ha="center", va="top", fontsize=8, fontweight="bold")
-        axis.text(left, -0.32, f"{seconds:.1f} s", ha="center", va="top", fontsize=8, color="#666666")
+    axis.axhline(0.0, color="#B8B8B8", linewidth=1.0, zorder=0)
+    for place, frame in enumerate(chosen):
+        camera = Camera(facing[place] - around, np.deg2rad(6.0), points[place, 0] * [1.0, 0.0, 1.0])
+        toes = touching[place] if touching else ()
+        _draw_body(axis, motion.skeleton, points[place], camera, 60.0, left=place * slot, touching=toes)
+        center = {"ha": "center", "va": "top", "fontsize": 8}
+        axis.text(place * slot, -0.14, f"{place + 1}", fontweight="bold", **center)
+        axis.text(place * slot, -0.32, f"{frame / motion.fps:.1f} s", color="#666666", **center)
     axis.set_xlim(-0.55 * slot, (len(chosen) - 0.45) * slot)
-    axis.set_ylim(-0.5, top)
+    axis.set_ylim(-0.5, max(1.7, points[..., 1].max() + 0.2))
     axis.set_aspect("equal", adjustable="box", anchor="W")
     axis.axis("off")
 
 
-def _name_colors(axis, contacts: bool) -> None:
-    """Put a legend over the poses, with the dot of a contact if any skeleton has some."""
-    keys = [
-        axis.plot([], [], color=LIMB_COLORS["left"], linewidth=3, label="left")[0],
-        axis.plot([], [], color=LIMB_COLORS["right"], linewidth=3, label="right")[0],
-    ]
-    if contacts:
-        keys += axis.plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
-    axis.legend(
-        handles=keys,
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=3,
-        borderaxespad=0.2,
-        handlelength=1.2,
-        columnspacing=1.2,
-        fontsize=8,
-    )
-
-
-def _draw_plan(axis, motion: Motion, chosen, path, legend: bool) -> None:
+def _draw_plan(axis, motion: Motion, chosen, path) -> None:
     root = np.asarray(motion.root_position, dtype=np.float64)[:, [0, 2]]
-    everything = [root]
+    target = root if path is None else path_on_ground(path)
     if path is not None:
-        target = path_on_ground(path)
-        everything.append(target)
         axis.plot(*target.T, color=TARGET_COLOR, linestyle="--", linewidth=1.6, label="target", zorder=3)
     axis.plot(*root.T, color=TRAIL_COLOR, linewidth=1.6, label="walked")
-    extent = np.ptp(np.concatenate(everything), axis=0).max()
+    everything = np.concatenate([root, target])
+    extent = np.ptp(everything, axis=0).max()
     reach = 0.09 * max(extent, 1.0)
     yaw = _facing(motion)
-    facing = np.zeros(len(chosen)) if yaw is None else yaw[chosen]
-    arrow = np.stack([np.sin(facing), np.cos(facing)], axis=-1)
-    for place, frame in enumerate(chosen):
-        start, end = root[frame], root[frame] + reach * arrow[place]
+    for place, frame in enumerate(chosen, start=1):
+        angle = 0.0 if yaw is None else yaw[frame]
+        ahead, beside = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
         if yaw is not None:
-            axis.plot(*np.stack([start, end]).T, color="#1A1A1A", linewidth=1.4)
-        axis.plot(*start, "o", color="#1A1A1A", markersize=3.5)
-        beside = start - 0.8 * reach * np.array([arrow[place, 1], -arrow[place, 0]])
-        axis.text(*beside, f"{place + 1}", fontsize=7, ha="center", va="center")
+            axis.plot(*np.stack([root[frame], root[frame] + reach * ahead]).T, color="#1A1A1A", linewidth=1.4)
+        axis.plot(*root[frame], "o", color="#1A1A1A", markersize=3.5)
+        axis.text(*(root[frame] - 0.8 * reach * beside), f"{place}", fontsize=7, ha="center", va="center")
     # A square window with some air, never narrower than 2 m: a standing figure is no path.
-    low, high = np.concatenate(everything).min(axis=0), np.concatenate(everything).max(axis=0)
-    half = 0.5 * max(1.25 * extent, 2.0)
-    middle = 0.5 * (low + high)
-    # Seen from above with +Z up the page, +X points to the left: a left turn looks like one.
-    axis.set_xlim(middle[0] + half, middle[0] - half)
-    axis.set_ylim(middle[1] - half, middle[1] + half)
-    axis.set_aspect("equal", adjustable="box")
+    frame_from_above(axis, everything, half=0.5 * max(1.25 * extent, 2.0))
     axis.locator_params(nbins=4)
     axis.set_xlabel("x (m)", fontsize=8, labelpad=1)
     axis.set_ylabel("z (m)", fontsize=8, labelpad=1)
     axis.tick_params(labelsize=7)
-    if legend:
-        axis.set_title("from above", fontsize=9, fontweight="normal")
-    if path is not None and legend:
-        axis.legend(fontsize=7, loc="best", handlelength=1.6)
 
 
-class _Camera:
-    """A perspective camera that keeps one direction and follows a point on the ground."""
+def frame_from_above(axis, points: np.ndarray, half: float) -> None:
+    """Show a square around points [N, 2], with +Z up the page and +X to the left: a left turn looks like one.
 
-    def __init__(self, facing: float, around: float, elevation: float, size: tuple[int, int]):
-        self.view = _view(facing, around, elevation)
-        self.width, self.height = size
-        self.distance = 4.6
-        # 2.3 m around the character fill the shorter side.
-        self.focal = min(size[1] / 2.35, size[0] / 1.9) * self.distance
-        self.target = np.zeros(3)
+    Args:
+      half: half the side of the square, metres.
+    """
+    x, z = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    axis.set(xlim=(x + half, x - half), ylim=(z - half, z + half))
+    axis.set_aspect("equal", adjustable="box")
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Map [..., 3] metres to [..., 3]: pixel column, pixel row, depth from the eye."""
-        seen = (points - self.target) @ self.view.T
-        depth = self.distance - seen[..., 2]
-        scale = self.focal / np.maximum(depth, 0.1)
-        column = self.width / 2 + scale * seen[..., 0]
-        row = self.height / 2 - scale * seen[..., 1]
-        return np.stack([column, row, depth], axis=-1)
+
+@plot_style()
+def poses_beside(motions: Mapping[str, Motion | None], frames: Sequence[int], *, width: float = 7.2):
+    """Draw the same frames of several motions, a panel each, poses side by side.
+
+    Every pose is seen from the character's own front right, wherever it goes.
+
+    Args:
+      motions: title -> motion, or None where a panel is to stay empty.
+      frames: which, in this order.
+      width: of the figure, inches.
+    """
+    rows, across = -(-len(motions) // 2), 0.95 * len(frames)
+    # As high as its panels are at equal scale, and a line for the title.
+    height = 0.4 + (width / 2 - 0.15) * 1.93 / across
+    figure, axes = new_figure(width, height * rows, rows, 2, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
+        if motion is None:
+            continue
+        for place, points in enumerate(drawn_points(motion, np.asarray(frames))):
+            camera = Camera(motion.yaw[frames[place]] - np.pi / 3, 0.0, points[0] * [1.0, 0.0, 1.0])
+            _draw_body(axis, motion.skeleton, points, camera, 40.0, left=0.95 * place)
+        axis.axhline(0.0, color=PALETTE["grey"], linewidth=0.8, zorder=0)
+        axis.set(xlim=(-0.5, across - 0.4), ylim=(-0.08, 1.85), aspect="equal")
+        axis.set_title(title, color=model_style(title).color)
+    return figure
+
+
+# ------------------------------------------------------------------------------------------ crowds
+
+
+def crowd_colors(labels: Sequence[str]) -> list[str]:
+    """Give each label (a style) a colour: the project's six, then lighter and darker ones.
+
+    Args:
+      labels: of each character.
+
+    Returns:
+      A colour each, as "#rrggbb", dealt in the order in which labels first occur.
+    """
+    base = np.array([to_rgb(PALETTE[c]) for c in ("purple", "orange", "green", "vermilion", "blue", "sky")])
+    turns = [base, base + 0.3 * (1 - base), 0.7 * base, base + 0.42 * (1 - base), 0.5 * base]
+    dealt = dict(zip(dict.fromkeys(labels), itertools.cycle(np.concatenate(turns)), strict=False))
+    return [to_hex(dealt[label]) for label in labels]
+
+
+@plot_style()
+def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, width: float = 9.0, aspect: float = 2.0):
+    """Draw crowds in perspective, a panel each, all seen from where the first one fills its panel.
+
+    Bodies have the thickness of a person's, far ones come first and paler. Nearer limbs cover those
+    behind them by an outline in white, which keeps bodies apart in grey print too.
+
+    Args:
+      crowds: title (a second line stands smaller below it) -> (motions, a colour for each).
+      frame: of the motions.
+      columns: panels in a row.
+      width: of the figure, inches.
+      aspect: width over height of a panel.
+
+    Returns:
+      A matplotlib Figure.
+    """
+    columns = min(columns, len(crowds))
+    rows, panel = -(-len(crowds) // columns), width / columns
+    height = rows * (panel / aspect + (0.42 if any(crowds) else 0.0))
+    figure, axes = new_figure(width, height, rows, columns, squeeze=False)
+    roots = np.array([motion.root_position[frame, [0, 2]] for motion in next(iter(crowds.values()))[0]], float)
+    x, z = middle = np.median(roots, axis=0)
+    reach = np.quantile(np.linalg.norm(roots - middle, axis=-1), 0.9)
+    camera = Camera(np.deg2rad(25.0), np.deg2rad(20.0), (x, 0.9, z), max(6.0, 1.7 * reach + 3.0))
+    # The sides leave out the outermost tenth; nobody near the lower edge is cut off at the legs.
+    feet = camera.project(_on_ground(roots))
+    feet = feet[camera.distance - feet[:, 2] > 1.5]
+    half = max(np.quantile(np.abs(feet[:, 0]), 0.9), 0.1 * camera.distance) + 0.8
+    low = feet[np.abs(feet[:, 0]) < half, 1].min() - 0.5
+    scale = 72.0 * 0.97 * panel / (2.0 * half)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (title, (motions, colors)) in zip(axes.flat, crowds.items(), strict=False):
+        axis.set(xlim=(-half, half), ylim=(low, low + 2.0 * half / aspect), aspect="equal")
+        _draw_crowd(axis, motions, colors, frame, camera, scale)
+        heading, _, note = title.partition("\n")
+        if heading:
+            axis.set_title(heading, pad=16 if note else 6)
+        axis.text(0.0, 1.015, note, transform=axis.transAxes, fontsize=9, color="#444444")
+    return figure
+
+
+def _draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) -> None:
+    bodies = [drawn_points(motion, np.array([frame]))[0] for motion in motions]
+    depths = camera.distance - camera.project([points[0] for points in bodies])[:, 2]
+    seen = [k for k in np.argsort(-depths) if depths[k] > 1.5]
+    far, near = depths[seen[0]], depths[seen[-1]]
+    axis.add_collection(_ground_lines(camera, 2.0, 8.0 * camera.distance, "#E6E6E6"))
+    for k in seen:
+        motion, color = motions[k], np.array(to_rgb(colors[k]))
+        paler = 0.4 * (depths[k] - near) / max(far - near, 1e-6)
+        tints = {"left": color + 0.22 * (1 - color), "right": 0.82 * color, "middle": color, "head": color}
+        tints = {side: tint + paler * (1 - tint) for side, tint in tints.items()}
+        # The last second and a half of the way.
+        walked = motion.root_position[max(0, frame - round(1.5 * motion.fps)) : frame + 1, [0, 2]]
+        walked = gaussian_filter1d(np.asarray(walked, float), 0.15 * motion.fps, axis=0, mode="nearest")
+        trail = camera.project(_on_ground(walked))[:, :2]
+        axis.plot(*trail.T, color=tints["middle"], alpha=0.55, linewidth=1.1, zorder=2)
+        _draw_body(axis, motion.skeleton, bodies[k], camera, scale, thick=_STOUT, colors=tints, rim=1.2)
+
+
+def _ground_lines(camera: Camera, step: float, radius: float, color: str) -> LineCollection:
+    """Lines on the ground a step apart, inside a circle around the camera's target and before the eye."""
+    lines = []
+    for across, along in ((0, 2), (2, 0)):
+        middle = camera.target[across]
+        for value in np.arange(step * np.ceil((middle - radius) / step), middle + radius, step):
+            half = np.sqrt(max(radius**2 - (value - middle) ** 2, 0.0))
+            line = np.zeros((200, 3))
+            line[:, across], line[:, along] = value, camera.target[along] + np.linspace(-half, half, 200)
+            seen = camera.project(line)
+            lines.append(seen[camera.distance - seen[:, 2] > 1.0, :2])
+    return LineCollection(lines, colors=color, linewidths=0.7, zorder=0.5)
+
+
+# ---------------------------------------------------------------------------------- moving pictures
 
 
 def write_gif(
-    path,
-    motions,
-    *,
-    target_paths=None,
-    titles=None,
-    every: int = 3,
-    size: tuple[int, int] = (256, 256),
-    around_deg: float = 50.0,
-    max_seconds: float | None = None,
-) -> Path:
+    path, motions, *, target_paths=None, titles=None, every: int = 3, size: tuple[int, int] = (256, 256),
+    around_deg: float = 50.0, max_seconds: float | None = None,
+) -> Path:  # fmt: skip
     """Write a small looping GIF of one motion, or of several in panels side by side.
 
     The camera keeps its direction and follows each character over a 1 m grid, so the grid shows
@@ -335,140 +391,70 @@ def write_gif(
     path = Path(path)
     if path.suffix != ".gif":
         raise ValueError(f"{path}: moving pictures are written as .gif")
-    motions = _as_list(motions)
+    rows = _beside_each_other(motions, target_paths, titles)
+    motions = [motion for motion, *_ in rows]
     rates = {motion.fps for motion in motions}
     if len(rates) > 1:
         raise ValueError(f"motions of one picture need one frame rate, got {sorted(rates)}")
     fps = rates.pop()
-    if int(every) != every or every < 1:
-        raise ValueError(f"every must be a whole number, 1 or more, got {every}")
     if fps / every > 30.0 + 1e-6:
-        raise ValueError(
-            f"{fps / every:g} frames a second are too many for a GIF (30 at most); "
-            f"raise every to {int(np.ceil(fps / 30.0))}"
-        )
+        least = int(np.ceil(fps / 30.0))
+        raise ValueError(f"{fps / every:g} frames a second are too many for a GIF (30 at most); raise every to {least}")
     last = max(motion.num_frames for motion in motions)
     if max_seconds is not None:
         last = min(last, max(1, round(max_seconds * fps)))
-    frames = np.arange(0, last, int(every))
-    targets = _per_motion(target_paths, len(motions), "target paths")
-    titles = _per_motion(titles, len(motions), "titles")
-
-    panels = []
-    for motion, target, title in zip(motions, targets, titles, strict=True):
-        text = title if title is not None else motion.name
-        panels.append(_draw_panel(motion, frames, target, text, size, np.deg2rad(around_deg)))
-    pictures = []
-    for images in zip(*panels, strict=True):
-        whole = Image.new("RGB", (size[0] * len(images), size[1]), "white")
-        for place, image in enumerate(images):
-            whole.paste(image, (place * size[0], 0))
-            if place:
-                edge = (place * size[0], 0, place * size[0], size[1])
-                ImageDraw.Draw(whole).line(edge, fill="#B8B8B8")
-        pictures.append(whole)
-
-    # One palette for all frames, or unchanged areas would flicker and cost bytes.
-    sample = Image.new("RGB", (pictures[0].width, pictures[0].height * 2))
-    sample.paste(pictures[0], (0, 0))
-    sample.paste(pictures[len(pictures) // 2], (0, pictures[0].height))
-    palette = sample.quantize(colors=32, method=Image.Quantize.MAXCOVERAGE)
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    frames = np.arange(0, last, every)
+    figure = Figure(figsize=(size[0] * len(rows) / 100, size[1] / 100), dpi=100)
+    canvas, pictures = FigureCanvasAgg(figure), []
+    bare = {"left": 0.0, "right": 1.0, "bottom": 0.0, "top": 1.0, "wspace": 0.0}
+    axes = figure.subplots(1, len(rows), squeeze=False, gridspec_kw=bare)[0]
+    draws = [_gif_panel(axis, *row, frames, size, np.deg2rad(around_deg)) for axis, row in zip(axes, rows, strict=True)]
+    for place in range(len(frames)):
+        for draw in draws:
+            draw(place)
+        canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # GIF counts in hundredths of a second: round the times, not the gaps, to stay in real time.
     ticks = np.round(np.arange(len(frames) + 1) * every / fps * 100).astype(int)
     durations = (np.diff(ticks) * 10).tolist()
     durations[-1] += 600  # a pause before it starts again
+    # One palette for all, of the first frame and one in the middle: unchanged areas do not flicker.
+    sample = np.concatenate([np.asarray(pictures[0]), np.asarray(pictures[len(pictures) // 2])])
+    palette = Image.fromarray(sample).quantize(32, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False)
     return path
 
 
-def _draw_panel(motion: Motion, frames, target, title: str, size, around: float) -> list:
-    """Draw one character at the given frames (held at its last), one image a frame."""
-    scale = 2  # draw twice as large, then shrink: smooth edges
+def _gif_panel(axis, motion: Motion, target, title: str, frames, size, around: float):
+    """Prepare a panel of a GIF; return what draws it at a place in `frames`, held at the motion's last."""
     frames = np.minimum(frames, motion.num_frames - 1)
-    points = drawn_points(motion, frames)
-    heads = head_center(motion.skeleton, points)
-    touching = _touching(motion, frames)
-    bones = bones_of(motion.skeleton)
+    points, touching, yaw = drawn_points(motion, frames), _toes_down(motion, frames), _facing(motion)
     root = np.asarray(motion.root_position, dtype=np.float64)
     follow = gaussian_filter1d(root, 0.25 * motion.fps, axis=0, mode="nearest")[frames]
-    yaw = _facing(motion)
-    first = 0.0 if yaw is None else yaw[0]
-    camera = _Camera(first, around, np.deg2rad(14.0), (size[0] * scale, size[1] * scale))
-    ground_target = None if target is None else _on_ground(path_on_ground(target))
-    trail = _on_ground(root[:, [0, 2]])
-    font = ImageFont.load_default(size=12 * scale)
-    images = []
-    for place, frame in enumerate(frames):
-        image = Image.new("RGB", (size[0] * scale, size[1] * scale), "white")
-        draw = ImageDraw.Draw(image)
-        camera.target = np.array([follow[place, 0], 0.88, follow[place, 2]])
-        _draw_grid(draw, camera, scale)
-        if ground_target is not None:
-            _draw_line(draw, camera, ground_target, TARGET_COLOR, 3 * scale)
-        _draw_line(draw, camera, trail[: frame + 1], TRAIL_COLOR, 2 * scale)
-        _draw_figure(
-            draw, camera, points[place], None if heads is None else heads[place], bones, touching[place], scale
-        )
-        draw.text((8 * scale, 6 * scale), title, fill="#1A1A1A", font=font)
-        clock = f"{frame / motion.fps:.1f} s"
-        draw.text(((size[0] - 8) * scale, (size[1] - 6) * scale), clock, fill="#666666", font=font, anchor="rs")
-        images.append(image.resize(size, Image.Resampling.BOX))
-    return images
+    walked, target = root[:, [0, 2]], None if target is None else path_on_ground(target)
+    pixels = min(size[1] / 2.35, size[0] / 1.9)  # a metre: 2.3 m around the character fill the shorter side
+    width, height = 0.5 * np.array(size) / pixels
+    axis.set(xlim=(-width, width), ylim=(-height, height), xticks=[], yticks=[])
+    axis.spines[:].set_color("#B8B8B8")
 
+    def draw(place: int) -> None:
+        x, _, z = follow[place]
+        camera = Camera((0.0 if yaw is None else yaw[0]) - around, np.deg2rad(14.0), (x, 0.88, z), distance=4.6)
+        for old in [*axis.lines, *axis.collections, *axis.patches, *axis.texts]:
+            old.remove()
+        axis.add_collection(_ground_lines(camera, 1.0, 3.0, "#D9D9D9"))
+        way = walked[: frames[place] + 1]
+        for line, color, thick in ((target, TARGET_COLOR, 2.2), (way, TRAIL_COLOR, 1.5)):
+            if line is not None:
+                near = np.linalg.norm(line - [x, z], axis=-1, keepdims=True) < 3.0
+                seen = np.where(near, camera.project(_on_ground(line))[:, :2], np.nan)
+                axis.plot(*seen.T, color=color, linewidth=thick, zorder=2)
+        toes = touching[place] if touching else ()
+        _draw_body(axis, motion.skeleton, points[place], camera, 0.72 * pixels, touching=toes)
+        corner = {"transform": axis.transAxes, "fontsize": 8.5}
+        axis.text(0.03, 0.97, title, va="top", color="#1A1A1A", **corner)
+        axis.text(0.97, 0.03, f"{frames[place] / motion.fps:.1f} s", ha="right", color="#666666", **corner)
 
-def _on_ground(xz: np.ndarray) -> np.ndarray:
-    return np.stack([xz[:, 0], np.zeros(len(xz)), xz[:, 1]], axis=-1)
-
-
-def _draw_grid(draw, camera: _Camera, scale: int, radius: float = 3.0) -> None:
-    """Draw grid lines a metre apart inside a circle around the character."""
-    center = camera.target[[0, 2]]
-    for axis in (0, 1):
-        for value in np.arange(np.ceil(center[axis] - radius), center[axis] + radius):
-            half = np.sqrt(max(radius**2 - (value - center[axis]) ** 2, 0.0))
-            ends = np.zeros((2, 3))
-            ends[:, 2 * axis] = value
-            ends[:, 2 - 2 * axis] = center[1 - axis] + np.array([-half, half])
-            seen = camera.project(ends)
-            draw.line([tuple(point) for point in seen[:, :2]], fill="#D9D9D9", width=scale)
-
-
-def _draw_line(draw, camera: _Camera, ground: np.ndarray, color: str, width: int) -> None:
-    """Draw the part of a ground line near the character."""
-    near = np.linalg.norm((ground - camera.target)[:, [0, 2]], axis=-1) < 3.0
-    seen = camera.project(ground)
-    for run in np.split(np.arange(len(ground)), np.flatnonzero(np.diff(near)) + 1):
-        if len(run) > 1 and near[run[0]]:
-            draw.line([tuple(p) for p in seen[run, :2]], fill=color, width=width, joint="curve")
-
-
-def _draw_figure(draw, camera: _Camera, points, head, bones, touching, scale: int) -> None:
-    base = points[0] * np.array([1.0, 0.0, 1.0])
-    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    rim = base + 0.24 * np.stack([np.cos(around), 0 * around, np.sin(around)], axis=-1)
-    draw.polygon([tuple(p) for p in camera.project(rim)[:, :2]], fill="#E2E2E2")
-    seen = camera.project(points)
-    pixel = camera.focal / camera.distance  # pixels a metre at the character
-    width = max(2, round(0.05 * pixel))
-    items = [(seen[[parent, child], 2].mean(), "bone", (parent, child, side)) for parent, child, side in bones]
-    if head is not None:
-        items.append((camera.project(head)[2], "head", None))
-    for _, kind, what in sorted(items, key=lambda item: -item[0]):  # far things first
-        if kind == "head":
-            column, row, _ = camera.project(head)
-            _disc(draw, column, row, 0.10 * pixel, LIMB_COLORS["middle"])
-        else:
-            parent, child, side = what
-            color = LIMB_COLORS[side]
-            draw.line([tuple(seen[parent, :2]), tuple(seen[child, :2])], fill=color, width=width)
-            for joint in (parent, child):
-                _disc(draw, *seen[joint, :2], (width - 1) / 2, color)
-    for toe in touching:
-        _disc(draw, *seen[toe, :2], 0.055 * pixel, "white")
-        _disc(draw, *seen[toe, :2], 0.04 * pixel, CONTACT_COLOR)
-
-
-def _disc(draw, column: float, row: float, radius: float, color: str) -> None:
-    draw.ellipse([column - radius, row - radius, column + radius, row + radius], fill=color)
+    return draw

@@ -1,10 +1,13 @@
-"""Stick figures: which lines and colours a skeleton is drawn with, wherever it is drawn.
+"""Stick figures: one camera, and the lines and colours of a skeleton, wherever it is drawn.
 
 Left limbs are light orange, right limbs dark blue, the trunk dark grey (they differ in lightness,
 so they survive grey print); a toe in contact gets green.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +19,40 @@ LIMB_COLORS = {"left": "#EF9A26", "right": "#1B4F8F", "middle": "#3A3A3A"}
 CONTACT_COLOR = "#0B9E64"
 TARGET_COLOR = "#C2649A"
 TRAIL_COLOR = "#6F6F6F"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Looks at a target from a side.
+
+    Attributes:
+      yaw: where it stands, radians: 0 on the side of +Z, pi/2 on that of +X.
+      elevation: above the horizon, radians.
+      target: the point it looks at, metres.
+      distance: from there, metres; infinity makes all rays parallel.
+    """
+
+    yaw: float = 0.0
+    elevation: float = 0.0
+    target: Sequence[float] = (0.0, 0.0, 0.0)
+    distance: float = np.inf
+
+    @property
+    def view(self) -> np.ndarray:
+        """Rows right, up and towards the viewer, [3, 3]."""
+        level, height = np.cos(self.elevation), np.sin(self.elevation)
+        towards = np.array([np.sin(self.yaw) * level, height, np.cos(self.yaw) * level])
+        right = np.array([np.cos(self.yaw), 0.0, -np.sin(self.yaw)])
+        return np.stack([right, np.cross(towards, right), towards])
+
+    def project(self, points) -> np.ndarray:
+        """Map metres [..., 3] to right, up and towards the viewer, [..., 3].
+
+        The first two shrink with the distance; at the target's they are metres.
+        """
+        seen = (np.asarray(points, np.float64) - self.target) @ self.view.T
+        shrink = np.maximum(1.0 - seen[..., 2:] / self.distance, 1e-6)
+        return np.concatenate([seen[..., :2] / shrink, seen[..., 2:]], axis=-1)
 
 
 def limb_side(name: str) -> str:
@@ -69,6 +106,23 @@ def head_center(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
     along = head - neck
     length = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
     return head + 0.07 * along / length
+
+
+def body_lines(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Lines of a body in one frame; the head is one of a millimetre, which a round cap makes a disc.
+
+    Args:
+      points: [J + tips, 3], a frame of `drawn_points`.
+
+    Returns:
+      (ends [N, 2, 3], and for each line "left", "right", "middle" or "head").
+    """
+    bones = bones_of(skeleton)
+    lines, sides = [points[[parent, child]] for parent, child, _ in bones], [side for *_, side in bones]
+    head = head_center(skeleton, points[None])
+    if head is not None:
+        lines, sides = [*lines, head + [[0.0, 0.0, 0.0], [0.0, 0.001, 0.0]]], [*sides, "head"]
+    return np.array(lines), sides
 
 
 def path_on_ground(path) -> np.ndarray:

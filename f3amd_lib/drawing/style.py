@@ -1,19 +1,21 @@
-"""One look for all figures: style sheet, colours by model name, saving.
+"""How every figure looks: style sheet, colours by model name, saving.
 
 Colours keep apart for colour-blind readers and, by lightness and marker, in grey print too.
 """
 
 from __future__ import annotations
 
-import contextlib
 import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
+import matplotlib.style
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 DPI = 150
 
@@ -29,34 +31,7 @@ PALETTE = {
 }
 """Colours from dark to light; neighbours in this order differ in lightness as well as in hue."""
 
-STYLE = {
-    "figure.dpi": 100,
-    "figure.facecolor": "white",
-    "figure.constrained_layout.use": True,
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same text on every machine
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.prop_cycle": matplotlib.cycler(
-        color=[PALETTE[c] for c in ("purple", "orange", "green", "vermilion", "blue", "sky")]
-    ),
-    "grid.color": "#E3E3E3",
-    "grid.linewidth": 0.7,
-    "lines.linewidth": 1.8,
-    "lines.markersize": 5.5,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "savefig.dpi": DPI,
-}
-"""matplotlib settings of every figure; use them through `plot_style`."""
+STYLE_SHEET = Path(__file__).with_name("project.mplstyle")
 
 
 @dataclass(frozen=True)
@@ -79,6 +54,8 @@ _TRANSFORMER_SHADES = {32: "#FBD29A", 48: "#F8BE6D", 64: "#F1A340", 96: "#D3831C
 # Our own recipes stand beside the paper's models and are never to be taken for one of them.
 _OUR_COLORS = {"-plus": PALETTE["vermilion"], "-steady": PALETTE["blue"]}
 _WIDTH_MARKERS = {32: "v", 48: "^", 64: "s", 96: "o", 128: "D"}
+# Motion broken on purpose (`measures.corruptions`); no network is drawn in these colours.
+_BROKEN_COLORS = {"frozen pose": "#4FA3CC", "shuffled frames": "#8C6D46", "noisy motion": "#C2649A"}
 
 
 def model_style(name: str) -> ModelStyle:
@@ -86,8 +63,8 @@ def model_style(name: str) -> ModelStyle:
 
     Args:
       name: a preset's name ("F3AMD-FNO-96", "CAMDM", ...), "real" for real motion, "paper" for
-        a printed number; suffixes such as "(FiLM)" keep the family's colour, our own recipes
-        ("-plus", "-steady") have one of their own.
+        a printed number, or a kind of broken motion; suffixes such as "(FiLM)" keep the family's
+        colour, our own recipes ("-plus", "-steady") have one of their own.
 
     Returns:
       The style. A name of no known family is drawn in grey.
@@ -99,6 +76,8 @@ def model_style(name: str) -> ModelStyle:
         return ModelStyle(PALETTE["black"], "", "--")
     if lowered.startswith("paper"):
         return ModelStyle(PALETTE["grey"], "x", ":")
+    if lowered in _BROKEN_COLORS:
+        return ModelStyle(_BROKEN_COLORS[lowered], ".", "-")
     if lowered.startswith("camdm"):
         line = ":" if "pytorch" in lowered else "--" if "code" in lowered or number else "-"
         return ModelStyle(PALETTE["green"], "P", line)
@@ -125,20 +104,23 @@ def system_line(label: str) -> dict:
     return line
 
 
+def shades(count: int) -> list[tuple]:
+    """Return dark to light shades of one colour, for curves in an order."""
+    return [matplotlib.colormaps["viridis"](value) for value in np.linspace(0.05, 0.85, count)]
+
+
 def use_style() -> None:
     """Use the project's style sheet from here on: for a notebook's first cell.
 
     matplotlib looks titles, legends and labels up when they are made, so the style must be in
     force then, and not only when the figure is started. Library code uses `plot_style` instead.
     """
-    matplotlib.rcParams.update(STYLE)
+    matplotlib.style.use(STYLE_SHEET)
 
 
-@contextlib.contextmanager
 def plot_style():
-    """Use the project's style sheet inside a `with` block, and the user's own outside."""
-    with matplotlib.rc_context(STYLE):
-        yield
+    """Use the project's style sheet inside a `with` block, or a function that this decorates."""
+    return matplotlib.style.context(STYLE_SHEET)
 
 
 def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: int = 1, **grid):
@@ -183,11 +165,37 @@ def save_figure(figure: Figure, path, *, dpi: int = DPI) -> Path:
     return path
 
 
-def show_figure(figure: Figure, *, dpi: int = 100):
-    """Return the figure as an image that Jupyter shows when it is a cell's last value."""
-    from IPython.display import Image
+def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
+    """Return the figure as an image that Jupyter shows when it is a cell's last value.
 
-    return Image(data=_png(figure, dpi))
+    Args:
+      figure: what to show.
+      dpi: dots an inch.
+      colors: keep this many; a third of the bytes, of which a notebook has few.
+    """
+    from IPython.display import Image as Shown
+
+    if colors is None:
+        return Shown(data=_png(figure, dpi))
+    whole, small = Image.open(io.BytesIO(_png(figure, dpi))).convert("RGB"), io.BytesIO()
+    few = whole.quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(small, "png", optimize=True)
+    return Shown(data=small.getvalue())
+
+
+def keep_figure(figure: Figure, results, name: str):
+    """Save a figure as `<results>/figures/<name>.png` and return a light copy for the notebook.
+
+    Args:
+      figure: any.
+      results: from `profiles.results_dir`.
+      name: without folder and ending.
+
+    Returns:
+      An image for a cell's last line: smaller, in 64 colours.
+    """
+    save_figure(figure, Path(results) / "figures" / f"{name}.png")
+    return show_figure(figure, dpi=76, colors=64)
 
 
 def _png(figure: Figure, dpi: int) -> bytes:

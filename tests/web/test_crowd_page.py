@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import DESKTOP, PHONE
 
-from f3amd_lib.drawing.plots_crowd import crowd_colors
+from f3amd_lib.drawing.pictures import crowd_colors
 from f3amd_lib.generation.crowd import plan_crowd
 from f3amd_lib.motion.skeleton import turn
 from f3amd_lib.motion.synthetic import synthesize

@@ -1,0 +1,52 @@
+"""Committed tables, for notebooks that draw what they do not measure themselves."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.ground.records import read_table
+
+
+def committed_table(dataset: str, name: str, *, profile: str = "laptop") -> tuple[pd.DataFrame, dict] | None:
+    """Read a table that `make measure` left under `paper_figures/`.
+
+    Args:
+      dataset: a name of `profiles.DATASETS`.
+      name: of the table, without ending.
+      profile: whose results.
+
+    Returns:
+      (table, record), or None if nothing is committed for this data set.
+
+    Raises:
+      ValueError: if the table is not the one that its record describes.
+    """
+    path = repository_root() / "paper_figures" / dataset / profile / "records" / f"{name}.csv"
+    return read_table(path) if path.exists() else None
+
+
+def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
+    """Read the committed table of a data set, else that of Bandai, and say where it comes from.
+
+    Args:
+      dataset: a name of `profiles.DATASETS`.
+      name: of the table, without ending.
+      measurement: of `measure.MEASUREMENTS`, which writes it.
+
+    Returns:
+      (table or None, a sentence: data, profile, machine, date and credit, or how to measure it).
+      `table.attrs["dataset"]` names the data set that was measured.
+    """
+    found = committed_table(dataset, name) or committed_table("bandai", name)
+    if found is None:
+        how = f"`make measure MEASURE={measurement} DATA=bandai`"
+        return None, f"Not measured yet: `{name}`. {how} measures it."
+    table, record = found
+    table.attrs["dataset"] = record["dataset"]
+    sentence = (
+        f"Stored result `{name}`: data {record['dataset']}, profile {record['profile']}, "
+        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}. "
+        f"{record['dataset_credit'] or ''}"
+    )
+    return table, sentence.strip()

@@ -1,0 +1,127 @@
+"""Where the camera puts things, what covers what, and that colours tell rows apart."""
+
+import numpy as np
+import pytest
+from builders import straight_motion, wandering_motion
+from matplotlib.collections import LineCollection
+from matplotlib.colors import same_color
+
+from f3amd_lib.drawing.diagrams import arrow, boxes, influence_maps
+from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure, poses_beside
+from f3amd_lib.drawing.stick_figures import Camera, body_lines, drawn_points
+from f3amd_lib.drawing.style import model_style, new_figure
+from f3amd_lib.measures.corruptions import CORRUPTIONS
+from f3amd_lib.motion.synthetic import synthesize
+
+# --- the camera --------------------------------------------------------------------------------
+
+
+def test_the_camera_sees_its_target_in_the_middle():
+    camera = Camera(0.7, 0.5, target=(3.0, 0.9, -2.0), distance=10.0)
+    np.testing.assert_allclose(camera.project([3.0, 0.9, -2.0]), 0.0, atol=1e-12)
+
+
+def test_perspective_by_hand():
+    # From the side of +Z, level: right is +X, up is +Y, and size falls with the distance.
+    points = [[1.0, 1.0, 0.0], [1.0, 1.0, -10.0], [0.0, 0.0, 4.0]]
+    seen = Camera(distance=10.0).project(points)
+    np.testing.assert_allclose(seen, [[1.0, 1.0, 0.0], [0.5, 0.5, -10.0], [0.0, 0.0, 4.0]], atol=1e-12)
+    np.testing.assert_allclose(Camera().project(points), points, atol=1e-12)  # parallel rays: no size is lost
+
+
+def test_from_the_right_a_camera_sees_plus_z_to_the_left():
+    right, up, _ = Camera(np.pi / 2, 0.0).project([0.0, 0.0, 1.0])
+    assert right == pytest.approx(-1.0) and up == pytest.approx(0.0, abs=1e-12)
+
+
+def test_only_a_body_with_a_head_gets_one():
+    for motion, heads in ((synthesize("Neutral", seconds=1.0), 1), (wandering_motion(20), 0)):
+        lines, sides = body_lines(motion.skeleton, drawn_points(motion, np.array([5]))[0])
+        assert sides.count("head") == heads and len(lines) == len(sides)
+
+
+# --- poses -------------------------------------------------------------------------------------
+
+
+def bodies(axis) -> list[LineCollection]:
+    return [item for item in axis.collections if isinstance(item, LineCollection) and item.get_zorder() == 5]
+
+
+def test_poses_stand_in_a_row_and_a_panel_may_stay_empty():
+    motions = {"real": wandering_motion(20), "": None, "frozen pose": straight_motion(20)}
+    figure = poses_beside(motions, [0, 5, 10])
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["real", "", "frozen pose", ""]
+    assert [len(bodies(axis)) for axis in figure.axes] == [3, 0, 3, 0]
+    # The hips of the stiff figure stand where the poses stand.
+    middles = [np.concatenate(body.get_segments())[:, 0].mean() for body in bodies(figure.axes[2])]
+    np.testing.assert_allclose(np.diff(middles), 0.95, atol=1e-6)
+
+
+def test_broken_motion_has_colours_that_no_network_has():
+    networks = ("real", "F3AMD-FNO-96", "F3AMD-FNO-96-plus", "F3AMD-FNO-96-steady", "F3AMD-Transformer-64", "CAMDM")
+    for name in CORRUPTIONS:
+        assert not any(same_color(model_style(name).color, model_style(other).color) for other in (*networks, "?"))
+
+
+# --- crowds ------------------------------------------------------------------------------------
+
+
+def standing_at(x, z, seed=0, num_frames=20):
+    """A motion moved so that its root stands at (x, z) in frame 10."""
+    motion = wandering_motion(num_frames, seed=seed)
+    shift = np.array([x, 0.0, z]) - motion.root_position[10] * np.array([1.0, 0.0, 1.0])
+    return motion.replace(root_position=motion.root_position + shift)
+
+
+def test_equal_labels_have_equal_colours_and_others_differ():
+    colors = crowd_colors([f"style {k % 22}" for k in range(44)])
+    assert colors[:22] == colors[22:] and len(set(colors)) == 22
+
+
+def test_near_bodies_cover_far_ones_and_are_drawn_larger():
+    motions = [standing_at(2.0 * (k % 3), 2.5 * (k // 3), seed=k) for k in range(6)]
+    figure = crowd_figure({"Six\n1.0 ms a round": (motions, crowd_colors("abcabc"))}, 10)
+    outlines, fills = bodies(figure.axes[0])[::2], bodies(figure.axes[0])[1::2]
+    assert len(fills) == len(outlines) == 6  # drawn in this order: later ones cover earlier ones
+    widest = np.array([np.max(body.get_linewidths()) for body in fills])
+    assert widest[-1] > 1.2 * widest[0]
+    assert widest[-3:].min() > widest[:3].max()
+    for outline, fill in zip(outlines, fills, strict=True):
+        assert (np.array(outline.get_linewidths()) > np.array(fill.get_linewidths())).all()
+
+
+def test_crowds_have_titles_notes_and_empty_panels():
+    crowd = ([standing_at(0.0, 0.0), standing_at(2.0, 1.0, seed=1)], ["#542788", "#F1A340"])
+    figure = crowd_figure({"One\nnote": crowd, "Two\nnote": crowd, "Three": crowd}, 10)
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["One", "Two", "Three", ""]
+    texts = [text.get_text() for axis in figure.axes for text in axis.texts]
+    assert texts.count("note") == 2
+    assert not bodies(figure.axes[3])
+
+
+# --- diagrams ----------------------------------------------------------------------------------
+
+
+def test_arrows_run_from_edge_to_edge_of_boxes():
+    figure, axis = new_figure(4.0, 2.0)
+    axis.set(xlim=(0, 4), ylim=(0, 2))
+    first, second, third = boxes(axis, 0.5, [(0.5, "one", "white"), (2.0, "+", "dashed"), (3.5, "end", "none")])
+    arrow(axis, first, third, bend="arc3,rad=-0.3")
+    figure.draw_without_rendering()
+    drawn = [text.arrow_patch for text in axis.texts if getattr(text, "arrow_patch", None)]
+    assert len(drawn) == 3
+    edges = [text.get_bbox_patch() for text in (first, second)]
+    left, right = (edge.get_window_extent().transformed(axis.transData.inverted()) for edge in edges)
+    assert left.x1 < right.x0 and drawn[0].patchA is edges[0] and drawn[0].patchB is edges[1]
+    assert third.get_bbox_patch().get_edgecolor()[3] == 0
+
+
+def test_influence_maps_share_a_scale():
+    maps = {"weak": np.full((4, 4), 0.5), "strong": np.eye(4) * 3}
+    for highest, end in ((None, 3.0), (2.0, 2.0)):
+        figure = influence_maps(maps, "here", "there", highest=highest)
+        images = [axis.images[0] for axis in figure.axes[:2]]
+        assert [image.get_clim() for image in images] == [(0.0, end)] * 2
+        assert figure.axes[0].get_ylabel() == "there"
+        # An arrow on the colour bar where something lies beyond it.
+        assert figure.axes[-1]._colorbar.extend == ("max" if end < 3 else "neither")
