@@ -592,7 +592,7 @@ def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, 
         ({"styles": []}, "at least one style"),
         ({"paths": ["circle", "cirkle"]}, "unknown path 'cirkle'; did you mean 'circle'"),
         ({"paths": []}, "at least one path"),
-        ({"paths": lambda c, p, f, s: (np.zeros((1, f, 2)), np.zeros((1, f)))}, r"\(3, 5, 2\)"),
+        ({"paths": lambda c, p, f, s: (np.zeros((1, f, 2)), np.zeros((1, f)))}, r"\[3, 5, 2\]"),
         ({"paths": lambda c, p, f, s: (np.full((3, f, 2), np.nan), np.zeros((3, f)))}, "finite"),
     ],
 )
