@@ -15,7 +15,7 @@ from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingC
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.zoo import PRESETS
-from f3amd_lib.training.loop import TrainingConfig
+from f3amd_lib.training.recipe import TrainingConfig
 
 _CONFIGS = {
     config.__name__: config

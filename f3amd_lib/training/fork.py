@@ -34,7 +34,8 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig, scaled_input
 from f3amd_lib.networks.spectral import cosine_basis
 from f3amd_lib.networks.zoo import build_config, build_from_config
-from f3amd_lib.training.loop import TrainingConfig, draw_sigma, learning_rate_schedule, short_recipe
+from f3amd_lib.training.denoising_task import draw_sigma
+from f3amd_lib.training.recipe import TrainingConfig, learning_rate_schedule, short_recipe
 
 TOLD = ("nothing", "left", "right")
 """What the condition says of the side, by the number that stands for it."""
