@@ -23,7 +23,8 @@ from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import Trainer, TrainingConfig
+from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task
+from f3amd_lib.training.recipe import TrainingConfig
 
 WINDOW = 8
 HISTORY = 4
@@ -166,12 +167,11 @@ def tiny_normaliser():
     return jax.jit(fit)(tiny_windows(), jax.random.key(5))
 
 
-def tiny_trainer(model=None, *, windows=None, mesh=None, **settings) -> Trainer:
-    """A trainer of the tiny network on the tiny data set."""
-    windows = tiny_windows() if windows is None else windows
-    normaliser = tiny_normaliser()
+def tiny_task(model=None, *, windows=None, **settings) -> DenoisingTask:
+    """The tiny network to train on the tiny data set."""
     config = TrainingConfig.from_dict({"num_steps": 12, "batch_size": 8, **settings})
-    return Trainer(model or tiny_config(), config, SKELETON, normaliser, windows, mesh=mesh)
+    windows = tiny_windows() if windows is None else windows
+    return denoising_task(model or tiny_config(), config, SKELETON, tiny_normaliser(), windows)
 
 
 def random_frames(shape, seed: int = 0) -> np.ndarray:

@@ -9,23 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import SKELETON, packed_from, same_tree
+from flax import nnx
 
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.measures import classifier as module
 from f3amd_lib.measures.classifier import (
     ACCURACY_BAR,
-    CLASSIFIER_JOINTS,
-    NUM_CHANNELS,
     ClassifierConfig,
+    ClassifierTraining,
     StyleNetwork,
-    classifier_frames,
-    classifier_joints,
-    classifier_windows,
+    StyleTask,
     load_classifier,
     obtain_classifier,
     require_telling_styles,
     save_classifier,
     train_classifier,
+)
+from f3amd_lib.measures.classifier_windows import (
+    CLASSIFIER_JOINTS,
+    NUM_CHANNELS,
+    classifier_frames,
+    classifier_joints,
+    classifier_windows,
+    mirror_channels,
 )
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
@@ -171,7 +177,7 @@ def test_place_and_direction_of_each_frame_are_not_seen():
 
 def test_mirrored_channels_show_the_mirrored_motion():
     motion = walk(style="LimpLeft")
-    channel, sign = module._mirror_channels()
+    channel, sign = mirror_channels()
     shown = sign * classifier_frames(motion.positions, SYNTHETIC_SKELETON)[:, channel]
     mirrored = classifier_frames(mirror(motion).positions, SYNTHETIC_SKELETON)
     np.testing.assert_allclose(shown, mirrored, atol=1e-6)
@@ -260,7 +266,7 @@ def test_network_equals_its_layers_written_out(trained):
 @functools.partial(jax.jit, static_argnums=0)
 def train_forward(config: ClassifierConfig, windows, key):
     """Features, batch statistics after, and the first convolution, of one pass in training."""
-    params, statistics, _ = module._initial_state(jax.random.key(0), config, 80)
+    _, params, statistics = nnx.split(StyleNetwork(config, rngs=nnx.Rngs(jax.random.key(0))), nnx.Param, nnx.BatchStat)
     network = module._network(config, params, statistics)
     features, _ = network(windows, key)
     return features, network, network.blocks[0].convolution(windows)
@@ -382,14 +388,15 @@ def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
     frames = np.zeros((40, NUM_CHANNELS), np.float32)
     frames[:, 3] = 1.0  # x of the neck
     frames[30:, 0] = 1.0  # tells the second style
-    data = module._TrainingData(
+    task = StyleTask(
+        *("fingerprint", ("one", "other"), ClassifierConfig(2, window=10), ClassifierTraining(1, 2000, 0)),
         frames=jnp.asarray(frames),
         starts=jnp.asarray([0, 5, 10, 15, 30]),
         first=jnp.asarray([0, 4]),
         count=jnp.asarray([4, 1]),
         mirrored=jnp.asarray([True, False]),
     )
-    windows, style = module._draw(data, jax.random.key(0), 2000, 10)
+    (windows, style), _ = task.draw(None, jax.random.key(0))
     second = np.asarray(style) == 1
     assert second.mean() == pytest.approx(0.5, abs=0.05)
     np.testing.assert_array_equal(np.asarray(windows[:, 0, 0]) == 1.0, second)

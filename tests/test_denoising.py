@@ -13,7 +13,7 @@ from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.experiments import denoising
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 
 
 class Fake:

@@ -15,7 +15,9 @@ from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
 from f3amd_lib.training import checkpoints, pipeline
-from f3amd_lib.training.pipeline import PreparedData, profile_recipe
+from f3amd_lib.training.optimise import initial_state
+from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.recipe import profile_recipe
 
 SHORT = {"num_steps": 4, "batch_size": 2, "learning_rate": 1e-3}
 
@@ -151,8 +153,8 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
 
 def state_of(prepared, profile):
     """What `load_tree` asks for: the shapes of a training state."""
-    trainer = prepared.trainer("F3AMD-FNO-32", profile_recipe(profile, "F3AMD-FNO-32"))
-    return lambda metadata: jax.eval_shape(trainer.initial_state)
+    task = prepared.task("F3AMD-FNO-32", profile_recipe(profile, "F3AMD-FNO-32"))
+    return lambda metadata: jax.eval_shape(initial_state, task)
 
 
 def test_an_unknown_preset_stops_before_anything_is_trained(prepared, tmp_path):

@@ -20,7 +20,7 @@ from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
 
 FEW = {"num_windows": 3, "num_seeds": 2}

@@ -11,9 +11,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from builders import tiny_config, tiny_trainer, tiny_windows
+from builders import tiny_config, tiny_task, tiny_windows
 
 from f3amd_lib.training import parallel
+from f3amd_lib.training.optimise import initial_state, optimise
 
 STEPS = 6
 # Every remedy that draws random numbers or runs the network a second time.
@@ -34,13 +35,12 @@ import jax, numpy as np
 assert len(jax.devices()) == 2, jax.devices()
 import test_parallel as here
 mesh = parallel.all_devices()
-trainer = here.trainer(mesh)
-state, history = trainer.run(
-    checkpoint=here.Path({out!r}) / "state.safetensors", held_out=here.tiny_windows(), chunk=3,
-    progress=False,
+path, task = here.Path({out!r}) / "state.safetensors", here.task()
+state, history = here.optimise(
+    task, checkpoint=path, held_out=here.tiny_windows(), chunk=3, mesh=mesh, progress=False
 )
 parallel.wait_for_all("trained")
-again = trainer.restore(here.Path({out!r}) / "state.safetensors")
+again = here.restore_state(path, task, mesh)
 assert int(again.step) == here.STEPS
 # The first process decides, and a difference is seen by both.
 if number >= 0:
@@ -64,15 +64,15 @@ def weights_of(tree) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in kept]
 
 
-def trainer(mesh=None):
+def task():
     """The same small run wherever it takes place."""
-    return tiny_trainer(tiny_config(), mesh=mesh, **SETTINGS)
+    return tiny_task(tiny_config(), **SETTINGS)
 
 
 @pytest.fixture(scope="module")
 def alone():
     """Weights and held-out loss of one device."""
-    state, history = trainer().run(held_out=tiny_windows(), chunk=3, progress=False)
+    state, history = optimise(task(), held_out=tiny_windows(), chunk=3, progress=False)
     return weights_of(state.ema), history[-1]["held_out_loss"]
 
 
@@ -90,7 +90,7 @@ def assert_same(out: Path, printed: str, alone) -> None:
     weights, held_out = alone
     with np.load(out / "weights.npz") as file:
         found = [file[name] for name in file.files]
-    initial = weights_of(trainer().initial_state().ema)
+    initial = weights_of(initial_state(task()).ema)
     moved = max(float(np.abs(a - b).max()) for a, b in zip(weights, initial, strict=True))
     assert moved > 1e-3, "nothing was learnt, so that nothing is compared"
     assert len(found) == len(weights)
@@ -121,7 +121,7 @@ def test_two_processes_end_with_the_weights_of_one(tmp_path, alone):
 
 def test_a_mesh_of_one_device_changes_no_number(alone):
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), (parallel.AXIS,))
-    state, _ = trainer(mesh).run(chunk=3, progress=False)
+    state, _ = optimise(task(), chunk=3, mesh=mesh, progress=False)
     for ours, theirs in zip(alone[0], weights_of(state.ema), strict=True):
         np.testing.assert_allclose(theirs, ours, atol=1e-6)
 

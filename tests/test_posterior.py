@@ -26,7 +26,7 @@ from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
 
 SPAN = HISTORY + WINDOW

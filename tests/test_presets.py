@@ -17,7 +17,9 @@ from f3amd_lib.data.windows import build_windows, fit_normaliser
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine, VariancePreservingLinear
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
-from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
+from f3amd_lib.training.denoising_task import denoising_task
+from f3amd_lib.training.optimise import initial_state, optimise
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, short_recipe
 
 COMMITTED_TABLE = Path(__file__).parent / "presets_table.csv"
 SIZE = {"channels": CHANNELS, "num_styles": 2}
@@ -253,10 +255,10 @@ def two_training_steps(config, recipe_json: str):
     frames = {"window": 32, "num_history": 10}
     windows = build_windows(packed, "train", **frames)
     normaliser = fit_normaliser(windows, jax.random.key(0), **frames)
-    trainer = Trainer(config, recipe, packed.skeleton, normaliser, windows)
-    before = trainer.initial_state()
+    task = denoising_task(config, recipe, packed.skeleton, normaliser, windows)
+    before = initial_state(task)
     # The first step has a learning rate of 0.
-    after, history = trainer.run(before, chunk=2, progress=False)
+    after, history = optimise(task, before, chunk=2, progress=False)
     assert int(after.step) == 2
     leaves = jax.tree_util.tree_flatten_with_path(after.params)[0]
     changes = {

@@ -12,8 +12,8 @@ from f3amd_lib.experiments import measure, recipes
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
-from f3amd_lib.training.loop import paper_recipe
 from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.recipe import paper_recipe
 
 PROFILE = load_profile("smoke", "synthetic", batch_size=2, window=WINDOW)
 

@@ -1,6 +1,5 @@
-"""The training loop: what it learns, that it resumes exactly, and that it stops when it must."""
+"""How a denoiser is trained: the recipes, and the task of undoing noise."""
 
-import copy
 import dataclasses
 import json
 
@@ -8,35 +7,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, WINDOW, same_tree, tiny_config, tiny_trainer, tiny_windows
+from builders import CHANNELS, HISTORY, WINDOW, same_tree, tiny_camdm, tiny_config, tiny_task, tiny_windows
+from safetensors import safe_open
 
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.training import loop
-from f3amd_lib.training.loop import (
-    TrainingConfig,
-    TrainingDiverged,
-    learning_rate_schedule,
-    network_inputs,
-    paper_recipe,
-    short_recipe,
-)
+from f3amd_lib.training import denoising_task
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.losses import LOSS_TERMS, LossWeights
+from f3amd_lib.training.optimise import advance, held_out_terms, initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.recipe import TrainingConfig, learning_rate_schedule, paper_recipe, short_recipe
 
 STEPS = 32
 QUIET = {"progress": False, "chunk": 2}
 
 
 @pytest.fixture(scope="module")
-def trainer():
-    return tiny_trainer(num_steps=STEPS, learning_rate=1e-2, ema_decay=0.9)
+def task():
+    return tiny_task(num_steps=STEPS, learning_rate=1e-2, ema_decay=0.9)
 
 
 @pytest.fixture(scope="module")
-def finished(trainer):
+def finished(task):
     """State and history after all steps, never interrupted."""
-    return trainer.run(**QUIET)
+    return optimise(task, **QUIET)
 
 
 def finite(tree) -> bool:
@@ -115,8 +110,8 @@ def test_config_names_unknown_keys():
         TrainingConfig.from_dict({"num_steps": 10, "learning_rat": 1e-3})
 
 
-def test_network_inputs_by_hand(trainer):
-    windows, normaliser = trainer.windows, trainer.normaliser
+def test_network_inputs_by_hand(task):
+    windows, normaliser = task.windows, task.normaliser
     index = jnp.array([0, 5])
     batch = gather_windows(windows, index, jnp.zeros(2), jnp.zeros(2, jnp.int32), window=WINDOW, num_history=HISTORY)
     x0, condition = network_inputs(batch, normaliser)
@@ -130,14 +125,14 @@ def test_network_inputs_by_hand(trainer):
 
 def test_eq09_training_noise_is_uniform_in_schedule_time():
     config = TrainingConfig(10)
-    sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, config))
+    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, config))
     time = config.diffusion.time(sigma)
     counts = np.histogram(time, bins=8, range=(0, 1))[0]
     assert counts.sum() == 4000 and np.all(np.abs(counts - 500) < 100)
 
 
 def test_mixed_noise_draws_half_of_the_levels_below_one():
-    sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, TrainingConfig(10, noise="mixed")))
+    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, TrainingConfig(10, noise="mixed")))
     # Half log-uniform on [0.01, 1], and of Eq. 9's half those with t > 0.837.
     expected = 0.5 + 0.5 * (1.0 - TrainingConfig(10).diffusion.time(1.0))
     assert np.mean(sigma <= 1.0) == pytest.approx(expected, abs=0.03)
@@ -145,170 +140,51 @@ def test_mixed_noise_draws_half_of_the_levels_below_one():
     assert np.median(sigma[sigma < 1.0]) == pytest.approx(0.1, rel=0.35)
 
 
-def test_history_has_a_row_per_chunk(finished):
-    state, history = finished
-    assert [row["step"] for row in history] == list(range(2, STEPS + 1, 2))
-    assert int(state.step) == STEPS
-    for row in history:
+def test_loss_falls(task, finished):
+    before = held_out_terms(task, initial_state(task), task.windows)
+    after = held_out_terms(task, finished[0], task.windows)
+    assert after["loss"] < 0.85 * before["loss"]
+    assert after["sample"] < before["sample"]
+    assert after["loss"] == pytest.approx(sum(after[name] for name in LOSS_TERMS), rel=1e-5)
+    for row in finished[1]:
         assert row["loss"] == pytest.approx(sum(row[name] for name in LOSS_TERMS), rel=1e-4)
 
 
-def test_loss_falls(trainer, finished):
-    before = trainer.held_out_terms(trainer.initial_state().params, trainer.windows)
-    after = trainer.held_out_terms(finished[0].params, trainer.windows)
-    assert after["loss"] < 0.85 * before["loss"]
-    assert after["sample"] < before["sample"]
-
-
-def test_first_step_is_adams_and_average_follows_by_formula(trainer):
-    start = trainer.initial_state()
-    one, _ = trainer.run(stop_after=1, chunk=1, progress=False)
-    two, _ = trainer.run(one, stop_after=2, chunk=1, progress=False)
-    # Adam's first step moves every weight by the learning rate, whatever its gradient's size.
-    assert largest_change(one.params, start.params) == pytest.approx(1e-2, rel=1e-3)
-    leaves = [jax.tree.leaves(t) for t in (start.params, one.params, two.params, one.ema, two.ema)]
-    for first, second, third, ema_one, ema_two in zip(*leaves, strict=True):
-        expected = 0.9 * first + 0.1 * second
-        np.testing.assert_allclose(ema_one, expected, atol=1e-7)
-        np.testing.assert_allclose(ema_two, 0.9 * expected + 0.1 * third, atol=1e-7)
-    assert same_tree(start.ema, start.params)
-
-
-def test_a_given_state_stays_alive(trainer):
-    state = trainer.initial_state()
-    trainer.run(state, stop_after=4, **QUIET)
-    assert same_tree(state, trainer.initial_state())
-
-
-class Killed(Exception):
-    pass
-
-
-@pytest.mark.parametrize("killed_after", [4, 8])
-def test_killed_and_resumed_equals_uninterrupted(trainer, finished, tmp_path, killed_after):
-    checkpoint = tmp_path / "state.safetensors"
-
-    def kill(row):
-        # After the chunk, and after the checkpoint of the one before.
-        if row["step"] == killed_after:
-            raise Killed
-
-    with pytest.raises(Killed):
-        trainer.run(checkpoint=checkpoint, checkpoint_every=4, on_chunk=kill, **QUIET)
-    assert int(trainer.restore(checkpoint).step) == killed_after
-    resumed, history = trainer.run(checkpoint=checkpoint, checkpoint_every=4, **QUIET)
-    assert [row["step"] for row in history] == list(range(killed_after + 2, STEPS + 1, 2))
-    assert same_tree(resumed, finished[0])
-    assert history[-1] == finished[1][-1]
-
-
-def test_stopped_between_chunks_and_resumed_equals_uninterrupted(trainer, finished, tmp_path):
-    checkpoint = tmp_path / "state.safetensors"
-    state, _ = trainer.run(checkpoint=checkpoint, stop_after=3, **QUIET)
-    assert int(state.step) == 3
-    resumed, _ = trainer.run(checkpoint=checkpoint, **QUIET)
-    assert same_tree(resumed, finished[0])
-
-
-def test_a_finished_run_does_nothing_more(trainer, tmp_path):
-    checkpoint = tmp_path / "state.safetensors"
-    trainer.save(checkpoint, trainer.initial_state()._replace(step=jnp.asarray(STEPS, jnp.int32)))
-    content = checkpoint.read_bytes()
-    state, history = trainer.run(checkpoint=checkpoint, **QUIET)
-    assert history == [] and int(state.step) == STEPS and checkpoint.read_bytes() == content
-
-
-def test_saved_state_comes_back_exactly(trainer, finished, tmp_path):
-    trainer.save(tmp_path / "state.safetensors", finished[0])
-    assert same_tree(trainer.restore(tmp_path / "state.safetensors"), finished[0])
+def test_a_state_keeps_the_names_that_earlier_files_have(task, finished, tmp_path):
+    path = tmp_path / "state.safetensors"
+    save_state(path, task, finished[0])
+    assert same_tree(restore_state(path, task), finished[0])
+    with safe_open(path, framework="numpy") as file:
+        names = set(file.keys())
+    assert {".step", ".params['decoder']['kernel']", ".ema['decoder']['kernel']"} <= names
+    assert {name.split("[")[0] for name in names} == {".params", ".ema", ".optimiser", ".step"}
 
 
 @pytest.mark.parametrize(
-    ("settings", "name"),
-    [({"learning_rate": 1e-3}, "learning_rate"), ({"seed": 1}, "seed"), ({"loss": LossWeights(ird=0.5)}, "loss")],
+    ("model", "settings", "name"),
+    [
+        ({}, {"learning_rate": 1e-3}, "training settings .*learning_rate"),
+        ({}, {"loss": LossWeights(ird=0.5)}, "training settings .*loss"),
+        ({"sigma_data": 0.5}, {}, "model settings .*sigma_data"),
+        ({"depth": 2}, {}, "model settings .*depth"),
+    ],
 )
-def test_checkpoints_of_other_settings_are_refused(trainer, tmp_path, settings, name):
+def test_states_of_other_settings_are_refused(task, tmp_path, model, settings, name):
     path = tmp_path / "state.safetensors"
-    trainer.save(path, trainer.initial_state())
-    other = tiny_trainer(**{"num_steps": STEPS, "learning_rate": 1e-2, "ema_decay": 0.9, **settings})
-    with pytest.raises(ValueError, match=rf"state\.safetensors.*other training settings.*{name}"):
-        other.restore(path)
+    save_state(path, task, initial_state(task))
+    other = tiny_task(tiny_config(**model), **{"num_steps": STEPS, "learning_rate": 1e-2, "ema_decay": 0.9, **settings})
+    with pytest.raises(ValueError, match=rf"state\.safetensors.*other {name}"):
+        restore_state(path, other)
 
 
-@pytest.mark.parametrize("changes", [{"sigma_data": 0.5}, {"latent_width": 16}, {"depth": 2}])
-def test_checkpoints_of_another_network_are_refused(trainer, tmp_path, changes):
-    path = tmp_path / "state.safetensors"
-    trainer.save(path, trainer.initial_state())
-    other = tiny_trainer(tiny_config(**changes), num_steps=STEPS, learning_rate=1e-2, ema_decay=0.9)
-    with pytest.raises(ValueError, match=r"state\.safetensors"):
-        other.restore(path)
-
-
-def test_broken_data_stop_training_and_keep_the_checkpoint(trainer, tmp_path):
-    checkpoint = tmp_path / "state.safetensors"
-    trainer.run(checkpoint=checkpoint, stop_after=4, **QUIET)
-    content = checkpoint.read_bytes()
-    broken = copy.copy(trainer)
-    windows = trainer.windows
-    broken.windows = dataclasses.replace(windows, frames=jnp.full_like(windows.frames, jnp.nan))
-    with pytest.raises(TrainingDiverged, match=r"at step 5 \(terms: .*sample.*state\.safetensors"):
-        broken.run(checkpoint=checkpoint, checkpoint_every=4, **QUIET)
-    assert checkpoint.read_bytes() == content
-    assert finite(trainer.restore(checkpoint))
-
-
-@pytest.fixture(scope="module")
-def exploding():
-    """A trainer whose fourth update is infinite; the loss shows it only at the fifth step."""
-    schedule = loop.learning_rate_schedule
-    loop.learning_rate_schedule = lambda config: lambda step: jnp.where(step < 3, 1e-3, jnp.inf)
-    try:
-        return tiny_trainer()
-    finally:
-        loop.learning_rate_schedule = schedule
-
-
-def test_divergence_names_the_step(exploding):
-    with pytest.raises(TrainingDiverged, match="not finite (at step 5|after step 4)"):
-        exploding.run(**QUIET)
-
-
-def test_broken_weights_never_reach_the_checkpoint(exploding, tmp_path):
-    checkpoint = tmp_path / "state.safetensors"
-    with pytest.raises(TrainingDiverged):
-        exploding.run(checkpoint=checkpoint, checkpoint_every=4, **QUIET)
-    assert not checkpoint.exists() or finite(exploding.restore(checkpoint))
-
-
-def test_stopping_after_no_steps_makes_none(trainer):
-    state, history = trainer.run(stop_after=0, **QUIET)
-    assert int(state.step) == 0 and history == []
-
-
-def test_checkpoints_are_written_though_chunks_end_elsewhere(trainer, tmp_path):
-    checkpoint, steps = tmp_path / "state.safetensors", []
-
-    def look(row):
-        steps.append(int(trainer.restore(checkpoint).step) if checkpoint.exists() else 0)
-
-    trainer.run(checkpoint=checkpoint, checkpoint_every=3, stop_after=6, on_chunk=look, **QUIET)
-    # Three steps are done for the first time when the second chunk ends.
-    assert steps == [0, 4, 6]
-
-
-def test_held_out_loss_is_measured_on_the_same_noise_every_time(trainer, finished):
-    held_out = tiny_windows("validation")
-    first = trainer.held_out_terms(finished[0].ema, held_out)
-    assert first == trainer.held_out_terms(finished[0].ema, held_out)
-    assert first["loss"] == pytest.approx(sum(first[name] for name in LOSS_TERMS), rel=1e-5)
-    _, history = trainer.run(held_out=held_out, checkpoint_every=STEPS // 2, **QUIET)
-    measured = [row["step"] for row in history if "held_out_loss" in row]
-    assert measured == [STEPS // 2, STEPS]
-    assert history[-1]["held_out_sample"] == pytest.approx(first["sample"], rel=1e-6)
+def test_a_state_of_camdm_with_its_levels_is_taken_up_again(tmp_path):
+    camdm, path = tiny_task(tiny_camdm()), tmp_path / "state.safetensors"
+    save_state(path, camdm, initial_state(camdm))
+    assert same_tree(restore_state(path, camdm), initial_state(camdm))
 
 
 def test_raw_networks_are_trained_without_normalisation():
-    raw = tiny_trainer(tiny_config(normalise=False, input_scaling=False)).normaliser
+    raw = tiny_task(tiny_config(normalise=False, input_scaling=False)).normaliser
     np.testing.assert_array_equal(raw.mean, np.zeros(CHANNELS))
     np.testing.assert_array_equal(raw.deviation, np.ones(CHANNELS))
     assert float(raw.path_scale) == 1.0
@@ -317,76 +193,76 @@ def test_raw_networks_are_trained_without_normalisation():
 def test_section_6_camdm_trains_on_the_levels_of_its_schedule():
     levels = VariancePreservingCosine(4)
     config = TrainingConfig(10, diffusion=levels)
-    sigma = np.asarray(loop.draw_sigma(jax.random.key(0), 4000, config))
+    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, config))
     found, counts = np.unique(sigma, return_counts=True)
     np.testing.assert_allclose(found, levels.sigmas, rtol=1e-6)
     assert np.all(np.abs(counts - 1000) < 120)
 
 
-def test_history_dropout_takes_whole_histories_away(trainer):
-    dropping = tiny_trainer(history_dropout=0.25)
+def test_history_dropout_takes_whole_histories_away(task):
+    dropping = tiny_task(history_dropout=0.25)
     history = 1.0 + jnp.zeros((400, HISTORY, CHANNELS))
     condition = Condition(history, jnp.zeros((400, WINDOW, 8)), jnp.zeros((400, 2)))
     disturbed = np.asarray(dropping._disturbed(condition, jax.random.key(1)).history)
     gone = (disturbed == 0.0).all(axis=(1, 2))
     assert 60 < gone.sum() < 140
     assert (disturbed[~gone] == 1.0).all()
-    assert trainer._disturbed(condition, jax.random.key(1)).history is history
+    assert task._disturbed(condition, jax.random.key(1)).history is history
 
 
 def test_dropout_is_drawn_in_training_alone():
     model = tiny_config(base_block="transformer", num_heads=2, dropout=0.5)
-    trainer = tiny_trainer(model)
-    params = trainer.initial_state().params
-    held_out = [trainer.held_out_terms(params, tiny_windows()) for _ in range(2)]
+    task = tiny_task(model)
+    state = initial_state(task)
+    held_out = [held_out_terms(task, state, tiny_windows()) for _ in range(2)]
     assert held_out[0] == held_out[1]
-    quiet = tiny_trainer(dataclasses.replace(model, dropout=0.0))
-    assert quiet.held_out_terms(params, tiny_windows()) == held_out[0]
+    quiet = tiny_task(dataclasses.replace(model, dropout=0.0))
+    assert held_out_terms(quiet, state, tiny_windows()) == held_out[0]
     # Same weights, batch and noise: only dropout makes a training step differ.
-    with_dropout, _ = trainer.run(stop_after=3, **QUIET)
-    without, _ = quiet.run(stop_after=3, **QUIET)
+    with_dropout, _ = optimise(task, stop_after=3, **QUIET)
+    without, _ = optimise(quiet, stop_after=3, **QUIET)
     assert largest_change(with_dropout.params, without.params) > 1e-6
 
 
 def test_our_recipe_trains_and_resumes_exactly(tmp_path):
     recipe = short_recipe("F3AMD-FNO-32-plus", 8, batch_size=8).to_dict()
     model = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
-    trainer = tiny_trainer(model, **recipe)
-    whole, _ = trainer.run(**QUIET)
+    task = tiny_task(model, **recipe)
+    whole, _ = optimise(task, **QUIET)
     checkpoint = tmp_path / "state.safetensors"
-    trainer.run(checkpoint=checkpoint, stop_after=4, **QUIET)
-    resumed, _ = trainer.run(checkpoint=checkpoint, **QUIET)
+    optimise(task, checkpoint=checkpoint, stop_after=4, **QUIET)
+    resumed, _ = optimise(task, checkpoint=checkpoint, **QUIET)
     assert finite(whole) and same_tree(whole, resumed)
-    assert largest_change(whole.params, trainer.initial_state().params) > 1e-4
+    assert largest_change(whole.params, initial_state(task).params) > 1e-4
 
 
 def test_log_normal_noise_has_the_mean_and_deviation_it_names():
     config = TrainingConfig(10, noise="log_normal")
-    log_sigma = np.log(loop.draw_sigma(jax.random.key(3), 20_000, config))
-    mean, deviation = loop.LOG_NORMAL_SIGMA
+    log_sigma = np.log(denoising_task.draw_sigma(jax.random.key(3), 20_000, config))
+    mean, deviation = denoising_task.LOG_NORMAL_SIGMA
     assert log_sigma.mean() == pytest.approx(mean, abs=0.03)
     assert log_sigma.std() == pytest.approx(deviation, abs=0.03)
     narrow = TrainingConfig(10, noise="log_normal", diffusion=VarianceExploding(sigma_max=1.0, sigma_min=0.5))
-    sigma = np.asarray(loop.draw_sigma(jax.random.key(3), 1000, narrow))
+    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(3), 1000, narrow))
     assert sigma.min() == pytest.approx(0.5) and sigma.max() == pytest.approx(1.0)
 
 
 def test_weights_towards_low_noise_are_those_of_karras_up_to_the_cap():
     sigma = jnp.array([0.1, 1.0, 128.0])
-    assert loop.noise_weights(sigma, TrainingConfig(10)) is None
-    weights = np.asarray(loop.noise_weights(sigma, TrainingConfig(10, noise_weighting="low_noise")))
+    assert denoising_task.noise_weights(sigma, TrainingConfig(10)) is None
+    weights = np.asarray(denoising_task.noise_weights(sigma, TrainingConfig(10, noise_weighting="low_noise")))
     expected = np.array([6.0, 2.0, 1.0 + 128.0**-2])
     np.testing.assert_allclose(weights, expected / expected.mean(), rtol=1e-6)
 
 
 def test_condition_dropout_hides_history_path_and_style_together():
-    trainer = tiny_trainer(condition_dropout=0.5)
+    task = tiny_task(condition_dropout=0.5)
     batch = gather_windows(
         tiny_windows(), jnp.zeros(64, int), jnp.zeros(64), jnp.zeros(64, int),
         window=WINDOW, num_history=HISTORY,
     )  # fmt: skip
-    _, condition = network_inputs(batch, trainer.normaliser)
-    hidden = trainer._disturbed(condition, jax.random.key(0))
+    _, condition = network_inputs(batch, task.normaliser)
+    hidden = task._disturbed(condition, jax.random.key(0))
     gone = np.array([not np.any(np.asarray(part)) for part in hidden.style])
     assert 16 < gone.sum() < 48
     for part, before in zip(hidden, condition, strict=True):
@@ -395,11 +271,11 @@ def test_condition_dropout_hides_history_path_and_style_together():
 
 
 def test_weighted_noise_changes_training_but_not_the_held_out_loss():
-    plain, weighted = tiny_trainer(), tiny_trainer(noise_weighting="low_noise")
-    state = plain.initial_state()
-    assert plain.held_out_terms(state.ema, tiny_windows()) == weighted.held_out_terms(state.ema, tiny_windows())
-    one, _ = plain.advance(plain.initial_state(), 2)
-    two, _ = weighted.advance(weighted.initial_state(), 2)
+    plain, weighted = tiny_task(), tiny_task(noise_weighting="low_noise")
+    state = initial_state(plain)
+    assert held_out_terms(plain, state, tiny_windows()) == held_out_terms(weighted, state, tiny_windows())
+    one, _ = advance(plain, initial_state(plain), 2)
+    two, _ = advance(weighted, initial_state(weighted), 2)
     assert largest_change(one.params, two.params) > 1e-5
 
 

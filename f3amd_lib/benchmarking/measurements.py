@@ -20,8 +20,10 @@ from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
 from f3amd_lib.networks import presets
-from f3amd_lib.training.loop import short_recipe
+from f3amd_lib.training.denoising_task import DenoisingTask
+from f3amd_lib.training.optimise import advance, initial_state, plan_memory
 from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.recipe import short_recipe
 
 log = logging.getLogger("f3amd")
 
@@ -162,9 +164,9 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
     calls, memory = {}, {}
     for name in tqdm(names, unit="compiled"):
         recipe = short_recipe(name, num_steps=steps, batch_size=batch_size, seed=profile.seed)
-        trainer = prepared.trainer(name, recipe)
-        memory[name] = trainer.plan_memory(chunk)
-        calls[name] = _training_call(trainer, chunk)
+        task = prepared.task(name, recipe)
+        memory[name] = plan_memory(task, chunk)
+        calls[name] = _training_call(task, chunk)
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows = prepared.windows("train").num_windows
     rows = [
@@ -192,13 +194,13 @@ def _write(prepared: PreparedData, profile: Profile, name: str, table: pd.DataFr
     return path
 
 
-def _training_call(trainer, chunk: int):
+def _training_call(task: DenoisingTask, chunk: int):
     """Return a function that trains on for `chunk` steps and waits."""
-    state = trainer.initial_state()
+    state = initial_state(task)
 
     def call():
         nonlocal state
-        state, _ = trainer.advance(state, chunk)
+        state, _ = advance(task, state, chunk)
         jax.block_until_ready(state)
 
     return call

@@ -19,7 +19,7 @@ from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 
 CM = 100.0
 

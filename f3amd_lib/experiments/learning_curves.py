@@ -13,8 +13,9 @@ from tqdm import tqdm
 
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training import parallel
-from f3amd_lib.training.loop import short_recipe
+from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise
 from f3amd_lib.training.pipeline import PreparedData, finished_model, model_files, train
+from f3amd_lib.training.recipe import short_recipe
 
 SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
 """What all runs have in common; enough to see a loss fall, far from enough to walk."""
@@ -92,13 +93,13 @@ def learning_curve(
       TrainingDiverged: if the loss stops being a number.
     """
     recipe = short_recipe(preset, seed=seed, **{**SHORT_RUN, **settings})
-    trainer = prepared.trainer(preset, recipe)
+    task = prepared.task(preset, recipe)
     held_out = prepared.windows(prepared.held_out_split)
     chunk = max(1, recipe.num_steps // 10)
-    state = trainer.initial_state()
-    before = trainer.held_out_terms(state.params, held_out)["loss"]
+    state = initial_state(task)
+    before = held_out_terms(task, state, held_out)["loss"]
     rows = [{"model": preset, "step": 0, "loss": float("nan"), "held_out_loss": before}]
-    _, history = trainer.run(state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=progress)
+    _, history = optimise(task, state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=progress)
     rows += [{"model": preset, **{name: row[name] for name in ("step", "loss", "held_out_loss")}} for row in history]
     return pd.DataFrame(rows)
 

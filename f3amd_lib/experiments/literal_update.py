@@ -25,7 +25,7 @@ from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 
 UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
 """Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""

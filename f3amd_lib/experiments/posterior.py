@@ -36,7 +36,7 @@ from f3amd_lib.measures.distributions import diversity_variance, mean_and_interv
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
-from f3amd_lib.training.loop import network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 
 GIVEN = {"style": (), "style, path": ("path",), "style, path, history": ("path", "history")}

@@ -15,8 +15,8 @@ from pathlib import Path
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.loop import TrainingConfig, paper_recipe
 from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_unlike, train
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
 RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
 """Optimiser steps of every row, by profile."""

@@ -21,179 +21,33 @@ import dataclasses
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from tqdm import tqdm
 
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
-from f3amd_lib.motion.rotations import matrix_from_yaw, yaw_from_direction
+from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.spectral import TemporalConvolution
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, load_tree, save_tree
-from f3amd_lib.training.loop import TrainingDiverged
-
-_SIDE = ("clavicle", "shoulder", "elbow", "hip", "knee", "ankle")
-
-CLASSIFIER_JOINTS = ("hips", "neck", "head", *(f"left {part}" for part in _SIDE), *(f"right {part}" for part in _SIDE))
-"""The 15 joints that the classifier sees; wrists and toes, the noisiest, are left out."""
-
-NUM_CHANNELS = 3 * len(CLASSIFIER_JOINTS)
-"""Numbers a frame: x, y, z of each of `CLASSIFIER_JOINTS`."""
+from f3amd_lib.training.optimise import TrainingState, optimise
 
 ACCURACY_BAR = 0.8
 """Least held-out accuracy of a classifier whose features may be used for FID, EMD and coverage."""
 
-# Conventions are matched as a whole: "LeftShoulder" is the upper arm in one and the collar bone in
-# another.
-_CONVENTIONS = {
-    "100STYLE": (
-        *("Hips", "Neck", "Head"),
-        *("LeftCollar", "LeftShoulder", "LeftElbow", "LeftHip", "LeftKnee", "LeftAnkle"),
-        *("RightCollar", "RightShoulder", "RightElbow", "RightHip", "RightKnee", "RightAnkle"),
-    ),
-    "Bandai Namco": (
-        *("Hips", "Neck", "Head"),
-        *("Shoulder_L", "UpperArm_L", "LowerArm_L", "UpperLeg_L", "LowerLeg_L", "Foot_L"),
-        *("Shoulder_R", "UpperArm_R", "LowerArm_R", "UpperLeg_R", "LowerLeg_R", "Foot_R"),
-    ),
-    "Mixamo": (
-        *("Hips", "Neck", "Head"),
-        *("LeftShoulder", "LeftArm", "LeftForeArm", "LeftUpLeg", "LeftLeg", "LeftFoot"),
-        *("RightShoulder", "RightArm", "RightForeArm", "RightUpLeg", "RightLeg", "RightFoot"),
-    ),
-}
+_SPLITS = {"train": ("train",), "held_out": ("validation", "test")}
+"""Splits whose clips are trained on, and whose clips say how well."""
 
-_STRIDE = 10
-"""Frames between the windows trained on (CAMDM's code)."""
-
-_LEARNING_RATE = 1e-3
-_HELD_OUT = ("validation", "test")
 _BATCH = 256
 """Windows that are evaluated at once; fixed, so that a window's features depend on it alone."""
-
-
-# ------------------------------------------------------------------------------ what it looks at
-
-
-def classifier_joints(skeleton: Skeleton) -> tuple[int, ...]:
-    """Find the joints of `CLASSIFIER_JOINTS` in a skeleton.
-
-    Args:
-      skeleton: with the joint names of 100STYLE (and our synthetic walker), Bandai Namco or Mixamo.
-
-    Returns:
-      15 joint indices, in the order of `CLASSIFIER_JOINTS`.
-
-    Raises:
-      ValueError: naming the joints that are missing.
-    """
-    names = [name.removeprefix("mixamorig:") for name in skeleton.names]
-    missing = {
-        convention: [
-            f"{wanted!r} ({joint})"
-            for joint, wanted in zip(CLASSIFIER_JOINTS, wanted_names, strict=True)
-            if wanted not in names
-        ]
-        for convention, wanted_names in _CONVENTIONS.items()
-    }
-    nearest = min(missing, key=lambda convention: len(missing[convention]))
-    if missing[nearest]:
-        raise ValueError(
-            f"the style classifier finds no {', '.join(missing[nearest])} in this skeleton; by "
-            f"the names of {nearest}, the nearest convention, it has {', '.join(skeleton.names)}"
-        )
-    return tuple(names.index(name) for name in _CONVENTIONS[nearest])
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-8)
-
-
-def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
-    """Reduce joint positions to what the classifier sees: posture, without place and direction.
-
-    Each frame is moved so that its hips are the origin and turned about the vertical so that its
-    own facing is +Z. Facing here is cross(a, +Y) with a = unit(left - right clavicle) + unit(left -
-    right hip): it takes in the shoulders, unlike `facing_yaw`, which serves paths and sees the hips
-    only. (CAMDM's code turns to +X, which is the same up to the order and sign of channels.)
-
-    Args:
-      positions: global joint positions, [..., T, J, 3], metres.
-      skeleton: J joints.
-
-    Returns:
-      [..., T, 45], metres, float64: x, y, z of each of `CLASSIFIER_JOINTS`.
-
-    Raises:
-      ValueError: for shapes that do not fit the skeleton, numbers that are not finite, or a
-        skeleton without one of the joints.
-
-    Source: CAMDM's evaluation code (its feature extraction).
-    """
-    positions = np.asarray(positions, np.float64)
-    if positions.ndim < 3 or positions.shape[-2:] != (skeleton.num_joints, 3):
-        raise ValueError(
-            f"positions must be [..., T, {skeleton.num_joints}, 3] in metres for this skeleton, got {positions.shape}"
-        )
-    if not np.all(np.isfinite(positions)):
-        place = [int(index) for index in np.argwhere(~np.isfinite(positions))[0]]
-        raise ValueError(
-            f"positions are not finite at frame {place[-3]}, joint {skeleton.names[place[-2]]!r}"
-            + (f" of motion {place[:-3]}" if len(place) > 3 else "")
-        )
-    body = positions[..., list(classifier_joints(skeleton)), :]
-    body = body - body[..., :1, :]
-    at = {joint: body[..., index, :] for index, joint in enumerate(CLASSIFIER_JOINTS)}
-    across = _unit(at["left clavicle"] - at["right clavicle"])
-    across = across + _unit(at["left hip"] - at["right hip"])
-    # cross(a, +Y) = (-a_z, 0, a_x)
-    forward = np.stack([-across[..., 2], np.zeros(across.shape[:-1]), across[..., 0]], axis=-1)
-    turned = body @ np.swapaxes(matrix_from_yaw(-yaw_from_direction(forward)), -1, -2)
-    return turned.reshape(*body.shape[:-2], NUM_CHANNELS)
-
-
-def classifier_windows(positions, skeleton: Skeleton, *, window: int = 60) -> np.ndarray:
-    """Cut motion into windows side by side; what is left at the end is not used.
-
-    Args:
-      positions: global joint positions, [..., T, J, 3], metres, at 30 fps.
-      skeleton: J joints.
-      window: frames of each.
-
-    Returns:
-      [..., T // window, window, 45], metres, float32.
-
-    Raises:
-      ValueError: as `classifier_frames`, or if the motion is shorter than a window.
-    """
-    frames = classifier_frames(positions, skeleton)
-    count = frames.shape[-2] // window
-    if count == 0:
-        raise ValueError(
-            f"{frames.shape[-2]} frames do not fill a window of the style classifier; it needs "
-            f"{window} ({window / 30:g} s)"
-        )
-    whole = frames[..., : count * window, :]
-    return whole.reshape(*whole.shape[:-2], count, window, NUM_CHANNELS).astype(np.float32)
-
-
-def _mirror_channels() -> tuple[np.ndarray, np.ndarray]:
-    """Return (which channel to take, its sign), each [45], that show a frame in the mirror."""
-    twins = [
-        CLASSIFIER_JOINTS.index(joint.replace("left", "right") if "left" in joint else joint.replace("right", "left"))
-        for joint in CLASSIFIER_JOINTS
-    ]
-    order = 3 * np.repeat(twins, 3) + np.tile(np.arange(3), len(twins))
-    return order, np.tile(np.array([-1.0, 1.0, 1.0], np.float32), len(twins))
 
 
 # ------------------------------------------------------------------------------------ the network
@@ -335,8 +189,7 @@ def _answers(config, params, statistics, windows) -> tuple[np.ndarray, np.ndarra
 # ----------------------------------------------------------------------------------- the classifier
 
 
-@dataclass(frozen=True, eq=False)
-class ReferenceFeatures:
+class ReferenceFeatures(NamedTuple):
     """Features of real windows, cut side by side from the clips of a split.
 
     Attributes:
@@ -410,8 +263,8 @@ class StyleClassifier:
             )
         return classifier_windows(positions, skeleton, window=self.config.window)
 
-    def _run(self, windows) -> tuple[np.ndarray, np.ndarray]:
-        """Return (features, scores) of windows [..., window, 45], or say what is wrong."""
+    def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
+        """Return what `features` and `predict` return, with one run of the network for both."""
         windows = np.asarray(windows, np.float32)
         expected = (self.config.window, NUM_CHANNELS)
         if windows.shape[-2:] != expected or windows.size == 0:
@@ -419,17 +272,12 @@ class StyleClassifier:
                 f"windows must be [..., {expected[0]}, {expected[1]}] and at least one, got "
                 f"{windows.shape}; cut them with `windows_of`"
             )
-        flat = windows.reshape(-1, *expected)
-        bad = ~np.isfinite(flat).all(axis=(1, 2))
+        bad = ~np.isfinite(windows).all(axis=(-1, -2))
         if bad.any():
             raise ValueError(f"window {int(np.argmax(bad))} is not finite")
-        answers = _answers(self.config, self.params, self.statistics, flat)
-        return tuple(answer.reshape(*windows.shape[:-2], -1) for answer in answers)
-
-    def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
-        """Return what `features` and `predict` return, with one run of the network for both."""
-        features, scores = self._run(windows)
-        return features, np.argmax(scores, axis=-1)
+        several = windows.shape[:-2]
+        features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *expected))
+        return features.reshape(*several, -1), np.argmax(scores, axis=-1).reshape(several)
 
     def features(self, windows) -> np.ndarray:
         """Return the features of windows, for FID and EMD.
@@ -443,7 +291,7 @@ class StyleClassifier:
         Raises:
           ValueError: for another shape, no windows, or numbers not finite.
         """
-        return self._run(windows)[0]
+        return self.features_and_classes(windows)[0]
 
     def predict(self, windows) -> np.ndarray:
         """Return the class that each window is taken for, for style coverage.
@@ -506,8 +354,7 @@ def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BA
 # --------------------------------------------------------------------------------------- training
 
 
-@dataclass(frozen=True, eq=False)
-class _Takes:
+class _Takes(NamedTuple):
     """The clips of some styles and splits, as frames put end to end; K clips, sorted by style.
 
     Attributes:
@@ -565,116 +412,127 @@ def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, .
     )
 
 
-class _TrainingData(NamedTuple):
-    """What batches are drawn from, on the device.
+@dataclass(frozen=True)
+class ClassifierTraining:
+    """How a classifier is trained; CAMDM's code, but for the schedule (see `train_classifier`).
 
     Attributes:
-      frames: [N, 45], metres.
+      num_steps, batch_size: optimiser steps, and windows in each.
+      seed: of weights, batches and dropout.
+      learning_rate: of Adam, at first.
+      schedule: of the learning rate; there is one.
+      stride: frames between the windows trained on.
+    """
+
+    ema_decay: ClassVar[None] = None
+    """The schedule falls to 0, so that weights and batch statistics settle without an average."""
+
+    num_steps: int
+    batch_size: int
+    seed: int
+    learning_rate: float = 1e-3
+    schedule: str = "cosine to 0"
+    stride: int = 10
+
+    def __post_init__(self):
+        if self.num_steps < 1 or self.batch_size < 2:
+            raise ValueError(
+                f"a style classifier needs at least 1 step and batches of 2, got {self.num_steps} and {self.batch_size}"
+            )
+
+
+def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining) -> dict:
+    """Return all but the data that decides a classifier's weights, as its record tells it."""
+    return {
+        "classifier": network.to_dict(),
+        "classifier_training": dataclasses.asdict(config),
+        "classifier_styles": styles,
+    }
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("frames", "starts", "first", "count", "mirrored"),
+    meta_fields=("dataset_fingerprint", "styles", "network", "config"),
+)
+@dataclass(frozen=True, eq=False)
+class StyleTask:
+    """A style classifier to train (a `training.optimise.Task`).
+
+    Attributes:
+      dataset_fingerprint, styles, network, config: what decides the weights.
+      frames: that windows are cut from, [N, 45], metres.
       starts: first frame of each window, sorted by style, [W].
       first, count: each style's first window and number of windows, [S].
       mirrored: whether a style's windows may be mirrored, [S].
     """
 
+    name: ClassVar[str] = "style classifier"
+
+    dataset_fingerprint: str
+    styles: tuple[str, ...]
+    network: ClassifierConfig
+    config: ClassifierTraining
     frames: jax.Array
     starts: jax.Array
     first: jax.Array
     count: jax.Array
     mirrored: jax.Array
 
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam, at a rate that falls to zero."""
+        return optax.adam(optax.cosine_decay_schedule(self.config.learning_rate, self.config.num_steps))
 
-def _training_data(takes: _Takes, stride: int, mirrored: np.ndarray) -> _TrainingData:
-    starts, take = takes.starts(stride)
-    count = np.bincount(takes.styles[take], minlength=len(mirrored))
-    return _TrainingData(
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        settings = _settings(self.styles, self.network, self.config)
+        return {"dataset_fingerprint": self.dataset_fingerprint, **settings}
+
+    def init(self, key):
+        """Return initial weights and batch statistics."""
+        _, params, statistics = nnx.split(StyleNetwork(self.network, rngs=nnx.Rngs(key)), nnx.Param, nnx.BatchStat)
+        return params, statistics
+
+    def draw(self, state: TrainingState | None, key):
+        """Draw a batch; return ((windows [B, window, 45], styles [B]), key of the dropout)."""
+        size = (self.config.batch_size,)
+        key_draw, key_dropout = jax.random.split(key)
+        key_style, key_place, key_mirror = jax.random.split(key_draw, 3)
+        # The style first, so that each is seen alike however much motion it has.
+        style = jax.random.randint(key_style, size, 0, len(self.count))
+        place = jax.random.randint(key_place, size, 0, self.count[style])
+        start = self.starts[self.first[style] + place]
+        windows = self.frames[start[:, None] + jnp.arange(self.network.window)]
+        channel, sign = mirror_channels()
+        swapped = self.mirrored[style] & jax.random.bernoulli(key_mirror, 0.5, size)
+        return (jnp.where(swapped[:, None, None], sign * windows[..., channel], windows), style), key_dropout
+
+    def loss(self, params, statistics, drawn, key):
+        """Return (cross entropy, (it by name, batch statistics after the step))."""
+        windows, style = drawn
+        network = _network(self.network, params, statistics)
+        _, scores = network(windows, key)
+        loss = optax.softmax_cross_entropy_with_integer_labels(scores, style).mean()
+        return loss, ({"loss": loss}, nnx.state(network, nnx.BatchStat))
+
+
+def _style_task(
+    packed: PackedMotion, styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining, takes: _Takes
+) -> StyleTask:
+    starts, take = takes.starts(config.stride)
+    count = np.bincount(takes.styles[take], minlength=len(styles))
+    return StyleTask(
+        packed.fingerprint,
+        styles,
+        network,
+        config,
         frames=jnp.asarray(takes.frames),
         starts=jnp.asarray(starts, jnp.int32),
         first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
         count=jnp.asarray(count, jnp.int32),
-        mirrored=jnp.asarray(mirrored),
+        mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
     )
-
-
-def _draw(data: _TrainingData, key, batch_size: int, window: int):
-    """Return (windows [B, window, 45], styles [B]) of a batch."""
-    key_style, key_place, key_mirror = jax.random.split(key, 3)
-    # The style first, so that each is seen alike however much motion it has.
-    style = jax.random.randint(key_style, (batch_size,), 0, len(data.count))
-    place = jax.random.randint(key_place, (batch_size,), 0, data.count[style])
-    start = data.starts[data.first[style] + place]
-    windows = data.frames[start[:, None] + jnp.arange(window)]
-    channel, sign = _mirror_channels()
-    swapped = data.mirrored[style] & jax.random.bernoulli(key_mirror, 0.5, (batch_size,))
-    return jnp.where(swapped[:, None, None], sign * windows[..., channel], windows), style
-
-
-def _optimiser(num_steps: int):
-    # Falling to zero lets the weights settle and the batch statistics catch up with them.
-    return optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps))
-
-
-@functools.partial(jax.jit, static_argnames=("config", "num_steps"))
-def _initial_state(key, config: ClassifierConfig, num_steps: int):
-    network = StyleNetwork(config, rngs=nnx.Rngs(key))
-    _, params, statistics = nnx.split(network, nnx.Param, nnx.BatchStat)
-    return params, statistics, _optimiser(num_steps).init(params)
-
-
-@functools.partial(jax.jit, static_argnames=("config", "num_steps", "batch_size"), donate_argnames="state")
-def _advance(state, data: _TrainingData, key, steps, config, num_steps: int, batch_size: int):
-    """Take the steps of the given numbers; return (state, loss of each)."""
-
-    def loss_of(params, statistics, windows, style, key):
-        network = _network(config, params, statistics)
-        _, scores = network(windows, key)
-        loss = optax.softmax_cross_entropy_with_integer_labels(scores, style).mean()
-        return loss, nnx.state(network, nnx.BatchStat)
-
-    def one_step(state, step):
-        params, statistics, moments = state
-        key_draw, key_dropout = jax.random.split(jax.random.fold_in(key, step))
-        windows, style = _draw(data, key_draw, batch_size, config.window)
-        (loss, statistics), gradient = jax.value_and_grad(loss_of, has_aux=True)(
-            params, statistics, windows, style, key_dropout
-        )
-        updates, moments = _optimiser(num_steps).update(gradient, moments, params)
-        return (optax.apply_updates(params, updates), statistics, moments), loss
-
-    return jax.lax.scan(one_step, state, steps)
-
-
-def _fit(config: ClassifierConfig, training: dict, data: _TrainingData, progress: bool):
-    """Train a network from scratch; return its weights and batch statistics."""
-    num_steps = training["num_steps"]
-    key_weights, key_steps = jax.random.split(jax.random.key(training["seed"]))
-    state = _initial_state(key_weights, config, num_steps)
-    chunk = max(1, min(20, num_steps // 10))
-    with tqdm(total=num_steps, unit="step", desc="style classifier", disable=not progress) as bar:
-        for done in range(0, num_steps, chunk):
-            steps = jnp.arange(done, min(done + chunk, num_steps))
-            state, losses = _advance(state, data, key_steps, steps, config, num_steps, training["batch_size"])
-            loss = float(losses.mean())
-            if not np.isfinite(loss):
-                raise TrainingDiverged(
-                    f"the style classifier's loss is not finite by step {done + len(steps)}: "
-                    "check the data for broken frames"
-                )
-            bar.update(len(steps))
-            bar.set_postfix(loss=f"{loss:.4f}")
-    return state[:2]
-
-
-def _recipe(num_steps: int, batch_size: int, seed: int) -> dict:
-    """Return all that decides how a network of given size is trained on given data."""
-    if num_steps < 1 or batch_size < 2:
-        raise ValueError(f"a style classifier needs at least 1 step and batches of 2, got {num_steps} and {batch_size}")
-    return {
-        "num_steps": num_steps,
-        "batch_size": batch_size,
-        "seed": seed,
-        "learning_rate": _LEARNING_RATE,
-        "schedule": "cosine to 0",
-        "stride": _STRIDE,
-    }
 
 
 def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
@@ -734,28 +592,23 @@ def train_classifier(
 
     Source: CAMDM's evaluation code (its classifier).
     """
-    training = _recipe(num_steps, batch_size, seed)
+    training = ClassifierTraining(num_steps, batch_size, seed)
     styles = _chosen_styles(packed, styles)
     config = ClassifierConfig.from_dict({"num_styles": len(styles), **sizes})
-    takes = {
-        "train": _collect(packed, styles, ("train",), config.window),
-        "held_out": _collect(packed, styles, _HELD_OUT, config.window),
-    }
-    mirrored = np.array([style in packed.mirror_styles for style in styles])
-    data = _training_data(takes["train"], _STRIDE, mirrored)
-    params, statistics = _fit(config, training, data, progress)
-    params = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(leaf.dtype), params)
+    takes = {split: _collect(packed, styles, members, config.window) for split, members in _SPLITS.items()}
+    task = _style_task(packed, styles, config, training, takes["train"])
+    state, _ = optimise(task, chunk=max(1, min(20, num_steps // 10)), progress=progress)
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(leaf.dtype), state.params)
     references = {}
     for split, part in takes.items():
         windows, labels, clips = part.side_by_side()
-        features, scores = _answers(config, params, statistics, windows)
-        rounded = features.astype(np.float16).astype(np.float32)
-        references[split] = ReferenceFeatures(rounded, labels, clips)
+        features, scores = _answers(config, params, state.statistics, windows)
+        references[split] = ReferenceFeatures(features.astype(np.float16).astype(np.float32), labels, clips)
     right = np.argmax(scores, axis=-1) == labels  # of the last split, held out
     return StyleClassifier(
         config=config,
         params=params,
-        statistics=statistics,
+        statistics=state.statistics,
         skeleton=packed.skeleton,
         styles=styles,
         held_out_accuracy={style: float(right[labels == number].mean()) for number, style in enumerate(styles)},
@@ -764,11 +617,9 @@ def train_classifier(
             profile=profile,
             dataset=packed,
             seed=seed,
-            classifier=config.to_dict(),
-            classifier_training=training,
-            classifier_styles=styles,
-            num_train_windows=len(data.starts),
+            num_train_windows=len(task.starts),
             num_held_out_windows=len(labels),
+            **_settings(styles, config, training),
         ),
     )
 
@@ -804,15 +655,12 @@ def obtain_classifier(
       ValueError: as `train_classifier`, or naming a file that is broken.
     """
     settings = {"seed": 0, "styles": None} | _PROFILE_TRAINING[profile.name] | changes
-    training = _recipe(*(settings[name] for name in ("num_steps", "batch_size", "seed")))
+    training = ClassifierTraining(*(settings[name] for name in ("num_steps", "batch_size", "seed")))
     styles = _chosen_styles(packed, settings["styles"])
-    sizes = {name: value for name, value in settings.items() if name not in (*training, "styles")}
-    identity = {
-        "dataset_fingerprint": packed.fingerprint,
-        "classifier": ClassifierConfig.from_dict({"num_styles": len(styles), **sizes}).to_dict(),
-        "classifier_training": training,
-        "classifier_styles": styles,
-    }
+    known = ("num_steps", "batch_size", "seed", "styles")
+    sizes = {name: value for name, value in settings.items() if name not in known}
+    config = ClassifierConfig.from_dict({"num_styles": len(styles), **sizes})
+    identity = {"dataset_fingerprint": packed.fingerprint, **_settings(styles, config, training)}
     folder = runs_dir(profile.dataset, profile.name) / "classifier"
     path = folder / f"style-classifier-{record_hash(identity)[:12]}.safetensors"
     if path.exists():
@@ -832,11 +680,7 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "params": jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), classifier.params),
         "statistics": classifier.statistics,
         "references": {
-            split: {
-                "features": jnp.asarray(reference.features, jnp.float16),
-                "styles": jnp.asarray(reference.styles, jnp.int32),
-                "clips": jnp.asarray(reference.clips, jnp.int32),
-            }
+            split: reference._replace(features=reference.features.astype(np.float16))._asdict()
             for split, reference in classifier.references.items()
         },
         "offsets": jnp.asarray(skeleton.offsets, jnp.float32),
@@ -869,8 +713,7 @@ def load_classifier(path: Path) -> StyleClassifier:
             styles=tuple(metadata["styles"]),
             held_out_accuracy=metadata["held_out_accuracy"],
             references={
-                split: ReferenceFeatures(**{name: np.asarray(part[name]) for name in part})
-                for split, part in tree["references"].items()
+                split: ReferenceFeatures(**jax.tree.map(np.asarray, part)) for split, part in tree["references"].items()
             },
             record=metadata["record"],
         )

@@ -16,7 +16,7 @@ from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.presets import PRESETS
-from f3amd_lib.training.loop import TrainingConfig
+from f3amd_lib.training.recipe import TrainingConfig
 
 _CONFIGS = {
     config.__name__: {field.name: field.default for field in dataclasses.fields(config)}

@@ -1,1 +1,1 @@
-"""Losses, the training loop and checkpoints that resume exactly."""
+"""Recipes, tasks, the one optimise loop that trains them, and checkpoints that resume exactly."""

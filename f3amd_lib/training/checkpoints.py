@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 from dataclasses import dataclass
@@ -155,6 +156,18 @@ def described_skeleton(metadata: dict, offsets) -> Skeleton:
     )
 
 
+@functools.lru_cache(maxsize=32)
+def _blank(config: NetworkConfig) -> tuple:
+    """Return a network's structure and the shapes of its weights."""
+    return nnx.split(nnx.eval_shape(lambda: build_from_config(config, jax.random.key(0))))
+
+
+def network_with(config: NetworkConfig, params) -> nnx.Module:
+    """Return a network with the given weights."""
+    # A fresh tree, so that editing the network leaves the given weights alone.
+    return nnx.merge(_blank(config)[0], jax.tree.map(lambda leaf: leaf, params))
+
+
 @dataclass(frozen=True)
 class TrainedModel:
     """A network ready to use: weights and all it needs to turn a path and a style into motion.
@@ -183,9 +196,7 @@ class TrainedModel:
 
     def network(self):
         """Return the network with its weights."""
-        model = nnx.eval_shape(lambda: build_from_config(self.config, jax.random.key(0)))
-        # A fresh tree, so that editing one network leaves the next alone.
-        return nnx.merge(nnx.graphdef(model), jax.tree.map(lambda leaf: leaf, self.params))
+        return network_with(self.config, self.params)
 
     def style_index(self, style: str) -> int:
         """Return a style's place in the one-hot vector; ValueError lists the styles."""
@@ -287,7 +298,7 @@ def _model_template(metadata: dict) -> dict:
         )
     single = jax.ShapeDtypeStruct
     config = config_from_dict(metadata["model"])
-    params = jax.eval_shape(lambda: nnx.state(build_from_config(config, jax.random.key(0))))
+    params = _blank(config)[1]
     if metadata.get("weights") == "int8":
         params = jax.eval_shape(lambda tree: jax.tree.map(_in_eight_bits, tree), params)
         # Scales of earlier files have single precision; both are read as what they are.

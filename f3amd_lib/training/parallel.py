@@ -71,24 +71,31 @@ def replicate(tree, mesh: Mesh | None):
     """
     if mesh is None:
         return tree
-    everywhere = NamedSharding(mesh, PartitionSpec())
+    whole = NamedSharding(mesh, PartitionSpec())
 
     def place(leaf):
-        # Shapes alone are asked for under `jax.eval_shape`, and lie nowhere.
-        if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "sharding", None) == everywhere:
+        if getattr(leaf, "sharding", None) == whole:
             return leaf
         values = np.asarray(leaf)
-        return jax.make_array_from_callback(values.shape, everywhere, lambda part: values[part])
+        return jax.make_array_from_callback(values.shape, whole, lambda part: values[part])
 
     return jax.tree.map(place, tree)
 
 
-def spread(tree, mesh: Mesh | None):
-    """Ask, inside jit, that arrays are spread over the devices along their first axis."""
+def _lying(tree, mesh: Mesh | None, places: PartitionSpec):
     if mesh is None:
         return tree
-    shares = NamedSharding(mesh, PartitionSpec(AXIS))
-    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, shares), tree)
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, places))
+
+
+def spread(tree, mesh: Mesh | None):
+    """Ask, inside jit, that arrays are spread over the devices along their first axis."""
+    return _lying(tree, mesh, PartitionSpec(AXIS))
+
+
+def everywhere(tree, mesh: Mesh | None):
+    """Ask, inside jit, that every device has arrays as a whole."""
+    return _lying(tree, mesh, PartitionSpec())
 
 
 def is_first_process() -> bool:

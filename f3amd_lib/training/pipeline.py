@@ -34,7 +34,9 @@ from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import OutdatedFile, TrainedModel, describe, load_model, save_model
-from f3amd_lib.training.loop import Trainer, TrainingConfig, paper_recipe, short_recipe
+from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task, weights_identity
+from f3amd_lib.training.optimise import TrainingState, differences, optimise, restore_state
+from f3amd_lib.training.recipe import TrainingConfig, profile_recipe
 
 log = logging.getLogger("f3amd")
 
@@ -96,22 +98,20 @@ class PreparedData:
             **settings,
         )
 
-    def trainer(self, preset: str, config: TrainingConfig, *, network=None, mesh: Mesh | None = None) -> Trainer:
+    def task(self, preset: str, config: TrainingConfig, *, network: Mapping | None = None) -> DenoisingTask:
         """Return what trains a preset on this data set's training windows.
 
         Args:
           preset, config: the model and its training.
           network: fields of the preset's network to change.
-          mesh: see `Trainer`.
         """
-        return Trainer(
+        return denoising_task(
             self.model_config(preset, **(network or {})),
             config,
             self.packed.skeleton,
             self.normaliser,
             self.windows("train"),
             dataset_fingerprint=self.packed.fingerprint,
-            mesh=mesh,
         )
 
 
@@ -166,20 +166,6 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
     )
 
 
-def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
-    """Return the training config of a profile: the paper's on `gpu`, a short recipe elsewhere."""
-    preset = _preset_name(profile, preset)
-    ours = preset.endswith(("-plus", "-steady"))
-    recipe = paper_recipe if profile.name == "gpu" and not ours else short_recipe
-    return recipe(
-        preset,
-        profile.train_steps,
-        learning_rate=profile.learning_rate,
-        batch_size=profile.batch_size,
-        seed=profile.seed,
-    )
-
-
 def train(
     prepared: PreparedData,
     profile: Profile,
@@ -202,7 +188,7 @@ def train(
       network: fields of the preset's network to change.
       folder: where files go instead of `runs/`; several processes must see the same one.
       mesh: devices that share each batch (`parallel.all_devices`); by default one.
-      stop_at: see `Trainer.run`.
+      stop_at: see `optimise`.
       progress: show a progress bar.
 
     Returns:
@@ -210,62 +196,41 @@ def train(
       where they were measured. The model is None where `stop_at` came first; the state waits.
 
     Raises:
-      ValueError: if a training state lies there that was made with other settings.
+      ValueError: if a training state lies there that was made with other settings, or the devices
+        cannot share a batch equally.
       TrainingDiverged: if the loss stops being a number.
     """
     preset = _preset_name(profile, preset)
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
-    packed = prepared.packed
-    trainer = prepared.trainer(preset, config, network=network, mesh=mesh)
-    held_out = prepared.windows(prepared.held_out_split)
+    parallel.check_batch(config.batch_size, mesh)
+    task = prepared.task(preset, config, network=network)
     record = run_record(
         profile=profile,
-        dataset=packed,
+        dataset=prepared.packed,
         seed=config.seed,
         model=preset,
         training=config.to_dict(),
         held_out_split=prepared.held_out_split,
-        num_train_windows=int(prepared.windows("train").num_windows),
+        num_train_windows=int(task.windows.num_windows),
+        **({} if mesh is None else {"training_devices": mesh.size}),
     )
-    if mesh is not None:
-        record["training_devices"] = mesh.size
-    state, rows = None, []
-    begun = files.state.exists()
-    parallel.wait_for_all("looked for a training state")
-    if not parallel.same_everywhere(int(begun)):
-        raise ValueError(
-            f"{files.state}: one process sees it and another does not; processes that train "
-            "together need one folder that all of them see (--out)"
-        )
-    if not begun:
-        if parallel.is_first_process():
-            _set_aside(files)  # a finished model without its state cannot be gone on with
-    else:
-        state = trainer.restore(files.state)
-        if not parallel.same_everywhere(int(state.step)):
-            raise ValueError(
-                f"{files.state}: processes found different steps in it; processes that train "
-                "together need one folder that all of them see (--out)"
-            )
-        if files.history.exists():
-            earlier, _ = read_table(files.history)
-            rows = earlier[earlier["step"] <= int(state.step)].to_dict("records")
-        else:  # it is written after the state: a run may be killed between the two
-            log.warning("%s is missing: losses of the first %d steps are lost", files.history, state.step)
+    state, rows = _begun(files, task, mesh)
 
     def keep(row: dict) -> None:
         rows.append(row)
         if "held_out_loss" in row and parallel.is_first_process():
             write_table(files.history, pd.DataFrame(rows), record)
 
-    state, _ = trainer.run(
+    state, _ = optimise(
+        task,
         state,
         checkpoint=files.state,
         checkpoint_every=max(1, config.num_steps // 20),
-        held_out=held_out,
+        held_out=prepared.windows(prepared.held_out_split),
         chunk=max(1, min(50, config.num_steps // 20)),
         stop_at=stop_at,
+        mesh=mesh,
         on_chunk=keep,
         progress=progress,
     )
@@ -274,29 +239,45 @@ def train(
         return None, history
     trained = TrainedModel(
         name=preset,
-        config=trainer.model_config,
-        params=state.ema,
-        normaliser=trainer.normaliser,
-        skeleton=packed.skeleton,
-        styles=packed.styles,
+        config=task.model_config,
+        params=state.averaged,
+        normaliser=task.normaliser,
+        skeleton=task.skeleton,
+        styles=prepared.packed.styles,
         diffusion=config.diffusion,
-        start_poses=starting_poses(packed, num_history=prepared.num_history),
+        start_poses=starting_poses(prepared.packed, num_history=prepared.num_history),
         record=record,
     )
     if parallel.is_first_process():
         save_model(files.model, trained)
-        trained = load_model(files.model)
+        trained = load_model(files.model)  # in the precision of the file
     parallel.wait_for_all("wrote the model")
     return trained, history
 
 
+def _begun(files: ModelFiles, task: DenoisingTask, mesh: Mesh | None) -> tuple[TrainingState | None, list[dict]]:
+    """Return the state and the rows to go on from, of which all processes must see the same."""
+    advice = "processes that train together need one folder that all of them see (--out)"
+    begun = files.state.exists()
+    parallel.wait_for_all("looked for a training state")
+    if not parallel.same_everywhere(int(begun)):
+        raise ValueError(f"{files.state}: one process sees it and another does not; {advice}")
+    if not begun:
+        if parallel.is_first_process():
+            _set_aside(files)  # a finished model without its state cannot be gone on with
+        return None, []
+    state = restore_state(files.state, task, mesh)
+    if not parallel.same_everywhere(int(state.step)):
+        raise ValueError(f"{files.state}: processes found different steps in it; {advice}")
+    if not files.history.exists():  # it is written after the state: a run may be killed between the two
+        log.warning("%s is missing: losses of the first %d steps are lost", files.history, state.step)
+        return state, []
+    earlier, _ = read_table(files.history)
+    return state, earlier[earlier["step"] <= int(state.step)].to_dict("records")
+
+
 def obtain_model(
-    prepared: PreparedData,
-    profile: Profile,
-    *,
-    preset: str | None = None,
-    allow_shipped: bool = True,
-    progress: bool = True,
+    prepared: PreparedData, profile: Profile, *, preset: str | None = None, progress: bool = True
 ) -> tuple[TrainedModel, pd.DataFrame, str]:
     """Return a trained model: shipped, finished earlier, or trained now.
 
@@ -308,7 +289,6 @@ def obtain_model(
       prepared: the data.
       profile: `laptop` may use shipped weights, the others never do.
       preset: by default the profile's own.
-      allow_shipped: whether shipped weights may be used.
       progress: show a progress bar if training is needed.
 
     Returns:
@@ -316,27 +296,24 @@ def obtain_model(
     """
     preset = _preset_name(profile, preset)
     wanted = prepared.model_config(preset)
-    if allow_shipped and profile.name == "laptop":
+    if profile.name == "laptop":
         shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
         if shipped.model.exists():
             trained = load_model(shipped.model)
-            if (
-                trained.config == wanted
-                and trained.skeleton == prepared.packed.skeleton
-                and trained.styles == prepared.packed.styles
-            ):
+            theirs = (trained.config, trained.skeleton, trained.styles)
+            if theirs == (wanted, prepared.packed.skeleton, prepared.packed.styles):
                 return trained, read_table(shipped.history)[0], "shipped"
     files = model_files(profile, preset)
-    mine = _identity(prepared, wanted, profile_recipe(profile, preset))
+    recipe = profile_recipe(profile, preset)
     if files.model.exists() and files.history.exists():
         with contextlib.suppress(OutdatedFile):  # set aside below
             trained = load_model(files.model)
-            if not _unlike(trained, mine):
+            if not _unlike(trained, prepared, wanted, recipe):
                 return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
     if files.model.exists() or not files.history.exists():
         _set_aside(files)
-    set_aside_unlike(prepared, files, wanted, profile_recipe(profile, preset))
+    set_aside_unlike(prepared, files, wanted, recipe)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
@@ -393,8 +370,8 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     if not files.model.exists():
         return None
     trained = load_model(files.model)
-    mine = _identity(prepared, prepared.model_config(preset), profile_recipe(profile, preset))
-    if unlike := _unlike(trained, mine):
+    unlike = _unlike(trained, prepared, prepared.model_config(preset), profile_recipe(profile, preset))
+    if unlike:
         raise ValueError(
             f"{files.model}: a model with another {' and '.join(unlike)} lies there; move it away "
             "or name another folder (--out)"
@@ -402,14 +379,10 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     return trained
 
 
-def _unlike(trained: TrainedModel, mine: dict) -> list[str]:
-    """List what a finished model has otherwise than `_identity` says."""
-    theirs = {
-        "model": trained.config.to_dict(),
-        "training": trained.record.get("training"),
-        "dataset_fingerprint": trained.record.get("dataset_fingerprint"),
-    }
-    return [name for name, value in mine.items() if theirs[name] != value]
+def _unlike(trained: TrainedModel, prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> list[str]:
+    """List in what a finished model is unlike the one that a run would make."""
+    mine = weights_identity(model, config, prepared.packed.fingerprint)
+    return differences(mine, {**trained.record, "model": trained.config.to_dict()})
 
 
 def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig) -> None:
@@ -420,9 +393,8 @@ def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkCo
       files: of the run.
       model, config: of the run that is to come.
     """
-    mine = _identity(prepared, model, config)
-    state = describe(files.state) if files.state.exists() else mine
-    if any(state.get(name) != value for name, value in mine.items()):
+    mine = weights_identity(model, config, prepared.packed.fingerprint)
+    if files.state.exists() and differences(mine, describe(files.state)):
         _set_aside(files)
 
 
@@ -442,11 +414,6 @@ def available_models(profile: Profile) -> list[str]:
         for name in dict.fromkeys(names)
         if any((folder / f"{name}{suffix}.safetensors").exists() for folder in folders)
     ]
-
-
-def _identity(prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> dict:
-    """Return all that decides a model's weights, as a state or record tells it."""
-    return {"model": model.to_dict(), "training": config.to_dict(), "dataset_fingerprint": prepared.packed.fingerprint}
 
 
 def find_model(dataset: str) -> Path:

@@ -1,0 +1,277 @@
+"""What a denoiser is trained to do: undo noise on windows of motion, from histories as they come.
+
+One step of training: `DenoisingTask.draw` cuts a batch of windows and noise levels,
+`DenoisingTask.loss` adds the noise, asks the network for the clean window and compares
+(`training.losses`); `training.optimise` takes the step.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+
+from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
+from f3amd_lib.data.windows import (
+    Batch,
+    WindowSet,
+    draw_windows,
+    gather_windows,
+    mean_poses,
+    restart_from,
+    spread_windows,
+)
+from f3amd_lib.diffusion.samplers import add_noise
+from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.losses import loss_terms, total_loss
+from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.recipe import TrainingConfig, make_optimiser
+
+LOG_NORMAL_SIGMA = (-1.2 + math.log(2.0), 1.2)
+"""Mean and deviation of ln sigma: Karras et al. 2022, Table 1, for features of deviation 1 where
+theirs have 0.5."""
+
+_HELD_OUT_WINDOWS = 512
+"""Most windows that the held-out loss is measured on."""
+
+
+def network_inputs(batch: Batch, normaliser: Normaliser) -> tuple[jax.Array, Condition]:
+    """Return (x0, condition) of a batch in network units."""
+    condition = Condition(
+        history=normaliser.normalise(batch.history), path=normaliser.normalise_path(batch.path), style=batch.style
+    )
+    return normaliser.normalise(batch.future), condition
+
+
+def draw_sigma(key, batch_size: int, config: TrainingConfig):
+    """Draw the noise level of each sample, [B], as `config.noise` says (Eqs 8 and 9)."""
+    key_time, key_low, key_choice = jax.random.split(key, 3)
+    sigma = config.diffusion.draw(key_time, (batch_size,))
+    if config.noise == "mixed":
+        log_low = jax.random.uniform(key_low, (batch_size,), minval=np.log(config.diffusion.sigma_min), maxval=0.0)
+        low = jax.random.bernoulli(key_choice, 0.5, (batch_size,))
+        sigma = jnp.where(low, jnp.exp(log_low), sigma)
+    if config.noise == "log_normal":
+        mean, deviation = LOG_NORMAL_SIGMA
+        log_sigma = mean + deviation * jax.random.normal(key_low, (batch_size,))
+        sigma = jnp.clip(jnp.exp(log_sigma), config.diffusion.sigma_min, config.diffusion.sigma_max)
+    return sigma
+
+
+def noise_weights(sigma, config: TrainingConfig):
+    """Return what each sample counts in the loss, [B], mean 1, or None where all count alike."""
+    if config.noise_weighting == "uniform":
+        return None
+    weights = 1.0 + jnp.minimum(sigma**-2.0, 5.0)
+    return weights / weights.mean()
+
+
+def weights_identity(model: NetworkConfig, config: TrainingConfig, dataset_fingerprint: str) -> dict:
+    """Return all that decides a denoiser's weights, as its training state or its record tells it."""
+    return {"model": model.to_dict(), "training": config.to_dict(), "dataset_fingerprint": dataset_fingerprint}
+
+
+@dataclass(frozen=True, eq=False)
+class Constants:
+    """What is known of the training windows as a whole, compiled into the step.
+
+    The same object means the same numbers. (As arguments of the step they would be rounded
+    differently, and a run would not repeat an earlier one to the bit.)
+
+    Attributes:
+      normaliser: of the features.
+      mean_poses: of each style, [S, C - 9].
+    """
+
+    normaliser: Normaliser
+    mean_poses: jax.Array
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("windows",),
+    meta_fields=("model_config", "config", "skeleton", "constants", "dataset_fingerprint"),
+)
+@dataclass(frozen=True, eq=False)
+class DenoisingTask:
+    """A denoiser to train on one window set (a `training.optimise.Task`); see `denoising_task`.
+
+    Attributes:
+      model_config: the network.
+      config: how to train it.
+      skeleton: for the kinematic losses.
+      constants: of the training windows.
+      windows: training windows on the device.
+      dataset_fingerprint: of the data they come from; a state of other data is not resumed.
+    """
+
+    name: ClassVar[str] = "denoiser"
+
+    model_config: NetworkConfig
+    config: TrainingConfig
+    skeleton: Skeleton
+    constants: Constants
+    windows: WindowSet
+    dataset_fingerprint: str
+
+    @property
+    def normaliser(self) -> Normaliser:
+        """Of the training windows; the identity where the network wants none."""
+        return self.constants.normaliser
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam, as the config says."""
+        return make_optimiser(self.config)
+
+    def identity(self) -> dict:
+        """See `weights_identity`."""
+        return weights_identity(self.model_config, self.config, self.dataset_fingerprint)
+
+    def init(self, key):
+        """Return initial weights; no network here keeps statistics."""
+        return nnx.state(build_from_config(self.model_config, key)), None
+
+    def draw(self, state: TrainingState, key):
+        """Draw windows and noise levels; return ((batch, sigma [B]), key of the loss).
+
+        Where the config asks, windows start from histories as a rollout meets them.
+        """
+        config, window = self.config, self.model_config.window
+        key_batch, key_sigma, key_loss = jax.random.split(key, 3)
+        key_draw, key_own, key_damping = jax.random.split(key_batch, 3)
+        drawn = draw_windows(self.windows, key_draw, config.batch_size, config.captured_path_share)
+        frames = {"window": window, "num_history": self.model_config.num_history}
+        batch = gather_windows(self.windows, *drawn, **frames)
+        history = batch.history
+        if config.own_history_share > 0:
+            before = gather_windows(self.windows, *drawn, **frames, earlier=window)
+            room = self.windows.room[drawn[0]] >= window
+            history = self._own_history(state, batch, before, room, key_own)
+        if config.history_damping > 0:
+            history = self._damped(history, batch.style, key_damping)
+        if history is not batch.history:
+            batch = restart_from(batch, history)
+        return (batch, draw_sigma(key_sigma, config.batch_size, config)), key_loss
+
+    def _own_history(self, state: TrainingState, batch: Batch, before: Batch, room, key):
+        """Replace a share of the histories by the last frames of the network's own window before.
+
+        That window is made in one step from pure noise, and no gradient flows through it.
+        """
+        config = self.config
+        key_noise, key_choice = jax.random.split(key)
+        x0, condition = network_inputs(before, self.normaliser)
+        model = network_with(self.model_config, state.params)
+        sigma = config.diffusion.sigma_max
+        x_noisy = sigma * jax.random.normal(key_noise, x0.shape)
+        x0_hat = jax.lax.stop_gradient(model(x_noisy, sigma, model.encode(condition)))
+        made = orthonormalise(self.normaliser.denormalise(x0_hat))
+        # Short windows leave some captured frames at the front, as they would in a rollout.
+        made = jnp.concatenate([before.history, made], axis=1)[:, -batch.history.shape[1] :]
+        # From the coordinates of the window before to those of this one.
+        made = center_window(made, before.future[:, -1, jnp.array([0, 2])])
+        # The share rises between 10 and 40 % of the run: before that there is nothing to learn from.
+        progress = state.step / config.num_steps
+        share = config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
+        chosen = room & jax.random.bernoulli(key_choice, share, room.shape)
+        return jnp.where(chosen[:, None, None], made, batch.history)
+
+    def _damped(self, history, style, key):
+        """Pull a share of the histories towards the mean pose of their style."""
+        key_choice, key_amount = jax.random.split(key)
+        size = (history.shape[0], 1, 1)
+        chosen = jax.random.bernoulli(key_choice, self.config.history_damping, size)
+        amount = jnp.where(chosen, jax.random.uniform(key_amount, size, maxval=0.8), 0.0)
+        mean = (style @ self.constants.mean_poses)[:, None, :]
+        # Where the root is and goes (9 numbers) stays; the pose alone loses its swing.
+        pose = history[..., 9:] + amount * (mean - history[..., 9:])
+        return orthonormalise(jnp.concatenate([history[..., :9], pose], axis=-1))
+
+    def loss(self, params, statistics, drawn, key):
+        """Return (loss, (terms, statistics)) of what `draw` drew."""
+        batch, sigma = drawn
+        terms = self._terms(params, batch, sigma, key, training=True)
+        return terms["loss"], (terms, statistics)
+
+    def held_out_terms(self, params, statistics, windows: WindowSet, key) -> dict:
+        """Return the mean loss terms on windows of another split, without any disturbance."""
+        batch = spread_windows(windows, _HELD_OUT_WINDOWS)
+        key_sigma, key_loss = jax.random.split(key)
+        sigma = self.config.diffusion.draw(key_sigma, (batch.future.shape[0],))
+        return self._terms(params, batch, sigma, key_loss, training=False)
+
+    def _terms(self, params, batch: Batch, sigma, key, *, training: bool) -> dict:
+        """Add noise, ask for the clean window and compare; "loss" is the weighted sum (Eq. 14)."""
+        key_noise, key_history, key_dropout = jax.random.split(key, 3)
+        x0, condition = network_inputs(batch, self.normaliser)
+        if training:
+            condition = self._disturbed(condition, key_history)
+        noise = jax.random.normal(key_noise, x0.shape)
+        model = network_with(self.model_config, params)
+        x_noisy = add_noise(x0, sigma[:, None, None], noise)
+        drops = training and self.model_config.dropout > 0
+        x0_hat = model(x_noisy, sigma, model.encode(condition), key=key_dropout if drops else None)
+        terms = loss_terms(
+            self.skeleton,
+            x0_hat,
+            x0,
+            self.normaliser.denormalise(x0_hat),
+            batch.future,
+            batch.history[:, -1],
+            self.config.loss.ird_form,
+            noise_weights(sigma, self.config) if training else None,
+        )
+        return {"loss": total_loss(terms, self.config.loss), **terms}
+
+    def _disturbed(self, condition: Condition, key) -> Condition:
+        """Add noise to the history, or take it or the whole condition away, as the config says."""
+        config, history = self.config, condition.history
+        key_noise, key_dropout = jax.random.split(key)
+        if config.history_noise > 0:
+            history = history + config.history_noise * jax.random.normal(key_noise, history.shape)
+        if config.history_dropout > 0:
+            size = (history.shape[0], 1, 1)
+            kept = jax.random.bernoulli(key_dropout, 1.0 - config.history_dropout, size)
+            history = jnp.where(kept, history, 0.0)
+        condition = condition._replace(history=history)
+        if config.condition_dropout > 0:
+            share = 1.0 - config.condition_dropout
+            kept = jax.random.bernoulli(jax.random.fold_in(key, 1), share, history.shape[:1])
+            condition = jax.tree.map(
+                lambda part: jnp.where(kept.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), condition
+            )
+        return condition
+
+
+def denoising_task(
+    model_config: NetworkConfig,
+    config: TrainingConfig,
+    skeleton: Skeleton,
+    normaliser: Normaliser,
+    windows: WindowSet,
+    *,
+    dataset_fingerprint: str = "",
+) -> DenoisingTask:
+    """Lay out what a denoiser is trained on.
+
+    Args:
+      normaliser: of the training windows; replaced by the identity where the network wants none
+        (`-raw`).
+      model_config, config, skeleton, windows, dataset_fingerprint: see `DenoisingTask`.
+    """
+    if not model_config.normalise:
+        normaliser = Normaliser.identity(model_config.channels)
+    constants = Constants(normaliser, mean_poses(windows))
+    return DenoisingTask(model_config, config, skeleton, constants, windows, dataset_fingerprint)

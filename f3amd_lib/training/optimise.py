@@ -1,0 +1,319 @@
+"""The one optimise loop: steps under a scan, moving average, exact resume (section 4.5).
+
+What is trained is a task, a small value that draws batches and knows its loss. The loop adds what
+all trainings share: the optimiser's step, the moving average, checkpoints, progress, a stop at a
+time or at the first number that is none, and several devices. The state is a value; `optimise`
+advances it in chunks of jitted steps that draw their batches on the device. Every random number of
+step k comes from the seed and k alone, so that a run that was killed and resumed gives the same
+weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from f3amd_lib.training import parallel
+from f3amd_lib.training.checkpoints import load_tree, save_tree
+
+
+class TrainingDiverged(ArithmeticError):
+    """The loss stopped being a number; the message names the step, the term and the checkpoint."""
+
+
+class TrainingState(NamedTuple):
+    """All that changes in training.
+
+    Attributes:
+      params: weights.
+      ema: their moving average; None where the task has none.
+      optimiser: optax state.
+      step: steps done, int32 scalar.
+      statistics: what else a network keeps, such as batch statistics; None where it keeps nothing.
+    """
+
+    params: Any
+    ema: Any
+    optimiser: Any
+    step: jax.Array
+    statistics: Any = None
+
+    @property
+    def averaged(self):
+        """The weights to evaluate and to ship: the moving average, where there is one."""
+        return self.params if self.ema is None else self.ema
+
+
+class Settings(Protocol):
+    """What the loop asks of a task's `config`.
+
+    Attributes:
+      num_steps: optimiser steps in all.
+      ema_decay: of the moving average of the weights; None keeps none.
+      seed: of initial weights and batches.
+    """
+
+    num_steps: int
+    ema_decay: float | None
+    seed: int
+
+
+class Task(Protocol):
+    """One training, as a JAX tree: its data are leaves, all else is static and compared by value.
+
+    Weights are any tree, and so are several players: one branch each, with a loss that stops the
+    gradient where it should not flow, and an optimiser that treats branches differently
+    (`optax.partition`; `optax.set_to_zero` freezes one).
+
+    Attributes:
+      name: of what is trained, for progress bars and errors.
+      config: how long and from which seed.
+      optimiser: turns gradients into updates.
+    """
+
+    name: str
+    config: Settings
+    optimiser: optax.GradientTransformation
+
+    def identity(self) -> dict:
+        """Return all that decides the weights, JSON-ready, so that a state is resumed only where it belongs."""
+
+    def init(self, key) -> tuple[Any, Any]:
+        """Return (weights, statistics) before the first step."""
+
+    def draw(self, state: TrainingState, key) -> tuple[Any, jax.Array]:
+        """Return (batch, key of the loss); arrays of a batch have the samples first."""
+
+    def loss(self, params, statistics, batch, key) -> tuple[jax.Array, tuple[dict, Any]]:
+        """Return (loss, (terms by name with "loss" among them, statistics after the step))."""
+
+    def held_out_terms(self, params, statistics, held_out, key) -> dict:
+        """Return terms by name on held-out data; only asked where such data are given."""
+
+
+@jax.jit
+def _initial_state(task: Task, key) -> TrainingState:
+    params, statistics = task.init(key)
+    return TrainingState(params, None, task.optimiser.init(params), jnp.zeros((), jnp.int32), statistics)
+
+
+def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
+    """Return the state before the first step, on every device of the mesh."""
+    state = _initial_state(task, jax.random.fold_in(jax.random.key(task.config.seed), 0))
+    if task.config.ema_decay is not None:
+        state = state._replace(ema=jax.tree.map(jnp.copy, state.params))
+    return parallel.replicate(state, mesh)
+
+
+@functools.partial(jax.jit, static_argnames=("length", "mesh"), donate_argnames="state")
+def _advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None):
+    decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
+
+    def one_step(state: TrainingState, _):
+        batch, key = task.draw(state, jax.random.fold_in(base, state.step))
+        batch = parallel.spread(batch, mesh)
+        gradient, (terms, statistics) = jax.grad(task.loss, has_aux=True)(state.params, state.statistics, batch, key)
+        updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
+        params = optax.apply_updates(state.params, updates)
+        ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
+        return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
+
+    return parallel.everywhere(jax.lax.scan(one_step, state, None, length=length), mesh)
+
+
+def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = None) -> tuple[TrainingState, dict]:
+    """Train some steps in one program, without checkpoints or checks (see `optimise`).
+
+    Args:
+      task: what to train; its data lie on every device of the mesh.
+      state: where to start; its arrays are given away.
+      length: steps.
+      mesh: devices that share each batch.
+
+    Returns:
+      (state, every loss term of every step, [length] each).
+    """
+    return _advance(task, state, length, mesh)
+
+
+def plan_memory(task: Task, length: int = 1) -> int:
+    """Return the bytes that the compiler plans for some steps: state, data, values between.
+
+    Args:
+      task: what to train.
+      length: steps in one program.
+    """
+    plan = _advance.lower(task, jax.eval_shape(initial_state, task), length, None).compile().memory_analysis()
+    shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
+    return int(plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - shared)
+
+
+@jax.jit
+def _held_out_terms(task: Task, params, statistics, held_out, key) -> dict:
+    return task.held_out_terms(params, statistics, held_out, key)
+
+
+def held_out_terms(task: Task, state: TrainingState, held_out, mesh: Mesh | None = None) -> dict[str, float]:
+    """Return the mean loss terms on held-out data, with the same noise every time.
+
+    Args:
+      task: what is trained.
+      state: whose moving average is measured (the weights where there is none).
+      held_out: data of another split than the one trained on.
+      mesh: devices that the state lies on.
+    """
+    held_out = parallel.replicate(held_out, mesh)
+    terms = _held_out_terms(task, state.averaged, state.statistics, held_out, jax.random.key(7))
+    return {name: float(value) for name, value in terms.items()}
+
+
+def save_state(path: Path, task: Task, state: TrainingState) -> None:
+    """Write the whole training state; an interrupted write leaves the old file whole."""
+    if parallel.is_first_process():
+        save_tree(path, state, {"kind": "training state", **task.identity()})
+
+
+def restore_state(path: Path, task: Task, mesh: Mesh | None = None) -> TrainingState:
+    """Read a state written by `save_state`.
+
+    Raises:
+      ValueError: if the file is broken, or was made with other settings or on other data.
+    """
+
+    def template(metadata: dict):
+        if unlike := differences(task.identity(), metadata):
+            raise ValueError(
+                f"{path}: checkpoint was made with other {'; '.join(unlike)}; choose another file or the old settings"
+            )
+        return jax.eval_shape(initial_state, task)
+
+    return parallel.replicate(load_tree(path, template)[0], mesh)
+
+
+def differences(identity: dict, found: dict) -> list[str]:
+    """Say in what a file is unlike a task, such as "training settings (batch_size, seed)".
+
+    Args:
+      identity: of the task.
+      found: the file's description; what it tells beside the task's identity does not matter.
+    """
+    # Files have lists where settings have tuples.
+    mine, theirs = (json.loads(json.dumps({part: of.get(part) for part in identity})) for of in (identity, found))
+    unlike = []
+    for part in (part for part in mine if mine[part] != theirs[part]):
+        if isinstance(mine[part], dict) and isinstance(theirs[part], dict):
+            names = sorted(mine[part].keys() | theirs[part].keys())
+            changed = [name for name in names if mine[part].get(name) != theirs[part].get(name)]
+            unlike.append(f"{part} settings ({', '.join(changed)})")
+        else:
+            unlike.append(part.replace("_", " "))
+    return unlike
+
+
+def optimise(
+    task: Task,
+    state: TrainingState | None = None,
+    *,
+    checkpoint: Path | None = None,
+    checkpoint_every: int = 500,
+    held_out=None,
+    chunk: int = 50,
+    stop_after: int | None = None,
+    stop_at: float | None = None,
+    mesh: Mesh | None = None,
+    on_chunk: Callable[[dict], None] | None = None,
+    progress: bool = True,
+) -> tuple[TrainingState, list[dict]]:
+    """Train to the number of steps that the task's config says.
+
+    Args:
+      task: what to train.
+      state: where to start; by default the checkpoint if it exists, else the beginning.
+      checkpoint: file to write the state to, every `checkpoint_every` steps and at the end.
+      checkpoint_every: steps between checkpoints and held-out evaluations.
+      held_out: data to evaluate on, of the kind that the task knows.
+      chunk: steps per jitted scan.
+      stop_after: stop once this many steps are done in all.
+      stop_at: stop, with a checkpoint, at the end of the first chunk after this time
+        (`time.monotonic`). Of processes that train together, the first one's clock counts.
+      mesh: devices to spread each batch over (`parallel.all_devices`); by default one does it all.
+      on_chunk: called with each history row as it is made.
+      progress: show a progress bar.
+
+    Returns:
+      (state, history): one row per chunk with step, mean of every loss term, and the held-out
+      loss where it was measured.
+
+    Raises:
+      TrainingDiverged: at the first loss or weight that is not finite; the checkpoint on disk
+        is from before.
+    """
+    if chunk < 1 or checkpoint_every < 1:
+        raise ValueError("chunk and checkpoint_every must be at least 1")
+    task = parallel.replicate(task, mesh)
+    if state is not None:
+        # The chunk donates its input; what the caller holds must stay alive.
+        state = jax.tree.map(jnp.copy, state)
+    elif checkpoint is not None and Path(checkpoint).exists():
+        state = restore_state(checkpoint, task, mesh)
+    else:
+        state = initial_state(task, mesh)
+    num_steps = task.config.num_steps
+    total = num_steps if stop_after is None else min(num_steps, stop_after)
+    done, history, late = int(state.step), [], False
+    hidden = not (progress and parallel.is_first_process())
+    with tqdm(total=total, initial=done, unit="step", desc=task.name, disable=hidden) as bar:
+        while done < total and not late:
+            # Chunks end on multiples, so that a resumed run makes the same ones.
+            length = min(chunk - done % chunk, total - done)
+            state, terms = advance(task, state, length, mesh)
+            terms = {name: np.asarray(value) for name, value in terms.items()}
+            if broken := _what_is_broken(done, terms, state):
+                raise TrainingDiverged(f"{task.name}: {broken}{_advice(checkpoint)}")
+            passed = (done + length) // checkpoint_every > done // checkpoint_every
+            done += length
+            row = {"step": done, **{name: float(value.mean()) for name, value in terms.items()}}
+            late = stop_at is not None and parallel.first_says(time.monotonic() >= stop_at)
+            due = passed or done == total or late
+            if due and held_out is not None:
+                measured = held_out_terms(task, state, held_out, mesh)
+                row.update({f"held_out_{name}": value for name, value in measured.items()})
+            if due and checkpoint is not None:
+                save_state(checkpoint, task, state)
+            history.append(row)
+            if on_chunk is not None:
+                on_chunk(row)
+            bar.update(length)
+            bar.set_postfix(loss=f"{row['loss']:.4f}")
+    return state, history
+
+
+def _what_is_broken(done: int, terms: dict, state: TrainingState) -> str | None:
+    """Say which step of a chunk made the loss or the weights something else than numbers, if one did."""
+    bad = ~np.isfinite(terms["loss"])
+    if bad.any():
+        first = int(np.argmax(bad))
+        guilty = [name for name in terms if name != "loss" and not np.isfinite(terms[name][first])]
+        terms = f" (terms: {', '.join(guilty)})" if guilty else ""
+        return f"loss is not finite at step {done + first + 1}{terms}"
+    # The loss of the last step is from before its update.
+    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+        return f"weights are not finite after step {done + len(bad)}"
+    return None
+
+
+def _advice(checkpoint: Path | None) -> str:
+    kept = checkpoint is not None and Path(checkpoint).exists()
+    kept = f"; the last good state is in {checkpoint}" if kept else ""
+    return f": lower the learning rate or check the data for broken frames{kept}"

@@ -1,0 +1,209 @@
+"""How a network is trained: all the settings, and the recipes that choose them (section 4.5).
+
+A preset's own noise, losses and remedies stand in `networks.presets`; the length of the run and what
+goes with it is chosen here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import optax
+
+from f3amd_lib.diffusion.schedules import NoiseSchedule, VarianceExploding, schedule_from_dict
+from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.training.losses import LossWeights
+
+_CHOICES = {
+    "schedule": ("inverse_square", "inverse_sqrt", "warmup_cosine"),
+    "noise": ("schedule", "mixed", "log_normal"),
+    "noise_weighting": ("uniform", "low_noise"),
+}
+"""For each setting that names a variant: the names there are."""
+
+_SHARES = ("history_dropout", "condition_dropout", "captured_path_share", "own_history_share", "history_damping")
+
+_RANGES = (
+    (("num_steps", "batch_size", "warmup_steps"), lambda x: type(x) is int and x >= 1, "positive and whole"),
+    (("learning_rate", "decay_steps"), lambda x: 0 < x < math.inf, "positive and finite"),
+    (("gradient_clip", "history_noise"), lambda x: 0 <= x < math.inf, "0 or more and finite"),
+    (_SHARES, lambda x: 0 <= x <= 1, "in [0, 1]"),
+    (("ema_decay",), lambda x: 0 <= x < 1, "in [0, 1)"),
+)
+"""Settings that are numbers, what they must fulfil, and how an error says so."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a network is trained; with the model's config, all that decides its weights.
+
+    Attributes:
+      num_steps: optimiser steps in all.
+      batch_size: windows a step (paper: 512).
+      learning_rate: peak value (paper: 5e-4).
+      schedule: "inverse_square" is the paper's text, lr (1 + step / decay_steps)^-2;
+        "inverse_sqrt" the usual reading of such schedules; "warmup_cosine" ours, for short runs.
+      decay_steps: the paper's decay constant, 1e5.
+      warmup_steps: of "warmup_cosine".
+      ema_decay: moving average of the weights (paper: 0.993); what is evaluated and shipped.
+      gradient_clip: largest global gradient norm; 0 clips nothing (the paper names none).
+      noise: "schedule" draws levels as the schedule says (Eq. 9: t uniform); "mixed" (ours) draws
+        every second sigma log-uniform between sigma_min and 1, where the noisy input says something
+        that the condition does not; "log_normal" (ours) draws the logarithm from
+        `LOG_NORMAL_SIGMA`, cut off at the ends of the schedule.
+      noise_weighting: "uniform" weighs all noise levels alike; "low_noise" (ours) by
+        1 + min(1 / sigma^2, 5), the weight of Karras et al. 2022 for a clean estimate, capped, and
+        divided by its mean over the batch.
+      history_noise: deviation, in network units, of noise added to the history in training (ours;
+        0 in paper presets): rounds are started from generated frames, which are never quite real.
+      history_dropout: share of samples whose history is set to 0 (CAMDM's code: 0.15; F3AMD
+        mentions none).
+      condition_dropout: share of samples that see no condition at all, history, path and style 0
+        (ours; 0 in paper presets), so that only the noisy input can tell them what to make.
+      captured_path_share: share of samples whose path condition is the captured root, sway and all;
+        the rest see a smoothed one, as users draw them (CAMDM: 0.5).
+      own_history_share: share of samples that start from the network's own last frames of the
+        window before, made in one step without gradient, instead of captured ones (ours; 0 in
+        paper presets). Without it small losses of swing add up over rounds until nobody walks.
+        It rises from 0 between 10 and 40 % of the run, when there is something to learn from.
+      history_damping: share of samples whose history is pulled towards the mean pose of its style,
+        by a random amount, while the target soon returns to what was captured (ours; 0 in paper
+        presets): the same remedy, for histories that have lost the swing of more than one round.
+      loss: weights of the loss terms.
+      diffusion: the noise schedule (section 4.5).
+      seed: of initial weights and batches.
+
+    Raises:
+      ValueError: for an unknown schedule or noise name, or sizes that are not positive.
+    """
+
+    num_steps: int
+    batch_size: int = 512
+    learning_rate: float = 5e-4
+    schedule: str = "inverse_square"
+    decay_steps: float = 1e5
+    warmup_steps: int = 200
+    ema_decay: float = 0.993
+    gradient_clip: float = 0.0
+    noise: str = "schedule"
+    noise_weighting: str = "uniform"
+    history_noise: float = 0.0
+    history_dropout: float = 0.0
+    condition_dropout: float = 0.0
+    captured_path_share: float = 0.5
+    own_history_share: float = 0.0
+    history_damping: float = 0.0
+    loss: LossWeights = field(default_factory=LossWeights)
+    diffusion: NoiseSchedule = field(default_factory=VarianceExploding)
+    seed: int = 0
+
+    def __post_init__(self):
+        for name, known in _CHOICES.items():
+            if getattr(self, name) not in known:
+                value = getattr(self, name)
+                raise ValueError(f"unknown {name} {value!r}{nearest_hint(value, known)}")
+        for names, fits, wanted in _RANGES:
+            for name in names:
+                if not fits(getattr(self, name)):
+                    raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
+        # The other draws reach below 1 by a logarithm, which such a schedule alone has room for.
+        if self.noise != "schedule" and not (
+            isinstance(self.diffusion, VarianceExploding) and self.diffusion.sigma_min < 1.0
+        ):
+            raise ValueError(
+                f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, got {self.diffusion!r}"
+            )
+
+    def to_dict(self) -> dict:
+        """Return the fields as JSON-ready values."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> TrainingConfig:
+        """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
+        refuse_unknown(values, cls, "training setting")
+        values = dict(values)
+        if isinstance(values.get("loss"), dict):
+            refuse_unknown(values["loss"], LossWeights, "loss setting")
+            values["loss"] = LossWeights(**values["loss"])
+        if isinstance(values.get("diffusion"), dict):
+            values["diffusion"] = schedule_from_dict(values["diffusion"])
+        return cls(**values)
+
+
+def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
+    """Return how the paper trains a preset (section 4.5), but for the number of steps.
+
+    Args:
+      preset: see `presets.find_preset`; its own noise, losses and remedies are in it.
+      num_steps: optimiser steps.
+      **settings: fields of `TrainingConfig` to change.
+    """
+    found = find_preset(preset)
+    return TrainingConfig.from_dict(
+        {"num_steps": num_steps, "diffusion": found.diffusion, **found.training, **settings}
+    )
+
+
+def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
+    """Return how a preset is trained in a run far shorter than the paper's 100 epochs.
+
+    As `paper_recipe`, with a warm-up and a cosine from a higher rate, which short runs need (the
+    paper's schedule is `TrainingConfig`'s default).
+
+    Args:
+      preset, num_steps, **settings: as for `paper_recipe`.
+    """
+    short = {
+        "batch_size": 128,
+        "learning_rate": 2e-3,
+        "schedule": "warmup_cosine",
+        "warmup_steps": max(1, min(200, num_steps // 10)),
+        "gradient_clip": 1.0,
+    }
+    return paper_recipe(preset, num_steps, **{**short, **settings})
+
+
+def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
+    """Return how a profile trains a preset: as the paper on `gpu`, by a short recipe elsewhere.
+
+    Args:
+      profile: says how long, in which batches, at which rate and from which seed.
+      preset: by default the profile's own; our own recipes are short ones on `gpu` too.
+    """
+    preset = find_preset(preset or profile.preset).name
+    as_printed = profile.name == "gpu" and not preset.endswith(("-plus", "-steady"))
+    recipe = paper_recipe if as_printed else short_recipe
+    return recipe(
+        preset,
+        profile.train_steps,
+        learning_rate=profile.learning_rate,
+        batch_size=profile.batch_size,
+        seed=profile.seed,
+    )
+
+
+def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
+    """Return learning rate against step (section 4.5: "inverse-square")."""
+    if config.schedule == "warmup_cosine":
+        return optax.warmup_cosine_decay_schedule(
+            0.0,
+            config.learning_rate,
+            min(config.warmup_steps, config.num_steps - 1),
+            config.num_steps,
+            0.01 * config.learning_rate,
+        )
+    power = {"inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
+    return lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
+
+
+def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
+    """Return Adam at the config's learning rate (section 4.5), after clipping where it asks for it."""
+    steps = [optax.adam(learning_rate_schedule(config))]
+    if config.gradient_clip > 0:
+        steps.insert(0, optax.clip_by_global_norm(config.gradient_clip))
+    return optax.chain(*steps)
