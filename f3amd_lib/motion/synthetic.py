@@ -200,7 +200,7 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
     count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
     time = np.arange(count) / _GRID_RATE - _LEAD
     kinds = np.array(["straight", "curve", "tight", "slalom", "fast", "slow", "diagonal", "side", "back"])
-    weights = np.array([0.20, 0.26, 0.15, 0.08, 0.07, 0.07, 0.06, 0.06, 0.05])
+    weights = np.array([0.17, 0.24, 0.13, 0.07, 0.11, 0.07, 0.05, 0.09, 0.07])
     speed, turn, heading = np.zeros(count), np.zeros(count), np.zeros(count)
     start, forced, stood = 0, "straight", False
     # Runs bend their paths less per second of turning than walks.
@@ -221,7 +221,7 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
         elif kind == "slalom":
             length = 4.5
         elif kind == "fast":
-            factor = rng.uniform(1.18, 1.35)
+            factor = rng.uniform(1.18, 1.60)
         elif kind == "slow":
             factor = rng.uniform(0.5, 0.7)
         elif kind == "diagonal":
@@ -229,10 +229,10 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
             factor *= 0.85
         elif kind == "side":
             offset = sign * 90.0
-            factor = min(0.55, 0.50 / style.speed) * rng.uniform(0.8, 1.1)
+            factor = rng.uniform(0.35, 0.70)
         elif kind == "back":
             offset = sign * 180.0
-            factor = min(0.62, 0.85 / style.speed) * rng.uniform(0.8, 1.1)
+            factor = rng.uniform(0.35, 0.70)
         elif kind == "stop":
             factor, length, rate = 0.0, rng.uniform(1.4, 3.2), 0.0
             if rng.random() < 0.25:
