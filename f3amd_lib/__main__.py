@@ -159,7 +159,7 @@ def train(
       coordinator: HOST:PORT of process 0.
       cluster: train in all processes of a job of Slurm, Open MPI or Kubernetes together.
     """
-    from f3amd_lib.experiments.family import train_family
+    from f3amd_lib.experiments.learning_curves import train_family
     from f3amd_lib.training import parallel
     from f3amd_lib.training.pipeline import model_files
 

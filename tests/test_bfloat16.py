@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config, tiny_packed, tiny_trained
 
 from f3amd_lib.experiments import bfloat16
@@ -10,6 +11,7 @@ from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.config import cast_network
 
 
+@pytest.mark.slow
 def test_a_cast_network_computes_in_the_other_type_and_leaves_the_first_alone():
     network = network_of(tiny_config())
     half = cast_network(network, jnp.bfloat16)

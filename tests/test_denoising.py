@@ -52,6 +52,7 @@ def test_a_network_that_returns_its_input_errs_by_the_noise(model_that):
     np.testing.assert_allclose(table["x0_error"] / table["x0_error"][0], np.divide(SIGMAS, 0.1))
 
 
+@pytest.mark.slow
 def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
     trained = model_that(lambda x_noisy: 0.0 * x_noisy)
     windows = tiny_windows()

@@ -239,7 +239,7 @@ def imported_packages(paths) -> set[str]:
 
 
 def test_what_is_imported_is_declared():
-    own = {"f3amd_lib", "tests", "conftest"}
+    own = {"f3amd_lib", "tests", "conftest", "helpers"}
     own |= {path.stem for path in (ROOT / "tests").glob("*.py")}
     declared = {IMPORT_NAMES.get(name, name) for name in all_requirements(PYPROJECT)}
     files = [*(ROOT / "f3amd_lib").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]

@@ -220,7 +220,9 @@ READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}",
 def test_a_broken_open_point_is_refused(changes, message):
     with pytest.raises(ValueError, match=f"f.toml, 'noise': .*{message}"):
         fill_reading(READING | changes, "f.toml")
-    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml") == str(F3AMDConfig(1, 1).dropout)
+    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml") == str(
+        F3AMDConfig(channels=1, num_styles=1).dropout
+    )
 
 
 def test_open_points_are_told_once_with_a_reason():

@@ -365,6 +365,7 @@ def test_a_path_that_was_dropped_faces_nowhere_and_is_no_nan():
     assert np.isfinite(run(network, x_noisy, condition=dropped)).all()
 
 
+@pytest.mark.slow
 def test_history_in_the_input_lies_before_the_window_and_is_not_answered():
     config = tiny_config(history_input=True, num_kept_modes=7)
     assert config.block_frames == HISTORY + WINDOW

@@ -37,6 +37,7 @@ def small(monkeypatch):
     monkeypatch.setattr(measure, "SHORT_RUN", SHORT)
 
 
+@pytest.mark.slow
 def test_a_learning_curve_starts_before_the_first_step(prepared):
     curve = learning_curves.learning_curve(prepared, "F3AMD-FNO-32", **SHORT)
     assert list(curve["step"]) == [0, 1, 2, 3, 4]
@@ -66,6 +67,7 @@ def test_the_table_says_what_fell():
     assert (row["held_out_before"], row["held_out_after"]) == (3.0, 1.0)
 
 
+@pytest.mark.slow
 def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     profile = load_profile("smoke", "synthetic")
@@ -119,6 +121,7 @@ def leg(prepared, profile, folder, presets=("F3AMD-FNO-32",), **settings):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
     profile = load_profile("smoke", "synthetic", train_steps=4, batch_size=2, window=WINDOW)
     # No time at all: nothing is begun.
@@ -143,10 +146,10 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
     # Other data or other settings must not pass for the same model, nor cost the one that is there.
     packed = dataclasses.replace(prepared.packed, fingerprint="others")
     others = PreparedData(packed, WINDOW, HISTORY)
-    with pytest.raises(ValueError, match=r"F3AMD-FNO-32.*\.safetensors: .* another .*fingerprint"):
+    with pytest.raises(ValueError, match=r"F3AMD-FNO-32.*\.safetensors: .* other .*fingerprint"):
         leg(others, profile, tmp_path)
     longer = load_profile("smoke", "synthetic", train_steps=5, batch_size=2, window=WINDOW)
-    with pytest.raises(ValueError, match="another training lies there; move it away"):
+    with pytest.raises(ValueError, match="other training settings .num_steps. lies there; move it away"):
         leg(prepared, longer, tmp_path)
     assert files.model.read_bytes() == before
 

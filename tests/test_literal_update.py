@@ -54,6 +54,7 @@ def one(table, update, steps, metric):
     return value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
 def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, spacing):
     trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy + 0.2)
@@ -117,6 +118,7 @@ def test_figures_by_hand():
     assert dict(zip(table["metric"], table["unit"], strict=True)) == WINDOW_METRICS
 
 
+@pytest.mark.slow
 def test_a_single_seed_has_no_spread():
     with pytest.raises(ValueError, match="num_seeds must be at least 2"):
         walk_windows(tiny_trained(), tiny_windows(), num_seeds=1)
@@ -179,6 +181,7 @@ def test_the_measurement_walks_both_updates_on_both_grids(measurement):
     assert set(windows["spacing"]) == {"endpoints", "uniform"}
 
 
+@pytest.mark.slow
 def test_the_measurement_goes_on_and_notices_other_weights(measurement):
     run, models = measurement
     path, first = run()
@@ -212,6 +215,7 @@ def test_seed_histories_go_straight_on_at_their_own_pace():
         np.testing.assert_allclose(path[:, 2:], rotation_6d_from_yaw(np.zeros(WINDOW)), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     trained = tiny_trained()
     walks = walk_seed_histories(trained, (8, 4), num_seeds=2, seed=1)

@@ -89,6 +89,14 @@ def test_appendix_b_foot_looks_at_toes_only():
     assert terms_of(swung, standing())["foot"] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_floor_counts_toes_below_the_lowest_real_one_and_no_others():
+    """Ours: 2 cm below for all toes and frames is 4e-4 square metres; above, or moved sideways, costs nothing."""
+    lowered = lambda y: standing().at[..., 1].add(y)
+    assert terms_of(lowered(-0.02), standing())["floor"] == pytest.approx(4e-4, rel=1e-3)
+    assert terms_of(lowered(0.02), standing())["floor"] == 0.0
+    assert terms_of(standing().at[..., 0].add(0.5), standing())["floor"] == pytest.approx(0.0, abs=1e-12)
+
+
 def test_eq10_seam_of_three_centimetres_reads_three_centimetres():
     seam = standing(first=(0.03, 0.0, 0.0))
     before = standing()[:, -1]
@@ -154,14 +162,14 @@ def test_position_gradient_points_downhill():
 
 def test_eq14_total_is_the_weighted_sum():
     terms = {name: 10.0**k for k, name in enumerate(LOSS_TERMS)}
-    assert total_loss(terms, LossWeights()) == 111111.0
-    weights = LossWeights(sample=2, position=0, feature_velocity=3, joint_velocity=4, foot=0, ird=5)
-    assert total_loss(terms, weights) == 504302.0
+    assert total_loss(terms, LossWeights()) == 1011111.0  # our term against sinking weighs nothing
+    weights = LossWeights(sample=2, position=0, feature_velocity=3, joint_velocity=4, foot=0, floor=6, ird=5)
+    assert total_loss(terms, weights) == 5604302.0
 
 
 def test_section_4_5_all_weights_are_one_and_the_seam_literal():
     weights = LossWeights()
-    assert [getattr(weights, name) for name in LOSS_TERMS] == [1.0] * 6
+    assert {name: getattr(weights, name) for name in LOSS_TERMS} == dict.fromkeys(LOSS_TERMS, 1.0) | {"floor": 0.0}
     assert weights.ird_form == "literal"
 
 
@@ -191,6 +199,7 @@ def test_kinematics_of_the_loss_is_that_of_the_features():
     assert terms_of(other, future)["position"] == pytest.approx(float(jnp.mean(difference**2)), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_weights_count_samples_and_equal_ones_change_nothing():
     """Twice the weight of a sample is that sample twice, in every term."""
     future_hat, future = (jnp.asarray(random_frames((2, FRAMES), seed), jnp.float32) for seed in (0, 1))

@@ -278,6 +278,7 @@ def test_worker_processes_give_the_same():
     assert_same(pack(dataset, progress=False), pack(dataset, progress=False, workers=2))
 
 
+@pytest.mark.slow
 def test_real_bandai_packs_small(bandai_dataset, tmp_path):
     packed = pack(bandai_dataset, progress=False)
     assert (packed.num_clips, packed.num_frames) == (1063, 167_423 - 20 - 24 - 31 - 31)

@@ -34,13 +34,14 @@ if number >= 0:
 import jax, numpy as np
 assert len(jax.devices()) == 2, jax.devices()
 import test_parallel as here
+from f3amd_lib.training.optimise import optimise, restore_state
 mesh = parallel.all_devices()
 path, task = here.Path({out!r}) / "state.safetensors", here.task()
-state, history = here.optimise(
+state, history = optimise(
     task, checkpoint=path, held_out=here.tiny_windows(), chunk=3, mesh=mesh, progress=False
 )
 parallel.wait_for_all("trained")
-again = here.restore_state(path, task, mesh)
+again = restore_state(path, task, mesh)
 assert int(again.step) == here.STEPS
 # The first process decides, and a difference is seen by both.
 if number >= 0:
@@ -100,6 +101,7 @@ def assert_same(out: Path, printed: str, alone) -> None:
     assert loss == pytest.approx(held_out, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_two_devices_end_with_the_weights_of_one(tmp_path, alone):
     process = start(tmp_path, -1)
     printed, errors = process.communicate(timeout=300)
@@ -107,6 +109,7 @@ def test_two_devices_end_with_the_weights_of_one(tmp_path, alone):
     assert_same(tmp_path, printed, alone)
 
 
+@pytest.mark.slow
 def test_two_processes_end_with_the_weights_of_one(tmp_path, alone):
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -119,6 +122,7 @@ def test_two_processes_end_with_the_weights_of_one(tmp_path, alone):
     assert "held out" not in done[1][0]
 
 
+@pytest.mark.slow
 def test_a_mesh_of_one_device_changes_no_number(alone):
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), (parallel.AXIS,))
     state, _ = optimise(task(), chunk=3, mesh=mesh, progress=False)

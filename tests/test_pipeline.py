@@ -77,6 +77,7 @@ def put_back(files):
         path.rename(path.with_name(path.name.replace(".old1", "")))
 
 
+@pytest.mark.slow
 def test_a_finished_model_without_its_state_is_not_overwritten(trained_once, same_runs):
     _, prepared, profile, model = trained_once
     files = pipeline.model_files(profile)
@@ -146,6 +147,7 @@ def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
         pipeline.find_model("bandai")
 
 
+@pytest.mark.slow
 def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path, capsys):
     _, _, profile, model = trained_once
     weights = pipeline.model_files(profile).model
@@ -175,6 +177,7 @@ def test_command_refuses_unknown_style_in_one_line(trained_once, same_runs, tmp_
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_command_runs_as_a_module():
     done = subprocess.run(
         [sys.executable, "-m", "f3amd_lib", "presets", "--channels", "129", "--styles", "22"],

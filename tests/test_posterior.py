@@ -212,6 +212,7 @@ def test_one_draw_has_no_spread():
 # ------------------------------------------------------------------------------- measurement
 
 
+@pytest.mark.slow
 def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeypatch, tmp_path):
     monkeypatch.setenv(RESULTS_DIR_VARIABLE, str(tmp_path))
     trained = model_that(lambda x_noisy: 0.5 * x_noisy)

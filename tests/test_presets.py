@@ -37,6 +37,7 @@ def test_every_row_of_every_table_has_a_preset(number):
     assert {presets.find_preset(name).name for name in table["model"]} <= set(presets.PRESETS)
 
 
+@pytest.mark.slow
 def test_table_is_the_committed_one():
     """A change of sizes or operations must be meant: then write the table anew.
 
@@ -268,6 +269,7 @@ def two_training_steps(config, recipe_json: str):
     return changes, history[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_every_preset_answers_and_takes_a_training_step(name):
     # Compiling is what takes time here, and depth, width, how many heads (if not one) and how many

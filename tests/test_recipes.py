@@ -68,6 +68,7 @@ def two_recipes(monkeypatch):
     return rows
 
 
+@pytest.mark.slow
 def test_recipes_are_trained_measured_and_gone_on_with(prepared, two_recipes, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     monkeypatch.setattr(measure, "runs_dir", lambda *names: tmp_path.joinpath("runs", *names))
@@ -99,6 +100,7 @@ def test_recipes_are_trained_measured_and_gone_on_with(prepared, two_recipes, tm
     assert len(list(folder.glob("F3AMD-FNO-96*.old1*"))) == 4
 
 
+@pytest.mark.slow
 def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     models = {

@@ -60,6 +60,7 @@ def test_a_single_frame_stands_still():
     assert lowest_toe_height(motion) == pytest.approx(0.05)
 
 
+@pytest.mark.slow
 def test_all_locomotion_clips_agree_with_the_manifest(bandai_dataset, bandai_manifest):
     rows = {row["file"].removesuffix(".bvh"): row for row in bandai_manifest}
     assert {clip.name for clip in bandai_dataset.clips} == {

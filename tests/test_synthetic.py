@@ -299,8 +299,8 @@ def test_accelerations_are_human(all_styles):
         change = 100.0 * np.linalg.norm(np.diff(motion.positions, 2, axis=0), axis=-1)
         medians.append(np.median(change))
         assert 0.03 < medians[-1] < 1.5, style
-        # Real runs peak at about 12 cm per frame squared, at the knees and feet.
-        assert change.max() < 16.0, style
+        # Real runs peak at about 12 cm per frame squared, at the knees and feet; ours hurry up to 1.6 times their pace.
+        assert change.max() < 18.0, style
         head = change[:, SYNTHETIC_SKELETON.index("Head")]
         assert head.max() < 4.0, style
     # Of real clips elderly walks have 0.2, ordinary ones 0.4, runs 1.8.

@@ -145,9 +145,9 @@ def test_loss_falls(task, finished):
     after = held_out_terms(task, finished[0], task.windows)
     assert after["loss"] < 0.85 * before["loss"]
     assert after["sample"] < before["sample"]
-    assert after["loss"] == pytest.approx(sum(after[name] for name in LOSS_TERMS), rel=1e-5)
+    assert after["loss"] == pytest.approx(sum(after[name] for name in LOSS_TERMS if name != "floor"), rel=1e-5)
     for row in finished[1]:
-        assert row["loss"] == pytest.approx(sum(row[name] for name in LOSS_TERMS), rel=1e-4)
+        assert row["loss"] == pytest.approx(sum(row[name] for name in LOSS_TERMS if name != "floor"), rel=1e-4)
 
 
 def test_a_state_keeps_the_names_that_earlier_files_have(task, finished, tmp_path):
@@ -156,7 +156,7 @@ def test_a_state_keeps_the_names_that_earlier_files_have(task, finished, tmp_pat
     assert same_tree(restore_state(path, task), finished[0])
     with safe_open(path, framework="numpy") as file:
         names = set(file.keys())
-    assert {".step", ".params['decoder']['kernel']", ".ema['decoder']['kernel']"} <= names
+    assert {f"{of}['encoder']['local_second']['kernel'].value" for of in (".params", ".ema")} <= names
     assert {name.split("[")[0] for name in names} == {".params", ".ema", ".optimiser", ".step"}
 
 
@@ -210,6 +210,7 @@ def test_history_dropout_takes_whole_histories_away(task):
     assert task._disturbed(condition, jax.random.key(1)).history is history
 
 
+@pytest.mark.slow
 def test_dropout_is_drawn_in_training_alone():
     model = tiny_config(base_block="transformer", num_heads=2, dropout=0.5)
     task = tiny_task(model)
@@ -224,6 +225,7 @@ def test_dropout_is_drawn_in_training_alone():
     assert largest_change(with_dropout.params, without.params) > 1e-6
 
 
+@pytest.mark.slow
 def test_our_recipe_trains_and_resumes_exactly(tmp_path):
     recipe = short_recipe("F3AMD-FNO-32-plus", 8, batch_size=8).to_dict()
     model = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
@@ -270,6 +272,7 @@ def test_condition_dropout_hides_history_path_and_style_together():
         np.testing.assert_array_equal(np.asarray(part)[~gone], np.asarray(before)[~gone])
 
 
+@pytest.mark.slow
 def test_weighted_noise_changes_training_but_not_the_held_out_loss():
     plain, weighted = tiny_task(), tiny_task(noise_weighting="low_noise")
     state = initial_state(plain)

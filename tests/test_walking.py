@@ -36,7 +36,7 @@ def test_the_walker_follows_a_drawn_path(walk):
     assert apart.max() < 0.12  # its sway
     turned = np.abs(np.unwrap(walk.yaw) - path.yaw)
     assert np.rad2deg(turned.mean()) < 10.0
-    with pytest.raises(ValueError, match=r"position \[T, 2\]"):
+    with pytest.raises(ValueError, match="yaw must be"):
         walk_along("Neutral", path.position[:-1], path.yaw)
     with pytest.raises(ValueError, match="finite"):
         walk_along("Neutral", path.position * np.nan, path.yaw)

@@ -123,7 +123,7 @@ def _protocol(prepared: PreparedData, profile: Profile, measurement: str) -> tup
 
 
 def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train every preset for a short while and keep its learning curve (see `experiments.family`).
+    """Train every preset for a short while and keep its learning curve (see `experiments.learning_curves`).
 
     Returns:
       The table, `records/learning.csv`.

@@ -373,7 +373,7 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     unlike = _unlike(trained, prepared, prepared.model_config(preset), profile_recipe(profile, preset))
     if unlike:
         raise ValueError(
-            f"{files.model}: a model with another {' and '.join(unlike)} lies there; move it away "
+            f"{files.model}: a model with other {' and '.join(unlike)} lies there; move it away "
             "or name another folder (--out)"
         )
     return trained
