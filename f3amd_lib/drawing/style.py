@@ -183,19 +183,20 @@ def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
     return Shown(data=small.getvalue())
 
 
-def keep_figure(figure: Figure, results, name: str):
+def keep_figure(figure: Figure, results, name: str, colors: int = 64):
     """Save a figure as `<results>/figures/<name>.png` and return a light copy for the notebook.
 
     Args:
       figure: any.
       results: from `profiles.results_dir`.
       name: without folder and ending.
+      colors: of the copy.
 
     Returns:
-      An image for a cell's last line: smaller, in 64 colours.
+      An image for a cell's last line: smaller, and in few colours.
     """
     save_figure(figure, Path(results) / "figures" / f"{name}.png")
-    return show_figure(figure, dpi=76, colors=64)
+    return show_figure(figure, dpi=76, colors=colors)
 
 
 def _png(figure: Figure, dpi: int) -> bytes:
