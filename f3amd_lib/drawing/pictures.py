@@ -156,7 +156,8 @@ def film_strip(
     if any(_toes_down(motion, [0]) is not None for motion, *_ in rows):
         keys += axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
     small = {"fontsize": 8, "handlelength": 1.2, "columnspacing": 1.2, "borderaxespad": 0.2}
-    axes[0, 0].legend(handles=keys, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, **small)
+    # Below everything: titles may be as long as the strip.
+    figure.legend(handles=keys, loc="outside lower left", ncols=3, **small)
     axes[0, 1].set_title("from above", fontsize=9, fontweight="normal")
     if rows[0][1] is not None:
         axes[0, 1].legend(fontsize=7, loc="best", handlelength=1.6)
