@@ -396,15 +396,15 @@ def test_pictures_leave_out_contacts_and_facing_of_an_unknown_rig(tmp_path):
     pole, known = pole_of_three(), wandering_motion(FRAMES)
 
     def legend_and_strokes(motions):
-        poses, plan = film_strip(motions, num_poses=3).axes[-2:]
-        texts = [text.get_text() for text in poses.get_legend().get_texts()]
+        figure = film_strip(motions, num_poses=3)
+        plan, texts = figure.axes[-1], [text.get_text() for text in figure.legends[0].get_texts()]
         return texts, sum(len(line.get_xdata()) == 2 for line in plan.lines)
 
     texts, strokes = legend_and_strokes(pole)
     assert texts == ["left", "right"] and strokes == 0
     texts, strokes = legend_and_strokes(known)
     assert texts == ["left", "right", "toe in contact"] and strokes == 3
-    legend = film_strip([pole, known]).axes[0].get_legend()  # it speaks for all rows
+    legend = film_strip([pole, known]).legends[0]  # it speaks for all rows
     assert "toe in contact" in [text.get_text() for text in legend.get_texts()]
     path = write_player(tmp_path / "pole.html", [pole, known])
     assert Image.open(path.with_suffix(".png")).width > 500

@@ -405,7 +405,8 @@ def write_gif(
     if max_seconds is not None:
         last = min(last, max(1, round(max_seconds * fps)))
     frames = np.arange(0, last, every)
-    figure = Figure(figsize=(size[0] * len(rows) / 100, size[1] / 100), dpi=100)
+    # Panels fill the picture: there is nothing for a layout to do, whatever style is in use.
+    figure = Figure(figsize=(size[0] * len(rows) / 100, size[1] / 100), dpi=100, layout="none")
     canvas, pictures = FigureCanvasAgg(figure), []
     bare = {"left": 0.0, "right": 1.0, "bottom": 0.0, "top": 1.0, "wspace": 0.0}
     axes = figure.subplots(1, len(rows), squeeze=False, gridspec_kw=bare)[0]
