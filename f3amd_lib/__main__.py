@@ -463,7 +463,7 @@ def claims(accept: bool = False) -> int:
 
 
 def cards() -> int:
-    """Write the cards of shipped weights, their checksums and the table of README."""
+    """Write the cards of shipped weights, their checksums and the table of docs/results.md."""
     from f3amd_lib.reports import model_cards
 
     return model_cards.main()

@@ -26,17 +26,17 @@ def test_every_shipped_model_has_its_card(path):
     assert f"{record['training']['num_steps']:,} steps" in card
 
 
-def test_readme_shows_what_is_on_record(tmp_path):
-    readme = repository_root() / "README.md"
-    copy = tmp_path / "README.md"
-    copy.write_text(readme.read_text(encoding="utf-8"), encoding="utf-8")
-    model_cards.write_readme_table(copy, model_cards.committed_quality("bandai"))
-    assert copy.read_text(encoding="utf-8") == readme.read_text(encoding="utf-8"), (
+def test_page_of_results_shows_what_is_on_record(tmp_path):
+    page = repository_root() / "docs" / "results.md"
+    copy = tmp_path / "results.md"
+    copy.write_text(page.read_text(encoding="utf-8"), encoding="utf-8")
+    model_cards.write_measured_table(copy, model_cards.committed_quality("bandai"))
+    assert copy.read_text(encoding="utf-8") == page.read_text(encoding="utf-8"), (
         "write the table anew: python -m f3amd_lib.reports.model_cards"
     )
     copy.write_text("no marks", encoding="utf-8")
     with pytest.raises(ValueError, match="no `<!-- measured: begin -->`"):
-        model_cards.write_readme_table(copy, model_cards.committed_quality("bandai"))
+        model_cards.write_measured_table(copy, model_cards.committed_quality("bandai"))
 
 
 def test_checksums_are_those_of_the_files():

@@ -1,6 +1,6 @@
 """A card for every model that ships: what it is, its data, how well it does, its limits.
 
-    python -m f3amd_lib.reports.model_cards        # writes cards, checksums and README's table
+    python -m f3amd_lib.reports.model_cards        # writes cards, checksums and the table of docs/results.md
 
 Everything on a card is read from the weights file and from committed results; nothing is typed in.
 """
@@ -21,7 +21,7 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import SHOWN
-from f3amd_lib.reports.quality_tables import figure_text, readme_table
+from f3amd_lib.reports.quality_tables import figure_text, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -185,11 +185,11 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     return cards
 
 
-def write_readme_table(path: Path, quality: pd.DataFrame) -> None:
-    """Put the table of measured figures between its two marks in README.
+def write_measured_table(path: Path, quality: pd.DataFrame) -> None:
+    """Put the table of measured figures between its two marks on a page.
 
     Args:
-      path: of README; all other text stays.
+      path: of the page; all other text stays.
       quality: from `committed_quality`.
 
     Raises:
@@ -199,16 +199,16 @@ def write_readme_table(path: Path, quality: pd.DataFrame) -> None:
     parts = re.split(r"(<!-- measured: (?:begin|end) -->\n)", text)
     if len(parts) != 5:
         raise ValueError(f"{path}: no `<!-- measured: begin -->` and `end` line around the table")
-    parts[2] = "\n" + readme_table(quality) + "\n"
+    parts[2] = "\n" + measured_table(quality) + "\n"
     Path(path).write_text("".join(parts), encoding="utf-8")
 
 
 def main() -> int:
-    """Write all cards and README's table; see the module's first lines."""
+    """Write all cards and the table of docs/results.md; see the module's first lines."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     for card in write_cards():
         log.info("%s", card)
-    write_readme_table(repository_root() / "README.md", committed_quality("bandai"))
+    write_measured_table(repository_root() / "docs" / "results.md", committed_quality("bandai"))
     return 0
 
 

@@ -191,7 +191,7 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
 
 
-README_COLUMNS = {
+MEASURED_COLUMNS = {
     ("real", 0): "real",
     ("frozen pose", 0): "frozen pose",
     ("CAMDM", 8): "`CAMDM`, 8 steps",
@@ -200,11 +200,11 @@ README_COLUMNS = {
     ("F3AMD-FNO-96-plus", 8): "`-plus`, 8 steps",
     ("F3AMD-FNO-96-plus", 1): "1 step ",
 }
-"""Model and steps of README's columns, with their headings."""
+"""Model and steps of the columns of docs/results.md, with their headings."""
 
 
-def readme_table(quality: pd.DataFrame, window: int = 32) -> str:
-    """Render README's table of what was measured on real motion, our own figures alone.
+def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
+    """Render the table of what was measured on real motion, our own figures alone.
 
     Args:
       quality: from `protocol.summarise`.
@@ -215,9 +215,9 @@ def readme_table(quality: pd.DataFrame, window: int = 32) -> str:
     """
     own = quality[quality["window_frames"] == window].set_index(["model", "steps", "metric"])
     rows = []
-    for metric in SHOWN["readme"]:
+    for metric in SHOWN["results"]:
         row = {"": "style coverage (%)" if metric.name == "style_coverage" else metric.title}
-        for (model, steps), title in README_COLUMNS.items():
+        for (model, steps), title in MEASURED_COLUMNS.items():
             row[title] = "–"
             if (model, steps, metric.name) in own.index:
                 value, low, high = own.loc[(model, steps, metric.name), ["value", "low", "high"]]
