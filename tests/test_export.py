@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.serving import artefact as artefact_module
@@ -24,7 +24,7 @@ from f3amd_lib.serving.artefact import load_artefact, manifest_digest
 from f3amd_lib.serving.export import compile_iree, export_model, export_round, save_artefact
 
 BATCH = 2
-SIGMAS = VarianceExploding().grid(2)
+SIGMAS = variance_exploding().grid(2)
 
 
 needs_iree = pytest.mark.needs("iree.compiler", "iree.runtime")
@@ -91,7 +91,7 @@ def test_an_exported_round_equals_jit(jax_folder, jit_round):
 
 def test_a_ddpm_round_takes_the_noise_that_the_sampler_would_draw(tmp_path):
     network = builders.network_of(builders.tiny_camdm())
-    sigmas = VariancePreservingCosine(4).grid(3)
+    sigmas = variance_preserving_cosine(4).grid(3)
     exported = export_round(network, sigmas, BATCH, "ddpm")
     assert exported.inputs["step_noise"] == (3, *exported.inputs["noise"])
     folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())

@@ -12,7 +12,7 @@ from helpers.seed_histories import seed_condition, walk_seed_histories
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.diffusion.samplers import sample
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import literal_update, measure
 from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, WindowWalks, walk_windows, window_figures
@@ -128,7 +128,7 @@ def test_a_single_seed_has_no_spread():
 def measurement(tmp_path, monkeypatch):
     """`measure_literal_update` on tiny models, with rollouts of a made-up value."""
     prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
-    schedule = VariancePreservingCosine(4)
+    schedule = variance_preserving_cosine(4)
     models = {"F3AMD-FNO-32": tiny_trained(), "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=schedule)}
     calls = []
 

@@ -10,7 +10,7 @@ from builders import packed_from
 
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.windows import starting_poses
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.experiments import measure
 from f3amd_lib.experiments import protocol as module
 from f3amd_lib.experiments.protocol import (
@@ -75,7 +75,7 @@ def generator(packed, prepared):
         prepared.normaliser,
         packed.skeleton,
         packed.styles,
-        VarianceExploding(),
+        variance_exploding(),
         starting_poses(packed, num_history=10),
         {},
     )

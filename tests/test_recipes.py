@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
 
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, recipes
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -105,7 +105,7 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     models = {
         "F3AMD-FNO-32": tiny_trained(),
-        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=VariancePreservingCosine(4)),
+        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=variance_preserving_cosine(4)),
     }
     asked = []
 
@@ -122,7 +122,7 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     levels = errors.groupby("model")["sigma"].apply(list)
     assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
     # A network that is told the number of a step is asked at its own levels.
-    assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
+    assert levels["CAMDM"] == pytest.approx(variance_preserving_cosine(4).levels.tolist(), rel=1e-6)
     assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
     assert set(table["model"]) == set(models) and "x0_error_ratio" in table
     before = len(errors)

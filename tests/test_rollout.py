@@ -6,7 +6,7 @@ import pytest
 from builders import CHANNELS, HISTORY, SKELETON, WINDOW, tiny_camdm, tiny_trained
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.motion.root_paths import RootPath, named_path
 from f3amd_lib.motion.rotations import wrap_angle
@@ -171,22 +171,22 @@ def test_frames_are_true_rotations_and_make_a_motion(network_generator):
 
 
 def test_noise_levels_are_those_of_training_unless_told(trained):
-    levels = VarianceExploding(80.0, 0.1, 7.0)
+    levels = variance_exploding(80.0, 0.1, 7.0)
     generator = MotionGenerator(tiny_trained(diffusion=levels), num_steps=3)
     np.testing.assert_array_equal(generator.sigmas, levels.grid(3))
-    np.testing.assert_array_equal(MotionGenerator(trained, 4).sigmas, VarianceExploding().grid(4))
-    chosen = MotionGenerator(trained, 4, schedule=VarianceExploding(8.0, 1.0), spacing="uniform")
-    np.testing.assert_array_equal(chosen.sigmas, VarianceExploding(8.0, 1.0).grid(4, "uniform"))
+    np.testing.assert_array_equal(MotionGenerator(trained, 4).sigmas, variance_exploding().grid(4))
+    chosen = MotionGenerator(trained, 4, schedule=variance_exploding(8.0, 1.0), spacing="uniform")
+    np.testing.assert_array_equal(chosen.sigmas, variance_exploding(8.0, 1.0).grid(4, "uniform"))
     with pytest.raises(ValueError, match="num_steps=0"):
         MotionGenerator(trained, 0)
 
 
 def test_the_sampler_belongs_to_the_noise_that_the_model_was_trained_with():
-    levels = VariancePreservingCosine(4)
+    levels = variance_preserving_cosine(4)
     camdm = tiny_trained(config=tiny_camdm(), diffusion=levels)
     assert MotionGenerator(camdm, 2).sampler == "ddpm"
     assert MotionGenerator(tiny_trained(), 2).sampler == "ddim"
-    np.testing.assert_array_equal(MotionGenerator(camdm, 4).sigmas[:-1], levels.sigmas[::-1])
+    np.testing.assert_array_equal(MotionGenerator(camdm, 4).sigmas[:-1], levels.levels[::-1])
     path = named_path("straight", 2 * WINDOW)
     made = {
         name: MotionGenerator(camdm, 4, sampler=name).rollout(path, "calm", seed=1).frames

@@ -13,11 +13,11 @@ from builders import CHANNELS, WINDOW, make_condition, network_of, tiny_config
 from jax.sharding import Mesh
 
 from f3amd_lib.diffusion.samplers import sample
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
 
 BATCH = 4
-SIGMAS = np.asarray(VarianceExploding().grid(3), np.float32)
+SIGMAS = np.asarray(variance_exploding().grid(3), np.float32)
 
 
 @pytest.fixture(scope="module")

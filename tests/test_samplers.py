@@ -21,13 +21,14 @@ from f3amd_lib.diffusion.samplers import (
 )
 from f3amd_lib.diffusion.schedules import (
     SCHEDULES,
-    VarianceExploding,
-    VariancePreservingCosine,
-    VariancePreservingLinear,
     alpha_bar_from_sigma,
+    straight,
+    variance_exploding,
+    variance_preserving_cosine,
+    variance_preserving_linear,
 )
 
-SCHEDULE = VarianceExploding()
+SCHEDULE = variance_exploding()
 DETERMINISTIC = ["ddim", "ddim_vp", "euler", "heun"]
 
 
@@ -105,7 +106,7 @@ def test_appendix_f_vp_equals_ve_in_float64(num_steps):
 
 
 def test_appendix_f_vp_equals_ve_on_variance_preserving_levels():
-    sigmas, x_init = VariancePreservingCosine().grid(4), jnp.asarray(start(), jnp.float32)
+    sigmas, x_init = variance_preserving_cosine().grid(4), jnp.asarray(start(), jnp.float32)
     ve = sample("ddim", two_modes(), x_init, sigmas, unroll=True)
     vp = sample("ddim_vp", two_modes(), x_init, sigmas, unroll=True)
     np.testing.assert_allclose(vp, ve, atol=2e-4)
@@ -266,7 +267,7 @@ def test_grids_without_a_step_are_refused(name, sigmas):
 
 def test_ddpm_posterior_is_camdms():
     # K = 4 levels, least noisy first; the last step of a sampler goes to a clean signal.
-    alpha_bars = VariancePreservingCosine(4).alpha_bars
+    alpha_bars = variance_preserving_cosine(4).alpha_bars
     on_x0, on_z, variance = ddpm_posterior(alpha_bars, np.append(1.0, alpha_bars[:-1]))
     np.testing.assert_allclose(on_x0, [1.0, 0.758145, 0.581307, 0.379507], atol=1e-6)
     np.testing.assert_allclose(on_z, [0.0, 0.230793, 0.319702, 0.027064], atol=1e-6)
@@ -314,7 +315,7 @@ def test_ddpm_adds_no_noise_at_the_end():
 
 def test_ddpm_equals_camdms_loop_over_its_own_levels():
     # The released code walks the VP state with a table of coefficients, from z ~ N(0, 1).
-    schedule, key = VariancePreservingCosine(4), jax.random.key(2)
+    schedule, key = variance_preserving_cosine(4), jax.random.key(2)
     alpha_bars = schedule.alpha_bars
     before = np.append(1.0, alpha_bars[:-1])
     betas = 1.0 - alpha_bars / before
@@ -324,7 +325,7 @@ def test_ddpm_equals_camdms_loop_over_its_own_levels():
         found = np.asarray(sample("ddpm", two_modes(), x_init, schedule.grid(4), key=key))
         for level, key_step in zip((3, 2, 1, 0), jax.random.split(key, 4), strict=True):
             noise = np.asarray(jax.random.normal(key_step, z.shape, z.dtype))
-            x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.sigmas[level]))
+            x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.levels[level]))
             left = 1.0 - alpha_bars[level]
             mean = betas[level] * np.sqrt(before[level]) / left * x0_hat
             mean += np.sqrt(1.0 - betas[level]) * (1.0 - before[level]) / left * z
@@ -346,10 +347,10 @@ def ddpm_variance(width, sigmas, variance):
 
 
 DDPM_GRIDS = {
-    "linear 1000": VariancePreservingLinear(1000).grid(1000),
-    "cosine 8": VariancePreservingCosine(8).grid(8),
-    "cosine 8 in 4": VariancePreservingCosine(8).grid(4),
-    "exploding 8": VarianceExploding().grid(8),
+    "linear 1000": variance_preserving_linear(1000).grid(1000),
+    "cosine 8": variance_preserving_cosine(8).grid(8),
+    "cosine 8 in 4": variance_preserving_cosine(8).grid(4),
+    "exploding 8": variance_exploding().grid(8),
 }
 
 
@@ -372,10 +373,10 @@ def test_ddpm_needs_many_levels_for_the_whole_variance():
     def share(sigmas):
         return ddpm_variance(0.3, sigmas, sigmas[0] ** 2) / 0.3**2
 
-    few = [share(VariancePreservingCosine(8).grid(num_steps)) for num_steps in (1, 2, 4, 8)]
+    few = [share(variance_preserving_cosine(8).grid(num_steps)) for num_steps in (1, 2, 4, 8)]
     assert np.all(np.diff(few) > 0.05) and few[-1] < 0.5
     counts = [500, 1000, 2000, 4000]
-    missing = [1.0 - share(VariancePreservingLinear(count).grid(count)) for count in counts]
+    missing = [1.0 - share(variance_preserving_linear(count).grid(count)) for count in counts]
     assert missing[-1] < 0.01
     assert -np.polyfit(np.log(counts), np.log(missing), 1)[0] == pytest.approx(1.0, abs=0.1)
     # One step from sigma = 1 with unit width, by hand: x0_hat is half of what is seen.
@@ -486,13 +487,61 @@ def test_samplers_go_by_name_and_take_traced_levels(name):
 
 def test_every_schedule_asks_for_a_sampler_that_is_there():
     # The paper pairs VE with DDIM, and VP with DDPM for the baseline.
-    wanted = {kind: schedule.sampler for kind, schedule in SCHEDULES.items()}
-    assert wanted == {
-        "variance_exploding": "ddim",
-        "variance_preserving_cosine": "ddpm",
-        "variance_preserving_linear": "ddpm",
-    }
-    assert set(wanted.values()) <= set(SAMPLERS)
+    for kind, make in SCHEDULES.items():
+        assert make().sampler == ("ddpm" if kind.startswith("variance_preserving") else "ddim")
+        assert make().sampler in SAMPLERS
+
+
+def test_a_walk_in_the_scaled_state_is_the_walk_in_the_unscaled_one():
+    """z = alpha x, and the denoiser of z looks at z / alpha at the level sigma / alpha."""
+    schedule = variance_preserving_cosine(8)
+    alphas, sigmas = schedule.scaled_grid(4)
+
+    def scaled(z, sigma):
+        alpha = jnp.sqrt(1.0 - sigma * sigma)
+        return two_modes()(z / alpha, sigma / alpha)
+
+    with jax.enable_x64(True):
+        x_init = schedule.sigma_max * jnp.asarray(start() / 128.0)
+        unscaled = np.asarray(sample("ddim", two_modes(), x_init, schedule.grid(4)))
+        walked = np.asarray(sample("ddim", scaled, alphas[0] * x_init, sigmas, alphas=alphas))
+        untold = np.asarray(sample("ddim", scaled, alphas[0] * x_init, sigmas))
+    np.testing.assert_allclose(walked, unscaled, atol=1e-12)
+    # Told of no scale, the same walk ends elsewhere.
+    assert np.std(walked) > 0.5 and np.abs(untold - unscaled).max() > 0.03
+
+
+@pytest.mark.parametrize("num_steps", [1, 5, 50])
+def test_the_straight_path_is_walked_by_euler_steps_from_noise_to_a_gaussian(num_steps):
+    """Of N(mean, width^2) the flow is known: it takes noise e to mean + width e, and one step takes all to the mean."""
+    mean, width = 0.4, 0.3
+    schedule = straight()
+
+    def denoise(z, sigma):
+        t = 1.0 - sigma
+        variance = t**2 * width**2 + sigma**2
+        return mean + t * width**2 / variance * (z - t * mean)
+
+    with jax.enable_x64(True):
+        alphas, sigmas = schedule.scaled_grid(num_steps)
+        noise = jnp.asarray(start(64) / 128.0)
+        walked = np.asarray(sample("ddim", denoise, noise, sigmas, alphas=alphas))
+        states = list(walk("ddim", denoise, noise, sigmas, alphas=alphas))
+        # By hand: z + dt v with v = (x0_hat - z) / sigma.
+        z = noise
+        for t in np.arange(num_steps) / num_steps:
+            velocity = (denoise(z, 1.0 - t) - z) / (1.0 - t)
+            z = z + velocity / num_steps
+    np.testing.assert_allclose(walked, z, atol=1e-10)
+    np.testing.assert_allclose(states[-1].x_noisy, walked, atol=1e-10)
+    off = np.abs(walked - (mean + width * np.asarray(noise))).max()
+    assert {1: off > 0.5, 5: 0.1 < off < 0.5, 50: off < 0.05}[num_steps]  # 0.997, 0.333, 0.038
+
+
+def test_shares_of_the_signal_are_for_ddim_and_fit_the_levels():
+    for name, alphas in (("heun", [0.5, 1.0]), ("ddim", [0.5, 0.7, 1.0])):
+        with pytest.raises(ValueError, match="alphas are for 'ddim' alone, one for each of the 2"):
+            sample(name, two_modes(), jnp.zeros((1, 1, 1)), [1.0, 0.0], alphas=alphas)
 
 
 def test_unknown_samplers_and_missing_keys_are_refused():

@@ -13,7 +13,7 @@ from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_o
 from flax import nnx
 
 from f3amd_lib.benchmarking import implementations
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
@@ -22,7 +22,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make bench-
 torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
 pytestmark = pytest.mark.needs("torch", "onnxscript", "onnxruntime")
 
-SIGMAS = VariancePreservingCosine(4).grid(4)
+SIGMAS = variance_preserving_cosine(4).grid(4)
 KEY = jax.random.key(3)
 TOLERANCE = 1e-4
 LAYOUTS = {

@@ -56,7 +56,7 @@ STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
 SPACINGS = ("endpoints", "uniform")
-"""Both readings of where N steps lie, ours first (see `VarianceExploding.grid`)."""
+"""Both readings of where N steps lie, ours first (see `NoiseSchedule.times`)."""
 
 SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
 """Noise levels at which an x0 error is measured, for networks that take any level."""

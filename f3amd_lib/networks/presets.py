@@ -67,8 +67,8 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
     schedule = schedule_from_dict(diffusion or {"kind": "variance_exploding"})
     network = network or {}
     # CAMDM is told the number of a level, and so must know the levels of its schedule.
-    if family == "CAMDM" and hasattr(schedule, "sigmas"):
-        network = {"noise_levels": tuple(schedule.sigmas.tolist()), **network}
+    if family == "CAMDM" and schedule.levels is not None:
+        network = {"noise_levels": tuple(schedule.levels.tolist()), **network}
     own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return Preset(name, paper, family, schedule, network, training or {}, **own)
 
