@@ -163,8 +163,7 @@ def tiny_windows(split: str = "train", packed: PackedMotion | None = None):
 @functools.cache
 def tiny_normaliser():
     """The normaliser of the tiny training windows."""
-    fit = functools.partial(fit_normaliser, window=WINDOW, num_history=HISTORY)
-    return jax.jit(fit)(tiny_windows(), jax.random.key(5))
+    return jax.jit(fit_normaliser)(tiny_windows(), jax.random.key(5))
 
 
 def tiny_task(model=None, *, windows=None, **settings) -> DenoisingTask:

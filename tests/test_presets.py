@@ -253,9 +253,8 @@ def two_training_steps(config, recipe_json: str):
     recipe = TrainingConfig.from_dict(json.loads(recipe_json))
     clips = [(wandering_motion(60, 0), 0, 0), (wandering_motion(50, 1), 1, 0)]
     packed = packed_from(clips)
-    frames = {"window": 32, "num_history": 10}
-    windows = build_windows(packed, "train", **frames)
-    normaliser = fit_normaliser(windows, jax.random.key(0), **frames)
+    windows = build_windows(packed, "train", window=32, num_history=10)
+    normaliser = fit_normaliser(windows, jax.random.key(0))
     task = denoising_task(config, recipe, packed.skeleton, normaliser, windows)
     before = initial_state(task)
     # The first step has a learning rate of 0.

@@ -113,7 +113,7 @@ def test_config_names_unknown_keys():
 def test_network_inputs_by_hand(task):
     windows, normaliser = task.windows, task.normaliser
     index = jnp.array([0, 5])
-    batch = gather_windows(windows, index, jnp.zeros(2), jnp.zeros(2, jnp.int32), window=WINDOW, num_history=HISTORY)
+    batch = gather_windows(windows, index, jnp.zeros(2), jnp.zeros(2, jnp.int32))
     x0, condition = network_inputs(batch, normaliser)
     standard = lambda x: (np.asarray(x) - normaliser.mean) / normaliser.deviation
     np.testing.assert_allclose(x0, standard(batch.future), atol=1e-5)
@@ -264,10 +264,7 @@ def test_weights_towards_low_noise_are_those_of_karras_up_to_the_cap():
 
 def test_condition_dropout_hides_history_path_and_style_together():
     task = tiny_task(condition_dropout=0.5)
-    batch = gather_windows(
-        tiny_windows(), jnp.zeros(64, int), jnp.zeros(64), jnp.zeros(64, int),
-        window=WINDOW, num_history=HISTORY,
-    )  # fmt: skip
+    batch = gather_windows(tiny_windows(), jnp.zeros(64, int), jnp.zeros(64), jnp.zeros(64, int))
     _, condition = network_inputs(batch, task.normaliser)
     hidden = task._disturbed(condition, jax.random.key(0))
     gone = np.array([not np.any(np.asarray(part)) for part in hidden.style])

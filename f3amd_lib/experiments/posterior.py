@@ -72,14 +72,7 @@ def _facing_windows(skeleton: Skeleton, windows: WindowSet, index):
       continuation relative to its root [B, T, J, 3].
     """
     last = windows.frames[windows.starts[index] + windows.num_history - 1]
-    batch = gather_windows(
-        windows,
-        index,
-        -frame_yaw(skeleton, last),
-        jnp.zeros(index.shape, jnp.int32),
-        window=windows.window,
-        num_history=windows.num_history,
-    )
+    batch = gather_windows(windows, index, -frame_yaw(skeleton, last), jnp.zeros(index.shape, jnp.int32))
     future = frame_positions(skeleton, batch.future)
     return frame_positions(skeleton, batch.history), batch.path, future - future[..., :1, :]
 

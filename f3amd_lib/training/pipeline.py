@@ -76,9 +76,7 @@ class PreparedData:
     @functools.cached_property
     def normaliser(self) -> Normaliser:
         """Mean and deviation of the training windows, from a fixed key."""
-        return fit_normaliser(
-            self.windows("train"), jax.random.key(0), window=self.window, num_history=self.num_history
-        )
+        return fit_normaliser(self.windows("train"), jax.random.key(0))
 
     @functools.cached_property
     def held_out_split(self) -> str:
