@@ -153,14 +153,14 @@ def test_transport_that_was_not_solved_is_no_answer(monkeypatch):
 
 def test_drawn_windows_are_windows_of_each_style_each_once():
     clouds = {"calm": np.arange(40.0).reshape(20, 2), "proud": 100.0 + np.arange(30.0).reshape(15, 2)}
-    drawn = d.draw_windows(clouds, 12, np.random.default_rng(3))
+    drawn = d.draw_per_style(clouds, 12, np.random.default_rng(3))
     assert drawn.shape == (24, 2) and len(np.unique(drawn, axis=0)) == 24
     assert {tuple(row) for row in drawn[:12]} <= {tuple(row) for row in clouds["calm"]}
     assert {tuple(row) for row in drawn[12:]} <= {tuple(row) for row in clouds["proud"]}
-    np.testing.assert_array_equal(drawn, d.draw_windows(clouds, 12, np.random.default_rng(3)))
-    assert len(d.draw_windows(clouds, 15, np.random.default_rng(3))) == 30
+    np.testing.assert_array_equal(drawn, d.draw_per_style(clouds, 12, np.random.default_rng(3)))
+    assert len(d.draw_per_style(clouds, 15, np.random.default_rng(3))) == 30
     with pytest.raises(ValueError, match="16 windows of style 'proud' are wanted, of 15"):
-        d.draw_windows(clouds, 16, np.random.default_rng(3))
+        d.draw_per_style(clouds, 16, np.random.default_rng(3))
 
 
 # ----------------------------------------------------------------------------------------- styles

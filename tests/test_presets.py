@@ -225,7 +225,7 @@ def test_counted_parameters_are_those_of_the_built_network():
 
 def test_counted_operations_of_a_linear_coder_by_hand():
     linear, spectral = (
-        presets.count_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
+        presets.count_model_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
         for kind in ("linear", "fno")
     )
     width, frames, modes = 96, 32, 17

@@ -215,7 +215,7 @@ def test_compiler_that_fails_says_why(monkeypatch):
 
     torch._dynamo.reset()
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=refuse))
-    task = implementations.Task("CAMDM", small(), 1, 2)
+    task = implementations.Workload("CAMDM", small(), 1, 2)
     with pytest.raises(implementations.NotPossible, match=r"there is no C\+\+ compiler") as caught:
         implementations.prepare_round("PyTorch, compiled", task)
     assert "debug" not in str(caught.value).lower()

@@ -313,8 +313,8 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     digests = _digests(trained)
 
     def summary(rows: pd.DataFrame) -> pd.DataFrame:
-        ways = rows.groupby(["spacing", "update"], sort=False)
-        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in ways)
+        groups = rows.groupby(["spacing", "update"], sort=False)
+        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
 
     records = Records(
         _records_dir(profile),

@@ -142,9 +142,9 @@ def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
       num_steps: optimiser steps.
       **settings: fields of `TrainingConfig` to change.
     """
-    found = find_preset(preset)
+    chosen = find_preset(preset)
     return TrainingConfig.from_dict(
-        {"num_steps": num_steps, "diffusion": found.diffusion, **found.training, **settings}
+        {"num_steps": num_steps, "diffusion": chosen.diffusion, **chosen.training, **settings}
     )
 
 
