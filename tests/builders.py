@@ -7,6 +7,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import nnx
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -205,6 +206,12 @@ def tiny_trained(record=None, config=None, diffusion=None, **changes) -> Trained
         start_poses=starting_poses(packed, num_history=HISTORY),
         record={"note": "made by hand"} if record is None else record,
     )
+
+
+def refused(match: str, call, /, *arguments, **settings):
+    """A call must end in a ValueError with a text like this."""
+    with pytest.raises(ValueError, match=match):
+        call(*arguments, **settings)
 
 
 def cut_off(png) -> bool:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import tiny_camdm, tiny_config, tiny_trained, tiny_windows
+from builders import refused, tiny_camdm, tiny_config, tiny_trained, tiny_windows
 
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import denoising
@@ -119,5 +119,4 @@ def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch)
 def test_windows_of_other_sizes_are_refused():
     trained = tiny_trained()
     longer = dataclasses.replace(trained.config, window=trained.config.window + 2)
-    with pytest.raises(ValueError, match="built for"):
-        denoising.held_out_batch(tiny_windows(), dataclasses.replace(trained, config=longer))
+    refused("built for", denoising.held_out_batch, tiny_windows(), dataclasses.replace(trained, config=longer))

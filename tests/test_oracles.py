@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import add_noise, ddim_step
@@ -118,5 +119,4 @@ def test_bad_mixtures_are_refused():
     ):
         with pytest.raises(ValueError):
             GaussianMixture(**bad)
-    with pytest.raises(ValueError, match="D = 1"):
-        PLANE.flow(np.zeros((1, 2)), 1.0, 0.0)
+    refused("D = 1", PLANE.flow, np.zeros((1, 2)), 1.0, 0.0)

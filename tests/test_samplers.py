@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import (
@@ -261,8 +262,7 @@ def test_gaussian_oracle_reaches_known_mean_and_deviation():
 @pytest.mark.parametrize("name", DETERMINISTIC)
 @pytest.mark.parametrize("sigmas", [[1.0], [], [[1.0, 0.0]]])
 def test_grids_without_a_step_are_refused(name, sigmas):
-    with pytest.raises(ValueError, match="sigmas"):
-        sample(name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
+    refused("sigmas", sample, name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
 
 
 def test_ddpm_posterior_is_camdms():
@@ -546,16 +546,11 @@ def test_shares_of_the_signal_are_for_ddim_and_fit_the_levels():
 
 def test_unknown_samplers_and_missing_keys_are_refused():
     x_init, sigmas = jnp.zeros((1, 1, 1)), [1.0, 0.0]
-    with pytest.raises(ValueError, match="'hein'.*did you mean 'heun'"):
-        sample("hein", two_modes(), x_init, sigmas)
-    with pytest.raises(ValueError, match="did you mean 'ddim'"):
-        num_evaluations("dim", 4)
-    with pytest.raises(ValueError, match="'ddpm'.*give it a key"):
-        sample("ddpm", two_modes(), x_init, sigmas)
-    with pytest.raises(ValueError, match="sigmas"):
-        sample("ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
-    with pytest.raises(ValueError, match="num_steps=0"):
-        num_evaluations("ddim", 0)
+    refused("'hein'.*did you mean 'heun'", sample, "hein", two_modes(), x_init, sigmas)
+    refused("did you mean 'ddim'", num_evaluations, "dim", 4)
+    refused("'ddpm'.*give it a key", sample, "ddpm", two_modes(), x_init, sigmas)
+    refused("sigmas", sample, "ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
+    refused("num_steps=0", num_evaluations, "ddim", 0)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
