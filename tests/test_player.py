@@ -21,15 +21,7 @@ from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.serving import player
-from f3amd_lib.serving.player import (
-    Character,
-    Scene,
-    player_page,
-    rollout_scene,
-    scenes_strip,
-    show_player,
-    write_player,
-)
+from f3amd_lib.serving.player import Character, Scene, player_page, rollout_scene, show_player, write_player
 
 FRAMES = 40
 
@@ -284,25 +276,6 @@ def test_a_rollout_becomes_a_scene():
     refused("1 colours for 2 characters", rollout_scene, rollout, colors=["#112233"])
 
 
-def test_what_needs_a_drag_has_keys_and_buttons_and_the_list_of_keys_says_so():
-    elements = Elements(player_page(wandering_motion(3)))
-    buttons = {
-        attributes["id"]: attributes["aria-label"]
-        for tag, attributes in elements.tags
-        if tag == "button" and "aria-label" in attributes
-    }
-    for way in ("left", "right", "up", "down"):
-        assert buttons[f"orbit-{way}"] == f"Orbit {way}"
-    for way in ("left", "right", "forward", "back"):
-        assert buttons[f"move-{way}"] == f"Move the view {way}"
-    (turn,) = [found for _, found in elements.tags if found.get("id") == "turn"]
-    assert (turn["aria-expanded"], turn["aria-controls"]) == ("false", "pad")
-    assert "orbit; with shift move the view" in elements.text
-    assert "without dragging" in elements.text
-    (sheet,) = [found for _, found in elements.tags if found.get("class") == "sheet"]
-    assert sheet["tabindex"] == "0" and sheet["aria-label"] == "List of keys"
-
-
 # ----------------------------------------------------------------------------------------- refusal
 
 
@@ -405,12 +378,6 @@ def test_a_strip_that_cannot_be_drawn_leaves_no_page_behind(tmp_path, monkeypatc
     monkeypatch.setattr(player, "scenes_strip", refuse)
     refused("no strip of this", write_player, tmp_path / "new" / "walk.html", wandering_motion(FRAMES))
     assert not list(tmp_path.iterdir())
-
-
-def test_the_strip_has_a_row_a_scene(tmp_path):
-    motions = [wandering_motion(FRAMES, seed) for seed in range(3)]
-    assert len(scenes_strip(motions).axes) == 6  # poses and plan each
-    assert len(scenes_strip(motions, max_rows=2).axes) == 4
 
 
 def test_a_notebook_gets_an_iframe_and_an_image(monkeypatch):
