@@ -77,7 +77,7 @@ def test_what_cannot_be_done_says_why():
     with pytest.raises(NotPossible, match="one device"):
         prepare_round("jit, all devices", workload())
     refused("did you mean.*jit", prepare_round, "jitt", workload())
-    refused("tf32", prepare_round, "jit", workload(precision="tf23"))
+    refused("tf32", workload, precision="tf23")
 
 
 def test_a_group_is_timed_and_counted():
