@@ -7,6 +7,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import nnx
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.networks.camdm import CAMDMConfig
@@ -113,7 +114,7 @@ def tiny_config(**changes) -> F3AMDConfig:
 
 def tiny_camdm(**changes) -> CAMDMConfig:
     """The smallest CAMDM, told the four steps of its schedule."""
-    levels = tuple(VariancePreservingCosine(4).sigmas.tolist())
+    levels = tuple(variance_preserving_cosine(4).levels.tolist())
     return CAMDMConfig(**{**_TINY, "num_heads": 2, "noise_levels": levels, **changes})
 
 
@@ -163,8 +164,7 @@ def tiny_windows(split: str = "train", packed: PackedMotion | None = None):
 @functools.cache
 def tiny_normaliser():
     """The normaliser of the tiny training windows."""
-    fit = functools.partial(fit_normaliser, window=WINDOW, num_history=HISTORY)
-    return jax.jit(fit)(tiny_windows(), jax.random.key(5))
+    return jax.jit(fit_normaliser)(tiny_windows(), jax.random.key(5))
 
 
 def tiny_task(model=None, *, windows=None, **settings) -> DenoisingTask:
@@ -202,10 +202,16 @@ def tiny_trained(record=None, config=None, diffusion=None, **changes) -> Trained
         normaliser=tiny_normaliser(),
         skeleton=SKELETON,
         styles=packed.styles,
-        diffusion=diffusion or VarianceExploding(),
+        diffusion=diffusion or variance_exploding(),
         start_poses=starting_poses(packed, num_history=HISTORY),
         record={"note": "made by hand"} if record is None else record,
     )
+
+
+def refused(match: str, call, /, *arguments, **settings):
+    """A call must end in a ValueError with a text like this."""
+    with pytest.raises(ValueError, match=match):
+        call(*arguments, **settings)
 
 
 def cut_off(png) -> bool:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.ground.arrays import finite_array
 
@@ -16,14 +17,11 @@ def test_what_fits_comes_back_as_an_array():
 
 @pytest.mark.parametrize("value", [np.zeros(3), np.zeros((3, 3)), np.zeros((0, 2)), np.zeros((1, 3, 2))])
 def test_another_shape_is_refused_and_named(value):
-    with pytest.raises(ValueError, match=r"path must be \[frame, 2\]"):
-        finite_array("path", value, ("frame", 2))
+    refused(r"path must be \[frame, 2\]", finite_array, "path", value, ("frame", 2))
 
 
 def test_the_first_number_that_is_not_finite_is_found():
     value = np.zeros((4, 3, 2))
     value[2, 1, 0], value[3, 0, 0] = np.inf, np.nan
-    with pytest.raises(ValueError, match="path is not finite at character 2, frame 1$"):
-        finite_array("path", value, ("character", "frame", 2))
-    with pytest.raises(ValueError, match=r"path is not finite at \[2, 1, 0\]"):
-        finite_array("path", value, (4, 3, 2))
+    refused("path is not finite at character 2, frame 1$", finite_array, "path", value, ("character", "frame", 2))
+    refused(r"path is not finite at \[2, 1, 0\]", finite_array, "path", value, (4, 3, 2))

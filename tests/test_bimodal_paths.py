@@ -12,11 +12,11 @@ from helpers import bimodal_paths as toy
 from helpers.bimodal_paths import BimodalPaths
 
 from f3amd_lib.diffusion import samplers
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 
 DATA = BimodalPaths()
 SMALL = BimodalPaths(num_frames=8, num_modes=4)
-EXPLODING, PRESERVING = VarianceExploding(), VariancePreservingCosine(8)
+EXPLODING, PRESERVING = variance_exploding(), variance_preserving_cosine(8)
 
 
 def real_paths(data=DATA, count=4000, seed=0):
@@ -193,7 +193,7 @@ def test_a_short_training_learns_the_mean_and_the_sides(trained):
 
 
 def test_a_trained_network_comes_near_the_exact_error_and_not_below(trained):
-    sigmas = PRESERVING.sigmas[[3, 5, 7]]
+    sigmas = PRESERVING.levels[[3, 5, 7]]
     found = toy.error_table(trained[0], sigmas, num_samples=1000)["x0_error"]
     exact = toy.error_table(SMALL, sigmas, num_samples=1000)["x0_error"]
     assert (found > 0.995 * exact).all() and (found < 1.3 * exact + 0.1).all()

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, WINDOW, draw, evaluate, make_condition, network_of, tiny_camdm
+from builders import CHANNELS, HISTORY, WINDOW, draw, evaluate, make_condition, network_of, refused, tiny_camdm
 from flax import nnx
 
 from f3amd_lib.networks import presets
@@ -165,13 +165,10 @@ def test_config_survives_json():
     ],
 )
 def test_impossible_configs_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        tiny_camdm(**changes)
+    refused(message, tiny_camdm, **changes)
 
 
 def test_wrong_shapes_are_refused_by_name():
     network, condition = network_of(tiny_camdm()), make_condition()
-    with pytest.raises(ValueError, match="condition path must have shape"):
-        network.encode(condition._replace(path=draw(2, WINDOW, 7)))
-    with pytest.raises(ValueError, match=rf"\[B, {WINDOW}, {CHANNELS}\]"):
-        network(draw(2, WINDOW + 1, CHANNELS), 1.0, network.encode(condition))
+    refused("condition path must have shape", network.encode, condition._replace(path=draw(2, WINDOW, 7)))
+    refused(rf"\[B, {WINDOW}, {CHANNELS}\]", network, draw(2, WINDOW + 1, CHANNELS), 1.0, network.encode(condition))

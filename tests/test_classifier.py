@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, packed_from, same_tree
+from builders import SKELETON, packed_from, refused, same_tree
 from flax import nnx
 
 from f3amd_lib.ground.profiles import load_profile
@@ -125,10 +125,8 @@ def test_names_with_the_mixamo_prefix_are_the_same_joints():
 
 def test_skeleton_without_a_joint_is_refused_by_its_name():
     without = named(tuple(name for name in BANDAI_NAMES if name != "LowerArm_R"))
-    with pytest.raises(ValueError, match=r"no 'LowerArm_R' \(right elbow\).*names of Bandai"):
-        classifier_joints(without)
-    with pytest.raises(ValueError, match="left clavicle"):
-        classifier_joints(SKELETON)
+    refused(r"no 'LowerArm_R' \(right elbow\).*names of Bandai", classifier_joints, without)
+    refused("left clavicle", classifier_joints, SKELETON)
 
 
 def figure(hips_yaw=0.0, clavicle_yaw=0.0) -> np.ndarray:
@@ -198,13 +196,10 @@ def test_windows_lie_side_by_side_and_the_rest_is_left():
 
 def test_motion_that_cannot_be_cut_is_refused():
     positions = np.array(walk(seconds=59 / 30).positions)
-    with pytest.raises(ValueError, match="59 frames do not fill .* needs 60"):
-        classifier_windows(positions, SYNTHETIC_SKELETON)
-    with pytest.raises(ValueError, match=r"\[\.\.\., T, 23, 3\].*\(59, 22, 3\)"):
-        classifier_windows(positions[:, 1:], SYNTHETIC_SKELETON)
+    refused("59 frames do not fill .* needs 60", classifier_windows, positions, SYNTHETIC_SKELETON)
+    refused(r"\[\.\.\., T, 23, 3\].*\(59, 22, 3\)", classifier_windows, positions[:, 1:], SYNTHETIC_SKELETON)
     positions[40, 3, 1] = np.nan
-    with pytest.raises(ValueError, match="not finite at frame 40, joint 'Chest3'$"):
-        classifier_windows(positions, SYNTHETIC_SKELETON)
+    refused("not finite at frame 40, joint 'Chest3'$", classifier_windows, positions, SYNTHETIC_SKELETON)
     with pytest.raises(ValueError, match=r"frame 40, joint 'Chest3' of motion \[1\]"):
         classifier_windows(np.stack([np.zeros_like(positions), positions]), SYNTHETIC_SKELETON)
 
@@ -300,12 +295,9 @@ def test_dropout_keeps_the_mean_of_what_it_passes_on():
 
 def test_sizes_that_make_no_network_are_refused():
     assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
-    with pytest.raises(ValueError, match="sizes must be 1 or more"):
-        ClassifierConfig(num_styles=3, hidden_width=0)
-    with pytest.raises(ValueError, match="dropout"):
-        ClassifierConfig(num_styles=3, dropout=1.0)
-    with pytest.raises(ValueError, match="'hiden_width'.*'hidden_width'"):
-        ClassifierConfig.from_dict({"num_styles": 3, "hiden_width": 5})
+    refused("sizes must be 1 or more", ClassifierConfig, num_styles=3, hidden_width=0)
+    refused("dropout", ClassifierConfig, num_styles=3, dropout=1.0)
+    refused("'hiden_width'.*'hidden_width'", ClassifierConfig.from_dict, {"num_styles": 3, "hiden_width": 5})
 
 
 # ------------------------------------------------------------------------------------ training
@@ -423,21 +415,15 @@ def test_windows_start_every_stride_within_a_clip_and_short_clips_give_none():
 
 def test_a_style_without_clips_long_enough_is_named():
     short = three_styles(seconds=(1.0, 1.0, 0.5, 0.5))
-    with pytest.raises(ValueError, match="'ArmsOverhead' has no validation or test clip .* 20"):
-        train_classifier(short, **TRAINING)
+    refused("'ArmsOverhead' has no validation or test clip .* 20", train_classifier, short, **TRAINING)
 
 
 def test_what_cannot_be_trained_is_refused(packed):
-    with pytest.raises(ValueError, match="no style 'Zomby'; did you mean 'Zombie'"):
-        train_classifier(packed, styles=("Runner", "Zomby"), **TRAINING)
-    with pytest.raises(ValueError, match="at least two styles"):
-        train_classifier(packed, styles=("Runner",), **TRAINING)
-    with pytest.raises(ValueError, match="each named once"):
-        train_classifier(packed, styles=("Runner", "Runner"), **TRAINING)
-    with pytest.raises(ValueError, match="at least 1 step and batches of 2"):
-        train_classifier(packed, **{**TRAINING, "batch_size": 1})
-    with pytest.raises(ValueError, match="unknown size of a style classifier 'widht'"):
-        train_classifier(packed, widht=3, **TRAINING)
+    refused("no style 'Zomby'; did you mean 'Zombie'", train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING)
+    refused("at least two styles", train_classifier, packed, styles=("Runner",), **TRAINING)
+    refused("each named once", train_classifier, packed, styles=("Runner", "Runner"), **TRAINING)
+    refused("at least 1 step and batches of 2", train_classifier, packed, **{**TRAINING, "batch_size": 1})
+    refused("unknown size of a style classifier 'widht'", train_classifier, packed, widht=3, **TRAINING)
 
 
 # ------------------------------------------------------------------------------------ refusals
@@ -446,42 +432,33 @@ def test_what_cannot_be_trained_is_refused(packed):
 def test_a_classifier_that_guesses_is_refused_with_accuracy_and_bar(trained):
     shares = dict(zip(STYLES, (0.5, 1.0, 0.7), strict=True))
     weak = dataclasses.replace(trained, held_out_accuracy=shares)
-    with pytest.raises(ValueError, match=r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %"):
-        require_telling_styles(weak)
+    refused(r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %", require_telling_styles, weak)
     require_telling_styles(weak, bar=0.7)
     at_the_bar = dataclasses.replace(trained, held_out_accuracy={"one": ACCURACY_BAR})
     require_telling_styles(at_the_bar)
     unknown = dataclasses.replace(trained, held_out_accuracy={"one": float("nan")})
-    with pytest.raises(ValueError, match="nan %"):
-        require_telling_styles(unknown)
+    refused("nan %", require_telling_styles, unknown)
 
 
 def test_motion_of_another_body_is_refused(trained):
     longer = dataclasses.replace(SYNTHETIC_SKELETON, offsets=1.1 * SYNTHETIC_SKELETON.offsets)
-    with pytest.raises(ValueError, match="23 joints of 'tiny'.*bone lengths"):
-        trained.windows_of(walk().positions, longer)
-    with pytest.raises(ValueError, match="here 6 joints"):
-        trained.windows_of(np.zeros((60, 6, 3)), SKELETON)
+    refused("23 joints of 'tiny'.*bone lengths", trained.windows_of, walk().positions, longer)
+    refused("here 6 joints", trained.windows_of, np.zeros((60, 6, 3)), SKELETON)
 
 
 def test_windows_of_the_wrong_kind_are_refused(trained):
     windows = np.zeros((3, WINDOW, NUM_CHANNELS))
     for wrong in (windows[:, :-1], windows[..., :-1], windows[:0], np.zeros(3)):
-        with pytest.raises(ValueError, match=r"must be \[\.\.\., 20, 45\]"):
-            trained.features(wrong)
+        refused(r"must be \[\.\.\., 20, 45\]", trained.features, wrong)
     windows[2, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="window 2 is not finite"):
-        trained.predict(windows)
+    refused("window 2 is not finite", trained.predict, windows)
 
 
 def test_unknown_styles_and_references_are_refused(trained):
     assert trained.style_index("Runner") == 1
-    with pytest.raises(ValueError, match="not trained on style 'runer'; did you mean 'Runner'"):
-        trained.style_index("runer")
-    with pytest.raises(ValueError, match="'runer'"):
-        trained.reference("train", "runer")
-    with pytest.raises(ValueError, match="unknown reference 'test'"):
-        trained.reference("test")
+    refused("not trained on style 'runer'; did you mean 'Runner'", trained.style_index, "runer")
+    refused("'runer'", trained.reference, "train", "runer")
+    refused("unknown reference 'test'", trained.reference, "test")
 
 
 # --------------------------------------------------------------------------------------- files
@@ -504,13 +481,10 @@ def test_classifier_comes_back_exactly(trained, saved):
 def test_broken_and_foreign_files_are_refused_by_name(saved, tmp_path):
     cut = shutil.copy(saved, tmp_path / "cut.safetensors")
     cut.write_bytes(cut.read_bytes()[:-100])
-    with pytest.raises(ValueError, match=r"cut\.safetensors: .*cut short or damaged"):
-        load_classifier(cut)
+    refused(r"cut\.safetensors: .*cut short or damaged", load_classifier, cut)
     save_tree(tmp_path / "model.safetensors", {"a": jnp.zeros(1)}, {"kind": "trained model"})
-    with pytest.raises(ValueError, match=r"model\.safetensors: holds a trained model, not a style"):
-        load_classifier(tmp_path / "model.safetensors")
-    with pytest.raises(ValueError, match="no such weights file"):
-        load_classifier(tmp_path / "absent.safetensors")
+    refused(r"model\.safetensors: holds a trained model, not a style", load_classifier, tmp_path / "model.safetensors")
+    refused("no such weights file", load_classifier, tmp_path / "absent.safetensors")
 
 
 def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, monkeypatch):

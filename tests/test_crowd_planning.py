@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders import refused
 from scipy.spatial.distance import pdist
 
 from f3amd_lib.generation.crowd import PATHS, crowd_paths, plan_crowd
@@ -151,5 +152,4 @@ def test_a_crowd_fits_into_a_given_room():
     ],
 )
 def test_impossible_asks_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+    refused(message, call)

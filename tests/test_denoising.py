@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import tiny_camdm, tiny_config, tiny_trained, tiny_windows
+from builders import refused, tiny_camdm, tiny_config, tiny_trained, tiny_windows
 
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import denoising
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -74,15 +74,15 @@ def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
 
     monkeypatch.setattr(denoising, "x0_error_by_sigma", spy)
     monkeypatch.setattr(denoising, "seed_spread", lambda *a, **k: 0.0)
-    four, one = VariancePreservingCosine(4), VariancePreservingCosine(1)
+    four, one = variance_preserving_cosine(4), variance_preserving_cosine(1)
     for schedule in (four, one):
-        config = tiny_camdm(noise_levels=tuple(schedule.sigmas.tolist()))
+        config = tiny_camdm(noise_levels=tuple(schedule.levels.tolist()))
         generator = MotionGenerator(tiny_trained(config=config, diffusion=schedule), 1)
         ratio = denoising.noise_use(generator, windows)["x0_error_ratio"]
         assert ratio == 0.5 if schedule is four else math.isnan(ratio)
     # 0.425 is the lowest of the four levels; with a single one there is nothing to compare.
     ((lowest, highest),) = asked
-    assert lowest == pytest.approx(four.sigmas[0]) and highest == pytest.approx(four.sigma_max)
+    assert lowest == pytest.approx(four.levels[0]) and highest == pytest.approx(four.sigma_max)
 
 
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
@@ -119,5 +119,4 @@ def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch)
 def test_windows_of_other_sizes_are_refused():
     trained = tiny_trained()
     longer = dataclasses.replace(trained.config, window=trained.config.window + 2)
-    with pytest.raises(ValueError, match="built for"):
-        denoising.held_out_batch(tiny_windows(), dataclasses.replace(trained, config=longer))
+    refused("built for", denoising.held_out_batch, tiny_windows(), dataclasses.replace(trained, config=longer))

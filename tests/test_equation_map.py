@@ -126,7 +126,7 @@ def test_every_equation_of_the_paper_has_code(whole_map):
     assert len(rows) == len(equation_labels()) == 16
     assert rows.loc[rows["functions"] == "", "equation"].tolist() == []
     by_label = rows.set_index("equation")["functions"]
-    assert "diffusion/schedules: VarianceExploding.sigma" in by_label["Eq. 9"].split(", ")
+    assert "diffusion/schedules: variance_exploding" in by_label["Eq. 9"].split(", ")
     assert "training/losses: total_loss" in by_label["Eq. 14"].split(", ")
 
 

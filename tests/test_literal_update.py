@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
+from builders import HISTORY, WINDOW, refused, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
 from helpers.seed_histories import seed_condition, walk_seed_histories
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.diffusion.samplers import sample
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import literal_update, measure
 from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, WindowWalks, walk_windows, window_figures
@@ -120,15 +120,14 @@ def test_figures_by_hand():
 
 @pytest.mark.slow
 def test_a_single_seed_has_no_spread():
-    with pytest.raises(ValueError, match="num_seeds must be at least 2"):
-        walk_windows(tiny_trained(), tiny_windows(), num_seeds=1)
+    refused("num_seeds must be at least 2", walk_windows, tiny_trained(), tiny_windows(), num_seeds=1)
 
 
 @pytest.fixture
 def measurement(tmp_path, monkeypatch):
     """`measure_literal_update` on tiny models, with rollouts of a made-up value."""
     prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
-    schedule = VariancePreservingCosine(4)
+    schedule = variance_preserving_cosine(4)
     models = {"F3AMD-FNO-32": tiny_trained(), "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=schedule)}
     calls = []
 
@@ -238,5 +237,4 @@ def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     )(noise)
     joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
     np.testing.assert_allclose(walks.made["rescaled", 8][0], joints, atol=1e-4)
-    with pytest.raises(ValueError, match="num_seeds must be at least 2"):
-        walk_seed_histories(trained, num_seeds=1)
+    refused("num_seeds must be at least 2", walk_seed_histories, trained, num_seeds=1)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from builders import same_tree
+from builders import refused, same_tree
 
 from f3amd_lib.training.optimise import (
     TrainingDiverged,
@@ -176,8 +176,7 @@ def test_a_finished_run_does_nothing_more(finished, tmp_path):
 def test_states_of_other_settings_or_data_are_refused(finished, tmp_path):
     path = tmp_path / "state.safetensors"
     save_state(path, line(), finished[0])
-    with pytest.raises(ValueError, match=r"state\.safetensors.*other training settings \(rate, seed\)"):
-        restore_state(path, line(seed=1, rate=1.0))
+    refused(r"state\.safetensors.*other training settings \(rate, seed\)", restore_state, path, line(seed=1, rate=1.0))
     mine = line().identity()
     assert differences(mine, {**mine, "sizes": [1, 2], "kind": "training state"}) == []
     assert differences(mine, {**mine, "dataset_fingerprint": "other"}) == ["dataset fingerprint"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from builders import tiny_config, tiny_task, tiny_windows
+from builders import refused, tiny_config, tiny_task, tiny_windows
 
 from f3amd_lib.training import parallel
 from f3amd_lib.training.optimise import initial_state, optimise
@@ -136,8 +136,7 @@ def test_a_batch_that_devices_cannot_share_is_refused():
 
     parallel.check_batch(8, Two())
     parallel.check_batch(7, None)
-    with pytest.raises(ValueError, match="batch of 7 .* equally by 2 devices: take 6"):
-        parallel.check_batch(7, Two())
+    refused("batch of 7 .* equally by 2 devices: take 6", parallel.check_batch, 7, Two())
 
 
 @pytest.mark.parametrize(
@@ -149,8 +148,7 @@ def test_a_batch_that_devices_cannot_share_is_refused():
     ],
 )
 def test_half_told_processes_are_refused(given, message):
-    with pytest.raises(ValueError, match=message):
-        parallel.join_processes(*given)
+    refused(message, parallel.join_processes, *given)
 
 
 def test_alone_there_is_nobody_to_agree_with():
@@ -163,5 +161,4 @@ def test_processes_that_cannot_join_are_a_clear_error(monkeypatch):
         raise RuntimeError("deadline exceeded")
 
     monkeypatch.setattr(jax.distributed, "initialize", late)
-    with pytest.raises(ValueError, match="could not join the others at host:1 .deadline exceeded"):
-        parallel.join_processes("host:1", 2, 1)
+    refused("could not join the others at host:1 .deadline exceeded", parallel.join_processes, "host:1", 2, 1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path, path_from_motion, read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -121,18 +122,15 @@ def test_ramp_starts_from_rest():
 
 
 def test_unknown_name_names_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'spiral'"):
-        named_path("spirale", 10)
-    with pytest.raises(ValueError, match="one of straight, circle"):
-        named_path("zzz", 10)
+    refused("did you mean 'spiral'", named_path, "spirale", 10)
+    refused("one of straight, circle", named_path, "zzz", 10)
 
 
 @pytest.mark.parametrize(
     "bad", [{"num_frames": 1}, {"speed": 0.0}, {"speed": np.nan}, {"fps": 0}, {"ramp_seconds": -1}]
 )
 def test_bad_numbers_are_refused(bad):
-    with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0]):
-        named_path("circle", **({"num_frames": 10} | bad))
+    refused(next(iter(bad)).split("_")[0], named_path, "circle", **{"num_frames": 10} | bad)
 
 
 def test_placed_moves_and_turns():
@@ -142,10 +140,8 @@ def test_placed_moves_and_turns():
 
 
 def test_root_path_refuses_nonsense():
-    with pytest.raises(ValueError, match="position"):
-        RootPath(np.zeros((4, 3)), np.zeros(4))
-    with pytest.raises(ValueError, match="not finite at frame 2"):
-        RootPath(np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))
+    refused("position", RootPath, np.zeros((4, 3)), np.zeros(4))
+    refused("not finite at frame 2", RootPath, np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))
 
 
 # ------------------------------------------------------------------------------------- CSV files
@@ -200,8 +196,7 @@ def test_csv_errors_name_file_and_line(tmp_path, text, message):
 def test_csv_that_is_no_text(tmp_path):
     file = tmp_path / "walk.csv"
     file.write_bytes(b"x,z\n\xff\xfe")
-    with pytest.raises(ValueError, match="not a text file"):
-        read_path_csv(file)
+    refused("not a text file", read_path_csv, file)
 
 
 def test_path_from_motion():

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from builders import refused
 
 import f3amd_lib.training.pipeline as pipeline
 from f3amd_lib.__main__ import main
@@ -19,8 +20,11 @@ from f3amd_lib.motion.bvh import read_bvh
 @pytest.fixture(scope="module")
 def trained_once(tmp_path_factory):
     """A model trained for four steps in a folder of its own; (folder, prepared, profile, model)."""
-    folder = tmp_path_factory.mktemp("pipeline")
+    folder, build = tmp_path_factory.mktemp("pipeline"), pipeline.presets.build_config
     with pytest.MonkeyPatch.context() as patch:
+        # One narrow block: what is looked at here are files, and compiling is what takes time.
+        narrow = {"depth": 1, "latent_width": 8}
+        patch.setattr(pipeline.presets, "build_config", lambda *a, **settings: build(*a, **narrow | settings))
         patch.setenv(CACHE_DIR_VARIABLE, str(folder / "cache"))
         patch.setattr(pipeline, "runs_dir", lambda dataset, profile: folder / dataset / profile)
         profile = load_profile("smoke", "synthetic", train_steps=4, num_styles=2)
@@ -143,8 +147,7 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
 def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: tmp_path / profile)
     monkeypatch.setattr(pipeline, "PRETRAINED_DIR", tmp_path / "pretrained")
-    with pytest.raises(ValueError, match="f3amd train --data bandai"):
-        pipeline.find_model("bandai")
+    refused("f3amd train --data bandai", pipeline.find_model, "bandai")
 
 
 @pytest.mark.slow

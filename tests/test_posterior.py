@@ -19,7 +19,7 @@ from builders import (
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, posterior
 from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
@@ -196,10 +196,10 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
 
 
 def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
-    schedule = VariancePreservingCosine(4)
-    config = tiny_camdm(noise_levels=tuple(schedule.sigmas.tolist()))
+    schedule = variance_preserving_cosine(4)
+    config = tiny_camdm(noise_levels=tuple(schedule.levels.tolist()))
     trained = model_that(lambda x_noisy: x_noisy, config=config, diffusion=schedule)
-    for sigmas, expected in (((0.01, 3.0), schedule.sigmas[:3]), ((1e-3, 1e-2), [schedule.sigma_max])):
+    for sigmas, expected in (((0.01, 3.0), schedule.levels[:3]), ((1e-3, 1e-2), [schedule.sigma_max])):
         table = posterior.answer_spread(trained, tiny_windows(), sigmas, num_windows=2, num_draws=2)
         np.testing.assert_allclose(sorted(set(table["sigma"])), expected, rtol=1e-6)
 

@@ -8,7 +8,7 @@ import pytest
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.predictions import from_noise, from_velocity, guided
 from f3amd_lib.diffusion.samplers import sample
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingLinear, alpha_bar_from_sigma
+from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma, variance_exploding, variance_preserving_linear
 
 MIXTURE = GaussianMixture([-1.0, 1.0], 0.2)
 
@@ -23,7 +23,7 @@ def velocity_of(x_noisy, sigma):
     return jnp.sqrt(alpha_bar) * (x_noisy - x0_hat) / sigma - jnp.sqrt(1.0 - alpha_bar) * x0_hat
 
 
-@pytest.mark.parametrize("schedule", [VarianceExploding(), VariancePreservingLinear(64)])
+@pytest.mark.parametrize("schedule", [variance_exploding(), variance_preserving_linear(64)])
 @pytest.mark.parametrize("wrapped", [from_noise(noise_of), from_velocity(velocity_of)])
 def test_every_prediction_of_an_exact_network_gives_the_same_samples(schedule, wrapped):
     sigmas = schedule.grid(8)

@@ -14,7 +14,7 @@ from builders import CHANNELS, network_of, packed_from, same_tree, tiny_config, 
 from flax import nnx
 
 from f3amd_lib.data.windows import build_windows, fit_normaliser
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine, VariancePreservingLinear
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine, variance_preserving_linear
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
 from f3amd_lib.training.denoising_task import denoising_task
@@ -97,19 +97,19 @@ def test_an_ablation_differs_from_the_baseline_in_this_alone(name, differs):
 
 def test_presets_say_how_they_are_trained():
     base = paper_recipe("F3AMD-FNO-96", 10)
-    assert base.loss.ird == 1.0 and base.diffusion == VarianceExploding()
+    assert base.loss.ird == 1.0 and base.diffusion == variance_exploding()
     assert paper_recipe("F3AMD-FNO-96-no-IRD", 10).loss.ird == 0.0
     camdm = paper_recipe("CAMDM", 10)
-    assert camdm.loss.ird == 0.0 and camdm.diffusion == VariancePreservingCosine(8)
+    assert camdm.loss.ird == 0.0 and camdm.diffusion == variance_preserving_cosine(8)
     assert camdm.diffusion.sampler == "ddpm" and base.diffusion.sampler == "ddim"
-    assert paper_recipe("CAMDM-VE", 10).diffusion == VarianceExploding()
+    assert paper_recipe("CAMDM-VE", 10).diffusion == variance_exploding()
     assert paper_recipe("CAMDM-IRD", 10).loss.ird == 1.0
     assert paper_recipe("CAMDM-code", 10).history_dropout == 0.15
     assert paper_recipe("F3AMD-Transformer-64-plus", 10).loss.ird_form == "excess"
     for levels in (4, 2, 1):
         config = presets.build_config(f"CAMDM-K{levels}", **SIZE)
         diffusion = paper_recipe(f"CAMDM-K{levels}", 10).diffusion
-        assert config.noise_levels == tuple(diffusion.sigmas) and len(diffusion.sigmas) == levels
+        assert config.noise_levels == tuple(diffusion.levels) and len(diffusion.levels) == levels
     for name in ("CAMDM", "CAMDM-VE"):
         told = bool(presets.build_config(name, **SIZE).noise_levels)
         assert told == (name == "CAMDM")
@@ -171,7 +171,7 @@ def test_another_paper_brings_a_file_of_its_own(tmp_path):
     assert list(found) == ["Wide", "Narrow"] and list(forms) == ["-slow"]
     wide, narrow = found.values()
     assert wide.paper == narrow.paper == "another"
-    assert wide.diffusion == narrow.diffusion == VariancePreservingLinear(100)
+    assert wide.diffusion == narrow.diffusion == variance_preserving_linear(100)
     # What a row does not say is that of the rows it is like, but for its names and windows.
     assert narrow.network == {"latent_width": 8, "num_heads": 2}
     assert narrow.training == {"noise": "mixed", "loss": {"ird": 0.0, "foot": 3.0}, "learning_rate": 1e-5}
@@ -225,7 +225,7 @@ def test_counted_parameters_are_those_of_the_built_network():
 
 def test_counted_operations_of_a_linear_coder_by_hand():
     linear, spectral = (
-        presets.count_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
+        presets.count_model_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
         for kind in ("linear", "fno")
     )
     width, frames, modes = 96, 32, 17
@@ -253,9 +253,8 @@ def two_training_steps(config, recipe_json: str):
     recipe = TrainingConfig.from_dict(json.loads(recipe_json))
     clips = [(wandering_motion(60, 0), 0, 0), (wandering_motion(50, 1), 1, 0)]
     packed = packed_from(clips)
-    frames = {"window": 32, "num_history": 10}
-    windows = build_windows(packed, "train", **frames)
-    normaliser = fit_normaliser(windows, jax.random.key(0), **frames)
+    windows = build_windows(packed, "train", window=32, num_history=10)
+    normaliser = fit_normaliser(windows, jax.random.key(0))
     task = denoising_task(config, recipe, packed.skeleton, normaliser, windows)
     before = initial_state(task)
     # The first step has a learning rate of 0.

@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.data import sources
 from f3amd_lib.ground import profiles
@@ -90,8 +91,7 @@ def test_sensible_values_become_the_fields_type(key, given, kept):
     ],
 )
 def test_wrong_values_are_refused(key, value, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        load_profile("smoke", "synthetic", **{key: value})
+    refused(complaint, load_profile, "smoke", "synthetic", **{key: value})
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,7 @@ def test_wrong_values_are_refused(key, value, complaint):
     ],
 )
 def test_unknown_names_are_refused_with_the_nearest(arguments, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        load_profile(**{"name": "smoke", "dataset": "synthetic", **arguments})
+    refused(complaint, load_profile, **{"name": "smoke", "dataset": "synthetic", **arguments})
 
 
 def test_a_profile_cannot_be_changed():
@@ -141,8 +140,7 @@ def test_results_dir_keeps_what_is_there(tmp_path):
 
 @pytest.mark.parametrize("dataset, profile", [("../elsewhere", "smoke"), ("bandai", "smok")])
 def test_results_dir_refuses_unknown_names(dataset, profile, tmp_path):
-    with pytest.raises(ValueError, match="unknown"):
-        results_dir(dataset, profile, root=tmp_path)
+    refused("unknown", results_dir, dataset, profile, root=tmp_path)
     assert not any(tmp_path.iterdir())
 
 

@@ -2,6 +2,7 @@
 
 import pandas as pd
 import pytest
+from builders import refused
 
 from f3amd_lib.reports.quality_bars import BAR_MODELS, quality_bars
 
@@ -87,5 +88,4 @@ def test_what_was_not_measured_is_said():
     alone = met_by(quality_bars(frame[~frame["model"].isin(BAR_MODELS)], 0.9))
     assert alone.pop("Classifier, held-out accuracy") == "both"
     assert set(alone.values()) == {"not measured"}
-    with pytest.raises(ValueError, match="no rows of real motion"):
-        quality_bars(frame[frame["model"] != "real"], 0.9)
+    refused("no rows of real motion", quality_bars, frame[frame["model"] != "real"], 0.9)

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from builders import refused
 
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
@@ -154,17 +155,13 @@ def test_figures_have_four_digits_and_as_many_decimals_in_the_interval(value, lo
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="quality tables are 3, 5, .* not 4"):
-        beside_paper(4, QUALITY, LABEL)
+    refused("quality tables are 3, 5, .* not 4", beside_paper, 4, QUALITY, LABEL)
     for label in ("", PAPER_SOURCE):
-        with pytest.raises(ValueError, match="dataset_label must say"):
-            beside_paper(3, QUALITY, label)
-    with pytest.raises(ValueError, match="unique"):
-        beside_paper(3, table_of(QUALITY, figures()), LABEL)
+        refused("dataset_label must say", beside_paper, 3, QUALITY, label)
+    refused("unique", beside_paper, 3, table_of(QUALITY, figures()), LABEL)
     with pytest.raises(ValueError, match="IRD is in m here and in cm in the paper"):
         beside_paper(3, QUALITY.assign(unit=QUALITY["unit"].replace("cm", "m")), LABEL)
-    with pytest.raises(ValueError, match="middle of its interval"):
-        figure_text(5.0, 4.0, 9.0)
+    refused("middle of its interval", figure_text, 5.0, 4.0, 9.0)
 
 
 def test_the_papers_numbers_stand_in_columns_of_their_own():
@@ -184,5 +181,4 @@ def test_the_papers_numbers_stand_in_columns_of_their_own():
 
 
 def test_paper_rows_that_are_not_there():
-    with pytest.raises(ValueError, match="Table 3 has no row 'F3AMD-FNO-97'"):
-        paper_rows(["F3AMD-FNO-97", "CAMDM"])
+    refused("Table 3 has no row 'F3AMD-FNO-97'", paper_rows, ["F3AMD-FNO-97", "CAMDM"])

@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
+from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_trained, wandering_motion
 
-from f3amd_lib.diffusion.schedules import VariancePreservingCosine
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, recipes
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -48,8 +48,7 @@ def test_every_recipe_changes_one_thing(prepared):
 
 
 def test_unknown_recipe_names_the_nearest():
-    with pytest.raises(ValueError, match="'wide-decodr'; did you mean 'wide-decoder'"):
-        recipes.find_recipe("wide-decodr")
+    refused("'wide-decodr'; did you mean 'wide-decoder'", recipes.find_recipe, "wide-decodr")
 
 
 @pytest.fixture
@@ -88,8 +87,7 @@ def test_recipes_are_trained_measured_and_gone_on_with(prepared, two_recipes, tm
 
     monkeypatch.setattr(measure, "train_recipe", refuse)
     assert measure.measure_recipes(prepared, PROFILE) == path
-    with pytest.raises(ValueError, match="leave --model out"):
-        measure.measure_recipes(prepared, PROFILE, ["F3AMD-FNO-96"])
+    refused("leave --model out", measure.measure_recipes, prepared, PROFILE, ["F3AMD-FNO-96"])
     # A run on other data makes way, under another name.
     packed = dataclasses.replace(prepared.packed, fingerprint="others")
     others = PreparedData(packed, WINDOW, HISTORY)
@@ -105,7 +103,7 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     models = {
         "F3AMD-FNO-32": tiny_trained(),
-        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=VariancePreservingCosine(4)),
+        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=variance_preserving_cosine(4)),
     }
     asked = []
 
@@ -122,7 +120,7 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     levels = errors.groupby("model")["sigma"].apply(list)
     assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
     # A network that is told the number of a step is asked at its own levels.
-    assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
+    assert levels["CAMDM"] == pytest.approx(variance_preserving_cosine(4).levels.tolist(), rel=1e-6)
     assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
     assert set(table["model"]) == set(models) and "x0_error_ratio" in table
     before = len(errors)

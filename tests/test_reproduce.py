@@ -7,6 +7,7 @@ from pathlib import Path
 import nbformat
 import pandas as pd
 import pytest
+from builders import refused
 
 from f3amd_lib import reproduce
 from f3amd_lib.__main__ import main
@@ -162,20 +163,17 @@ def test_a_parameter_must_be_known_to_every_notebook_that_runs(checkout):
         write_notebook(folder, "00_first", PARAMETERS),
         write_notebook(folder, "01_second", PARAMETERS.replace("num_steps = 2", "seed = 0")),
     ]
-    with pytest.raises(ValueError, match="01_second.ipynb has no parameter 'num_steps'"):
-        reproduce.check_parameters(paths, ["num_steps"])
+    refused("01_second.ipynb has no parameter 'num_steps'", reproduce.check_parameters, paths, ["num_steps"])
     reproduce.check_parameters(paths[:1], ["num_steps", "profile", "data"])
 
 
 def test_a_notebook_without_parameters_is_refused(checkout):
     path = write_notebook(checkout / "notebooks", "00_bare", "pass")
-    with pytest.raises(ValueError, match="no parameter 'profile'; there is none to choose from"):
-        reproduce.check_parameters([path], ["profile"])
+    refused("no parameter 'profile'; there is none to choose from", reproduce.check_parameters, [path], ["profile"])
 
 
 def test_a_folder_without_notebooks_is_refused(checkout):
-    with pytest.raises(ValueError, match="no numbered notebooks"):
-        reproduce.reproduce("synthetic", "smoke")
+    refused("no numbered notebooks", reproduce.reproduce, "synthetic", "smoke")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import (
@@ -21,13 +22,14 @@ from f3amd_lib.diffusion.samplers import (
 )
 from f3amd_lib.diffusion.schedules import (
     SCHEDULES,
-    VarianceExploding,
-    VariancePreservingCosine,
-    VariancePreservingLinear,
     alpha_bar_from_sigma,
+    straight,
+    variance_exploding,
+    variance_preserving_cosine,
+    variance_preserving_linear,
 )
 
-SCHEDULE = VarianceExploding()
+SCHEDULE = variance_exploding()
 DETERMINISTIC = ["ddim", "ddim_vp", "euler", "heun"]
 
 
@@ -38,15 +40,6 @@ def two_modes(width=0.1):
         variance = width**2 + sigma**2
         share = width**2 / variance
         return share * x_noisy + (1.0 - share) * jnp.tanh(x_noisy / variance)
-
-    return denoise
-
-
-def one_mode(mean, width):
-    """Exact denoiser of N(mean, width^2)."""
-
-    def denoise(x_noisy, sigma):
-        return mean + width**2 / (width**2 + sigma**2) * (x_noisy - mean)
 
     return denoise
 
@@ -83,44 +76,17 @@ def test_a_step_to_zero_returns_the_estimate_exactly():
     np.testing.assert_array_equal(ddim_step(np.float32([3e3, -4e3]), x0_hat, 0.01, 0.0), x0_hat)
 
 
-@pytest.mark.parametrize("num_steps", [1, 2, 4, 8, 64])
-def test_appendix_f_vp_equals_ve_in_float32(num_steps):
-    sigmas, x_init = SCHEDULE.grid(num_steps), jnp.asarray(start(), jnp.float32)
-    ve = sample("ddim", two_modes(), x_init, sigmas)
-    vp = sample("ddim_vp", two_modes(), x_init, sigmas)
-    assert ve.dtype == vp.dtype == jnp.float32
-    np.testing.assert_allclose(vp, ve, atol=2e-4)
-    assert float(jnp.std(ve)) > 1e-4  # not equal merely because all is zero
-
-
-@pytest.mark.parametrize("num_steps", [1, 4, 8, 64])
-def test_appendix_f_vp_equals_ve_in_float64(num_steps):
-    sigmas = SCHEDULE.grid(num_steps)
-    with jax.enable_x64(True):
-        x_init = jnp.asarray(start(), jnp.float64)
-        ve = np.asarray(sample("ddim", two_modes(), x_init, sigmas))
-        vp = np.asarray(sample("ddim_vp", two_modes(), x_init, sigmas))
-    assert ve.dtype == np.float64
-    np.testing.assert_allclose(vp, ve, atol=1e-12)
-
-
-def test_appendix_f_vp_equals_ve_on_variance_preserving_levels():
-    sigmas, x_init = VariancePreservingCosine().grid(4), jnp.asarray(start(), jnp.float32)
-    ve = sample("ddim", two_modes(), x_init, sigmas, unroll=True)
-    vp = sample("ddim_vp", two_modes(), x_init, sigmas, unroll=True)
-    np.testing.assert_allclose(vp, ve, atol=2e-4)
-    assert float(jnp.std(ve)) > 0.1
-
-
-@pytest.mark.parametrize("unroll", [False, True])
-def test_scan_equals_a_python_loop(unroll):
-    sigmas, x = SCHEDULE.grid(8), start(64)
-    with jax.enable_x64(True):
-        sampled = np.asarray(sample("ddim", two_modes(), jnp.asarray(x), sigmas, unroll=unroll))
-    for sigma, sigma_next in zip(sigmas[:-1], sigmas[1:], strict=True):
-        x0_hat = np.asarray(two_modes()(x, sigma))
-        x = x0_hat + sigma_next * (x - x0_hat) / sigma
-    np.testing.assert_allclose(sampled, x, atol=1e-6)
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 2e-4), ("float64", 1e-12)])
+@pytest.mark.parametrize("num_steps", [1, 4, 8, 64, "cosine"])
+def test_appendix_f_vp_equals_ve(num_steps, dtype, tolerance):
+    cosine = num_steps == "cosine"
+    sigmas = variance_preserving_cosine().grid(4) if cosine else SCHEDULE.grid(num_steps)
+    with jax.enable_x64(dtype == "float64"):
+        x_init = jnp.asarray(start(), dtype)
+        ve, vp = (sample(name, two_modes(), x_init, sigmas, unroll=cosine) for name in ("ddim", "ddim_vp"))
+        assert ve.dtype == vp.dtype == dtype
+        np.testing.assert_allclose(vp, ve, atol=tolerance)
+        assert float(jnp.std(ve)) > 1e-4  # not equal merely because all is zero
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -233,40 +199,15 @@ def test_both_modes_are_reached_and_keep_their_width():
     assert right.std() == pytest.approx(0.1, rel=0.1)
 
 
-def exact_end(mean, width, x_init):
-    """Where dx/dsigma = (x - D(x, sigma)) / sigma ends for a single Gaussian."""
-    return mean + (x_init - mean) * width / np.sqrt(width**2 + 128.0**2)
-
-
-@pytest.mark.parametrize("name", ["ddim", "ddim_vp"])
-def test_error_falls_at_first_order_on_the_gaussian_oracle(name):
-    mean, width, x_init = 0.7, 0.3, start(32)
-    errors = []
-    with jax.enable_x64(True):
-        for num_steps in (64, 128, 256, 512):
-            x = sample(name, one_mode(mean, width), jnp.asarray(x_init), SCHEDULE.grid(num_steps))
-            errors.append(np.abs(np.asarray(x) - exact_end(mean, width, x_init)).mean())
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    np.testing.assert_allclose(orders, 1.0, atol=0.15)
-
-
-def test_gaussian_oracle_reaches_known_mean_and_deviation():
-    x_init = jnp.asarray(start(4000), jnp.float32)
-    x = np.asarray(sample("ddim", one_mode(0.7, 0.3), x_init, SCHEDULE.grid(1024)))
-    assert x.mean() == pytest.approx(0.7, abs=0.02)
-    assert x.std() == pytest.approx(0.3, rel=0.05)
-
-
 @pytest.mark.parametrize("name", DETERMINISTIC)
 @pytest.mark.parametrize("sigmas", [[1.0], [], [[1.0, 0.0]]])
 def test_grids_without_a_step_are_refused(name, sigmas):
-    with pytest.raises(ValueError, match="sigmas"):
-        sample(name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
+    refused("sigmas", sample, name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
 
 
 def test_ddpm_posterior_is_camdms():
     # K = 4 levels, least noisy first; the last step of a sampler goes to a clean signal.
-    alpha_bars = VariancePreservingCosine(4).alpha_bars
+    alpha_bars = variance_preserving_cosine(4).alpha_bars
     on_x0, on_z, variance = ddpm_posterior(alpha_bars, np.append(1.0, alpha_bars[:-1]))
     np.testing.assert_allclose(on_x0, [1.0, 0.758145, 0.581307, 0.379507], atol=1e-6)
     np.testing.assert_allclose(on_z, [0.0, 0.230793, 0.319702, 0.027064], atol=1e-6)
@@ -314,7 +255,7 @@ def test_ddpm_adds_no_noise_at_the_end():
 
 def test_ddpm_equals_camdms_loop_over_its_own_levels():
     # The released code walks the VP state with a table of coefficients, from z ~ N(0, 1).
-    schedule, key = VariancePreservingCosine(4), jax.random.key(2)
+    schedule, key = variance_preserving_cosine(4), jax.random.key(2)
     alpha_bars = schedule.alpha_bars
     before = np.append(1.0, alpha_bars[:-1])
     betas = 1.0 - alpha_bars / before
@@ -324,7 +265,7 @@ def test_ddpm_equals_camdms_loop_over_its_own_levels():
         found = np.asarray(sample("ddpm", two_modes(), x_init, schedule.grid(4), key=key))
         for level, key_step in zip((3, 2, 1, 0), jax.random.split(key, 4), strict=True):
             noise = np.asarray(jax.random.normal(key_step, z.shape, z.dtype))
-            x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.sigmas[level]))
+            x0_hat = np.asarray(two_modes()(z / np.sqrt(alpha_bars[level]), schedule.levels[level]))
             left = 1.0 - alpha_bars[level]
             mean = betas[level] * np.sqrt(before[level]) / left * x0_hat
             mean += np.sqrt(1.0 - betas[level]) * (1.0 - before[level]) / left * z
@@ -346,10 +287,10 @@ def ddpm_variance(width, sigmas, variance):
 
 
 DDPM_GRIDS = {
-    "linear 1000": VariancePreservingLinear(1000).grid(1000),
-    "cosine 8": VariancePreservingCosine(8).grid(8),
-    "cosine 8 in 4": VariancePreservingCosine(8).grid(4),
-    "exploding 8": VarianceExploding().grid(8),
+    "linear 1000": variance_preserving_linear(1000).grid(1000),
+    "cosine 8": variance_preserving_cosine(8).grid(8),
+    "cosine 8 in 4": variance_preserving_cosine(8).grid(4),
+    "exploding 8": variance_exploding().grid(8),
 }
 
 
@@ -372,10 +313,10 @@ def test_ddpm_needs_many_levels_for_the_whole_variance():
     def share(sigmas):
         return ddpm_variance(0.3, sigmas, sigmas[0] ** 2) / 0.3**2
 
-    few = [share(VariancePreservingCosine(8).grid(num_steps)) for num_steps in (1, 2, 4, 8)]
+    few = [share(variance_preserving_cosine(8).grid(num_steps)) for num_steps in (1, 2, 4, 8)]
     assert np.all(np.diff(few) > 0.05) and few[-1] < 0.5
     counts = [500, 1000, 2000, 4000]
-    missing = [1.0 - share(VariancePreservingLinear(count).grid(count)) for count in counts]
+    missing = [1.0 - share(variance_preserving_linear(count).grid(count)) for count in counts]
     assert missing[-1] < 0.01
     assert -np.polyfit(np.log(counts), np.log(missing), 1)[0] == pytest.approx(1.0, abs=0.1)
     # One step from sigma = 1 with unit width, by hand: x0_hat is half of what is seen.
@@ -486,27 +427,70 @@ def test_samplers_go_by_name_and_take_traced_levels(name):
 
 def test_every_schedule_asks_for_a_sampler_that_is_there():
     # The paper pairs VE with DDIM, and VP with DDPM for the baseline.
-    wanted = {kind: schedule.sampler for kind, schedule in SCHEDULES.items()}
-    assert wanted == {
-        "variance_exploding": "ddim",
-        "variance_preserving_cosine": "ddpm",
-        "variance_preserving_linear": "ddpm",
-    }
-    assert set(wanted.values()) <= set(SAMPLERS)
+    for kind, make in SCHEDULES.items():
+        assert make().sampler == ("ddpm" if kind.startswith("variance_preserving") else "ddim")
+        assert make().sampler in SAMPLERS
+
+
+def test_a_walk_in_the_scaled_state_is_the_walk_in_the_unscaled_one():
+    """z = alpha x, and the denoiser of z looks at z / alpha at the level sigma / alpha."""
+    schedule = variance_preserving_cosine(8)
+    alphas, sigmas = schedule.scaled_grid(4)
+
+    def scaled(z, sigma):
+        alpha = jnp.sqrt(1.0 - sigma * sigma)
+        return two_modes()(z / alpha, sigma / alpha)
+
+    with jax.enable_x64(True):
+        x_init = schedule.sigma_max * jnp.asarray(start() / 128.0)
+        unscaled = np.asarray(sample("ddim", two_modes(), x_init, schedule.grid(4)))
+        walked = np.asarray(sample("ddim", scaled, alphas[0] * x_init, sigmas, alphas=alphas))
+        untold = np.asarray(sample("ddim", scaled, alphas[0] * x_init, sigmas))
+    np.testing.assert_allclose(walked, unscaled, atol=1e-12)
+    # Told of no scale, the same walk ends elsewhere.
+    assert np.std(walked) > 0.5 and np.abs(untold - unscaled).max() > 0.03
+
+
+@pytest.mark.parametrize("num_steps", [1, 5, 50])
+def test_the_straight_path_is_walked_by_euler_steps_from_noise_to_a_gaussian(num_steps):
+    """Of N(mean, width^2) the flow is known: it takes noise e to mean + width e, and one step takes all to the mean."""
+    mean, width = 0.4, 0.3
+    schedule = straight()
+
+    def denoise(z, sigma):
+        t = 1.0 - sigma
+        variance = t**2 * width**2 + sigma**2
+        return mean + t * width**2 / variance * (z - t * mean)
+
+    with jax.enable_x64(True):
+        alphas, sigmas = schedule.scaled_grid(num_steps)
+        noise = jnp.asarray(start(64) / 128.0)
+        walked = np.asarray(sample("ddim", denoise, noise, sigmas, alphas=alphas))
+        states = list(walk("ddim", denoise, noise, sigmas, alphas=alphas))
+        # By hand: z + dt v with v = (x0_hat - z) / sigma.
+        z = noise
+        for t in np.arange(num_steps) / num_steps:
+            velocity = (denoise(z, 1.0 - t) - z) / (1.0 - t)
+            z = z + velocity / num_steps
+    np.testing.assert_allclose(walked, z, atol=1e-10)
+    np.testing.assert_allclose(states[-1].x_noisy, walked, atol=1e-10)
+    off = np.abs(walked - (mean + width * np.asarray(noise))).max()
+    assert {1: off > 0.5, 5: 0.1 < off < 0.5, 50: off < 0.05}[num_steps]  # 0.997, 0.333, 0.038
+
+
+def test_shares_of_the_signal_are_for_ddim_and_fit_the_levels():
+    for name, alphas in (("heun", [0.5, 1.0]), ("ddim", [0.5, 0.7, 1.0])):
+        with pytest.raises(ValueError, match="alphas are for 'ddim' alone, one for each of the 2"):
+            sample(name, two_modes(), jnp.zeros((1, 1, 1)), [1.0, 0.0], alphas=alphas)
 
 
 def test_unknown_samplers_and_missing_keys_are_refused():
     x_init, sigmas = jnp.zeros((1, 1, 1)), [1.0, 0.0]
-    with pytest.raises(ValueError, match="'hein'.*did you mean 'heun'"):
-        sample("hein", two_modes(), x_init, sigmas)
-    with pytest.raises(ValueError, match="did you mean 'ddim'"):
-        num_evaluations("dim", 4)
-    with pytest.raises(ValueError, match="'ddpm'.*give it a key"):
-        sample("ddpm", two_modes(), x_init, sigmas)
-    with pytest.raises(ValueError, match="sigmas"):
-        sample("ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
-    with pytest.raises(ValueError, match="num_steps=0"):
-        num_evaluations("ddim", 0)
+    refused("'hein'.*did you mean 'heun'", sample, "hein", two_modes(), x_init, sigmas)
+    refused("did you mean 'ddim'", num_evaluations, "dim", 4)
+    refused("'ddpm'.*give it a key", sample, "ddpm", two_modes(), x_init, sigmas)
+    refused("sigmas", sample, "ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
+    refused("num_steps=0", num_evaluations, "ddim", 0)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -534,15 +518,3 @@ def test_a_recording_denoiser_may_be_walked_with():
 
     list(walk("heun", denoise, jnp.ones((1, 1, 1)), SCHEDULE.grid(3)))
     assert len(shown) == num_evaluations("heun", 3)
-
-
-def test_one_ddim_step_serves_rectified_flow():
-    """On the straight path x = (1 - t) x0 + t noise, an exact estimate is carried along that line."""
-    x0, noise = np.float64([0.3, -2.0]), np.float64([1.5, 0.2])
-    at = lambda t: (1.0 - t) * x0 + t * noise
-    moved = ddim_step(at(0.8), x0, 0.8, 0.3, alpha=0.2, alpha_next=0.7)
-    np.testing.assert_allclose(moved, at(0.3), rtol=1e-12)
-    # The Euler step of dx/dt = v with the velocity v = noise - x0.
-    np.testing.assert_allclose(moved, at(0.8) + (0.3 - 0.8) * (noise - x0), rtol=1e-12)
-    # At t = 1 nothing of the signal is left, and the step still has a value.
-    np.testing.assert_allclose(ddim_step(at(1.0), x0, 1.0, 0.5, 0.0, 0.5), at(0.5), rtol=1e-12)

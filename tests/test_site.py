@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from builders import refused
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from test_environment import LOCK, read_hashed
@@ -150,8 +151,7 @@ def test_results_without_a_licence_are_not_shown(tmp_path, monkeypatch):
     (folder / "tables").mkdir(parents=True)
     (folder / "tables" / "00_x.json").write_text(json.dumps({"dataset_licence": None}))
     monkeypatch.setattr(pages, "ROOT", tmp_path)
-    with pytest.raises(ValueError, match="paper_figures/new/laptop: no record names"):
-        pages.credit_of(folder)
+    refused("paper_figures/new/laptop: no record names", pages.credit_of, folder)
     record = {"dataset_licence": "CC BY 4.0", "dataset_credit": "Somebody."}
     (folder / "tables" / "01_x.json").write_text(json.dumps(record))
     assert pages.credit_line(folder).endswith("Somebody. CC BY 4.0, with credit.")
@@ -195,10 +195,8 @@ def test_the_readme_is_taken_from_its_quick_start_on_with_links_from_the_root():
 
 def test_an_unknown_insert_is_refused():
     assert pages.insert("a\nb") == "a\nb"
-    with pytest.raises(ValueError, match="insert: galery: unknown; there are room, gallery"):
-        pages.insert("<!-- insert: galery bandai -->")
-    with pytest.raises(ValueError, match="room f3amd_lib.motoin: there is no such"):
-        pages.insert("<!-- insert: room f3amd_lib.motoin -->")
+    refused("insert: galery: unknown; there are room, gallery", pages.insert, "<!-- insert: galery bandai -->")
+    refused("room f3amd_lib.motoin: there is no such", pages.insert, "<!-- insert: room f3amd_lib.motoin -->")
 
 
 # Docstrings

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.fft
+from builders import refused
 from flax import nnx
 
 from f3amd_lib.networks.spectral import (
@@ -102,8 +103,7 @@ def test_fourier_matrices_cannot_be_spoilt_by_a_caller():
 
 @pytest.mark.parametrize(("num_frames", "modes"), [(8, 0), (8, 6), (9, 6)])
 def test_eq02_modes_out_of_range_are_refused(num_frames, modes):
-    with pytest.raises(ValueError, match=f"between 1 and 5 for {num_frames} frames, got {modes}"):
-        fourier_matrices(num_frames, modes)
+    refused(f"between 1 and 5 for {num_frames} frames, got {modes}", fourier_matrices, num_frames, modes)
 
 
 @pytest.mark.parametrize("num_frames", [31, 32])
@@ -173,8 +173,7 @@ def test_table_8_cosine_basis_is_orthonormal(num_frames):
 @pytest.mark.parametrize("modes", [0, 9])
 def test_table_8_cosine_modes_out_of_range_are_refused(modes):
     layer = SpectralConvolution(3, 4, modes, "cosine", rngs=nnx.Rngs(params=0))
-    with pytest.raises(ValueError, match=f"between 1 and 8 for 8 frames, got {modes}"):
-        layer(draw(2, 8, 3))
+    refused(f"between 1 and 8 for 8 frames, got {modes}", layer, draw(2, 8, 3))
 
 
 @pytest.mark.parametrize(("num_frames", "modes"), [(8, 8), (8, 3), (9, 9), (9, 4), (1, 1)])
@@ -268,10 +267,8 @@ def test_eq02_rank_out_of_range_is_refused(rank):
 
 
 def test_unknown_variant_names_the_nearest():
-    with pytest.raises(ValueError, match="'cosines'; did you mean 'cosine'"):
-        FNOBlock(3, 4, 5, variant="cosines", rngs=nnx.Rngs(params=0))
-    with pytest.raises(ValueError, match="did you mean 'reduced_rank'"):
-        count_modes("reduced-rank", 32)
+    refused("'cosines'; did you mean 'cosine'", FNOBlock, 3, 4, 5, variant="cosines", rngs=nnx.Rngs(params=0))
+    refused("did you mean 'reduced_rank'", count_modes, "reduced-rank", 32)
 
 
 def flax_convolution(layer):

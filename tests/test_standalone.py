@@ -127,14 +127,14 @@ def test_eq08_noise_and_labels_are_the_librarys(standalone, states, sigma):
 
 @pytest.mark.parametrize("rho", [3.0, 7.0])
 def test_eq09_levels_are_the_librarys(standalone, rho):
-    library = schedules.VarianceExploding(rho=rho)
+    library = schedules.variance_exploding(rho=rho)
     t = np.linspace(0.0, 1.0, 33)
     np.testing.assert_allclose(standalone["sigma_at"](t, rho=rho), library.sigma(t), rtol=1e-14)
     for num_steps in (1, 2, 4, 8, 64):
         ours = standalone["rho_grid"](num_steps, rho=rho)
         np.testing.assert_allclose(ours, library.grid(num_steps), rtol=1e-14)
         assert ours[-1] == 0.0
-    assert standalone["rho_grid"](2)[0] == pytest.approx(schedules.VarianceExploding().sigma_max)
+    assert standalone["rho_grid"](2)[0] == pytest.approx(schedules.variance_exploding().sigma_max)
 
 
 @pytest.mark.parametrize(("sigma", "sigma_next"), LEVELS)
@@ -167,7 +167,7 @@ def test_appendix_f_steps_are_the_librarys(standalone, states, sigma, sigma_next
 @pytest.mark.parametrize("num_steps", [1, 8])
 def test_walks_end_where_the_librarys_samplers_end(standalone, step, sampler, num_steps):
     library = oracles.GaussianMixture([-1.0, 1.0], 0.3)
-    grid = schedules.VarianceExploding().grid(num_steps)
+    grid = schedules.variance_exploding().grid(num_steps)
     start = grid[0] * np.random.default_rng(3).standard_normal((60, 1))
     # The VP state starts and ends as z; at sigma = 0 both states are one.
     first = start / np.sqrt(1.0 + grid[0] ** 2) if step == "vp_step" else start

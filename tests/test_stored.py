@@ -1,7 +1,7 @@
 """Committed tables that notebooks draw from are checked, and say where they come from."""
 
 import pandas as pd
-import pytest
+from builders import refused
 
 from f3amd_lib.ground import stored
 from f3amd_lib.ground.profiles import load_profile
@@ -18,8 +18,7 @@ def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
     assert table["loss"].tolist() == [0.5] and read["seed"] == 3
     assert stored.committed_table("bandai", "learning") is None
     path.write_text(path.read_text().replace("0.5", "0.4"))
-    with pytest.raises(ValueError, match="not the table"):
-        stored.committed_table("synthetic", "learning")
+    refused("not the table", stored.committed_table, "synthetic", "learning")
 
 
 def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
@@ -84,10 +85,8 @@ def test_there_are_a_hundred_styles_with_parameters_of_their_own():
 
 
 def test_unknown_style_names_the_nearest():
-    with pytest.raises(ValueError, match=r"unknown synthetic style 'Zombi'; did you mean 'Zombie'"):
-        style_parameters("Zombi")
-    with pytest.raises(ValueError, match="unknown synthetic style"):
-        synthesize("qqq", 1.0)
+    refused(r"unknown synthetic style 'Zombi'; did you mean 'Zombie'", style_parameters, "Zombi")
+    refused("unknown synthetic style", synthesize, "qqq", 1.0)
 
 
 def test_every_parameter_is_explained_beside_its_number():
@@ -183,8 +182,7 @@ def test_the_frame_rate_does_not_change_the_motion():
     ],
 )
 def test_impossible_lengths_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        synthesize("Neutral", **arguments)
+    refused(message, synthesize, "Neutral", **arguments)
 
 
 def test_rotations_are_rotations(all_styles):

@@ -11,6 +11,7 @@ from builders import (
     WINDOW,
     packed_from,
     random_frames,
+    refused,
     straight_motion,
     tiny_packed,
     wandering_motion,
@@ -41,11 +42,11 @@ from f3amd_lib.motion.skeleton import mirror
 SPAN = WINDOW + HISTORY
 SIZES = {"window": WINDOW, "num_history": HISTORY}
 
-gather = jax.jit(lambda windows, index, yaw, smoothing: gather_windows(windows, index, yaw, smoothing, **SIZES))
+gather = jax.jit(gather_windows)
 
 # Every batch here is handed on as numpy arrays, which saves compiling each test's own arithmetic.
-_sample = jax.jit(lambda windows, key, size: sample_windows(windows, key, size, **SIZES), static_argnums=2)
-_fit = jax.jit(lambda windows, key: fit_normaliser(windows, key, **SIZES))
+_sample = jax.jit(sample_windows, static_argnums=2)
+_fit = jax.jit(fit_normaliser)
 
 
 def sample(windows, seed, size) -> Batch:
@@ -136,8 +137,8 @@ def test_room_counts_the_frames_of_the_clip_before_each_window(packed, train):
 def test_earlier_windows_end_where_the_later_begin(packed, train):
     index = jnp.flatnonzero(train.room >= WINDOW)
     settings = index, jnp.full(len(index), 0.7), jnp.zeros(len(index), jnp.int32)
-    later = gather_windows(train, *settings, **SIZES)
-    before = gather_windows(train, *settings, earlier=WINDOW, **SIZES)
+    later = gather_windows(train, *settings)
+    before = gather_windows(train, *settings, earlier=WINDOW)
     # The last H frames before are the later one's history, seen from another origin.
     shared = before.future[:, -HISTORY:]
     np.testing.assert_allclose(later.history[..., 3:], shared[..., 3:], atol=1e-6)
@@ -158,10 +159,8 @@ def test_stride_takes_every_third_start(packed):
 
 
 def test_unknown_splits_and_short_clips_are_refused(packed):
-    with pytest.raises(ValueError, match="'training': use one of train, validation, test"):
-        build_windows(packed, "training", **SIZES)
-    with pytest.raises(ValueError, match="'tiny' has no test clip of at least 36 frames"):
-        build_windows(packed, "test", window=32, num_history=4)
+    refused("'training': use one of train, validation, test", build_windows, packed, "training", **SIZES)
+    refused("'tiny' has no test clip of at least 36 frames", build_windows, packed, "test", window=32, num_history=4)
 
 
 @pytest.mark.parametrize("yaw", [-2.5, 0.9, 3.0])
@@ -364,7 +363,7 @@ def test_windows_of_64_frames():
     long = packed_from([(straight_motion(120), 0, 0)])
     windows = build_windows(long, "train", window=64, num_history=10)
     assert windows.num_windows == 120 - 74 + 1
-    batch = gather_windows(windows, jnp.arange(2), jnp.zeros(2), jnp.zeros(2, int), window=64, num_history=10)
+    batch = gather_windows(windows, jnp.arange(2), jnp.zeros(2), jnp.zeros(2, int))
     assert batch.future.shape[:2] == batch.path.shape[:2] == (2, 64)
     step = np.diff(np.asarray(batch.future[..., [0, 2]]), axis=1)
     np.testing.assert_allclose(step, np.broadcast_to([0.03, 0.04], step.shape), atol=1e-5)

@@ -33,7 +33,7 @@ class NotPossible(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Task:
+class Workload:
     """What is asked for, in whichever implementation.
 
     Attributes:
@@ -82,10 +82,10 @@ class Round:
     bytes_accessed: int | None = None
 
 
-def round_flops(task: Task) -> int:
+def round_flops(workload: Workload) -> int:
     """Return the operations of one round for all characters (see `networks.counting`)."""
-    encode, evaluate = presets.count_flops(task.config)
-    return task.characters * (encode + evaluate * num_evaluations(task.sampler, task.steps))
+    encode, evaluate = presets.count_model_flops(workload.config)
+    return workload.characters * (encode + evaluate * num_evaluations(workload.sampler, workload.steps))
 
 
 def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> Condition:
@@ -100,19 +100,19 @@ def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> C
     )
 
 
-def _network(task: Task):
-    """Return the network with random weights, in the task's precision."""
-    network = presets.build_from_config(task.config, jax.random.key(0))
-    return cast_network(network, PRECISIONS[task.precision][1])
+def _network(workload: Workload):
+    """Return the network with random weights, in the workload's precision."""
+    network = presets.build_from_config(workload.config, jax.random.key(0))
+    return cast_network(network, PRECISIONS[workload.precision][1])
 
 
-def compile_round(task: Task, run: Callable, sharding=None) -> Round:
-    """Compile `run(condition, key)` ahead of time in the task's precision, for a random condition."""
-    dtype = PRECISIONS[task.precision][1]
-    condition = jax.device_put(random_condition(task.config, task.characters), sharding)
+def compile_round(workload: Workload, run: Callable, sharding=None) -> Round:
+    """Compile `run(condition, key)` ahead of time in the workload's precision, for a random condition."""
+    dtype = PRECISIONS[workload.precision][1]
+    condition = jax.device_put(random_condition(workload.config, workload.characters), sharding)
     given = jax.tree.map(lambda leaf: leaf.astype(dtype), condition), jax.random.key(0)
     started = time.perf_counter()
-    with matmul_precision(task.precision):
+    with matmul_precision(workload.precision):
         compiled = jax.jit(run).lower(*given).compile()
     seconds = time.perf_counter() - started
     accessed = (compiled.cost_analysis() or {}).get("bytes accessed")
@@ -120,60 +120,60 @@ def compile_round(task: Task, run: Callable, sharding=None) -> Round:
     return Round(call, seconds, None if accessed is None else int(accessed))
 
 
-def _jit(task: Task, form=lambda network: network) -> Round:
-    network, sigmas = form(_network(task)), task.sigmas
-    run = lambda condition, key: sample_round(network, condition, sigmas, key, sampler=task.sampler)
-    return compile_round(task, run)
+def _jit(workload: Workload, form=lambda network: network) -> Round:
+    network, sigmas = form(_network(workload)), workload.sigmas
+    run = lambda condition, key: sample_round(network, condition, sigmas, key, sampler=workload.sampler)
+    return compile_round(workload, run)
 
 
-def _all_devices(task: Task) -> Round:
+def _all_devices(workload: Workload) -> Round:
     devices = jax.local_devices()
     if len(devices) < 2:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
     mesh = Mesh(np.array(devices), ("characters",))
-    network, sigmas = _network(task), task.sigmas
+    network, sigmas = _network(workload), workload.sigmas
     run = lambda condition, key: sample_round_on_devices(
-        network, condition, sigmas, key, mesh=mesh, sampler=task.sampler
+        network, condition, sigmas, key, mesh=mesh, sampler=workload.sampler
     )
-    return compile_round(task, run, NamedSharding(mesh, PartitionSpec("characters")))
+    return compile_round(workload, run, NamedSharding(mesh, PartitionSpec("characters")))
 
 
-def _check_outside_of_jax(task: Task, framework: str) -> None:
-    if device_name() != "CPU" or task.precision != "float32":
+def _check_outside_of_jax(workload: Workload, framework: str) -> None:
+    if device_name() != "CPU" or workload.precision != "float32":
         raise NotPossible(f"{framework} is timed on a CPU in float32 only")
 
 
-def _iree(task: Task) -> Round:
+def _iree(workload: Workload) -> Round:
     """Compile ahead of time for this CPU; noise is drawn by numpy, inside the timed call."""
-    _check_outside_of_jax(task, "IREE")
+    _check_outside_of_jax(workload, "IREE")
     from f3amd_lib.serving.artefact import load_artefact
     from f3amd_lib.serving.export import export_round, save_artefact
 
     started = time.perf_counter()
-    exported = export_round(_network(task), task.sigmas, task.characters, task.sampler)
+    exported = export_round(_network(workload), workload.sigmas, workload.characters, workload.sampler)
     with tempfile.TemporaryDirectory() as folder:
-        artefact = load_artefact(save_artefact(Path(folder) / "artefact", exported, name=task.model))
+        artefact = load_artefact(save_artefact(Path(folder) / "artefact", exported, name=workload.model))
     seconds = time.perf_counter() - started
-    given = [artefact.put(part) for part in random_condition(task.config, task.characters)]
+    given = [artefact.put(part) for part in random_condition(workload.config, workload.characters)]
     shapes = [shape for name, shape in exported.inputs.items() if name.endswith("noise")]
     rng = np.random.default_rng(0)
     draw = lambda shape: artefact.put(rng.standard_normal(shape, dtype=np.float32))
     return Round(lambda: artefact(*given, *map(draw, shapes)), seconds)
 
 
-def _torch(task: Task, *, runtime: str = "eager", products: str = "blas") -> Round:
-    _check_outside_of_jax(task, "PyTorch")
+def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas") -> Round:
+    _check_outside_of_jax(workload, "PyTorch")
     from f3amd_lib.benchmarking import torch_camdm
 
     started = time.perf_counter()
-    module = torch_camdm.torch_camdm(_network(task), products=products)
-    run = torch_camdm.torch_round(module, task.sigmas, task.sampler, runtime=runtime)
-    condition = torch_camdm.torch_condition(random_condition(task.config, task.characters))
+    module = torch_camdm.torch_camdm(_network(workload), products=products)
+    run = torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime)
+    condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters))
     run(condition)
     return Round(lambda: run(condition), time.perf_counter() - started)
 
 
-IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Task], Round]]] = {
+IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Workload], Round]]] = {
     "jit": ("jax", _jit),
     "jit, all devices": ("jax", _all_devices),
     "jit, FFT": ("jax", partial(_jit, form=fft_reference)),
@@ -183,24 +183,24 @@ IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Task], Round]]] = {
     "PyTorch, compiled": ("torch", partial(_torch, runtime="compiled")),
     "ONNX Runtime": ("onnx", partial(_torch, runtime="onnx")),
 }
-"""Implementation -> (framework, function that makes a task's round ready)."""
+"""Implementation -> (framework, function that makes a workload's round ready)."""
 
 
-def prepare_round(implementation: str, task: Task) -> Round:
+def prepare_round(implementation: str, workload: Workload) -> Round:
     """Make a round ready to run.
 
     Args:
       implementation: of `IMPLEMENTATIONS`.
-      task: what is asked for.
+      workload: what is asked for.
 
     Raises:
       ValueError: for an unknown implementation.
-      NotPossible: if it does not work for the task or on this machine.
+      NotPossible: if it does not work for the workload or on this machine.
     """
     if implementation not in IMPLEMENTATIONS:
         raise ValueError(f"unknown implementation {implementation!r}{nearest_hint(implementation, IMPLEMENTATIONS)}")
     try:
-        return IMPLEMENTATIONS[implementation][1](task)
+        return IMPLEMENTATIONS[implementation][1](workload)
     except (ImportError, ValueError, RuntimeError) as error:
         # The first line may only tell who spoke; advice on debugging comes after the second.
         lines = [line for line in str(error).splitlines() if line.strip()]

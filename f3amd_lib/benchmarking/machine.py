@@ -48,11 +48,11 @@ def usable_cores() -> int:
 def _processor() -> str:
     """Return the processor's name, which `platform.processor` leaves out on Linux."""
     try:
-        told = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return platform.processor() or platform.machine()
-    found = re.search(r"^model name\s*:\s*(.+)$", told, flags=re.MULTILINE)
-    return found.group(1).strip() if found else platform.machine()
+    name = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
+    return name.group(1).strip() if name else platform.machine()
 
 
 def _graphics_clocks() -> str | None:

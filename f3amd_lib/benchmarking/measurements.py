@@ -11,7 +11,7 @@ import jax
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_lib.benchmarking.implementations import Task
+from f3amd_lib.benchmarking.implementations import Workload
 from f3amd_lib.benchmarking.machine import describe_machine, device_name
 from f3amd_lib.benchmarking.speed_tables import fastest_implementations
 from f3amd_lib.benchmarking.synthesis import CANDIDATE_COLUMNS, Candidate, check_suites, plan, time_group
@@ -43,24 +43,24 @@ _TRAINING = {"smoke": (4, 2, 8), "laptop": (200, 10, 64), "gpu": (200, 20, 512)}
 
 def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra) -> dict:
     """Return a record that tells the machine; another machine's rows do not belong in its table."""
-    told = describe_machine()
+    machine = describe_machine()
     lasting = ("processor", "cores", "system")
     return run_record(
         profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement,
-        timed_on={name: told[name] for name in lasting} | {"device": jax.devices()[0].device_kind},
+        timed_on={name: machine[name] for name in lasting} | {"device": jax.devices()[0].device_kind},
         **extra,
     )  # fmt: skip
 
 
 def _circumstances() -> dict:
     """Return what of the machine may change from one group of rows to the next."""
-    told = describe_machine()
+    machine = describe_machine()
     return {
-        "load": told["load"],
-        "clock_mhz": told["clock_mhz"],
+        "load": machine["load"],
+        "clock_mhz": machine["clock_mhz"],
         "devices": jax.local_device_count(),
-        "xla_flags": told["xla_flags"],
-        "clocks": told["graphics_clocks"],
+        "xla_flags": machine["xla_flags"],
+        "clocks": machine["graphics_clocks"],
     }
 
 
@@ -142,8 +142,8 @@ def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterab
       The table `records/round_parts.csv`.
     """
     model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
-    tasks = [Task(model, prepared.model_config(model), 1, characters) for characters in counts]
-    table = pd.concat(time_breakdown(task, progress=True, **turns) for task in tasks)
+    workloads = [Workload(model, prepared.model_config(model), 1, characters) for characters in counts]
+    table = pd.concat(time_breakdown(workload, progress=True, **turns) for workload in workloads)
     return _write(prepared, profile, "round_parts", table)
 
 

@@ -193,12 +193,12 @@ def speedups(times: pd.DataFrame, *, window: int = 32) -> pd.DataFrame:
     Raises:
       ValueError: if CAMDM is timed twice for one device and number of characters.
     """
-    mine = times[times["window_frames"] == window]
-    is_camdm = (mine["model"] == "CAMDM") & (mine["steps"] == 8)
-    camdm = mine[is_camdm].set_index(["device", "characters"])["value"]
+    of_window = times[times["window_frames"] == window]
+    is_camdm = (of_window["model"] == "CAMDM") & (of_window["steps"] == 8)
+    camdm = of_window[is_camdm].set_index(["device", "characters"])["value"]
     if not camdm.index.is_unique:
         raise ValueError("CAMDM is timed twice for one number of characters: keep one framework")
-    others = mine[~is_camdm]
+    others = of_window[~is_camdm]
     keys = pd.MultiIndex.from_frame(others[["device", "characters"]])
     slow = camdm.reindex(keys).to_numpy()
     return others.assign(speedup=slow / others["value"]).dropna(subset=["speedup"])

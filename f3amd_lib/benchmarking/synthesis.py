@@ -20,7 +20,7 @@ from tqdm import tqdm
 from f3amd_lib.benchmarking.implementations import (
     IMPLEMENTATIONS,
     NotPossible,
-    Task,
+    Workload,
     framework_probe,
     prepare_round,
     round_flops,
@@ -109,18 +109,18 @@ def time_group(
     if len(groups) != 1:
         raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
     ((window, characters, precision),) = groups
-    ready, tasks, failed = {}, {}, {}
+    ready, workloads, failed = {}, {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:
             bar.set_postfix_str(str(candidate))
             config = build_config(candidate.model, window)
-            task = Task(candidate.model, config, candidate.steps, characters, precision)
+            workload = Workload(candidate.model, config, candidate.steps, characters, precision)
             try:
-                ready[candidate] = prepare_round(candidate.implementation, task)
+                ready[candidate] = prepare_round(candidate.implementation, workload)
             except NotPossible as reason:
                 failed[str(candidate)] = str(reason)
             else:
-                tasks[candidate] = task
+                workloads[candidate] = workload
     if not ready:
         return pd.DataFrame(), failed
     frameworks = {candidate: IMPLEMENTATIONS[candidate.implementation][0] for candidate in ready}
@@ -130,8 +130,8 @@ def time_group(
     calls |= {name: multiply for name, (multiply, _) in probes.items()}
     timings = take_turns(calls, progress=progress, **turns)
     rows = []
-    for candidate, task in tasks.items():
-        timing, yardstick, flops = timings[candidate], yardsticks[candidate], round_flops(task)
+    for candidate, workload in workloads.items():
+        timing, yardstick, flops = timings[candidate], yardsticks[candidate], round_flops(workload)
         reached = flops / timing.median / 1e9
         peak = probes[yardstick][1] / timings[yardstick].median / 1e9
         rows.append(
@@ -139,7 +139,7 @@ def time_group(
                 "model": candidate.model,
                 "window_frames": window,
                 "steps": candidate.steps,
-                "sampler": task.sampler,
+                "sampler": workload.sampler,
                 "framework": frameworks[candidate],
                 "way": candidate.implementation,
                 "device": device_name(),

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from flax import nnx
 
-from f3amd_lib.benchmarking.implementations import Task, compile_round
+from f3amd_lib.benchmarking.implementations import Workload, compile_round
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.generation.rounds import sample_round
@@ -83,11 +83,11 @@ def without(network: F3AMD, part: str) -> F3AMD:
     return left
 
 
-def time_breakdown(task: Task, *, progress: bool = False, **turns) -> pd.DataFrame:
+def time_breakdown(workload: Workload, *, progress: bool = False, **turns) -> pd.DataFrame:
     """Time a round whole and without each of its parts, by turns.
 
     Args:
-      task: a model of Fourier blocks with FiLM, under jit on one device.
+      workload: a model of Fourier blocks with FiLM, under jit on one device.
       progress: show a bar.
       **turns: settings of `take_turns`.
 
@@ -95,14 +95,16 @@ def time_breakdown(task: Task, *, progress: bool = False, **turns) -> pd.DataFra
       A row each: model, steps, characters, device, without ("nothing" for the whole round), unit,
       value, low and high in ms, rounds, and saved: the share of the whole round's time.
     """
-    network = presets.build_from_config(task.config, jax.random.key(0))
-    noise = jax.random.normal(jax.random.key(1), (task.characters, task.config.window, task.config.channels))
+    network = presets.build_from_config(workload.config, jax.random.key(0))
+    noise = jax.random.normal(
+        jax.random.key(1), (workload.characters, workload.config.window, workload.config.channels)
+    )
 
     def call(network, noise=None):
         run = lambda condition, key: sample_round(
-            network, condition, task.sigmas, key, noise=noise, sampler=task.sampler
+            network, condition, workload.sigmas, key, noise=noise, sampler=workload.sampler
         )
-        return compile_round(task, run).call
+        return compile_round(workload, run).call
 
     calls = {"nothing": call(network)} | {part: call(without(network, part)) for part in PARTS[:-1]}
     calls["noise"] = call(network, noise)
@@ -110,9 +112,9 @@ def time_breakdown(task: Task, *, progress: bool = False, **turns) -> pd.DataFra
     whole = timings["nothing"].median
     rows = [
         {
-            "model": task.model,
-            "steps": task.steps,
-            "characters": task.characters,
+            "model": workload.model,
+            "steps": workload.steps,
+            "characters": workload.characters,
             "device": device_name(),
             "without": part,
             **timing.columns("ms", 1e3),

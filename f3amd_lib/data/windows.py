@@ -177,13 +177,11 @@ def build_windows(
     )
 
 
-def gather_windows(
-    windows: WindowSet, index, yaw, smoothing, *, window: int = 32, num_history: int = 10, earlier: int = 0
-) -> Batch:
+def gather_windows(windows: WindowSet, index, yaw, smoothing, *, earlier: int = 0) -> Batch:
     """Cut chosen windows, turned and made relative.
 
     Args:
-      windows: from `build_windows`, with the same window and num_history.
+      windows: from `build_windows`.
       index: which windows, [B].
       yaw: turn of each, [B], radians (the random facing of section 3.2).
       smoothing: which path to show as condition, [B] of 0, 1, 2: as captured, or smoothed with a
@@ -193,17 +191,10 @@ def gather_windows(
 
     Returns:
       The batch.
-
-    Raises:
-      ValueError: if the windows were built for other numbers of frames.
     """
-    if (window, num_history) != (windows.window, windows.num_history):
-        raise ValueError(
-            f"these windows were built for {windows.num_history} + {windows.window} frames, not "
-            f"{num_history} + {window}: build them anew with `build_windows`"
-        )
+    num_history = windows.num_history
     start = jnp.maximum(windows.starts[index] - earlier, 0)
-    span = start[:, None] + jnp.arange(num_history + window)[None, :]
+    span = start[:, None] + jnp.arange(num_history + windows.window)[None, :]
     frames = windows.frames[span]
     last = num_history - 1
     frames = turn_frames(center_window(frames, frames[:, last, jnp.array([0, 2])]), yaw)
@@ -242,13 +233,12 @@ def draw_windows(windows: WindowSet, key, batch_size: int, captured_path_share: 
     return index, yaw, jnp.where(captured, 0, width)
 
 
-def sample_windows(windows: WindowSet, key, batch_size: int, *, window: int = 32, num_history: int = 10) -> Batch:
+def sample_windows(windows: WindowSet, key, batch_size: int) -> Batch:
     """Draw random windows with random facing and random path smoothing (see `draw_windows`).
 
     Source: paper section 3.2 (facing); CAMDM's training recipe (smoothing).
     """
-    index, yaw, smoothing = draw_windows(windows, key, batch_size)
-    return gather_windows(windows, index, yaw, smoothing, window=window, num_history=num_history)
+    return gather_windows(windows, *draw_windows(windows, key, batch_size))
 
 
 def spread_windows(windows: WindowSet, num_samples: int) -> Batch:
@@ -263,8 +253,7 @@ def spread_windows(windows: WindowSet, num_samples: int) -> Batch:
     """
     count = min(num_samples, windows.num_windows)
     index = jnp.asarray(np.linspace(0, windows.num_windows - 1, count).astype(np.int32))
-    sizes = {"window": windows.window, "num_history": windows.num_history}
-    return gather_windows(windows, index, jnp.zeros(count), jnp.zeros(count, jnp.int32), **sizes)
+    return gather_windows(windows, index, jnp.zeros(count), jnp.zeros(count, jnp.int32))
 
 
 def restart_from(batch: Batch, history) -> Batch:
@@ -307,9 +296,7 @@ def mean_poses(windows: WindowSet) -> jax.Array:
     return total / jnp.maximum(count, 1.0)[:, None]
 
 
-def fit_normaliser(
-    windows: WindowSet, key, *, window: int = 32, num_history: int = 10, num_samples: int = 8192
-) -> Normaliser:
+def fit_normaliser(windows: WindowSet, key, *, num_samples: int = 8192) -> Normaliser:
     """Measure mean and deviation of each channel over randomly turned training windows.
 
     Deviations are kept above 0.02, so that a joint which hardly moves does not turn rounding of the
@@ -319,7 +306,7 @@ def fit_normaliser(
 
     @jax.jit
     def measure(windows, key):
-        batch = sample_windows(windows, key, num_samples, window=window, num_history=num_history)
+        batch = sample_windows(windows, key, num_samples)
         flat = batch.future.reshape(-1, batch.future.shape[-1])
         mean, deviation = flat.mean(axis=0), flat.std(axis=0)
         # A random turn makes x and z alike, of the root and of its rotation: measure

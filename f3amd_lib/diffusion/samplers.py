@@ -179,8 +179,8 @@ class Sampler:
     evaluations: int = 1
 
 
-def _ddim(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
-    return ddim_step(x_noisy, x0_hat, sigma, sigma_next)
+def _ddim(x_noisy, x0_hat, sigma, sigma_next, denoise, noise, *alphas):
+    return ddim_step(x_noisy, x0_hat, sigma, sigma_next, *alphas)
 
 
 def _ddim_vp(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
@@ -233,14 +233,15 @@ def _sampler(name: str) -> Sampler:
 
 
 class _Leg(NamedTuple):
-    """One interval of the walk: its two levels, and the key of its noise."""
+    """One interval of the walk: its two levels, the key of its noise, and what is left of the signal at each end."""
 
     sigma: jax.Array
     sigma_next: jax.Array
     key: jax.Array | None
+    alphas: tuple[jax.Array, ...]
 
 
-def _legs(name: str, x_init, sigmas, key) -> _Leg:
+def _legs(name: str, x_init, sigmas, alphas, key) -> _Leg:
     """Return all intervals at once, each field [N, ...]; ValueError as `sample` says."""
     sampler = _sampler(name)
     sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
@@ -252,14 +253,21 @@ def _legs(name: str, x_init, sigmas, key) -> _Leg:
     if sampler.draws_noise and key is None:
         raise ValueError(f"sampler {name!r} draws fresh noise at every step: give it a key")
     keys = jax.random.split(key, len(sigmas) - 1) if sampler.draws_noise else None
-    return _Leg(sigmas[:-1], sigmas[1:], keys)
+    if alphas is None:
+        return _Leg(sigmas[:-1], sigmas[1:], keys, ())
+    alphas = jnp.asarray(alphas, dtype=sigmas.dtype)
+    if name != "ddim" or alphas.shape != sigmas.shape:
+        raise ValueError(
+            f"alphas are for 'ddim' alone, one for each of the {len(sigmas)} sigmas; got {alphas.shape} for {name!r}"
+        )
+    return _Leg(sigmas[:-1], sigmas[1:], keys, (alphas[:-1], alphas[1:]))
 
 
 def _take(step: Callable, denoise: Denoiser, x_noisy, leg: _Leg):
     """Go over one interval; return the state at its end and the clean estimate at its start."""
     x0_hat = denoise(x_noisy, leg.sigma)
     noise = None if leg.key is None else jax.random.normal(leg.key, x_noisy.shape, x_noisy.dtype)
-    return step(x_noisy, x0_hat, leg.sigma, leg.sigma_next, denoise, noise), x0_hat
+    return step(x_noisy, x0_hat, leg.sigma, leg.sigma_next, denoise, noise, *leg.alphas), x0_hat
 
 
 def _pick(legs: _Leg, which) -> _Leg:
@@ -278,14 +286,16 @@ def _fold(step: Callable, denoise: Denoiser, x_init, legs: _Leg, unroll: bool):
     return jax.lax.scan(over, x_noisy, legs, unroll=num_steps if unroll else 1)[0]
 
 
-def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bool = False) -> jax.Array:
-    """Walk a variance-exploding state down the noise levels, in one scan.
+def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None, unroll: bool = False) -> jax.Array:
+    """Walk a state down the noise levels, in one scan: the variance-exploding one unless `alphas` are given.
 
     Args:
       name: of `SAMPLERS`.
       denoise: `denoise(x_noisy, sigma) -> x0_hat`; sigma comes as a scalar.
       x_init: state at sigmas[0], usually sigmas[0] * normal noise, [B, T, C].
       sigmas: [N + 1], falling, the last may be 0 (a schedule's `grid`).
+      alphas: [N + 1], what is left of the signal at each of `sigmas` (a schedule's `scaled_grid`), for "ddim" alone:
+        the state, which the denoiser sees, is then alpha x0 + sigma noise.
       key: JAX random key, needed by "ddpm"; the others draw nothing and leave it alone.
       unroll: write the steps out one by one instead of a `lax.scan` (for exports). The walk is then
         free of loops, but JAX's default random numbers bring one of their own; those of
@@ -295,10 +305,10 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bo
       State at sigmas[-1], [B, T, C].
 
     Raises:
-      ValueError: for an unknown name, a sampler that draws noise without a key, or `sigmas` that
-        are not a list of at least two levels.
+      ValueError: for an unknown name, a sampler that draws noise without a key, `sigmas` that
+        are not a list of at least two levels, or `alphas` that do not fit them or the sampler.
     """
-    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, key)
+    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, alphas, key)
     if sampler.last is None:
         return _fold(sampler.step, denoise, x_init, legs, unroll)
     # Apart from the scan: masked inside, it would cost an evaluation that nobody uses.
@@ -314,11 +324,11 @@ class Visited(NamedTuple):
     x0_hat: jax.Array | None
 
 
-def walk(name: str, denoise: Denoiser, x_init, sigmas, *, key=None) -> Iterator[Visited]:
+def walk(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None) -> Iterator[Visited]:
     """Walk as `sample` does, step by step in plain Python, and yield every state.
 
     Args:
-      name, denoise, x_init, sigmas, key: as for `sample`.
+      name, denoise, x_init, sigmas, alphas, key: as for `sample`.
 
     Yields:
       N + 1 states, the first `x_init`; the last is the sample, where no estimate is made.
@@ -326,7 +336,7 @@ def walk(name: str, denoise: Denoiser, x_init, sigmas, *, key=None) -> Iterator[
     Raises:
       ValueError: as `sample`.
     """
-    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, key)
+    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, alphas, key)
     x_noisy, num_steps = jnp.asarray(x_init), len(legs.sigma)
     for number in range(num_steps):
         leg = _pick(legs, number)

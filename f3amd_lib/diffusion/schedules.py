@@ -1,225 +1,181 @@
-"""Noise levels: the variance-exploding schedule of Eq. 9 and two variance-preserving ones.
+"""Noise schedules: one value with a constructor for each kind, that of Eq. 9 among them.
 
-`sigma` is the standard deviation of the noise added to an unscaled signal (Eq. 8), `alpha_bar` the
-share of signal power in the variance-preserving form of the same state (Appendix F), and
-`log_snr = -2 log sigma`. They are one line with three labels. Here `t` in [0, 1] is schedule time:
-0 is pure noise, 1 is almost clean, as in Eq. 9. Grids are worked out in float64 with numpy.
-
-A schedule says which noise levels are trained on and which a sampler visits. Each is a value with
-the same few parts, and `sigma` is the language they all speak, so that networks and samplers need
-not know which one they work under:
-
-- `kind`: its name in a file;
-- `sampler`: the name of the sampler that belongs to it;
-- `sigma_max`: the largest noise level;
-- `grid(num_steps, spacing)`: the levels that an N-step sampler visits;
-- `draw(key, shape)`: random levels to train on.
+Noisy data is `z_t = alpha(t) x0 + sigma(t) noise`. `t` in [0, 1] is schedule time: 0 is noise, 1 is clean or almost
+so, as in Eq. 9. What networks and samplers hear of is the noise level `sigma / alpha`, the standard deviation of the
+noise on an unscaled signal (Eq. 8): with it they need not know which schedule they work under. `alpha_bar` is the share
+of signal power in the variance-preserving form of the same state (Appendix F), and `log_snr = -2 log level`. They are
+one line with three labels. Grids are worked out in float64 with numpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.names import nearest_hint
 
 
-def _check_grid(num_steps: int, spacing: str) -> None:
-    """Raise ValueError for a number of steps or a spacing that no schedule can serve."""
-    if num_steps < 1:
-        raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
-    if spacing not in ("endpoints", "uniform"):
-        raise ValueError(f"unknown spacing {spacing!r}: use 'endpoints' or 'uniform'")
-
-
-@dataclass(frozen=True)
-class VarianceExploding:
-    """The rho schedule of Eq. 9 (paper section 3.5; Karras et al. 2022, Eq. 5).
+@dataclass(frozen=True, repr=False)
+class NoiseSchedule:
+    """How much of the data is left at each time, and how much noise there is; made by the constructors below.
 
     Attributes:
-      kind: "variance_exploding".
-      sigma_max, sigma_min: first and last noise level, in units of the (normalised) features.
-      rho: curvature; larger values put more steps at low noise.
-
-    Raises:
-      ValueError: unless 0 < sigma_min < sigma_max and rho > 0, all finite.
+      kind: name of its constructor, as files have it.
+      settings: what that constructor was given, (name, value) pairs. Two schedules are equal if kind and settings are.
+      sampler: name of the sampler that belongs to it.
+      alpha, sigma: functions of schedule time, any shape: the signal's share, and the noise's standard deviation.
+      sigma_min, sigma_max: lowest and highest noise level that is trained on.
+      levels: K noise levels, rising, [K] float64, where the schedule has only these; None if it is continuous.
+      alpha_bars: the signal's share of power at each of them, falling, [K] float64, or None.
     """
 
-    sampler: ClassVar[str] = "ddim"
-    """The paper pairs this schedule with DDIM, which adds no noise (sections 3.5 and 6)."""
+    kind: str
+    settings: tuple[tuple[str, float], ...]
+    sampler: str = field(compare=False)
+    alpha: Callable = field(compare=False)
+    sigma: Callable = field(compare=False)
+    sigma_min: float = field(compare=False)
+    sigma_max: float = field(compare=False)
+    levels: np.ndarray | None = field(default=None, compare=False)
+    alpha_bars: np.ndarray | None = field(default=None, compare=False)
 
-    kind: str = field(default="variance_exploding", init=False, repr=False)
-    sigma_max: float = 128.0
-    sigma_min: float = 0.01
-    rho: float = 3.0
+    def __repr__(self) -> str:
+        return f"{self.kind}({', '.join(f'{name}={value}' for name, value in self.settings)})"
 
-    def __post_init__(self):
-        if not (0.0 < self.sigma_min < self.sigma_max < np.inf and 0.0 < self.rho < np.inf):
-            raise ValueError(
-                "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, "
-                f"all finite; got sigma_min={self.sigma_min}, sigma_max={self.sigma_max}, "
-                f"rho={self.rho}"
-            )
-
-    def sigma(self, t):
-        """Return sigma(t) of Eq. 9.
-
-        Args:
-          t: schedule time in [0, 1], any shape; 0 gives sigma_max, 1 gives sigma_min.
-
-        Returns:
-          Noise levels of the same shape.
-        """
-        high, low = self.sigma_max ** (1.0 / self.rho), self.sigma_min ** (1.0 / self.rho)
-        return (high + t * (low - high)) ** self.rho
-
-    def time(self, sigma):
-        """Return the schedule time t at which Eq. 9 gives `sigma` (its inverse)."""
-        high, low = self.sigma_max ** (1.0 / self.rho), self.sigma_min ** (1.0 / self.rho)
-        return (sigma ** (1.0 / self.rho) - high) / (low - high)
-
-    def grid(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
-        """Return the noise levels that an N-step sampler visits, ending at 0.
-
-        Args:
-          num_steps: network evaluations N.
-          spacing: "endpoints" takes t = linspace(0, 1, N), so that the last evaluation is at
-            sigma_min (our reading: the paper does not say); "uniform" takes t = i / N.
-
-        Returns:
-          [N + 1] float64, falling, first sigma_max, last 0.
-
-        Raises:
-          ValueError: for num_steps < 1 or an unknown spacing.
-        """
-        _check_grid(num_steps, spacing)
-        if spacing == "endpoints":
-            t = np.linspace(0.0, 1.0, num_steps)
-        else:
-            t = np.arange(num_steps) / num_steps
-        return np.append(self.sigma(t), 0.0)
-
-    def draw(self, key, shape: tuple[int, ...]):
-        """Draw noise levels to train on: t uniform in Eq. 9.
-
-        Args:
-          key: JAX random key.
-          shape: of the answer, usually [B].
-
-        Returns:
-          sigma, float32.
-        """
-        return self.sigma(jax.random.uniform(key, shape, jnp.float32))
-
-
-class _VariancePreserving:
-    """What schedules of K discrete levels share: a subclass says only what `alpha_bars` is.
-
-    Level k stands for diffusion time s = (k + 1) / K in (0, 1]; level 0 is the least noisy.
-    Schedule time t runs the other way.
-    """
-
-    sampler: ClassVar[str] = "ddpm"
-    """Ancestral DDPM: the paper names VP and DDPM together as what CAMDM uses (section 6)."""
-
-    num_levels: int
-
-    def _check(self, *rules: tuple[str, bool]) -> None:
-        """Raise ValueError for the first (what is needed, whether it holds) that does not hold."""
-        whole = type(self.num_levels) is int and self.num_levels >= 1
-        for needed, holds in (("a whole num_levels of at least 1", whole), *rules):
-            if not holds:
-                raise ValueError(f"{self.kind} schedule needs {needed}, got {self}")
-        # Training and sampling are float32, in which a level beyond 3e38 is infinite.
-        sigmas = self.sigmas
-        if not (0.0 < sigmas[0] and sigmas[-1] < np.finfo(np.float32).max):
-            raise ValueError(
-                f"{self} has noise levels from {sigmas[0]:g} to {sigmas[-1]:g}, but only positive "
-                "ones that a float32 can hold are of use: make its betas less extreme"
-            )
-
-    @property
-    def alpha_bars(self) -> np.ndarray:
-        """Share of signal power at each level, falling, [K] float64."""
-        raise NotImplementedError
+    def to_dict(self) -> dict:
+        """Return kind and settings as JSON-ready values, for `schedule_from_dict`."""
+        return {"kind": self.kind, **dict(self.settings)}
 
     @property
     def betas(self) -> np.ndarray:
-        """Share of signal power lost from one level to the next, [K] float64."""
-        alpha_bars = self.alpha_bars
-        return 1.0 - alpha_bars / np.append(1.0, alpha_bars[:-1])
+        """Share of signal power lost from one of K levels to the next, [K] float64."""
+        return 1.0 - self.alpha_bars / np.append(1.0, self.alpha_bars[:-1])
 
-    @property
-    def sigmas(self) -> np.ndarray:
-        """The levels as standard deviations of noise on an unscaled signal, rising, [K] float64."""
-        with np.errstate(divide="ignore", over="ignore"):
-            return sigma_from_alpha_bar(self.alpha_bars)
+    def perturb(self, x0, noise, t):
+        """Return z_t = alpha(t) x0 + sigma(t) noise; t broadcasts against x0."""
+        return self.alpha(t) * x0 + self.sigma(t) * noise
 
-    @property
-    def sigma_max(self) -> float:
-        """The largest noise level."""
-        return float(self.sigmas[-1])
+    def start(self, key, shape: tuple[int, ...]):
+        """Draw what is left of any data at t = 0: noise alone, float32."""
+        return jnp.float32(self.sigma(0.0)) * jax.random.normal(key, shape)
 
-    def grid(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
-        """Return the noise levels that an N-step sampler visits, ending at 0.
+    def times(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
+        """Return the times at which an N-step sampler asks the network.
 
-        With fewer steps than levels the schedule is respaced: the network sees only levels that it
+        With fewer steps than levels a schedule of K levels is respaced: the network sees only levels that it
         was trained on. The first is always the noisiest, also for N = 1, because a sampler starts
         from noise alone. Respacing rules in use for diffusion models count their strides from level
         0, and a single stride then ends where it starts: at the least noisy level, where the
         network would be told that pure noise is almost clean motion.
 
         Args:
-          num_steps: network evaluations N, at most K; K of them visit every level.
-          spacing: "endpoints" takes the levels linspace(K - 1, 0, N), so that the last evaluation
-            is at the least noisy one; "uniform" takes those at s = 1 - i / N, whose last is higher.
-            Both are rounded to whole levels.
+          num_steps: network evaluations N; at most K where there are K levels.
+          spacing: "endpoints" takes t = linspace(0, 1, N), so that the last evaluation is at the lowest level (our
+            reading: the paper does not say); "uniform" takes t = i / N, whose last is higher. K levels are
+            counted alike, and rounded to whole ones. Where no noise is left at t = 1, both are "uniform".
+
+        Returns:
+          [N] float64, rising from 0.
+
+        Raises:
+          ValueError: for num_steps outside 1 ... K, or an unknown spacing.
+        """
+        if num_steps < 1:
+            raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
+        if spacing not in ("endpoints", "uniform"):
+            raise ValueError(f"unknown spacing {spacing!r}: use 'endpoints' or 'uniform'")
+        if self.levels is None:
+            to_the_end = spacing == "endpoints" and self.sigma_min > 0.0
+            return np.linspace(0.0, 1.0, num_steps) if to_the_end else np.arange(num_steps) / num_steps
+        num_levels = len(self.levels)
+        if num_steps > num_levels:
+            raise ValueError(
+                f"this schedule has {num_levels} noise levels and no more steps than that, "
+                f"got num_steps={num_steps}: take fewer, or train with more levels"
+            )
+        last = 0.0 if spacing == "endpoints" else num_levels / num_steps - 1.0
+        return 1.0 - (np.rint(np.linspace(num_levels - 1.0, last, num_steps)) + 1.0) / num_levels
+
+    def grid(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
+        """Return the noise levels at `times`, then 0: what a sampler of the variance-exploding state visits.
 
         Returns:
           [N + 1] float64, falling, first sigma_max, last 0.
 
         Raises:
-          ValueError: for num_steps outside 1 ... K or an unknown spacing.
+          ValueError: as `times`.
         """
-        _check_grid(num_steps, spacing)
-        if num_steps > self.num_levels:
-            raise ValueError(
-                f"this schedule has {self.num_levels} noise levels and no more steps than that, "
-                f"got num_steps={num_steps}: take fewer, or train with more levels"
-            )
-        last = 0.0 if spacing == "endpoints" else self.num_levels / num_steps - 1.0
-        levels = np.rint(np.linspace(self.num_levels - 1.0, last, num_steps)).astype(int)
-        return np.append(self.sigmas[levels], 0.0)
+        t = self.times(num_steps, spacing)
+        if self.levels is not None:
+            return np.append(self.levels[_rank(t, len(self.levels)) - 1], 0.0)
+        with np.errstate(divide="ignore"):  # the straight path begins at an infinite level
+            return np.append(self.sigma(t) / self.alpha(t), 0.0)
+
+    def scaled_grid(self, num_steps: int, spacing: str = "endpoints") -> tuple[np.ndarray, np.ndarray]:
+        """Return (alphas, sigmas) at `times`, then (1, 0), each [N + 1]: what a sampler of z_t itself visits."""
+        t = self.times(num_steps, spacing)
+        return np.append(self.alpha(t), 1.0), np.append(self.sigma(t), 0.0)
 
     def draw(self, key, shape: tuple[int, ...]):
-        """Draw noise levels to train on: every level as likely as the next.
-
-        Args:
-          key: JAX random key.
-          shape: of the answer, usually [B].
-
-        Returns:
-          sigma, float32.
-        """
-        levels = jax.random.randint(key, shape, 0, self.num_levels)
-        return jnp.asarray(self.sigmas, jnp.float32)[levels]
+        """Draw noise levels to train on, float32: t uniform, or every one of K levels as likely as the next."""
+        if self.levels is None:
+            t = jax.random.uniform(key, shape, jnp.float32)
+            return self.sigma(t) / self.alpha(t)
+        return jnp.asarray(self.levels, jnp.float32)[jax.random.randint(key, shape, 0, len(self.levels))]
 
 
-@dataclass(frozen=True)
-class VariancePreservingCosine(_VariancePreserving):
-    """The cosine schedule of CAMDM, in K discrete levels (Nichol and Dhariwal 2021, Eq. 17).
+def variance_exploding(sigma_max: float = 128.0, sigma_min: float = 0.01, rho: float = 3.0) -> NoiseSchedule:
+    """Return the rho schedule of Eq. 9 (section 3.5; Karras et al. 2022, Eq. 5): all signal, and noise to drown it.
+
+    The paper pairs it with DDIM, which adds no noise (sections 3.5 and 6).
+
+    Args:
+      sigma_max, sigma_min: first and last noise level, in units of the (normalised) features.
+      rho: curvature; larger values put more steps at low noise.
+
+    Raises:
+      ValueError: unless 0 < sigma_min < sigma_max and rho > 0, all finite.
+    """
+    if not (0.0 < sigma_min < sigma_max < np.inf and 0.0 < rho < np.inf):
+        raise ValueError(
+            "variance-exploding schedule needs 0 < sigma_min < sigma_max and rho > 0, "
+            f"all finite; got sigma_min={sigma_min}, sigma_max={sigma_max}, rho={rho}"
+        )
+    high, low = sigma_max ** (1.0 / rho), sigma_min ** (1.0 / rho)
+    return NoiseSchedule(
+        "variance_exploding",
+        (("sigma_max", sigma_max), ("sigma_min", sigma_min), ("rho", rho)),
+        sampler="ddim",
+        alpha=lambda t: array_module(t).ones_like(t),
+        sigma=lambda t: (high + t * (low - high)) ** rho,
+        sigma_min=sigma_min,
+        sigma_max=sigma_max,
+    )
+
+
+def straight() -> NoiseSchedule:
+    """Return the straight path of flow matching: alpha = t and sigma = 1 - t (Liu et al. 2023; Lipman et al. 2023).
+
+    At t = 0 nothing is left of the data, the level is infinite, and a sampler walks in z_t itself (`scaled_grid`).
+    """
+    return NoiseSchedule(
+        "straight", (), sampler="ddim", alpha=lambda t: t, sigma=lambda t: 1.0 - t, sigma_min=0.0, sigma_max=np.inf
+    )
+
+
+def variance_preserving_cosine(num_levels: int = 8, offset: float = 0.008, max_beta: float = 0.999) -> NoiseSchedule:
+    """Return the cosine schedule of CAMDM, in K discrete levels (Nichol and Dhariwal 2021, Eq. 17).
 
     The signal power falls along cos^2((s + offset) / (1 + offset) pi / 2) with s = (k + 1) / K,
     but by no more than `max_beta` from one level to the next, so that some is left at the end.
 
-    Attributes:
-      kind: "variance_preserving_cosine".
+    Args:
       num_levels: K. The paper runs CAMDM with 8; the released configuration has 4.
       offset: keeps the first levels from being too small.
       max_beta: largest loss of signal power in one level.
@@ -228,34 +184,27 @@ class VariancePreservingCosine(_VariancePreserving):
       ValueError: unless num_levels >= 1 is whole, offset >= 0 and 0 < max_beta < 1.
     """
 
-    kind: str = field(default="variance_preserving_cosine", init=False, repr=False)
-    num_levels: int = 8
-    offset: float = 0.008
-    max_beta: float = 0.999
+    def alpha_bars():
+        s = np.arange(num_levels + 1) / num_levels
+        wanted = np.cos((s + offset) / (1.0 + offset) * np.pi / 2) ** 2
+        return np.cumprod(np.maximum(wanted[1:] / wanted[:-1], 1.0 - max_beta))
 
-    def __post_init__(self):
-        self._check(
-            ("a finite offset of at least 0", 0.0 <= self.offset < np.inf),
-            ("0 < max_beta < 1", 0.0 < self.max_beta < 1.0),
-        )
-
-    @property
-    def alpha_bars(self) -> np.ndarray:
-        """Share of signal power at each level, falling, [K] float64."""
-        s = np.arange(self.num_levels + 1) / self.num_levels
-        wanted = np.cos((s + self.offset) / (1.0 + self.offset) * np.pi / 2) ** 2
-        return np.cumprod(np.maximum(wanted[1:] / wanted[:-1], 1.0 - self.max_beta))
+    return _variance_preserving(
+        "variance_preserving_cosine",
+        {"num_levels": num_levels, "offset": offset, "max_beta": max_beta},
+        alpha_bars,
+        ("a finite offset of at least 0", 0.0 <= offset < np.inf),
+        ("0 < max_beta < 1", 0.0 < max_beta < 1.0),
+    )
 
 
-@dataclass(frozen=True)
-class VariancePreservingLinear(_VariancePreserving):
-    """The VP diffusion with a linear beta, in K discrete levels (Song et al. 2021, Appendix C).
+def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, beta_max: float = 20.0) -> NoiseSchedule:
+    """Return the VP diffusion with a linear rate, in K discrete levels (Song et al. 2021, Appendix C).
 
     A rate beta(s) = beta_min + s (beta_max - beta_min) leaves, at s = (k + 1) / K, the signal power
     alpha_bar(s) = exp(-beta_min s - (beta_max - beta_min) s^2 / 2).
 
-    Attributes:
-      kind: "variance_preserving_linear".
+    Args:
       num_levels: K.
       beta_min, beta_max: rate at s = 0 and at s = 1 (not a share of one level, which `betas` is).
 
@@ -264,39 +213,118 @@ class VariancePreservingLinear(_VariancePreserving):
         enough for a signal to be left at the last level.
     """
 
-    kind: str = field(default="variance_preserving_linear", init=False, repr=False)
-    num_levels: int = 1000
-    beta_min: float = 0.1
-    beta_max: float = 20.0
+    def alpha_bars():
+        s = np.arange(1, num_levels + 1) / num_levels
+        return np.exp(-beta_min * s - 0.5 * (beta_max - beta_min) * s**2)
 
-    def __post_init__(self):
-        self._check(("0 < beta_min <= beta_max, finite", 0.0 < self.beta_min <= self.beta_max < np.inf))
-
-    @property
-    def alpha_bars(self) -> np.ndarray:
-        """Share of signal power at each level, falling, [K] float64."""
-        s = np.arange(1, self.num_levels + 1) / self.num_levels
-        return np.exp(-self.beta_min * s - 0.5 * (self.beta_max - self.beta_min) * s**2)
+    return _variance_preserving(
+        "variance_preserving_linear",
+        {"num_levels": num_levels, "beta_min": beta_min, "beta_max": beta_max},
+        alpha_bars,
+        ("0 < beta_min <= beta_max, finite", 0.0 < beta_min <= beta_max < np.inf),
+    )
 
 
-NoiseSchedule = VarianceExploding | VariancePreservingCosine | VariancePreservingLinear
-"""Any noise schedule, for annotations."""
+def variance_preserving_betas(
+    num_levels: int = 1000, first: float = 0.00085, last: float = 0.012, power: float = 2.0
+) -> NoiseSchedule:
+    """Return the VP schedule whose betas, to the power of 1 / `power`, rise evenly from level to level.
 
-SCHEDULES: dict[str, type] = {
-    schedule.kind: schedule for schedule in (VarianceExploding, VariancePreservingCosine, VariancePreservingLinear)
+    Power 2 is called scaled-linear (Rombach et al. 2022, whose numbers are the defaults and MotionPCM's teacher's);
+    power 1 is the linear schedule of DDPM (Ho et al. 2020: 1e-4 to 0.02).
+
+    Args:
+      num_levels: K.
+      first, last: share of signal power lost in the first and in the last level.
+      power: see above.
+
+    Raises:
+      ValueError: unless num_levels >= 1 is whole, 0 < first <= last < 1 and power is positive.
+    """
+
+    def alpha_bars():
+        return np.cumprod(1.0 - np.linspace(first ** (1.0 / power), last ** (1.0 / power), num_levels) ** power)
+
+    return _variance_preserving(
+        "variance_preserving_betas",
+        {"num_levels": num_levels, "first": first, "last": last, "power": power},
+        alpha_bars,
+        ("0 < first <= last < 1", 0.0 < first <= last < 1.0),
+        ("a positive finite power", 0.0 < power < np.inf),
+    )
+
+
+def _variance_preserving(
+    kind: str, settings: dict, make_alpha_bars: Callable, *rules: tuple[str, bool]
+) -> NoiseSchedule:
+    """Return the schedule of K discrete levels with these shares of signal power.
+
+    Level k stands for schedule time t = 1 - (k + 1) / K; level 0 is the least noisy, and t = 1 is clean. The sampler is
+    ancestral DDPM: the paper names VP and DDPM together as what CAMDM uses (section 6).
+
+    Raises:
+      ValueError: for the first of `rules` (what is needed, whether that holds) that does not hold.
+    """
+    num_levels = settings["num_levels"]
+    whole = type(num_levels) is int and num_levels >= 1
+    for needed, holds in (("a whole num_levels of at least 1", whole), *rules):
+        if not holds:
+            raise ValueError(f"{kind} schedule needs {needed}, got {settings}")
+    alpha_bars = make_alpha_bars()
+    with np.errstate(divide="ignore", over="ignore"):
+        levels = sigma_from_alpha_bar(alpha_bars)
+    # Training and sampling are float32, in which a level beyond 3e38 is infinite.
+    if not (0.0 < levels[0] and levels[-1] < np.finfo(np.float32).max):
+        raise ValueError(
+            f"{kind} with {settings} has noise levels from {levels[0]:g} to {levels[-1]:g}, but only positive "
+            "ones that a float32 can hold are of use: make its betas less extreme"
+        )
+    shares = np.append(1.0, alpha_bars)
+
+    def alpha_bar(t):
+        return array_module(t).asarray(shares)[_rank(t, num_levels)]
+
+    return NoiseSchedule(
+        kind,
+        tuple(settings.items()),
+        sampler="ddpm",
+        alpha=lambda t: alpha_bar(t) ** 0.5,
+        sigma=lambda t: (1.0 - alpha_bar(t)) ** 0.5,
+        sigma_min=float(levels[0]),
+        sigma_max=float(levels[-1]),
+        levels=levels,
+        alpha_bars=alpha_bars,
+    )
+
+
+def _rank(t, num_levels: int):
+    """Return the number, from 1, of the level that schedule time t stands for; 0 is clean data."""
+    xp = array_module(t)
+    return xp.rint(num_levels * (1.0 - xp.asarray(t))).astype(int)
+
+
+SCHEDULES: dict[str, Callable[..., NoiseSchedule]] = {
+    make.__name__: make
+    for make in (
+        variance_exploding,
+        straight,
+        variance_preserving_cosine,
+        variance_preserving_linear,
+        variance_preserving_betas,
+    )
 }
-"""Noise schedules by the name that they have in a file."""
+"""Constructors of noise schedules by the name that they have in a file."""
 
 
 def schedule_from_dict(values: Mapping) -> NoiseSchedule:
-    """Build the noise schedule of which `dataclasses.asdict` made these values.
+    """Build the noise schedule of which `NoiseSchedule.to_dict` made these values.
 
     Args:
-      values: "kind", a name of `SCHEDULES`, and fields of that schedule; those that are missing
+      values: "kind", a name of `SCHEDULES`, and arguments of that constructor; those that are missing
         take their defaults.
 
     Raises:
-      ValueError: for a missing or unknown kind, an unknown field (with the nearest name), or values
+      ValueError: for a missing or unknown kind, an unknown setting (with the nearest name), or values
         that the schedule refuses.
     """
     settings = dict(values)
@@ -305,8 +333,10 @@ def schedule_from_dict(values: Mapping) -> NoiseSchedule:
     kind = settings.pop("kind")
     if kind not in SCHEDULES:
         raise ValueError(f"unknown noise schedule {kind!r}{nearest_hint(kind, SCHEDULES)}")
-    refuse_unknown(settings, SCHEDULES[kind], f"{kind} setting")
+    known = inspect.signature(SCHEDULES[kind]).parameters
     for name, value in settings.items():
+        if name not in known:
+            raise ValueError(f"unknown {kind} setting {name!r}{nearest_hint(name, known)}")
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{kind} setting {name!r} must be a number, got {value!r}")
     return SCHEDULES[kind](**settings)

@@ -56,7 +56,7 @@ STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
 SPACINGS = ("endpoints", "uniform")
-"""Both readings of where N steps lie, ours first (see `VarianceExploding.grid`)."""
+"""Both readings of where N steps lie, ours first (see `NoiseSchedule.times`)."""
 
 SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
 """Noise levels at which an x0 error is measured, for networks that take any level."""
@@ -313,8 +313,8 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     digests = _digests(trained)
 
     def summary(rows: pd.DataFrame) -> pd.DataFrame:
-        ways = rows.groupby(["spacing", "update"], sort=False)
-        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in ways)
+        groups = rows.groupby(["spacing", "update"], sort=False)
+        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
 
     records = Records(
         _records_dir(profile),

@@ -72,14 +72,7 @@ def _facing_windows(skeleton: Skeleton, windows: WindowSet, index):
       continuation relative to its root [B, T, J, 3].
     """
     last = windows.frames[windows.starts[index] + windows.num_history - 1]
-    batch = gather_windows(
-        windows,
-        index,
-        -frame_yaw(skeleton, last),
-        jnp.zeros(index.shape, jnp.int32),
-        window=windows.window,
-        num_history=windows.num_history,
-    )
+    batch = gather_windows(windows, index, -frame_yaw(skeleton, last), jnp.zeros(index.shape, jnp.int32))
     future = frame_positions(skeleton, batch.future)
     return frame_positions(skeleton, batch.history), batch.path, future - future[..., :1, :]
 
@@ -168,7 +161,7 @@ def continuation_spread(
     asked = _conditions(skeleton, windows, chosen)
     styles, pool_styles = np.asarray(windows.styles)[chosen], np.asarray(pool.styles)
     gap = pool.window + pool.num_history
-    found: dict[str, list] = {name: [] for name in given}
+    neighbours: dict[str, list] = {name: [] for name in given}
     for style in np.unique(styles):
         candidates = np.flatnonzero(pool_styles == style).astype(np.int32)
         if not len(candidates):
@@ -188,8 +181,8 @@ def continuation_spread(
                 near = _apart(usable[order], starts, gap, num_neighbours)
                 if len(near) > 1:
                     apart = {part: float(squares[part][row, near].mean()) for part in squares}
-                    found[name].append((candidates[near], apart))
-    if not any(found.values()):
+                    neighbours[name].append((candidates[near], apart))
+    if not any(neighbours.values()):
         raise ValueError(
             f"no style of the windows has two windows of {gap} frames in the pool that do not overlap: take more data"
         )
@@ -199,20 +192,20 @@ def continuation_spread(
         return _facing_windows(skeleton, pool, index)[2]
 
     rows = []
-    for name, neighbours in found.items():
+    for name, of_windows in neighbours.items():
         # Of the same length for all, so that there is one compilation; copies are cut off again.
-        padded = np.stack([np.resize(near, num_neighbours) for near, _ in neighbours])
+        padded = np.stack([np.resize(near, num_neighbours) for near, _ in of_windows])
         variances = [
             diversity_variance(np.asarray(continuations(pool, index))[: len(near)])
-            for index, (near, _) in zip(padded, neighbours, strict=True)
+            for index, (near, _) in zip(padded, of_windows, strict=True)
         ]
         rows.append(
             {
                 "given": name,
                 **_root_mean_square(np.array(variances)),
-                "neighbours": float(np.mean([len(near) for near, _ in neighbours])),
+                "neighbours": float(np.mean([len(near) for near, _ in of_windows])),
                 **{
-                    f"{part}_apart": CM * float(np.sqrt(np.mean([a[part] for _, a in neighbours])))
+                    f"{part}_apart": CM * float(np.sqrt(np.mean([a[part] for _, a in of_windows])))
                     for part in ("history", "path")
                 },
             }

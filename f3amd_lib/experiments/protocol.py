@@ -262,7 +262,7 @@ def _distribution_figures(
     for number, reference in real.items():
         of_style = seen.features[seen.style == number]
         for cloud, part in ((of_style, drawn), (reference, wanted)):
-            part.append(distributions.draw_windows({number: cloud}, count, rng))
+            part.append(distributions.draw_per_style({number: cloud}, count, rng))
         if len(of_style) > 1 and len(reference) > 1:
             by_style.append(distributions.frechet_distance_per_dimension(of_style, reference))
     features, reference = np.concatenate(drawn), np.concatenate(wanted)

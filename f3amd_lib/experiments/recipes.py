@@ -15,7 +15,7 @@ from pathlib import Path
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_unlike, train
+from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_other_state, train
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
 RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
@@ -84,7 +84,7 @@ def train_recipe(prepared: PreparedData, profile: Profile, name: str, *, folder,
     config = recipe.config(RECIPE_STEPS[profile.name], profile.batch_size, profile.seed)
     network = prepared.model_config(recipe.preset, **recipe.network)
     files = model_files(profile, recipe.preset, folder=folder)
-    set_aside_unlike(prepared, files, network, config)
+    set_aside_other_state(prepared, files, network, config)
     trained, _ = train(
         prepared, profile, preset=recipe.preset, config=config, network=recipe.network, folder=folder, progress=progress
     )

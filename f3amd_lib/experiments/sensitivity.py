@@ -91,7 +91,7 @@ def graded_corruptions(
         broken = [corrupt(name, motion, strength=strength, seed=int(rng.integers(2**31))) for motion in motions]
         seen = classify_windows(classifier, broken, names)
         made = {style: seen.features[seen.style == classifier.style_index(style)] for style in real}
-        drawn = [distributions.draw_windows(side, protocol.windows_per_style, rng) for side in (made, real)]
+        drawn = [distributions.draw_per_style(side, protocol.windows_per_style, rng) for side in (made, real)]
         figures = {metric: distance(*drawn) for metric, distance in distributions.DISTANCES.items()}
         figures["style_accuracy"] = distributions.style_accuracy(seen.predicted, seen.style)
         named = {"corruption": name, "strength": float(strength), "seed": seed}
@@ -251,11 +251,11 @@ def foot_spectrum(
         named = dict(zip(("model", "window_frames", "steps"), key, strict=True))
         quotient = np.log(table / real.loc[table.index])
         for band in bands:
-            plain = distributions.mean_and_interval(table[band].to_numpy())
+            absolute = distributions.mean_and_interval(table[band].to_numpy())
             ratio = distributions.mean_and_interval(quotient[band].to_numpy())
             ratio |= {bound: float(np.exp(ratio[bound])) for bound in ("value", "low", "high")}
             rows += [
-                {**named, "band": band, "metric": "toe_power", **plain},
+                {**named, "band": band, "metric": "toe_power", **absolute},
                 {**named, "band": band, "metric": "toe_power_over_real", **ratio},
             ]
     return pd.DataFrame(rows)

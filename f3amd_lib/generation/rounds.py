@@ -20,7 +20,7 @@ def sample_round(
 
     Args:
       network: has `config`, `encode(condition)` and is called as `network(x_noisy, sigma, context)`
-        (`networks.config.Denoiser`).
+        (`networks.config.DenoisingNetwork`).
       condition: in the network's normalised units, history [B, H, C] first.
       sigmas: [N + 1], falling, from a noise schedule's `grid`.
       key: JAX random key of the noise; not needed if `noise` is given and the sampler draws none.

@@ -388,15 +388,15 @@ def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, .
     """Collect the clips of styles and splits; one shorter than a window holds none to give."""
     frames, labels, clips = [], [], []
     for number, style in enumerate(styles):
-        mine = np.asarray(packed.clip_style) == packed.styles.index(style)
-        mine &= np.isin(packed.clip_split, [SPLITS.index(split) for split in splits])
-        mine &= np.diff(packed.clip_start) >= window
-        if not mine.any():
+        usable = np.asarray(packed.clip_style) == packed.styles.index(style)
+        usable &= np.isin(packed.clip_split, [SPLITS.index(split) for split in splits])
+        usable &= np.diff(packed.clip_start) >= window
+        if not usable.any():
             raise ValueError(
                 f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip "
                 f"of at least {window} frames; add clips, or leave the style out with `styles`"
             )
-        for clip in np.flatnonzero(mine):
+        for clip in np.flatnonzero(usable):
             positions = packed.motion(int(clip)).positions
             frames.append(classifier_frames(positions, packed.skeleton).astype(np.float32))
             labels.append(number)

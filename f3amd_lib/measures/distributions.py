@@ -4,7 +4,7 @@ Where `metrics` looks at one character at a time, these functions compare sets. 
 is an array [N, D]: N windows of motion, each described by the D features of a style classifier.
 What a figure means depends on that classifier, on the number of windows and on the definition, so
 that numbers of different sources can be compared in order only, if at all. Equal counts on both
-sides are the caller's to see to (`draw_windows`); `earth_movers_distance` insists on them.
+sides are the caller's to see to (`draw_per_style`); `earth_movers_distance` insists on them.
 
 All arithmetic is float64 numpy.
 """
@@ -44,7 +44,7 @@ def _two_clouds(features, reference) -> tuple[np.ndarray, np.ndarray]:
     return features, reference
 
 
-def draw_windows(clouds: Mapping, count: int, generator: np.random.Generator) -> np.ndarray:
+def draw_per_style(clouds: Mapping, count: int, generator: np.random.Generator) -> np.ndarray:
     """Draw as many windows of each style without replacement, so that both sides of a distance have as many.
 
     Args:
@@ -154,7 +154,7 @@ def earth_movers_distance(features, reference) -> float:
     if len(features) != len(reference):
         raise ValueError(
             f"{len(features)} windows against {len(reference)}: the earth mover's distance needs "
-            "as many on both sides (see `draw_windows`)"
+            "as many on both sides (see `draw_per_style`)"
         )
     weights = np.full(len(features), 1.0 / len(features))
     cost, log = ot.emd2(weights, weights, cdist(features, reference), numItermax=_MOST_PIVOTS, log=True)
@@ -349,7 +349,7 @@ def settling_curve(features, reference, sizes: Sequence[int], *, repeats: int = 
     for size in sizes:
         for repeat in range(repeats):
             generator = np.random.default_rng([seed, size, repeat])
-            drawn = [draw_windows(side, size, generator) for side in sides]
+            drawn = [draw_per_style(side, size, generator) for side in sides]
             rows += [
                 {"metric": metric, "windows": len(drawn[0]), "value": distance(*drawn)}
                 for metric, distance in DISTANCES.items()

@@ -20,7 +20,7 @@ from flax import nnx
 
 from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, dropout, position_code
 from f3amd_lib.networks.conditioning import Condition, ConditionedConfig, noise_features
-from f3amd_lib.networks.config import Denoiser, scaled_input
+from f3amd_lib.networks.config import DenoisingNetwork, scaled_input
 
 POSITION_BASE = 10_000.0
 """Base of the sinusoids, as in Vaswani et al. 2017: sequences are long here."""
@@ -78,7 +78,7 @@ def step_features(step, width: int):
     return paired.reshape(*angle.shape[:-1], -1)[..., :width]
 
 
-class CAMDM(Denoiser):
+class CAMDM(DenoisingNetwork):
     """Denoiser of Chen et al. 2024: conditions are tokens before the noisy frames."""
 
     def __init__(self, config: CAMDMConfig, *, rngs: nnx.Rngs):

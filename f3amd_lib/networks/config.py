@@ -111,7 +111,7 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
     return x_noisy * scale.reshape(-1, 1, 1)
 
 
-class Denoiser(nnx.Module):
+class DenoisingNetwork(nnx.Module):
     """What samplers, training and rollout ask of any network.
 
     A subclass has `config`, `encode(condition) -> context` (once a round) and `stages`, a generator

@@ -27,7 +27,7 @@ from f3amd_lib.networks.conditioning import (
     Context,
     conditioning_layer,
 )  # fmt: skip
-from f3amd_lib.networks.config import Denoiser, scaled_input
+from f3amd_lib.networks.config import DenoisingNetwork, scaled_input
 from f3amd_lib.networks.spectral import SPECTRAL_VARIANTS, FNOBlock, FrameLayer, cosine_basis, count_modes, frames_first
 
 
@@ -187,7 +187,7 @@ def _applied(layer, turned: bool):
     return layer.frames_first if turned and isinstance(layer, FrameLayer) else layer
 
 
-class F3AMD(Denoiser):
+class F3AMD(DenoisingNetwork):
     """Denoiser G of Eq. 1: noisy features, noise level and context in, clean features out."""
 
     def __init__(self, config: F3AMDConfig, *, rngs: nnx.Rngs):

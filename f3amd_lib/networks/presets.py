@@ -21,9 +21,9 @@ from flax import nnx
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.networks import counting
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
 from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 
 FAMILIES = {"F3AMD": (F3AMDConfig, F3AMD), "CAMDM": (CAMDMConfig, CAMDM)}
@@ -67,8 +67,8 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
     schedule = schedule_from_dict(diffusion or {"kind": "variance_exploding"})
     network = network or {}
     # CAMDM is told the number of a level, and so must know the levels of its schedule.
-    if family == "CAMDM" and hasattr(schedule, "sigmas"):
-        network = {"noise_levels": tuple(schedule.sigmas.tolist()), **network}
+    if family == "CAMDM" and schedule.levels is not None:
+        network = {"noise_levels": tuple(schedule.levels.tolist()), **network}
     own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return Preset(name, paper, family, schedule, network, training or {}, **own)
 
@@ -76,14 +76,14 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
 def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
     """Return the presets of a paper's file by name, and its forms by what follows a name."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
-    rows, found = {}, {"forms": {}, "presets": {}}
-    for kind in found:
+    rows, named = {}, {"forms": {}, "presets": {}}
+    for kind in named:
         for name, row in table.get(kind, {}).items():
             own = {key: row.pop(key) for key in ("source", "paper_names", "windows") if key in row}
             lower = [rows[other] for other in row.pop("like", ())]
             rows[name] = functools.reduce(laid_over, [*lower, row])
-            found[kind][name] = _preset(name, path.parent.name, **own, **rows[name])
-    return found["presets"], found["forms"]
+            named[kind][name] = _preset(name, path.parent.name, **own, **rows[name])
+    return named["presets"], named["forms"]
 
 
 PRESETS: dict[str, Preset] = {}
@@ -188,7 +188,7 @@ def count_parameters(config: NetworkConfig) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(nnx.state(_abstract(config), nnx.Param)))
 
 
-def count_flops(config: NetworkConfig) -> tuple[int, int]:
+def count_model_flops(config: NetworkConfig) -> tuple[int, int]:
     """Count the operations of one character's round.
 
     Args:
@@ -205,8 +205,8 @@ def count_flops(config: NetworkConfig) -> tuple[int, int]:
     encode = lambda state, condition: nnx.merge(graph, state).encode(condition)
     denoise = lambda state, *inputs: nnx.merge(graph, state)(*inputs)
     context = jax.eval_shape(encode, state, condition)
-    once = counting.count_flops(encode, state, condition)
-    return once, counting.count_flops(denoise, state, x_noisy, sigma, context)
+    once = count_flops(encode, state, condition)
+    return once, count_flops(denoise, state, x_noisy, sigma, context)
 
 
 def table(*, channels: int, num_styles: int) -> pd.DataFrame:
@@ -218,14 +218,14 @@ def table(*, channels: int, num_styles: int) -> pd.DataFrame:
 
     Returns:
       Columns model, window, latent_width, depth, parameters, mflop_per_evaluation (of one
-      character; see `count_flops`), diffusion, sampler, source (the paper's tables, or "ours").
+      character; see `count_model_flops`), diffusion, sampler, source (the paper's tables, or "ours").
     """
     columns = "model window latent_width depth parameters mflop_per_evaluation diffusion sampler source"
     rows = []
     for preset in PRESETS.values():
         for window in preset.windows:
             config = build_config(preset.name, channels=channels, num_styles=num_styles, window=window)
-            mflop = round(count_flops(config)[1] / 1e6, 2)
+            mflop = round(count_model_flops(config)[1] / 1e6, 2)
             sizes = window, config.latent_width, config.depth, count_parameters(config), mflop
             rows.append((preset.name, *sizes, preset.diffusion.kind, preset.diffusion.sampler, preset.source))
     return pd.DataFrame(rows, columns=columns.split())

@@ -10,7 +10,6 @@ import dataclasses
 
 import pandas as pd
 
-from f3amd_lib.diffusion.schedules import VarianceExploding, VariancePreservingCosine
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.networks.camdm import CAMDMConfig
@@ -20,7 +19,7 @@ from f3amd_lib.training.recipe import TrainingConfig
 
 _CONFIGS = {
     config.__name__: {field.name: field.default for field in dataclasses.fields(config)}
-    for config in (F3AMDConfig, CAMDMConfig, TrainingConfig, VarianceExploding, VariancePreservingCosine)
+    for config in (F3AMDConfig, CAMDMConfig, TrainingConfig)
 }
 
 
@@ -44,7 +43,9 @@ def fill_reading(reading: dict, where: str) -> str:
         return reading["here"]
     owner, *names = reading["field"].split(".")
     preset = PRESETS.get(owner)
-    value = _CONFIGS.get(owner, {}) if preset is None else {**preset.network, **preset.training}
+    value = _CONFIGS.get(owner, {})
+    if preset is not None:
+        value = {**preset.network, **preset.training, "diffusion": preset.diffusion.to_dict()}
     for name in names:
         if name not in value:
             raise ValueError(f"{where}: {reading['field']} is no setting; no {name!r}{nearest_hint(name, value)}")

@@ -55,7 +55,7 @@ _STEPS = {"rescaled": _rescaled_step, "printed": samplers.ddim_step_literal}
 
 def _walk(step: Callable, num_steps: int) -> np.ndarray:
     """Return where steps lead noise with an exact denoiser of two modes, [512, 1]."""
-    levels = schedules.VarianceExploding().grid(num_steps)
+    levels = schedules.variance_exploding().grid(num_steps)
     x = levels[0] * np.random.default_rng(0).standard_normal((512, 1))
     for sigma, sigma_next in zip(levels, levels[1:], strict=False):
         x = step(x, _MODES.denoise(x, sigma), sigma, sigma_next)

@@ -7,7 +7,6 @@ the name, so that a crash leaves the old file whole. Reading checks names, shape
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import json
@@ -258,7 +257,7 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "model": trained.config.to_dict(),
         "weights": jnp.dtype(dtype).name,
         "styles": list(trained.styles),
-        "diffusion": dataclasses.asdict(trained.diffusion),
+        "diffusion": trained.diffusion.to_dict(),
         **describe_skeleton(trained.skeleton),
         "seed_shapes": {name: list(np.shape(poses)) for name, poses in trained.start_poses.items()},
         "record": trained.record,

@@ -152,11 +152,10 @@ class DenoisingTask:
         key_batch, key_sigma, key_loss = jax.random.split(key, 3)
         key_draw, key_own, key_damping = jax.random.split(key_batch, 3)
         drawn = draw_windows(self.windows, key_draw, config.batch_size, config.captured_path_share)
-        frames = {"window": window, "num_history": self.model_config.num_history}
-        batch = gather_windows(self.windows, *drawn, **frames)
+        batch = gather_windows(self.windows, *drawn)
         history = batch.history
         if config.own_history_share > 0:
-            before = gather_windows(self.windows, *drawn, **frames, earlier=window)
+            before = gather_windows(self.windows, *drawn, earlier=window)
             room = self.windows.room[drawn[0]] >= window
             history = self._own_history(state, batch, before, room, key_own)
         if config.history_damping > 0:

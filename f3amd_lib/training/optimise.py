@@ -201,20 +201,22 @@ def restore_state(path: Path, task: Task, mesh: Mesh | None = None) -> TrainingS
     return parallel.replicate(load_tree(path, template)[0], mesh)
 
 
-def differences(identity: dict, found: dict) -> list[str]:
+def differences(identity: dict, description: dict) -> list[str]:
     """Say in what a file is unlike a task, such as "training settings (batch_size, seed)".
 
     Args:
       identity: of the task.
-      found: the file's description; what it tells beside the task's identity does not matter.
+      description: of the file; what it tells beside the task's identity does not matter.
     """
     # Files have lists where settings have tuples.
-    mine, theirs = (json.loads(json.dumps({part: of.get(part) for part in identity})) for of in (identity, found))
+    wanted, stored = (
+        json.loads(json.dumps({part: of.get(part) for part in identity})) for of in (identity, description)
+    )
     unlike = []
-    for part in (part for part in mine if mine[part] != theirs[part]):
-        if isinstance(mine[part], dict) and isinstance(theirs[part], dict):
-            names = sorted(mine[part].keys() | theirs[part].keys())
-            changed = [name for name in names if mine[part].get(name) != theirs[part].get(name)]
+    for part in (part for part in wanted if wanted[part] != stored[part]):
+        if isinstance(wanted[part], dict) and isinstance(stored[part], dict):
+            names = sorted(wanted[part].keys() | stored[part].keys())
+            changed = [name for name in names if wanted[part].get(name) != stored[part].get(name)]
             unlike.append(f"{part} settings ({', '.join(changed)})")
         else:
             unlike.append(part.replace("_", " "))

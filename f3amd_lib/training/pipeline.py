@@ -76,9 +76,7 @@ class PreparedData:
     @functools.cached_property
     def normaliser(self) -> Normaliser:
         """Mean and deviation of the training windows, from a fixed key."""
-        return fit_normaliser(
-            self.windows("train"), jax.random.key(0), window=self.window, num_history=self.num_history
-        )
+        return fit_normaliser(self.windows("train"), jax.random.key(0))
 
     @functools.cached_property
     def held_out_split(self) -> str:
@@ -313,7 +311,7 @@ def obtain_model(
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
     if files.model.exists() or not files.history.exists():
         _set_aside(files)
-    set_aside_unlike(prepared, files, wanted, recipe)
+    set_aside_other_state(prepared, files, wanted, recipe)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
@@ -381,11 +379,13 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
 
 def _unlike(trained: TrainedModel, prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> list[str]:
     """List in what a finished model is unlike the one that a run would make."""
-    mine = weights_identity(model, config, prepared.packed.fingerprint)
-    return differences(mine, {**trained.record, "model": trained.config.to_dict()})
+    wanted = weights_identity(model, config, prepared.packed.fingerprint)
+    return differences(wanted, {**trained.record, "model": trained.config.to_dict()})
 
 
-def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig) -> None:
+def set_aside_other_state(
+    prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig
+) -> None:
     """Keep a training state under another name if it is of other data or settings.
 
     Args:
@@ -393,8 +393,8 @@ def set_aside_unlike(prepared: PreparedData, files: ModelFiles, model: NetworkCo
       files: of the run.
       model, config: of the run that is to come.
     """
-    mine = weights_identity(model, config, prepared.packed.fingerprint)
-    if files.state.exists() and differences(mine, describe(files.state)):
+    wanted = weights_identity(model, config, prepared.packed.fingerprint)
+    if files.state.exists() and differences(wanted, describe(files.state)):
         _set_aside(files)
 
 

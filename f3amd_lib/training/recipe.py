@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import optax
 
-from f3amd_lib.diffusion.schedules import NoiseSchedule, VarianceExploding, schedule_from_dict
+from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
 from f3amd_lib.ground.names import nearest_hint, refuse_unknown
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
@@ -98,7 +98,7 @@ class TrainingConfig:
     own_history_share: float = 0.0
     history_damping: float = 0.0
     loss: LossWeights = field(default_factory=LossWeights)
-    diffusion: NoiseSchedule = field(default_factory=VarianceExploding)
+    diffusion: NoiseSchedule = field(default_factory=variance_exploding)
     seed: int = 0
 
     def __post_init__(self):
@@ -111,16 +111,15 @@ class TrainingConfig:
                 if not fits(getattr(self, name)):
                     raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
         # The other draws reach below 1 by a logarithm, which such a schedule alone has room for.
-        if self.noise != "schedule" and not (
-            isinstance(self.diffusion, VarianceExploding) and self.diffusion.sigma_min < 1.0
-        ):
+        exploding = self.diffusion.kind == "variance_exploding"
+        if self.noise != "schedule" and not (exploding and self.diffusion.sigma_min < 1.0):
             raise ValueError(
                 f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, got {self.diffusion!r}"
             )
 
     def to_dict(self) -> dict:
         """Return the fields as JSON-ready values."""
-        return dataclasses.asdict(self)
+        return dataclasses.asdict(self) | {"diffusion": self.diffusion.to_dict()}
 
     @classmethod
     def from_dict(cls, values: dict) -> TrainingConfig:
@@ -143,9 +142,9 @@ def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
       num_steps: optimiser steps.
       **settings: fields of `TrainingConfig` to change.
     """
-    found = find_preset(preset)
+    chosen = find_preset(preset)
     return TrainingConfig.from_dict(
-        {"num_steps": num_steps, "diffusion": found.diffusion, **found.training, **settings}
+        {"num_steps": num_steps, "diffusion": chosen.diffusion, **chosen.training, **settings}
     )
 
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import sample
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import variance_exploding
 from scipy.optimize import brentq
 
 from helpers.bimodal_paths import BimodalPaths, crossing, outcome_shares
@@ -15,7 +15,7 @@ from helpers.exercises.judging import agree, normal_quantiles
 
 def _unequal_ways(answer) -> str | None:
     walkers = GaussianMixture([-1, 1], width=0.1, weights=[0.3, 0.7])
-    sigma = VarianceExploding().sigma_max
+    sigma = variance_exploding().sigma_max
     x_noisy = sigma * normal_quantiles(2000)[:, None]
     if agree(answer, walkers.denoise(x_noisy, sigma).mean(), atol=0.02):
         return None

@@ -9,11 +9,11 @@ import numpy as np
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
-from f3amd_lib.diffusion.schedules import VarianceExploding
+from f3amd_lib.diffusion.schedules import variance_exploding
 
 from helpers.exercises.judging import NotAnswered, agree, is_missing, normal_quantiles, sample
 
-_SCHEDULE = VarianceExploding()
+_SCHEDULE = variance_exploding()
 
 
 def _mended_step(answer) -> str | None:

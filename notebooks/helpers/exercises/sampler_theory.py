@@ -10,7 +10,7 @@ from helpers.exercises.judging import agree, normal_quantiles, sample
 
 _WIDE = GaussianMixture([-1.0, 1.0], width=0.3)
 _NARROW_PAIR = GaussianMixture([-0.1, 0.1], width=0.1)
-_SIGMA_MAX = schedules.VarianceExploding().sigma_max
+_SIGMA_MAX = schedules.variance_exploding().sigma_max
 _MOST_STEPS = 20_000
 
 
@@ -19,7 +19,7 @@ def _pure_noise() -> np.ndarray:
     return _SIGMA_MAX * normal_quantiles(400)[:, None]
 
 
-def _error(sampler: str, schedule: schedules.VarianceExploding, num_steps: int) -> float:
+def _error(sampler: str, schedule: schedules.variance_exploding, num_steps: int) -> float:
     """Return the mean distance from the exact flow on the wide modes, as notebook 02 measures it.
 
     The last step of every sampler is the denoiser's answer at sigma_min, and so is the truth's.
@@ -30,7 +30,7 @@ def _error(sampler: str, schedule: schedules.VarianceExploding, num_steps: int) 
 
 
 def _one_step_spread(answer) -> str | None:
-    ends = sample("ddim", _NARROW_PAIR.denoise, _pure_noise(), schedules.VarianceExploding().grid(1))
+    ends = sample("ddim", _NARROW_PAIR.denoise, _pure_noise(), schedules.variance_exploding().grid(1))
     if agree(answer, ends.std(), rtol=0.1):
         return None
     return (
@@ -52,8 +52,8 @@ def _ve_step(answer) -> str | None:
 
 
 def _curvature(answer) -> str | None:
-    before = _error("ddim", schedules.VarianceExploding(), 8)
-    after = _error("ddim", schedules.VarianceExploding(rho=float(answer)), 8)
+    before = _error("ddim", schedules.variance_exploding(), 8)
+    after = _error("ddim", schedules.variance_exploding(rho=float(answer)), 8)
     if after <= 0.75 * before:
         return None
     return (
@@ -67,7 +67,7 @@ def _numbers_of_steps(answer) -> str | None:
     if len(steps) != 2 or not all(1 <= count <= _MOST_STEPS for count in steps):
         return f"two numbers of steps are asked for, each from 1 to {_MOST_STEPS}"
     for sampler, name, count in zip(("euler", "heun"), ("Euler", "Heun"), steps, strict=True):
-        error = _error(sampler, schedules.VarianceExploding(), round(count))
+        error = _error(sampler, schedules.variance_exploding(), round(count))
         if not agree(error, 0.001, rtol=0.1):
             return (
                 f"{name} has an error of {error:.2g} after {round(count)} steps; by which factor "
