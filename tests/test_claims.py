@@ -815,6 +815,7 @@ def test_both_compilers_are_judged_and_named(tmp_path):
     judgement = judge(keep(tmp_path, {"synthesis_time": rows}), "E11")
     found = {s.says.split(",")[0]: (s.verdict, s.figure) for s in judgement.ours if "2 to 5" in s.says}
     assert found["IREE"][0] == HOLDS and found["IREE"][1].endswith("at 32")
+    assert found["IREE"][1].startswith("JAX by IREE / ") and found["XLA"][1].startswith("JAX by XLA / ")
     assert found["XLA"][0] == FAILS and judgement.verdict == IN_PART
 
 
@@ -1019,8 +1020,8 @@ PAPERS_OWN = {
     "E11": (
         IN_PART,
         {
-            "IREE, CPU, 32 characters": "JAX / PyTorch 1.8",
-            "IREE, GPU, 1 to 16 characters: alike within a fifth": "JAX / PyTorch 0.346 to 0.717, 0 of 5 in the range",
+            "IREE, CPU, 32 characters": "JAX by IREE / PyTorch 1.8",
+            "IREE, GPU, 1 to 16 characters: alike within a fifth": "JAX by IREE / PyTorch 0.346 to 0.717, 0 of 5 in the range",
         },
     ),
     "E12": (

@@ -355,7 +355,8 @@ def jax_over_torch(
     """Judge the time in JAX, compiled by XLA ("jax") or "iree", over that in PyTorch at each number of characters."""
     found = _jax_over_torch(evidence, model, released, device, characters, compiler)
     verdict, text = _ranged(list(found.values()), bounds, "", gain=gain)
-    return verdict, f"JAX / PyTorch {text}" + ("" if len(found) == len(characters) else f" at {_list_text(found)}")
+    by = {"iree": "IREE", "jax": "XLA"}[compiler or evidence.framework]
+    return verdict, f"JAX by {by} / PyTorch {text}" + ("" if len(found) == len(characters) else f" at {_list_text(found)}")
 
 
 def speedup_over_torch(evidence: Evidence, slow, released, fast, device, characters) -> Finding:
