@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_trained, wandering_motion
 
@@ -135,3 +136,19 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     again, _ = read_table(path)
     assert len(again) == len(table)
     assert again[again["model"] == "CAMDM"]["x0_error_ratio"].tolist() != first
+
+
+def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkeypatch):
+    """Windows are steps times batch; the fall is that of the held-out loss over the last quarter."""
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    tiny = tiny_trained()
+    tiny = dataclasses.replace(tiny, record=tiny.record | {"training": {"batch_size": 16}})
+    losses = [4.0, np.nan, 2.0, 1.9, 1.5]  # watched at 20, 60, 80 and 100 of 100 steps
+    history = pd.DataFrame({"step": [20, 40, 60, 80, 100], "held_out_loss": losses})
+    histories = {"F3AMD-FNO-32": history, "F3AMD-FNO-48": history[["step"]]}
+    monkeypatch.setattr(measure, "obtain_model", lambda prepared, profile, *, preset: (tiny, histories[preset], ""))
+    monkeypatch.setattr(measure, "available_models", lambda profile: list(histories))
+    table, record = read_table(measure.measure_trained(prepared, PROFILE))
+    found = table.set_index(["model", "metric"])["value"]
+    assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(0.25)
+    assert np.isnan(found["F3AMD-FNO-48", "held_out_fall"]) and set(record["weights_digests"]) == set(histories)

@@ -176,6 +176,7 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
             "device": device_name(),
             "batch_size": batch_size,
             **timing.columns("s/step", 1.0 / chunk),
+            "rounds": timing.rounds,
             "steps_timed": timing.rounds * chunk,
             "compile_seconds": round(timing.first, 1),
             "epoch_windows": windows,

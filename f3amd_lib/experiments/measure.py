@@ -247,6 +247,36 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     return records.path("walking")
 
 
+def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Write down how long every model that has weights was trained, and whether its held-out loss was flat by then.
+
+    Nothing is computed: both stand in the history beside the weights.
+
+    Returns:
+      The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
+      the held-out loss fell over the last quarter of training (NaN where none was watched).
+    """
+    asked = _names(models)
+    record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="trained")
+    found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
+
+    def sum_up(row: Mapping) -> dict:
+        trained, history, _ = found[row["model"]]
+        last = history["step"].max()
+        loss = history.get("held_out_loss", history["step"] * np.nan).dropna()
+        early = loss[history["step"] <= 0.75 * last]
+        fall = 1.0 - loss.iloc[-1] / early.iloc[-1] if len(early) else np.nan
+        figures = {"windows": last * trained.record["training"]["batch_size"], "held_out_fall": fall}
+        return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
+
+    records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
+    digests = _digests({name: model for name, (model, *_) in found.items()})
+    records.measure(
+        [{"model": name, "window_frames": profile.window, "weights": digests[name]} for name in found], sum_up
+    )
+    return records.path("trained")
+
+
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Ask the metrics themselves (see `experiments.sensitivity`), some minutes in all.
 
@@ -453,6 +483,7 @@ MEASUREMENTS: dict[str, Callable] = {
     "recipes": measure_recipes,
     "quality": measure_quality,
     "walking": measure_walking,
+    "trained": measure_trained,
     "sensitivity": measure_sensitivity,
 }
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""

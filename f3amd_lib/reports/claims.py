@@ -20,7 +20,7 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pandas as pd
@@ -41,7 +41,20 @@ from f3amd_lib.reports.evidence import (
     paper_evidence,
     recorded_evidence,
 )
-from f3amd_lib.reports.judgements import FAILS, HOLDS, IN_PART, OPEN, REMARK, UNMEASURED, VERDICTS, Family, combine
+from f3amd_lib.reports.gate import LEAST_SHARE, why_not_judged
+from f3amd_lib.reports.judgements import (
+    FAILS,
+    HOLDS,
+    IN_PART,
+    LARGER,
+    OPEN,
+    REMARK,
+    UNJUDGED,
+    UNMEASURED,
+    VERDICTS,
+    Family,
+    combine,
+)
 
 log = logging.getLogger("f3amd")
 
@@ -51,7 +64,7 @@ DATASET_ORDER = ("bandai", "synthetic")
 PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
-_MARKS = {HOLDS: "✓", IN_PART: "±", FAILS: "✗", OPEN: "≈", REMARK: "·"}
+_MARKS = {HOLDS: "✓", IN_PART: "±", LARGER: ">", FAILS: "✗", OPEN: "≈", UNJUDGED: "○", REMARK: "·"}
 _SYNTHETIC = "synthetic (procedural, no real motion)"
 
 
@@ -66,6 +79,7 @@ class Statement:
       remark: it decides nothing.
       verdict: of `VERDICTS`; "" for a remark, and before it is judged.
       figure: what was found, or why nothing was.
+      reasons: why no verdict is drawn from it -> the models of which that is true.
       sources: tables that it rests on.
       no_table: it was not measured because a whole table is missing.
     """
@@ -76,18 +90,22 @@ class Statement:
     remark: bool = False
     verdict: str = REMARK
     figure: str = ""
+    reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sources: tuple[Source, ...] = ()
     no_table: bool = False
 
-    def judge(self, evidence: Evidence) -> Statement:
-        """Return the statement as this evidence has it."""
+    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor: Sequence[str] = ()) -> Statement:
+        """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
         evidence.sources.clear()
+        evidence.trained.clear()
         try:
             verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
             return replace(self, verdict=UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
-        verdict = REMARK if self.remark else verdict
-        return replace(self, verdict=verdict, figure=figure, sources=tuple(dict.fromkeys(evidence.sources)))
+        reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
+        verdict = REMARK if self.remark else UNJUDGED if reasons else verdict
+        sources = tuple(dict.fromkeys(evidence.sources))
+        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources)
 
 
 @dataclass(frozen=True)
@@ -104,6 +122,7 @@ class Claim:
       statements: what it stands for, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
+      poor: models that it says do badly; they need not walk to be judged.
     """
 
     paper: str
@@ -115,10 +134,12 @@ class Claim:
     statements: tuple[Statement, ...]
     paper_says: str = ""
     computed: bool = False
+    poor: tuple[str, ...] = ()
 
     def judge(self, evidence: Evidence) -> list[Statement]:
         """Return its statements as this evidence has them."""
-        return [statement.judge(evidence) for statement in self.statements]
+        windows = load_paper_file("paper", self.paper).get("training", {}).get("windows", {})
+        return [statement.judge(evidence, windows, self.poor) for statement in self.statements]
 
 
 # ------------------------------------------------------------------------------------- the paper's file
@@ -189,10 +210,12 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
     claims: dict[str, Claim] = {}
     for entry in about["claim"]:
         here = f"{where}, claim {entry.get('id')}"
-        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed"))
+        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed", "poor"))
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
             raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
-        fields = {key: value for key, value in entry.items() if key != "statement"}
+        fields = {key: tuple(value) if key == "poor" else value for key, value in entry.items() if key != "statement"}
+        for model in fields.get("poor", ()):
+            check_model(model, here)
         statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
         claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
     return list(claims.values())
@@ -248,17 +271,17 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     return tuple(s for s in statements if not (s.optional and s.verdict == UNMEASURED))
 
 
+def _says_more(statement: Statement) -> int:
+    """Rank what is known of a statement: a verdict, a figure without one, a row that is missing, a table that is."""
+    if statement.verdict == UNMEASURED:
+        return 0 if statement.no_table else 1
+    return 2 if statement.verdict == UNJUDGED else 3
+
+
 def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
-    """Take each statement from the first evidence that can decide it."""
-    merged: dict[str, Statement] = {}
-    for evidence in evidences:
-        for statement in claim.judge(evidence):
-            known = merged.get(statement.says)
-            if known is None or (
-                known.verdict == UNMEASURED and (statement.verdict != UNMEASURED or known.no_table > statement.no_table)
-            ):
-                merged[statement.says] = statement
-    return _seen(merged.values())
+    """Take each statement from the evidence that says most, of equals the first."""
+    judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
+    return _seen(max(statements, key=_says_more) for statements in judged)
 
 
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
@@ -266,24 +289,20 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
 
     Args:
       claim: which.
-      evidences: data set -> its evidence; the first that can decide anything decides. At least one.
+      evidences: data set -> its evidence, at least one; the first that can decide anything decides.
 
     Returns:
-      The judgement; where nothing was measured, with the reasons of the first data set that has
-      at least the table.
+      The judgement; where nothing was decided, with what the first data set has that says most:
+      figures without a verdict, a row that is missing, or a table.
     """
     paper = _seen(claim.judge(paper_evidence(claim.paper)))
     if claim.computed:
         return Judgement(claim, paper, (), "computed")
-    tried = []
-    for dataset, some in evidences.items():
-        ours = _merged(claim, some)
-        if combine(statement.verdict for statement in ours) != UNMEASURED:
-            return Judgement(claim, ours, paper, dataset)
-        tried.append(ours)
-    # A row that is missing says more than a missing table.
-    says_more = (ours for ours in tried if not all(statement.no_table for statement in ours))
-    return Judgement(claim, next(says_more, tried[0]), paper, "")
+    tried = {data: _merged(claim, some) for data, some in evidences.items()}
+    dataset = max(tried, key=lambda data: max((_says_more(s) for s in tried[data] if not s.remark), default=0))
+    ours = tried[dataset]
+    nothing = combine(statement.verdict for statement in ours) == UNMEASURED
+    return Judgement(claim, ours, paper, "" if nothing else dataset)
 
 
 def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
@@ -311,11 +330,13 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
 
 
 def _figures(statements: Sequence[Statement]) -> str:
-    """Return all figures in one line, each with a mark for its verdict; or why there are none."""
+    """Return all figures in one line, each with a mark for its verdict; or why there are none, or no verdict."""
     measured = [f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (UNMEASURED, REMARK)]
     gaps = [s.figure for s in statements if s.verdict == UNMEASURED]
     if measured:
-        return "; ".join(measured) + (f"; {len(gaps)} of {len(gaps) + len(measured)} not measured" if gaps else "")
+        if gaps:
+            measured.append(f"{len(gaps)} of {len(gaps) + len(measured)} not measured")
+        return "; ".join([*dict.fromkeys(reason for s in statements for reason in s.reasons), *measured])
     first, *others = dict.fromkeys(gaps) or [""]
     return first + (f"; and {len(others)} more" if others else "")
 
@@ -368,6 +389,8 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
     for column, statements in (("ours", judgement.ours), ("the paper's tables", judgement.paper)):
         for found in statements:
             text = f"{found.figure} · {found.verdict}" if found.verdict else found.figure
+            why = "; ".join(f"{reason}: {', '.join(models)}" for reason, models in found.reasons.items())
+            text += f" ({why})" if why else ""
             rows[found.says][column] = f"{UNMEASURED} ({found.figure})" if found.verdict == UNMEASURED else text
     return pd.DataFrame(row for row in rows.values() if row["ours"] or row["the paper's tables"])
 
@@ -383,9 +406,13 @@ written before our numbers were known. This page is generated by
   under `laptop` were trained for minutes on two cores, those under `gpu` at the paper's length.
 - **the paper's tables**: the same rule on the paper's own figures, which have no intervals:
   {setting}.
-- A claim **holds in part** where only some of its statements do, or only some were measured, or
-  where a gain is larger than stated. A difference that lies inside its interval **cannot be told
-  apart**.
+- A claim **holds in part** where only some of its statements do, or only some were measured; a statement on
+  many figures where at least half of them do, and the count stands beside it. It **does not hold** where more
+  than half lie outside. A gain beyond the stated range is another number: it is **larger than stated**. What
+  lies inside its own interval **cannot be told apart**. Intervals are those of a mean or a median, 95 %.
+- Quality is **not judged** on a network that was trained with less than {least:g} % of the paper's windows
+  ({windows}),
+  whose held-out loss was still falling, or that does not walk; its figures are shown all the same.
 - Marks: {marks}.
   Statements in brackets are remarks, which decide nothing.
 """
@@ -414,7 +441,13 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
     marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
     about = load_paper_file("paper", paper)
     head = _HEAD.format(
-        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks
+        count=len(load_claims(paper)),
+        name=about["name"],
+        setting=about["setting"],
+        paper=paper,
+        marks=marks,
+        least=100.0 * LEAST_SHARE,
+        windows=about.get("training", {}).get("says", "their number is not known"),
     )
     parts = [head, markdown_table(counts)]
     paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]

@@ -19,6 +19,7 @@ from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 
 
@@ -39,8 +40,8 @@ class Figure:
 
     Attributes:
       value: mean over seeds, or median time.
-      low, high: 95 % interval of the mean, or 5 and 95 % of the times; both equal to `value` where
-        there was a single repeat, so that nothing is known about its spread.
+      low, high: 95 % interval of that mean or median; both equal to `value` where there was a single
+        repeat, so that nothing is known about its spread.
     """
 
     value: float
@@ -145,6 +146,8 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     "training_time": ("model", "window_frames", "device", "batch_size"),
     "gradient_norm": ("sigma",),
     "x0_by_sigma": ("model", "sigma"),
+    "trained": ("model", "window_frames", "metric"),
+    "walking": ("model", "steps", "metric"),
 }
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
 `x0_error`) and, where it was repeated, `low` and `high`."""
@@ -154,6 +157,12 @@ NINE_METRICS = {
     for row in load_paper_table(3).drop_duplicates("metric")[["metric", "unit", "better"]].itertuples(index=False)
 }
 """The metrics of Table 3, in its order -> (unit, "up" or "down")."""
+
+JUDGED_METRICS = NINE_METRICS | {"IRD_excess": ("cm", "down")}
+"""Those nine, and the excess form of IRD, which stands beside the literal one."""
+
+OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma")
+"""Tables that say how well a network does: it must have passed the gate (`reports.gate`)."""
 
 PUBLISHED_CAMDM = "CAMDM published"
 """Row of the network with the weights that CAMDM's authors published: no preset of ours."""
@@ -205,17 +214,24 @@ class Evidence:
     Attributes:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
       sources: the tables that were looked into, in that order and as often; whoever asks clears the list first.
+      trained: (model, window) of the trained networks whose quality was looked up; cleared likewise.
     """
 
     def __init__(self, framework: str, load: Callable):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
         self.framework = framework
         self.sources: list[Source] = []
+        self.trained: list[tuple[str, int]] = []
         self._load = functools.cache(load)
+
+    @property
+    def printed(self) -> bool:
+        """Whether these are a paper's tables."""
+        return self.framework != "jax"
 
     def called(self, name: str) -> str:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
-        return f"{name}.csv has" if self.framework == "jax" else "the paper prints"
+        return "the paper prints" if self.printed else f"{name}.csv has"
 
     def table(self, name: str, device: str | None = None) -> pd.DataFrame:
         """Return a table of `SCHEMAS`, checked, and note it among the sources.
@@ -242,6 +258,8 @@ class Evidence:
         table = self.table(name, device)
         for column, wanted in row.items():
             table = table[table[column] == wanted]
+        if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
+            self.trained.append((row["model"], row.get("window_frames", 32)))
         return table
 
     def figure(self, name: str, device: str | None = None, value: str = "value", **row) -> Figure:
@@ -315,10 +333,30 @@ def _foreign_unit(name: str, table: pd.DataFrame) -> pd.Series:
     return wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
 
 
+def _with_interval_of_median(table: pd.DataFrame) -> pd.DataFrame:
+    """Put the interval of the median of timed rounds in the place of their spread.
+
+    Records have it as `median_low` and `median_high`. Older ones have the 5 and 95 % quantiles of the
+    rounds and their number alone: as for a normal distribution, on either side of its own, the median
+    reaches 1.96 sqrt(pi / 2) / sqrt(rounds) deviations, and those quantiles 1.645.
+    """
+    if "rounds" not in table:
+        return table
+    reach = 1.96 / 1.645 * np.sqrt(np.pi / 2.0 / table["rounds"])
+    bounds = {bound: table["value"] + reach * (table[bound] - table["value"]) for bound in ("low", "high")}
+    known = {bound: table.get(f"median_{bound}", about).fillna(about) for bound, about in bounds.items()}
+    return table.assign(**known)
+
+
 def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
     """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken."""
     keys = list(SCHEMAS[name])
     table = table.rename(columns={"x0_error": "value"})
+    if name == "walking" and "metric" not in table:  # a row per style and seed, its figures side by side
+        means = table.groupby(["model", "steps"])[[check for check in CHECKS if check in table]].mean()
+        table = means.melt(var_name="metric", ignore_index=False).reset_index()
+    if name in ("synthesis_time", "training_time"):
+        table = _with_interval_of_median(table)
     for needed in (*keys, "value"):
         if needed not in table:
             raise ValueError(f"{where}: needs a column {needed!r}, it has {', '.join(map(str, table.columns))}")

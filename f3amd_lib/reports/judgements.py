@@ -4,12 +4,15 @@ A claim is a list of statements: small sentences that are true or false of `Evid
 or the paper's own tables). What the claim is worth follows from them (`combine`). Three things
 decide a statement:
 
-- **A stated figure or range** ("3 to 4 times", `within`). The figure itself supports it; only a
-  figure whose whole interval lies outside contradicts it; in between nothing can be told. A gain
-  that is larger than stated is there, but was stated wrongly: the statement holds in part.
+- **A stated figure or range** ("3 to 4 times", `within`). A figure whose whole interval lies inside
+  supports it, one whose whole interval lies outside contradicts it; in between nothing can be told.
+  A gain beyond the range is another number than the paper's, and has a verdict of its own.
 - **Better or worse** (`ordered`). The interval of the ratio must leave out 1. Otherwise the two
   cannot be told apart.
 - **Alike.** A range around 1.
+
+A statement on many figures (metrics, models, numbers of characters) goes by `majority`, and says how
+many hold.
 
 The thresholds, here and in `claims.toml`, were chosen before our numbers were known, and are the
 same for all claims and for the paper's own tables.
@@ -25,6 +28,7 @@ import pandas as pd
 
 from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.reports.evidence import (
+    JUDGED_METRICS,
     NINE_METRICS,
     Evidence,
     Figure,
@@ -38,10 +42,12 @@ from f3amd_lib.reports.evidence import (
 
 HOLDS = "holds"
 IN_PART = "holds in part"
+LARGER = "larger than stated"
 FAILS = "does not hold"
 OPEN = "cannot be told apart"
+UNJUDGED = "not judged"
 UNMEASURED = "not measured"
-VERDICTS = (HOLDS, IN_PART, FAILS, OPEN, UNMEASURED)
+VERDICTS = (HOLDS, IN_PART, LARGER, FAILS, OPEN, UNJUDGED, UNMEASURED)
 """What can be said of a claim, or of a statement."""
 
 REMARK = ""
@@ -101,26 +107,40 @@ class Family:
 
 
 def combine(verdicts: Iterable[str]) -> str:
-    """Return the verdict on a whole from those on its parts.
+    """Return the verdict on a claim from those on its statements.
 
-    All parts hold: it holds. Some do, and others do not or were not measured: it holds in part.
-    None does, and one was contradicted: it does not hold. Otherwise nothing can be told apart, or
-    nothing was measured.
+    All hold: it holds. Some do, and others do not or could not be judged: it holds in part. None
+    does: it does not hold where one was contradicted; else it is larger than stated where one is.
+    Otherwise nothing can be told apart, judged or measured.
     """
     found = set(verdicts) - {REMARK}
-    if not found - {UNMEASURED}:
-        return UNMEASURED
     if found == {HOLDS}:
         return HOLDS
     if found & {HOLDS, IN_PART}:
         return IN_PART
-    return FAILS if FAILS in found else OPEN
+    return next((verdict for verdict in (FAILS, LARGER, OPEN, UNJUDGED) if verdict in found), UNMEASURED)
+
+
+def majority(verdicts: Iterable[str]) -> str:
+    """Return the verdict on a statement from those on its figures, at least one.
+
+    All hold: it holds. At least half do: it holds in part. More than half lie beyond what was
+    stated: it is larger; more than half lie outside on either side: it does not hold. Otherwise
+    nothing can be told apart.
+    """
+    found = list(verdicts)
+    share = lambda *wanted: sum(verdict in wanted for verdict in found) / len(found)
+    if share(HOLDS) >= 0.5:
+        return HOLDS if share(HOLDS) == 1.0 else IN_PART
+    if share(LARGER) > 0.5:
+        return LARGER
+    return FAILS if share(FAILS, LARGER) > 0.5 else OPEN
 
 
 def every(verdicts: Iterable[str]) -> str:
     """Return the verdict on "each of them": one that fails is enough."""
     found = set(verdicts)
-    return next(verdict for verdict in (FAILS, OPEN, IN_PART, HOLDS) if verdict in found)
+    return next(verdict for verdict in (FAILS, LARGER, OPEN, HOLDS) if verdict in found)
 
 
 def any_of(verdicts: Iterable[str]) -> str:
@@ -144,8 +164,8 @@ def within(figure: Figure, bounds: tuple[float, float], *, gain: bool = False) -
     if figure.high < low:
         return FAILS
     if figure.low > high:
-        return IN_PART if gain else FAILS
-    return HOLDS if low <= figure.value <= high else OPEN
+        return LARGER if gain else FAILS
+    return HOLDS if low <= figure.low and figure.high <= high else OPEN
 
 
 def ordered(harm: Figure) -> str:
@@ -165,7 +185,7 @@ def _ranged(figures: Sequence[Figure], bounds: tuple[float, float], unit: str, *
     text, inside = range_text(figures, unit), verdicts.count(HOLDS)
     if len(figures) > 1 and inside < len(figures):
         text += f", {inside} of {len(figures)} in the range"
-    return combine(verdicts), text
+    return majority(verdicts), text
 
 
 def stated_range(low: float, high: float) -> tuple[float, float]:
@@ -282,7 +302,7 @@ def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Findin
         ratio(evidence.speedup(slow, model, device, many), evidence.speedup(slow, model, device, few))
         for model in _timed(evidence, fast, device, characters)
     ]
-    return combine(map(ordered, growth)), f"{range_text(growth)} times the gain"
+    return majority(map(ordered, growth)), f"{range_text(growth)} times the gain"
 
 
 def speedup_at_each(evidence: Evidence, slow, fast, device, characters) -> Finding:
@@ -317,21 +337,26 @@ def mean_saving(evidence: Evidence, slow, fast, device, characters, bounds) -> F
     return within(found, bounds, gain=True), f"{figure_text(found)} % at {_list_text(shared)}"
 
 
-def _jax_over_torch(evidence: Evidence, model: Setting, released: Setting, device, characters) -> dict[int, Figure]:
+def _jax_over_torch(
+    evidence: Evidence, model: Setting, released: Setting, device, characters, compiler=None
+) -> dict[int, Figure]:
     """Return time in JAX over time in PyTorch, which has the same network or the released one."""
     peer = model if evidence.counts(model, device, "torch") else released
-    known = evidence.counts(model, device) & evidence.counts(peer, device, "torch")
+    known = evidence.counts(model, device, compiler) & evidence.counts(peer, device, "torch")
     return {
-        count: ratio(evidence.time(model, device, count), evidence.time(peer, device, count, "torch"))
+        count: ratio(evidence.time(model, device, count, compiler), evidence.time(peer, device, count, "torch"))
         for count in sorted(known & set(characters)) or characters[:1]
     }
 
 
-def jax_over_torch(evidence: Evidence, model, released, device, characters, bounds=EVERYTHING, gain=False) -> Finding:
-    """Judge the time in JAX over that in PyTorch at each number of characters."""
-    figures = list(_jax_over_torch(evidence, model, released, device, characters).values())
-    verdict, text = _ranged(figures, bounds, "", gain=gain)
-    return verdict, f"JAX / PyTorch {text}"
+def jax_over_torch(
+    evidence: Evidence, model, released, device, characters, bounds=EVERYTHING, gain=False, compiler=None
+) -> Finding:
+    """Judge the time in JAX, compiled by XLA ("jax") or "iree", over that in PyTorch at each number of characters."""
+    found = _jax_over_torch(evidence, model, released, device, characters, compiler)
+    verdict, text = _ranged(list(found.values()), bounds, "", gain=gain)
+    by = {"iree": "IREE", "jax": "XLA"}[compiler or evidence.framework]
+    return verdict, f"JAX by {by} / PyTorch {text}" + ("" if len(found) == len(characters) else f" at {_list_text(found)}")
 
 
 def speedup_over_torch(evidence: Evidence, slow, released, fast, device, characters) -> Finding:
@@ -408,7 +433,7 @@ def convergence(evidence: Evidence, model, against) -> Finding:
         texts.append(f"{metric} {epoch:g} against {other:g}")
     if not verdicts:
         raise NotMeasured("quality_by_epoch.csv has no metric of both models")
-    return combine(verdicts), ", ".join(texts)
+    return majority(verdicts), ", ".join(texts)
 
 
 # ----------------------------------------------------------------------------------------- quality
@@ -417,7 +442,7 @@ def convergence(evidence: Evidence, model, against) -> Finding:
 def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
     """Return how many times worse a metric is; above 1 where `model` is the worse one."""
     found, before = evidence.quality(model, metric), evidence.quality(against, metric)
-    return ratio(before, found) if NINE_METRICS[metric][1] == "up" else ratio(found, before)
+    return ratio(before, found) if JUDGED_METRICS[metric][1] == "up" else ratio(found, before)
 
 
 def _has(evidence: Evidence, settings: Iterable[Setting], metric: str) -> bool:
@@ -450,7 +475,7 @@ def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
     """Judge whether a model is worse than another in one metric, or by a factor in a range."""
     harm = _harm(evidence, model, against, metric)
     values = " against ".join(figure_text(evidence.quality(setting, metric)) for setting in (model, against))
-    text = f"{values} {NINE_METRICS[metric][0]}".rstrip()
+    text = f"{values} {JUDGED_METRICS[metric][0]}".rstrip()
     return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
 
 
@@ -467,7 +492,7 @@ def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
     verdicts = [ordered(_harm(evidence, model, against, metric)) for metric in metrics]
     better = [metric for metric, verdict in zip(metrics, verdicts, strict=True) if verdict == FAILS]
     text = f"worse in {verdicts.count(HOLDS)} of {len(verdicts)}"
-    return combine(verdicts), text + (f", better in {_list_text(better)}" if better else "")
+    return majority(verdicts), text + (f", better in {_list_text(better)}" if better else "")
 
 
 def worst_in(evidence: Evidence, model, models) -> Finding:
@@ -489,7 +514,7 @@ def alike(evidence: Evidence, models, bounds) -> Finding:
         if verdicts[-1] != HOLDS:
             texts.append(f"{metric} {number_text(spread.value)}x ({largest.model} over {least.model})")
     text = f"alike in {verdicts.count(HOLDS)} of {len(verdicts)}"
-    return combine(verdicts), text + (f"; apart: {', '.join(texts)}" if texts else "")
+    return majority(verdicts), text + (f"; apart: {', '.join(texts)}" if texts else "")
 
 
 def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
@@ -525,7 +550,7 @@ def better_at_each_width(evidence: Evidence, better, worse, widths, metric, wind
     for verdict, word in ((HOLDS, "yes at"), (FAILS, "no at"), (OPEN, "open at")):
         if chosen := [width for width, found in verdicts.items() if found == verdict]:
             texts.append(f"{word} D = {_list_text(chosen)}")
-    return combine(verdicts.values()), ", ".join(texts)
+    return majority(verdicts.values()), ", ".join(texts)
 
 
 def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple[Setting, Setting]]:
@@ -546,7 +571,8 @@ def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
         worst = max(harms, key=lambda model: harms[model].value)
         if verdicts[-1] != HOLDS:
             texts.append(f"{metric} {_change_text(harms[worst])} ({worst})")
-    return combine(verdicts), f"worse: {', '.join(texts)}" if texts else f"{len(metrics)} metrics"
+    text = f"{verdicts.count(HOLDS)} of {len(metrics)} metrics"
+    return majority(verdicts), text + (f"; worse: {', '.join(texts)}" if texts else "")
 
 
 def window_gain(evidence: Evidence, models, window, metric) -> Finding:
@@ -556,8 +582,12 @@ def window_gain(evidence: Evidence, models, window, metric) -> Finding:
     return REMARK, f"in {better} of {len(pairs)} models"
 
 
-def steady_over_steps(evidence: Evidence, model, steps, bounds) -> Finding:
-    """Judge, metric by metric, whether fewer steps give what the model's own number of steps gives."""
+def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=0.0) -> Finding:
+    """Judge, metric by metric, whether fewer steps give what the model's own number of steps gives.
+
+    A network that gives one motion whatever its noise does so for a dull reason: where samples of
+    one condition differ by less than `least_diversity` cm, nothing was kept.
+    """
     fewer = [Setting(model.model, count) for count in steps]
     metrics = _shared_metrics(evidence, [model, *fewer])
     changes = {
@@ -569,7 +599,11 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds) -> Finding:
     metric, setting = max(changes, key=lambda key: abs(np.log(changes[key].value)))
     largest = f"{metric} {figure_text(_in_percent(changes[metric, setting]))} %"
     at = f"{setting.steps} step{'s' if setting.steps > 1 else ''}"
-    return combine(verdicts), f"{verdicts.count(HOLDS)} of {len(metrics)} metrics; largest change: {largest} at {at}"
+    text = f"{verdicts.count(HOLDS)} of {len(metrics)} metrics; largest change: {largest} at {at}"
+    spread = max((evidence.quality(one, "diversity") for one in (model, *fewer)), key=lambda figure: figure.value)
+    if spread.high < least_diversity:
+        return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
+    return majority(verdicts), text
 
 
 def change_between_steps(evidence: Evidence, model, steps) -> Finding:
@@ -601,12 +635,11 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
             continue
         late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
         growth = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
-        grown = within(growth, bounds)
-        verdicts.append(OPEN if grown == HOLDS and growth.low <= 1.0 else grown)
+        verdicts.append(within(growth, bounds))
         texts.append(f"{metric} {_change_text(growth)}")
     if not verdicts:
         raise NotMeasured(f"{evidence.called('quality_by_round')} no {model} over 8 rounds or more")
-    return combine(verdicts), ", ".join(texts)
+    return majority(verdicts), f"{verdicts.count(HOLDS)} of {len(verdicts)}: {', '.join(texts)}"
 
 
 def _order_score(rows: pd.DataFrame) -> float:
@@ -638,33 +671,45 @@ def better_graded(evidence: Evidence, metric, than) -> Finding:
 # ----------------------------------------------------------------------------------------- theory
 
 
-def _x0_errors(evidence: Evidence, model: str) -> pd.DataFrame:
-    curve = evidence.rows("x0_by_sigma", model=model)
+def _excess_errors(evidence: Evidence, model: str) -> pd.Series:
+    """Return the x0 error of a model over that of linear shrinkage, by noise level.
+
+    Where x0 has the deviation s, the estimate x s² / (s² + sigma²) is off by s sigma / sqrt(s² + sigma²):
+    exact for independent normal numbers, and more than an exact denoiser's error for all others. s is the
+    error at the highest level, where nothing is left to see, and at most 1, the deviation of all data.
+    """
+    curve = evidence.rows("x0_by_sigma", model=model).sort_values("sigma")
     if len(curve) < 3:
         raise NotMeasured(f"x0_by_sigma.csv has no three noise levels of {model}")
-    return curve
+    error, sigma = (curve[column].to_numpy(np.float64) for column in ("value", "sigma"))
+    spread = min(error[-1], 1.0)
+    return pd.Series(error * np.hypot(spread, sigma) / (spread * sigma), sigma)
 
 
 def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
-    """Judge the largest x0 error of a model over the least, of all noise levels."""
-    error = _x0_errors(evidence, model.model)["value"]
-    spread = Figure.of(error.max() / error.min())
-    return within(spread, bounds), f"x0 error differs by {number_text(spread.value)}x"
+    """Judge, of all noise levels, the largest x0 error over that of linear shrinkage.
+
+    An exact denoiser of Gaussian data reads 1. One that ignores its input has one error for all
+    levels, and at a low level many times what is due.
+    """
+    excess = _excess_errors(evidence, model.model)
+    worst = Figure.of(excess.max())
+    text = f"x0 error at most {number_text(worst.value)}x that of linear shrinkage, at sigma {excess.idxmax():.2g}"
+    return within(worst, bounds), text
 
 
 def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
-    """Judge how much more another model's x0 error spreads, over the noise levels that both know."""
-    curves = {setting.model: _x0_errors(evidence, setting.model) for setting in (model, against)}
-    low = max(curve["sigma"].min() for curve in curves.values())
-    high = min(curve["sigma"].max() for curve in curves.values())
-    spreads = []
+    """Judge how many times larger that figure is of another model, over the noise levels that both know."""
+    curves = {setting.model: _excess_errors(evidence, setting.model) for setting in (model, against)}
+    low = max(curve.index.min() for curve in curves.values())
+    high = min(curve.index.max() for curve in curves.values())
+    worst = []
     for name, curve in curves.items():
-        shared = curve.loc[curve["sigma"].between(low, high), "value"]
+        shared = curve.loc[low:high]
         if len(shared) < 3:
             raise NotMeasured(f"x0_by_sigma.csv has no three levels of {name} that both models know")
-        spreads.append(shared.max() / shared.min())
-    more = Figure.of(spreads[1] / spreads[0])
-    return within(more, bounds), " against ".join(f"{number_text(spread)}x" for spread in spreads)
+        worst.append(shared.max())
+    return within(Figure.of(worst[1] / worst[0]), bounds), " against ".join(f"{number_text(one)}x" for one in worst)
 
 
 def gradient_growth(evidence: Evidence, bounds) -> Finding:

@@ -1,0 +1,73 @@
+"""What a network must have behind it before its quality says anything of a paper's claim.
+
+A network that was stopped after minutes, or whose feet slide, says what brief training gives, and
+nothing of the paper's. Its figures are shown, and no verdict is drawn from them. Asked are the
+length of its training, as a share of the paper's windows, whether its held-out loss was flat at the
+end, and whether it walks (`measures.walking.CHECKS`). A network that the claim itself calls poor
+need not walk. All of this is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+from f3amd_lib.measures.walking import CHECKS
+from f3amd_lib.reports.evidence import Evidence, NotMeasured
+
+LEAST_SHARE = 0.05
+"""Of the paper's windows. 100 passes over Bandai, the smallest data set here, are a tenth of them."""
+
+FLAT = 0.05
+"""A held-out loss that falls by less over the last quarter of training is flat."""
+
+GATE_STEPS = 8
+"""Denoising steps with which a network has to walk."""
+
+
+def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | None, walks: bool) -> Iterator[str]:
+    """Yield what a network lacks, in words."""
+    try:
+        row = {"model": model, "window_frames": window}
+        windows, fall = (
+            evidence.figure("trained", **row, metric=metric).value for metric in ("windows", "held_out_fall")
+        )
+    except NotMeasured:
+        yield "no record of training"
+    else:
+        if paper_windows and windows < LEAST_SHARE * paper_windows:
+            yield f"trained {100.0 * windows / paper_windows:.2g} % of the paper's windows"
+        if fall > FLAT:
+            yield "held-out loss was still falling"
+    if not walks:
+        return
+    try:
+        figures = {
+            check: [
+                evidence.figure("walking", model=name, steps=steps, metric=check).value
+                for name, steps in ((model, GATE_STEPS), ("real", 0))
+            ]
+            for check in CHECKS
+        }
+    except NotMeasured:
+        yield "no record of walking"
+    else:
+        if not all(holds(*figures[check]) for check, (_, holds) in CHECKS.items()):
+            yield "does not walk"
+
+
+def why_not_judged(
+    evidence: Evidence, paper_windows: Mapping[str, int], poor: Collection[str] = ()
+) -> dict[str, list[str]]:
+    """Return why the networks that were looked up last decide nothing: reason -> models; none where they may.
+
+    Args:
+      evidence: records, after a rule has looked into them; a paper's own tables may always be judged.
+      paper_windows: frames of a window, as text -> windows that the paper trained with.
+      poor: models that the claim calls poor.
+    """
+    lacking: dict[str, list[str]] = {}
+    networks = [] if evidence.printed else dict.fromkeys(evidence.trained)
+    for model, window in networks:
+        for fault in _faults(evidence, model, window, paper_windows.get(str(window)), model not in poor):
+            lacking.setdefault(fault, []).append(model)
+    return lacking
