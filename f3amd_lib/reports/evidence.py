@@ -148,6 +148,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     "x0_by_sigma": ("model", "sigma"),
     "trained": ("model", "window_frames", "metric"),
     "walking": ("model", "steps", "metric"),
+    "input_use": ("model", "metric"),
 }
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
 `x0_error`) and, where it was repeated, `low` and `high`."""
