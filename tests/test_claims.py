@@ -1035,7 +1035,8 @@ PAPERS_OWN = {
         IN_PART,
         {
             "IREE, CPU, 32 characters": "JAX by IREE / PyTorch 1.8",
-            "IREE, GPU, 1 to 16 characters: alike within a fifth": "JAX by IREE / PyTorch 0.346 to 0.717, 0 of 5 in the range",
+            "IREE, GPU, 1 to 16 characters: alike within a fifth": "JAX by IREE / PyTorch 0.346 to 0.717, "
+            "0 of 5 in the range",
         },
     ),
     "E12": (

@@ -356,9 +356,8 @@ def jax_over_torch(
     found = _jax_over_torch(evidence, model, released, device, characters, compiler)
     verdict, text = _ranged(list(found.values()), bounds, "", gain=gain)
     by = {"iree": "IREE", "jax": "XLA"}[compiler or evidence.framework]
-    return verdict, f"JAX by {by} / PyTorch {text}" + (
-        "" if len(found) == len(characters) else f" at {_list_text(found)}"
-    )
+    at = "" if len(found) == len(characters) else f" at {_list_text(found)}"
+    return verdict, f"JAX by {by} / PyTorch {text}{at}"
 
 
 def speedup_over_torch(evidence: Evidence, slow, released, fast, device, characters) -> Finding:
