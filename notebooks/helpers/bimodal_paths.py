@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,6 @@ from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.networks.config import scaled_input
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import cosine_basis
 from flax import nnx
@@ -194,23 +193,12 @@ def outcome_shares(data: BimodalPaths, paths) -> dict[str, float]:
     }
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("params", "input_scaling"), meta_fields=("data", "graph")
-)
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("data", "graph"))
 @dataclass(frozen=True, eq=False)
 class PathNetwork:
-    """A small trained F3AMD.
-
-    Attributes:
-      params: weights (the moving average).
-      input_scaling: whether the noisy input is multiplied by c_in (see `scaled_input`). It is a
-        value and no part of the network, so that one compiled program serves with and without.
-      data: what it was trained on.
-      graph: the network without its weights, whose own config scales nothing.
-    """
+    """A small trained F3AMD: its weights (the moving average), what it was trained on, its graph without weights."""
 
     params: Any
-    input_scaling: Any
     data: BimodalPaths
     graph: Any
 
@@ -218,56 +206,55 @@ class PathNetwork:
         """Return the network's clean estimate; arguments as for `BimodalPaths.denoise`."""
         network = nnx.merge(self.graph, self.params)
         sigma = jnp.broadcast_to(jnp.asarray(sigma, x_noisy.dtype), x_noisy.shape[:1])
-        scaling = dataclasses.replace(network.config, input_scaling=True)
-        scaled = scaled_input(scaling, x_noisy, sigma)
-        shown = jnp.where(self.input_scaling, scaled, x_noisy)
-        return network(shown, sigma, network.encode(self.data.condition(side)))
+        return network(x_noisy, sigma, network.encode(self.data.condition(side)))
 
 
-def train_network(
+def train_networks(
     data: BimodalPaths,
     diffusion: NoiseSchedule,
+    seeds: Sequence[int],
     *,
-    input_scaling: bool = True,
     num_steps: int = 1500,
     batch_size: int = 32,
     learning_rate: float = 4e-3,
     latent_width: int = 16,
     depth: int = 2,
-    seed: int = 0,
-) -> tuple[PathNetwork, np.ndarray]:
-    """Train a small F3AMD on paths drawn afresh at every step, half of them with the side given.
+) -> tuple[list[PathNetwork], np.ndarray]:
+    """Train small F3AMDs, one a seed, on paths drawn afresh at every step, half of them with the side given.
 
     The loss is the square error of the clean estimate alone (Eq. 11), the rate a short warm-up and
-    a cosine. Networks that differ in noise or input scaling start from the same weights and see the
-    same paths, noise and conditions.
+    a cosine. All seeds train side by side in one program. Networks of one seed that differ in noise
+    start from the same weights and see the same paths and conditions.
 
     Args:
       data: the paths.
       diffusion: the noise.
-      input_scaling: multiply the noisy input by c_in.
+      seeds: of weights and paths.
       num_steps, batch_size, learning_rate: of the optimiser.
       latent_width, depth: of the network (D and N of sections 4.2 and 4.5).
-      seed: of weights and paths.
 
     Returns:
-      (network, loss at every step [num_steps]).
+      (a network a seed, loss at every step [S, num_steps]).
     """
     config = build_config(
         "F3AMD-FNO-32", channels=2, num_styles=1, window=data.num_frames, num_history=_HISTORY,
-        latent_width=latent_width, depth=depth, input_scaling=False,
+        latent_width=latent_width, depth=depth,
     )  # fmt: skip
-    key_init, key_sigma, key_batches = jax.random.split(jax.random.key(seed), 3)
-    graph = nnx.graphdef(nnx.eval_shape(lambda: build_from_config(config, key_init)))
-    params = jax.jit(lambda key: nnx.state(build_from_config(config, key)))(key_init)
-    sigmas = diffusion.draw(jax.random.split(key_sigma, 3)[0], (num_steps * batch_size,))
-    batches = _draw_batches(data, sigmas.reshape(num_steps, batch_size), key_batches)
-    network = PathNetwork(params, jnp.asarray(input_scaling), data, graph)
-    network, losses = _train(network, learning_rate, batches)
-    return network, np.asarray(losses)
+    keys = [jax.random.split(jax.random.key(seed), 3) for seed in seeds]
+    graph = nnx.graphdef(nnx.eval_shape(lambda: build_from_config(config, keys[0][0])))
+    begin = jax.jit(jax.vmap(lambda key: nnx.state(build_from_config(config, key))))
+    params = begin(jnp.stack([key_init for key_init, _, _ in keys]))
+    shape = (num_steps, batch_size)
+    sigmas = [diffusion.draw(jax.random.split(key_sigma, 3)[0], (num_steps * batch_size,)) for _, key_sigma, _ in keys]
+    sigmas = jnp.stack(sigmas).reshape(-1, *shape)
+    batches = _draw_batches(data, sigmas, jnp.stack([key_batches for _, _, key_batches in keys]))
+    average, losses = _train(PathNetwork(params, data, graph), learning_rate, batches)
+    of_seed = lambda number: jax.tree.map(lambda leaf: leaf[number], average)
+    return [PathNetwork(of_seed(number), data, graph) for number in range(len(keys))], np.asarray(losses)
 
 
 @functools.partial(jax.jit, static_argnames="data")
+@functools.partial(jax.vmap, in_axes=(None, 0, 0))
 def _draw_batches(data: BimodalPaths, sigmas, key):
     """Draw all that training sees, [num_steps, B, ...]: the toy fits into memory as a whole."""
     key_path, key_noise, key_known = jax.random.split(key, 3)
@@ -281,7 +268,8 @@ def _draw_batches(data: BimodalPaths, sigmas, key):
 
 @functools.partial(jax.jit, static_argnames="learning_rate")
 def _train(network: PathNetwork, learning_rate: float, batches):
-    num_steps = len(batches[0])
+    """Train all seeds side by side; return their averaged weights and losses, [S, ...]."""
+    num_steps = batches[0].shape[1]
     rate = optax.warmup_cosine_decay_schedule(
         0.0, learning_rate, max(1, num_steps // 10), num_steps, 0.01 * learning_rate
     )
@@ -299,9 +287,11 @@ def _train(network: PathNetwork, learning_rate: float, batches):
         average = optax.incremental_update(params, average, 0.01)
         return (params, average, moments), loss
 
-    start = (network.params, network.params, optimiser.init(network.params))
-    (_, average, _), losses = jax.lax.scan(step, start, batches)
-    return dataclasses.replace(network, params=average), losses
+    def train(params, batches):
+        (_, average, _), losses = jax.lax.scan(step, (params, params, optimiser.init(params)), batches)
+        return average, losses
+
+    return jax.vmap(train)(network.params, batches)
 
 
 @jax.jit
@@ -312,8 +302,8 @@ def _denoise(model, x_noisy, sigma, side):
 def sample_paths(model: BimodalPaths | PathNetwork, diffusion: NoiseSchedule, num_steps: int, side, key) -> np.ndarray:
     """Sample paths with the sampler that belongs to a noise schedule.
 
-    The answer is that of `samplers.sample`, but only the denoiser is compiled, once for all numbers
-    of steps: this toy waits for its compiler more than for its steps.
+    Only the denoiser is compiled, once for all numbers of steps: this toy waits for its compiler
+    more than for its steps.
 
     Args:
       model: a trained network, or the data themselves, whose denoiser is exact.
@@ -327,17 +317,11 @@ def sample_paths(model: BimodalPaths | PathNetwork, diffusion: NoiseSchedule, nu
     """
     key_init, key_steps = jax.random.split(key)
     side = jnp.asarray(side, jnp.int32)
-    sigmas = np.asarray(diffusion.grid(num_steps), np.float32)
-    x = sigmas[0] * jax.random.normal(key_init, (len(side), model.data.num_frames, 2))
-    keys = jax.random.split(key_steps, num_steps)
-    for sigma, sigma_next, key_noise in zip(sigmas[:-1], sigmas[1:], keys, strict=True):
-        x0_hat = _denoise(model, x, sigma, side)
-        if diffusion.sampler == "ddpm":
-            noise = jax.random.normal(key_noise, x.shape)
-            x = samplers.ddpm_step(x, x0_hat, sigma, sigma_next, noise)
-        else:
-            x = samplers.ddim_step(x, x0_hat, sigma, sigma_next)
-    return np.asarray(x)
+    sigmas = diffusion.grid(num_steps)
+    x_init = sigmas[0] * jax.random.normal(key_init, (len(side), model.data.num_frames, 2))
+    denoise = lambda x_noisy, sigma: _denoise(model, x_noisy, sigma, side)
+    *_, end = samplers.walk(diffusion.sampler, denoise, x_init, sigmas, key=key_steps)
+    return np.asarray(end.x_noisy)
 
 
 def outcome_table(
