@@ -450,6 +450,20 @@ def test_each_rule_holds_and_fails_on_made_up_records(tmp_path, claim_id, wanted
     assert all(s.sources for s in judgement.ours if s.verdict not in (UNMEASURED, REMARK))
 
 
+KEYS = ("use_of_x", "use_of_sigma")
+
+
+@pytest.mark.parametrize(
+    ("uses", "expected"),
+    [((0.6, 1.6), "0.6 cm with the noisy input, 1.6 cm with the noise level alone"),
+     ((2.4, 0.0), "2.4 cm with the noisy input, 0 cm with the noise level alone")],
+)  # fmt: skip
+def test_the_remark_on_q5_tells_use_of_the_input_from_use_of_the_level(tmp_path, uses, expected):
+    rows = [{"model": FNO, "metric": key, "value": use} for key, use in zip(KEYS, uses, strict=True)]
+    remarks = [s.figure for s in judge(keep(tmp_path, {"input_use": rows}), "Q5").ours if s.verdict == REMARK]
+    assert remarks == [expected]
+
+
 @pytest.mark.parametrize("claim_id", RECORDED)
 def test_each_rule_says_why_nothing_was_measured(tmp_path, claim_id):
     judgement = judge(tmp_path, claim_id)

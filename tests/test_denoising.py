@@ -4,11 +4,15 @@ import dataclasses
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 from builders import tiny_camdm, tiny_config, tiny_trained, tiny_windows
+from scipy.stats import norm
 
+from f3amd_lib.diffusion import samplers
+from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import VariancePreservingCosine
 from f3amd_lib.experiments import denoising
 from f3amd_lib.generation.rollout import MotionGenerator
@@ -121,3 +125,73 @@ def test_windows_of_other_sizes_are_refused():
     longer = dataclasses.replace(trained.config, window=trained.config.window + 2)
     with pytest.raises(ValueError, match="built for"):
         denoising.held_out_batch(tiny_windows(), dataclasses.replace(trained, config=longer))
+
+
+# ------------------------------------------------------------------------- use of x, use of sigma
+
+
+def estimates_on_a_walk(denoise, *, num_seeds=400, num_steps=64, low=0.002):
+    """Clean estimates [L, S, 1] of a denoiser on its own walk from noise."""
+    sigmas = np.append(np.geomspace(128.0, low, num_steps), 0.0)
+    start = sigmas[0] * norm.ppf((np.arange(num_seeds) + 0.5) / num_seeds)[:, None]
+    with jax.enable_x64(True):
+        visited = list(samplers.walk("ddim", denoise, start, sigmas))[:-1]
+    return np.stack([np.asarray(one.x0_hat) for one in visited])
+
+
+@pytest.mark.parametrize("means", [[0.8], [-1.0, 1.0], [-2.0, 0.5, 1.0]])
+def test_an_exact_denoiser_uses_its_input_and_not_the_level_alone(means):
+    mixture = GaussianMixture(means, width=0.3)
+    over_noise, over_levels = denoising.estimate_variances(estimates_on_a_walk(mixture.denoise))
+    assert over_noise > 0.01
+    # The mean of posterior means is the mean of the data, at every level.
+    assert abs(over_levels) < 0.02 * over_noise
+
+
+def test_a_constant_uses_nothing():
+    constant = estimates_on_a_walk(lambda x, sigma: 0.0 * x + 0.3)
+    assert denoising.estimate_variances(constant) == pytest.approx((0.0, 0.0), abs=1e-20)
+
+
+def test_a_network_that_sees_sigma_alone_moves_with_it_though_it_ignores_its_input():
+    # 0.5 below sigma 1 and 0.3 above: its samples are 0.5 from 2 steps on, and 0.3 at 1.
+    answer = lambda x, sigma: 0.0 * x + jnp.where(sigma < 1.0, 0.5, 0.3)
+    estimates = estimates_on_a_walk(answer)
+    share = np.mean(np.unique(estimates, return_inverse=True)[1])
+    over_noise, over_levels = denoising.estimate_variances(estimates)
+    assert over_noise == pytest.approx(0.0, abs=1e-20)
+    assert over_levels == pytest.approx(0.2**2 * share * (1 - share))
+
+
+def test_variances_are_unbiased_in_few_seeds():
+    rng = np.random.default_rng(0)
+    own = rng.standard_normal((8, 20_000, 1)) + np.linspace(0, 1, 8)[:, None, None]
+    few = [denoising.estimate_variances(own[:, k : k + 5]) for k in range(0, 20_000, 5)]
+    over_noise, over_levels = np.mean(few, axis=0)
+    assert over_noise == pytest.approx(1.0, rel=0.02)
+    assert over_levels == pytest.approx(np.linspace(0, 1, 8).var(), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("answer", "uses_x", "uses_sigma"),
+    [
+        (lambda x, sigma: 0.0 * x, False, False),
+        (lambda x, sigma: 0.0 * x + jnp.log(sigma), False, True),
+        (lambda x, sigma: x / jnp.hypot(1.0, sigma), True, False),
+    ],
+    ids=["constant", "level alone", "input"],
+)
+def test_use_of_inputs_is_told_on_held_out_windows(monkeypatch, answer, uses_x, uses_sigma):
+    class Answers(Fake):
+        def __call__(self, x_noisy, sigma, context):
+            return self.answer(x_noisy, sigma)
+
+    monkeypatch.setattr(TrainedModel, "network", lambda self: Answers(answer))
+    trained = tiny_trained()
+    condition = denoising.held_out_condition(tiny_windows(), trained, 4)
+    table = denoising.input_use(trained, condition, num_seeds=4)
+    value = table.set_index("metric")["value"]
+    assert (value["use_of_x"] > 0.5) == uses_x
+    assert (value["use_of_sigma"] > 0.5 * max(1.0, value["use_of_x"])) == uses_sigma
+    if not uses_x:
+        assert value["use_of_x"] < 1e-3

@@ -125,6 +125,10 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
     assert levels["CAMDM"] == pytest.approx(VariancePreservingCosine(4).sigmas.tolist(), rel=1e-6)
     assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
     assert set(table["model"]) == set(models) and "x0_error_ratio" in table
+    use, _ = read_table(path.with_name("input_use.csv"))
+    assert set(zip(use["model"], use["metric"], strict=True)) == {
+        (model, metric) for model in models for metric in ("use_of_x", "use_of_sigma")
+    }
     before = len(errors)
     # Nothing changed: nothing new. Other weights: that model alone anew.
     measure.measure_noise_use(prepared, PROFILE)

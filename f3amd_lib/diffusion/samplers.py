@@ -281,6 +281,8 @@ def _fold(step: Callable, denoise: Denoiser, x_init, legs: _Leg, unroll: bool):
 def sample(name: str, denoise: Denoiser, x_init, sigmas, *, key=None, unroll: bool = False) -> jax.Array:
     """Walk a variance-exploding state down the noise levels, in one scan.
 
+    A denoiser that prints or records what it is shown gets tracers here, not numbers: take `walk`.
+
     Args:
       name: of `SAMPLERS`.
       denoise: `denoise(x_noisy, sigma) -> x0_hat`; sigma comes as a scalar.

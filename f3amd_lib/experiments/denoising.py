@@ -1,8 +1,9 @@
-"""What a network does with one window: error against noise level, use of its noise, motion quality.
+"""What a network does with one window: error against noise level, use of its inputs, motion quality.
 
 A network that predicts clean motion can lower its loss by ignoring the noisy input and answering
-with the mean of what history, path and style allow. Such a network gives the same answer at every
-noise level and for every seed; these functions tell.
+with the mean of what history, path and style allow. Such a network gives the same motion for every
+seed. It may still change its answer with the noise level that it is told, so that its motion differs
+with the number of steps. These functions tell the two apart.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import pandas as pd
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import Batch, WindowSet, spread_windows
-from f3amd_lib.diffusion.samplers import add_noise
+from f3amd_lib.diffusion.samplers import add_noise, walk
 from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.measures.distributions import diversity
+from f3amd_lib.measures.distributions import diversity, mean_and_interval
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
@@ -33,6 +34,20 @@ def held_out_batch(windows: WindowSet, trained: TrainedModel, num_samples: int =
             f"were built for {windows.num_history} + {windows.window}"
         )
     return spread_windows(windows, num_samples)
+
+
+def held_out_condition(windows: WindowSet, trained: TrainedModel, num_conditions: int = 32):
+    """Return the conditions of windows spread evenly over a held-out set, in network units."""
+    return network_inputs(held_out_batch(windows, trained, num_conditions), trained.normaliser)[1]
+
+
+def root_mean_square(squares, scale: float = CM) -> dict:
+    """Return the root of a mean over windows, [W], times `scale`, with its 95 % interval."""
+    interval = mean_and_interval(squares)
+    for bound in ("value", "low", "high"):
+        # The interval of a mean of squares may reach below 0, that of its root may not.
+        interval[bound] = scale * float(np.sqrt(np.maximum(interval[bound], 0.0)))
+    return interval
 
 
 def _joint_error(trained: TrainedModel, x0_hat, batch: Batch):
@@ -108,8 +123,7 @@ def seed_spread(
     Averaged over several held-out conditions, for a steadier figure.
     """
     trained = generator.trained
-    batch = held_out_batch(windows, trained, num_conditions)
-    _, condition = network_inputs(batch, trained.normaliser)
+    condition = held_out_condition(windows, trained, num_conditions)
 
     @jax.jit
     def sample_positions(key):
@@ -136,6 +150,76 @@ def noise_use(generator: MotionGenerator, windows: WindowSet, *, low_sigma: floa
         table = x0_error_by_sigma(generator.trained, windows, [lowest, top], seed=seed)
         low, high = table["x0_error"]
     return {"x0_error_ratio": float(low / high), "seed_spread_cm": seed_spread(generator, windows, seed=seed)}
+
+
+def estimate_variances(estimates) -> tuple[float, float]:
+    """Split the variance of clean estimates on a walk: over noise at one level, and over levels.
+
+    With estimates x_ls at level l, from seed s, all under one condition, the total variance is
+
+        Var x_ls = mean_l Var_s x_ls  +  Var_l mean_s x_ls.
+
+    The first part is 0 for a network that ignores its noisy input, the second for one that ignores
+    the level it is told. The second is 0 for an exact denoiser, too: its mean over seeds is
+    E[x0 | condition] at every level.
+
+    Args:
+      estimates: [L, S, ..., D], levels, at least 2 seeds, then what is averaged (such as frames and
+        joints) and the coordinates, which are summed.
+
+    Returns:
+      (over noise, over levels), in squared units of the estimates, both unbiased in the seeds.
+
+    Source: ours; the law of total variance.
+    """
+    estimates = np.asarray(estimates, np.float64)
+    num_seeds = estimates.shape[1]
+    over_noise = estimates.var(axis=1, ddof=1)
+    # What a seed does on top of its own mean. The mean over seeds has an error, whose square is taken off again.
+    moved = estimates - estimates.mean(axis=0)
+    over_levels = moved.mean(axis=1) ** 2 - moved.var(axis=1, ddof=1) / num_seeds
+    return tuple(float(part.sum(axis=-1).mean()) for part in (over_noise, over_levels))
+
+
+def input_use(
+    trained: TrainedModel, condition, *, num_levels: int = 8, num_seeds: int = 10, seed: int = 0
+) -> pd.DataFrame:
+    """Measure how far a model's clean estimates move with its noisy input, and with the noise level.
+
+    Args:
+      trained: the model, walked by its own sampler.
+      condition: B of them, in network units (`held_out_condition`).
+      num_levels: levels of the walk, or as many as the model was told, if they are fewer.
+      num_seeds: walks under each condition, at least 2.
+      seed: of the noise.
+
+    Returns:
+      Rows metric "use_of_x" and "use_of_sigma": value, low, high (cm of joints relative to the root;
+      roots of `estimate_variances`, root mean square over conditions with its 95 % interval), repeats.
+    """
+    network = trained.network()
+    context = jax.jit(network.encode)(condition)
+    denoise = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, context))
+
+    @jax.jit
+    def relative_joints(x0_hat):
+        positions = frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
+        return positions - positions[..., :1, :]
+
+    sigmas = trained.diffusion.grid(min(num_levels, len(getattr(trained.config, "noise_levels", ())) or num_levels))
+    shape = (len(condition.style), trained.config.window, trained.config.channels)
+    estimates = []
+    for key in jax.random.split(jax.random.key(seed), num_seeds):
+        key_init, key_steps = jax.random.split(key)
+        x_init = float(sigmas[0]) * jax.random.normal(key_init, shape)
+        visited = list(walk(trained.diffusion.sampler, denoise, x_init, sigmas, key=key_steps))[:-1]
+        estimates.append([np.asarray(relative_joints(one.x0_hat)) for one in visited])
+    by_condition = np.moveaxis(np.array(estimates), 2, 0).swapaxes(1, 2)  # [B, L, S, T, J, 3]
+    squares = np.array([estimate_variances(one) for one in by_condition])
+    return pd.DataFrame(
+        {"metric": metric, "unit": "cm", **root_mean_square(of_metric)}
+        for metric, of_metric in zip(("use_of_x", "use_of_sigma"), squares.T, strict=True)
+    )
 
 
 def window_row(trained: TrainedModel, windows: WindowSet, *, steps=(8, 1), seed: int = 0) -> pd.DataFrame:

@@ -19,7 +19,7 @@ import pandas as pd
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import WindowSet
-from f3amd_lib.diffusion.samplers import ddim_step, ddim_step_literal
+from f3amd_lib.diffusion.samplers import walk
 from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
@@ -40,8 +40,6 @@ WINDOW_METRICS = {
 """Metric of `window_figures` -> unit."""
 
 CM = 100.0
-
-_STEP = {"rescaled": ddim_step, "literal": ddim_step_literal}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +123,8 @@ def walk_conditions(
     for key in jax.random.split(jax.random.key(seed), num_seeds):
         noise = jax.random.normal(key, shape)
         for (update, number), draws in made.items():
-            x_noisy = grids[number][0] * noise
-            for sigma, sigma_next in zip(grids[number][:-1], grids[number][1:], strict=True):
-                x_noisy = _STEP[update](x_noisy, denoise(x_noisy, sigma), sigma, sigma_next)
-            draws.append(np.asarray(joints(x_noisy)))
+            *_, end = walk(UPDATES[update], denoise, grids[number][0] * noise, grids[number])
+            draws.append(np.asarray(joints(end.x_noisy)))
     return {way: np.stack(draws) for way, draws in made.items()}
 
 

@@ -25,7 +25,7 @@ import pandas as pd
 
 from f3amd_lib.experiments import literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
-from f3amd_lib.experiments.denoising import window_row, x0_error_by_sigma
+from f3amd_lib.experiments.denoising import held_out_condition, input_use, window_row, x0_error_by_sigma
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.protocol import (
@@ -360,7 +360,8 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
     Returns:
       The table `records/noise_use.csv`, a row per model and number of steps (see
       `denoising.window_row`); beside it `x0_by_sigma.csv`, the x0 error against the noise level, at
-      the levels that a model was told where it was told some.
+      the levels that a model was told where it was told some, and `input_use.csv`, how far the
+      estimates move with noisy input and noise level (see `denoising.input_use`).
     """
     record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="noise_use")
     held_out = prepared.windows(prepared.held_out_split)
@@ -377,11 +378,16 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
             "x0_by_sigma": x0_error_by_sigma(model, held_out, levels),
         }
 
-    keys = {"x0_by_sigma": ["model"], "noise_use": ["model"]}
+    keys = {"x0_by_sigma": ["model"], "noise_use": ["model"], "input_use": ["model"]}
     records = Records(_records_dir(profile), record, keys, again=asked)
-    records.measure(
-        [{"model": name, "noise": trained[name].diffusion.kind, "weights": digests[name]} for name in trained], ask
-    )
+    rows = [{"model": name, "noise": trained[name].diffusion.kind, "weights": digests[name]} for name in trained]
+    records.measure(rows, ask)
+
+    def ask_inputs(row: Mapping) -> dict:
+        model = trained[row["model"]]
+        return {"input_use": input_use(model, held_out_condition(held_out, model), seed=profile.seed)}
+
+    records.measure(rows, ask_inputs, into="input_use")
     return records.path("noise_use")
 
 

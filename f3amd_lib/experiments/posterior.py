@@ -29,10 +29,10 @@ from tqdm import tqdm
 from f3amd_lib.data.features import frame_positions, frame_yaw, num_channels
 from f3amd_lib.data.windows import WindowSet, gather_windows
 from f3amd_lib.diffusion.samplers import add_noise
-from f3amd_lib.experiments.denoising import held_out_batch
+from f3amd_lib.experiments.denoising import CM, held_out_batch, root_mean_square
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
-from f3amd_lib.measures.distributions import diversity_variance, mean_and_interval
+from f3amd_lib.measures.distributions import diversity_variance
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
@@ -48,17 +48,7 @@ POSTERIOR = {
 }
 """How much is measured, by profile; others take what `laptop` takes."""
 
-CM = 100.0
 _CHUNK = 2048
-
-
-def _root_mean_square(squares, scale: float = CM) -> dict:
-    """Return the root of a mean over windows, [W], times `scale`, with its 95 % interval."""
-    interval = mean_and_interval(squares)
-    for bound in ("value", "low", "high"):
-        # The interval of a mean of squares may reach below 0, that of its root may not.
-        interval[bound] = scale * float(np.sqrt(np.maximum(interval[bound], 0.0)))
-    return interval
 
 
 # -------------------------------------------------------------------------------- real motion
@@ -209,7 +199,7 @@ def continuation_spread(
         rows.append(
             {
                 "given": name,
-                **_root_mean_square(np.array(variances)),
+                **root_mean_square(np.array(variances)),
                 "neighbours": float(np.mean([len(near) for near, _ in neighbours])),
                 **{
                     f"{part}_apart": CM * float(np.sqrt(np.mean([a[part] for _, a in neighbours])))
@@ -289,7 +279,7 @@ def answer_spread(
             ("error", "cm", CM, error),
             ("x0 error", "network units", 1.0, x0_error),
         ):
-            interval = _root_mean_square(squares, scale)
+            interval = root_mean_square(squares, scale)
             rows.append({"quantity": quantity, "unit": unit, "sigma": sigma, **interval})
     return pd.DataFrame(rows).sort_values(["quantity", "sigma"], ignore_index=True)
 

@@ -145,6 +145,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     "training_time": ("model", "window_frames", "device", "batch_size"),
     "gradient_norm": ("sigma",),
     "x0_by_sigma": ("model", "sigma"),
+    "input_use": ("model", "metric"),
 }
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
 `x0_error`) and, where it was repeated, `low` and `high`."""

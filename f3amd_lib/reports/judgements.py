@@ -586,6 +586,17 @@ def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     return REMARK, ", ".join(texts)
 
 
+def moved_by_inputs(evidence: Evidence, model) -> Finding:
+    """Write how far a model's estimates move with its noisy input and with the noise level alone (a remark).
+
+    A model that moves with the level makes other motion with other numbers of steps, even if it ignores its input.
+    """
+    inputs = {"use_of_x": "the noisy input", "use_of_sigma": "the noise level alone"}
+    figures = {name: evidence.figure("input_use", model=model.model, metric=key) for key, name in inputs.items()}
+    parts = [f"{figure_text(value, ' cm')} with {name}" for name, value in figures.items()]
+    return REMARK, ", ".join(parts)
+
+
 def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
     """Judge, metric by metric, how much worse the last quarter of the rounds is than the first.
 
@@ -685,7 +696,7 @@ KINDS = {
         figure, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above, saving, mean_saving,
         jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
         worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
-        window_gain, steady_over_steps, change_between_steps, drift, better_graded, steady_over_noise,
+        window_gain, steady_over_steps, change_between_steps, moved_by_inputs, drift, better_graded, steady_over_noise,
         steadier_over_noise, gradient_growth,
     )
 }  # fmt: skip

@@ -1,0 +1,40 @@
+"""Every notebook runs with other seeds too: what it says must not hang on the one that was committed.
+
+Seed 0 is what nbval runs. A copy of the repository keeps the runs of these seeds apart from the reader's own.
+"""
+
+import shutil
+from pathlib import Path
+
+import papermill
+import pytest
+
+from f3amd_lib import reproduce
+from f3amd_lib.ground import profiles
+
+ROOT = Path(__file__).resolve().parents[1]
+PICTURES = shutil.ignore_patterns("*.png", "*.gif", "*.html", "__pycache__", ".ipynb_checkpoints")
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A repository with library, notebooks and stored results, and no runs."""
+    folder = tmp_path_factory.mktemp("repository")
+    for name in ("f3amd_lib", "notebooks", "paper_figures"):
+        shutil.copytree(ROOT / name, folder / name, ignore=PICTURES)
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("path", reproduce.find_notebooks(ROOT / "notebooks"), ids=lambda path: path.stem)
+def test_notebooks_run_with_any_seed(copy, path, seed, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(copy))
+    monkeypatch.setenv(profiles.RESULTS_DIR_VARIABLE, str(tmp_path / "results"))
+    # As a reader runs them, not as the other tests do.
+    monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS", raising=False)
+    papermill.execute_notebook(
+        str(copy / "notebooks" / path.name), str(tmp_path / path.name), parameters={"profile": "smoke", "seed": seed},
+        kernel_name=reproduce.KERNEL, cwd=str(copy / "notebooks"), progress_bar=False,
+    )  # fmt: skip
