@@ -4,7 +4,10 @@ Every cell tagged `exercise` or `solution` is run alone, as a reader would who j
 """
 
 import ast
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -12,8 +15,6 @@ import numpy as np
 import pytest
 from helpers.exercises import CHECKS, check, hint
 from helpers.exercises.judging import NotAnswered, agree
-
-from f3amd_lib.diffusion import samplers
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 NUMBER = re.compile(r"\d{1,2}\.[a-z]")
@@ -97,6 +98,21 @@ def test_solutions_lie_in_one_notebook_each_with_its_reason():
 # The check itself.
 
 
+def test_a_check_speaks_in_a_script_too(tmp_path):
+    script = tmp_path / "homework.py"
+    script.write_text('from helpers.exercises import check\ncheck("11.b", [4.0, 5.0])\ncheck("11.b", ...)\n')
+    ran = subprocess.run(
+        [sys.executable, str(script)], cwd=NOTEBOOKS, env=os.environ | {"PYTHONPATH": search_path()},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert ran.stdout == "11.b: right\n11.b: not yet: put your answer in the place of `...`\n"
+
+
+def search_path() -> str:
+    """Where a script finds the library and the checks: the repository, and its notebooks."""
+    return os.pathsep.join(map(str, (NOTEBOOKS.parent, NOTEBOOKS)))
+
+
 def test_a_check_prints_a_sentence_and_returns_nothing(capsys):
     assert check("11.b", [4.0, 5.0]) is None and check("11.b", 4.0) is None
     assert capsys.readouterr().out == "11.b: right\n11.b: not yet: two numbers are asked for, in centimetres\n"
@@ -132,64 +148,3 @@ def test_agreement_asks_for_shape_and_value():
     for nothing in (None, ..., (1.0, ...)):
         with pytest.raises(NotAnswered, match="returns nothing"):
             agree(nothing, 1.0)
-
-
-# Notebook 02: answers that one can easily come to, and that are wrong.
-
-
-@pytest.mark.parametrize("answer", [0.14, 0.01, 0.1**2 / 128, 0.02])
-def test_one_steps_spread_is_neither_the_datas_nor_that_of_one_mode(answer):
-    assert hint("2.a", answer)
-
-
-@pytest.mark.parametrize(
-    "step",
-    [
-        samplers.ddim_step_literal,
-        lambda x, x0_hat, sigma, sigma_next: x0_hat + sigma_next * (x - x0_hat),
-        lambda x, x0_hat, sigma, sigma_next: samplers.ddpm_step(x, x0_hat, sigma, sigma_next, 0.0),
-    ],
-    ids=["printed", "not divided by sigma", "ancestral"],
-)
-def test_another_step_is_not_ddim(step):
-    assert "sigma = 2 to 0.5" in hint("2.b", step)
-
-
-def test_hints_on_the_curvature_say_what_was_measured():
-    assert "at rho = 3 it is 0.309, and 0.232 is wanted" in hint("2.c", 2)
-    assert hint("2.c", 5) and hint("2.c", 20) is None
-
-
-def test_numbers_of_steps_are_judged_one_by_one():
-    assert hint("2.d", [2048, 114]).startswith("Euler has an error of 0.0011 after 2048")
-    assert hint("2.d", [2253, 58]).startswith("Heun")
-    assert hint("2.d", 2253) and "two numbers" in hint("2.d", [1, 2, 3])
-
-
-def test_ddims_shares_are_not_ddpms():
-    right, wrong = (0.0625, 0.4841, 0.25), (0.25, 0.4841, 0.484)
-    late = (0.9025, 0.5933, 3.61)
-    assert hint("2.e", np.array([right, late])) is None
-    assert "first row" in hint("2.e", [wrong, late])
-    assert "second row" in hint("2.e", [right, right])
-
-
-def test_the_vp_state_itself_is_not_what_a_ve_network_wants():
-    assert hint("2.f", lambda denoise: lambda z, ab: denoise(z, np.sqrt((1 - ab) / ab)))
-    assert hint("2.f", lambda denoise: lambda z, ab: denoise(z / np.sqrt(ab), np.sqrt(1 - ab)))
-
-
-def test_appendix_f_defines_a_root_that_its_update_does_not_use():
-    """alpha_t = sqrt(alpha_bar_t / alpha_bar_(t-1)) stands in DDPM's mean, not in DDIM's step."""
-    levels = np.array([1e-4, 0.2, 0.8, 0.99, 1.0])
-    for alpha_bar, alpha_bar_next in zip(levels, levels[1:], strict=False):
-        alpha_t = np.sqrt(alpha_bar / alpha_bar_next)
-        noise_left = (1 - alpha_bar_next) / (1 - alpha_bar)
-        on_z = samplers.ddpm_posterior(alpha_bar, alpha_bar_next)[1]
-        np.testing.assert_allclose(on_z, alpha_t * noise_left, rtol=1e-12)
-        # The DDIM step is told by both alpha_bars alone.
-        ddim = samplers.ddim_step_vp(1.0, 0.0, alpha_bar, alpha_bar_next)
-        np.testing.assert_allclose(ddim, np.sqrt(noise_left), rtol=1e-12)
-    right = lambda root, ab, ab_next: (root * (1 - ab_next) / (1 - ab), np.sqrt((1 - ab_next) / (1 - ab)))
-    assert hint("2.g", right) is None
-    assert "DDPM" in hint("2.g", lambda *given: right(*given)[::-1])

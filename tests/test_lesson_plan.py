@@ -4,6 +4,7 @@ import ast
 import re
 from pathlib import Path
 
+import nbformat
 import pytest
 from helpers.exercises import CHECKS, hint
 
@@ -68,3 +69,60 @@ def test_expected_answers_that_are_numbers_are_right(number):
 
 def test_many_answers_are_numbers_that_are_checked():
     assert len(NUMERIC) >= 10
+
+
+# Reading times: what a notebook's head says is what the plan's rule gives.
+
+
+def minutes_by_rule(notebook) -> float:
+    """180 words or 30 lines of code a minute, and 45 seconds for a displayed equation or a picture."""
+    prose = " ".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    shown = prose.count("$$") // 2
+    shown += sum("image/png" in output.get("data", {}) for cell in code for output in cell.outputs)
+    words = len(re.findall(r"\w+", re.sub(r"\$\$.*?\$\$|\$[^$]*\$", " x ", prose, flags=re.S)))
+    lines = sum(bool(line.strip()) for cell in code for line in cell.source.splitlines())
+    return words / 180 + lines / 30 + 0.75 * shown
+
+
+def stated_minutes(notebook) -> tuple[int, int]:
+    """Minutes to read, and for the exercises, as the first cell says."""
+    found = re.search(
+        r"about (\d+) minutes to read(?: as a whole)?(?:, and (\d+) for the exercises)?;", notebook.cells[0].source
+    )
+    return int(found[1]), int(found[2] or 0)
+
+
+THEORY = [*(f"{name}.ipynb" for name in (
+    "02_sampler_theory", "10_printed_update", "11_one_step", "12_spectral_and_film", "13_exercise_solutions",
+    "standalone/sampler_theory_standalone",
+))]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", THEORY)
+def test_a_notebook_says_honestly_how_long_it_takes(name):
+    notebook = nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4)
+    reading, exercises = stated_minutes(notebook)
+    assert reading == pytest.approx(minutes_by_rule(notebook), rel=0.2)
+    count = sum("exercise" in cell.metadata.get("tags", []) for cell in notebook.cells)
+    assert 3 * count <= exercises <= 5 * count
+
+
+def test_the_plan_takes_as_long_over_a_notebook_as_its_head_says():
+    planned = {}
+    for cells in [cells for session in SESSIONS for cells in rows(session)]:
+        name = Path(re.search(r"\((.*)\)", cells[2])[1]).name
+        planned[name] = planned.get(name, 0) + int(cells[0])
+    for name, minutes in planned.items():
+        total = sum(stated_minutes(nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4)))
+        taught_whole = name.startswith("02")
+        assert (0.9 * total if taught_whole else 0) <= minutes <= 1.1 * total, name
+
+
+def test_answers_are_folded_away_and_the_plan_is_linked():
+    unfolded = re.sub(r"<details>.*?</details>", "", TEXT, flags=re.S)
+    assert TEXT.count("<details>") == TEXT.count("Board question") + 1
+    assert not any(f"| {answer} |" in unfolded for answer in ANSWERS.values())
+    root = PLAN.parents[1]
+    assert "docs/lesson_plan.md" in (root / "README.md").read_text(encoding="utf-8")
+    assert "lesson_plan" in (root / "docs/index.md").read_text(encoding="utf-8")

@@ -146,6 +146,38 @@ def test_notebooks_are_numbered_without_gaps():
     assert [path.name[:2] for path in NOTEBOOKS] == [f"{i:02d}" for i in range(len(NOTEBOOKS))]
 
 
+def written_names(path: Path) -> list[re.Pattern]:
+    """Names of results that a notebook writes, "12_svd"; a part in braces may be anything."""
+    code = "\n".join(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
+    names = re.findall(rf"[\"'/]({path.name[:2]}_[\w{{}}:]+)", code)
+    return [re.compile(re.sub(r"\{[^}]*\}", r"\\w+", name)) for name in names]
+
+
+def orphans(results, notebooks) -> list[str]:
+    """Numbered figures, tables and pictures that no notebook of their number writes."""
+    written = {path.name[:2]: written_names(path) for path in notebooks}
+    numbered = [path for path in results if re.match(r"\d\d_", path.name)]
+    return [
+        path.as_posix()
+        for path in numbered
+        if not any(name.fullmatch(path.name.split(".")[0]) for name in written.get(path.name[:2], []))
+    ]
+
+
+def test_every_committed_result_is_one_that_a_notebook_writes():
+    results = [path for path in tracked_files() if "paper_figures" in path.parts]
+    assert orphans(results, NOTEBOOKS) == []
+
+
+def test_a_result_that_nothing_writes_is_found(tmp_path):
+    source = 'keep_figure(figure, results, "03_one")\nwrite_table(results / f"03_table_{number:02d}.csv")'
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    nbformat.write(notebook, tmp_path / "03_words.ipynb")
+    names = ("03_one.png", "03_table_07.csv", "03_two.png", "03_one_more.json", "04_one.png", "records.csv")
+    found = orphans(map(Path, names), [tmp_path / "03_words.ipynb"])
+    assert found == ["03_two.png", "03_one_more.json", "04_one.png"]
+
+
 def test_no_committed_figure_is_cut_off():
     figures = [path for path in tracked_files() if path.suffix == ".png" and "figures" in path.parts]
     assert figures

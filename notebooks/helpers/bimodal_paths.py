@@ -17,7 +17,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,8 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import cosine_basis
+from f3amd_lib.training.optimise import TrainingState, advance, initial_state
+from f3amd_lib.training.recipe import TrainingConfig, make_optimiser
 from flax import nnx
 
 UNKNOWN, LEFT, RIGHT = range(3)
@@ -223,8 +225,8 @@ def train_networks(
     """Train small F3AMDs, one a seed, on paths drawn afresh at every step, half of them with the side given.
 
     The loss is the square error of the clean estimate alone (Eq. 11), the rate a short warm-up and
-    a cosine. All seeds train side by side in one program. Networks of one seed that differ in noise
-    start from the same weights and see the same paths and conditions.
+    a cosine. All seeds train side by side, in the library's own loop. Networks of one seed that
+    differ in noise start from the same weights and see the same paths and conditions.
 
     Args:
       data: the paths.
@@ -248,9 +250,14 @@ def train_networks(
     sigmas = [diffusion.draw(jax.random.split(key_sigma, 3)[0], (num_steps * batch_size,)) for _, key_sigma, _ in keys]
     sigmas = jnp.stack(sigmas).reshape(-1, *shape)
     batches = _draw_batches(data, sigmas, jnp.stack([key_batches for _, _, key_batches in keys]))
-    average, losses = _train(PathNetwork(params, data, graph), learning_rate, batches)
-    of_seed = lambda number: jax.tree.map(lambda leaf: leaf[number], average)
-    return [PathNetwork(of_seed(number), data, graph) for number in range(len(keys))], np.asarray(losses)
+    recipe = TrainingConfig(
+        num_steps, batch_size, learning_rate, schedule="warmup_cosine", warmup_steps=max(1, num_steps // 10),
+        ema_decay=0.99, gradient_clip=1.0, diffusion=diffusion,
+    )  # fmt: skip
+    task = PathTask(PathNetwork(params, data, graph), batches, recipe)
+    state, terms = advance(task, initial_state(task), num_steps)
+    of_seed = lambda number: jax.tree.map(lambda leaf: leaf[number], state.averaged)
+    return [PathNetwork(of_seed(number), data, graph) for number in range(len(keys))], np.asarray(terms["by_seed"]).T
 
 
 @functools.partial(jax.jit, static_argnames="data")
@@ -266,32 +273,50 @@ def _draw_batches(data: BimodalPaths, sigmas, key):
     return by_step(x0), by_step(x_noisy), sigmas, by_step(side)
 
 
-@functools.partial(jax.jit, static_argnames="learning_rate")
-def _train(network: PathNetwork, learning_rate: float, batches):
-    """Train all seeds side by side; return their averaged weights and losses, [S, ...]."""
-    num_steps = batches[0].shape[1]
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, learning_rate, max(1, num_steps // 10), num_steps, 0.01 * learning_rate
-    )
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("networks", "batches"), meta_fields=("config",))
+@dataclass(frozen=True, eq=False)
+class PathTask:
+    """Networks to train side by side, one a seed (a `training.optimise.Task`).
 
-    def loss_of(params, x0, *inputs):
-        x0_hat = dataclasses.replace(network, params=params).denoise(*inputs)
-        return jnp.mean((x0_hat - x0) ** 2)
+    Attributes:
+      networks: the networks before the first step; each leaf of their weights is [S, ...].
+      batches: what each sees at every step, from `_draw_batches`, [S, num_steps, B, ...].
+      config: the recipe; its seed decides nothing here, since weights and batches come with the task.
+    """
 
-    def step(state, batch):
-        params, average, moments = state
-        loss, gradient = jax.value_and_grad(loss_of)(params, *batch)
-        updates, moments = optimiser.update(gradient, moments, params)
-        params = optax.apply_updates(params, updates)
-        average = optax.incremental_update(params, average, 0.01)
-        return (params, average, moments), loss
+    name: ClassVar[str] = "paths past a wall"
 
-    def train(params, batches):
-        (_, average, _), losses = jax.lax.scan(step, (params, params, optimiser.init(params)), batches)
-        return average, losses
+    networks: PathNetwork
+    batches: tuple[jax.Array, ...]
+    config: TrainingConfig
 
-    return jax.vmap(train)(network.params, batches)
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """The recipe's, for each seed on its own: one seed's large gradient clips no other's."""
+        one = make_optimiser(self.config)
+        return optax.GradientTransformation(jax.vmap(one.init), jax.vmap(one.update))
+
+    def identity(self) -> dict:
+        """Return the recipe; no state of this toy is kept in a file."""
+        return {"training": self.config.to_dict()}
+
+    def init(self, key):
+        """Return the weights that the task came with; these networks keep no statistics."""
+        return self.networks.params, None
+
+    def draw(self, state: TrainingState, key):
+        """Return the batch of this step, [S, B, ...] each."""
+        return jax.tree.map(lambda array: array[:, state.step], self.batches), key
+
+    def loss(self, params, statistics, batch, key):
+        """Return the sum over seeds of Eq. 11, so that each seed gets the gradient of its own."""
+
+        def of_one(params, x0, *inputs):
+            x0_hat = dataclasses.replace(self.networks, params=params).denoise(*inputs)
+            return jnp.mean((x0_hat - x0) ** 2)
+
+        by_seed = jax.vmap(of_one)(params, *batch)
+        return by_seed.sum(), ({"loss": by_seed.sum(), "by_seed": by_seed}, statistics)
 
 
 @jax.jit

@@ -8,6 +8,9 @@ import numpy as np
 from f3amd_lib.diffusion import samplers
 from scipy.stats import norm
 
+FLOAT32 = {"rtol": 1e-4, "atol": 1e-4}
+"""Tolerance for what a reader's function computes: JAX works in float32, and is right to."""
+
 
 class NotAnswered(ValueError):
     """There is no answer to judge yet; the message is the hint."""
@@ -30,6 +33,35 @@ def numbers(answer) -> np.ndarray:
     if is_missing(answer):
         raise NotAnswered("your function returns nothing yet")
     return np.asarray(answer, dtype=np.float64)
+
+
+def read(answer, shape: tuple[int, ...], asked: str) -> np.ndarray:
+    """Return an answer that is made of numbers, as float64 of the shape asked for.
+
+    A single number may come alone, from NumPy or JAX, or in an array of one.
+
+    Args:
+      answer: the reader's.
+      shape: of what is asked for, () for a single number.
+      asked: what is asked for, as a hint.
+
+    Raises:
+      NotAnswered: for another shape, for what is no number, or for numbers that are not finite.
+    """
+    try:
+        found = np.asarray(answer, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise NotAnswered(asked) from None
+    if shape == () and found.size == 1:
+        found = found.reshape(())
+    if found.shape != shape or not np.isfinite(found).all():
+        raise NotAnswered(asked)
+    return found
+
+
+def too(found, expected) -> str:
+    """Say on which side of the right number a wrong one lies."""
+    return "too large" if found > expected else "too small"
 
 
 def agree(answer, expected, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
