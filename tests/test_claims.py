@@ -214,6 +214,17 @@ def x0_errors(fno, ve, vp):
     }
 
 
+def recipe_errors(*errors):
+    """Joint errors with the scaled loss at 8 steps and at 1; without it they are 1 cm."""
+    return {
+        "recipes": [
+            {"recipe": recipe, "steps": steps, "joint_error_cm": error if recipe != "paper" else 1.0}
+            for recipe in ("paper", "low-noise-weighting")
+            for steps, error in zip((8, 1), errors, strict=True)
+        ]
+    }
+
+
 def gradient(values):
     return {
         "gradient_norm": [
@@ -425,6 +436,15 @@ CASES = {
             quality("CAMDM published", trajectory_error=0.01, direction_error=1.0, IRD=1.0),
         ),
     ),
+    "E18": (
+        {"training_time": training((T64, 32, 1.0), (FNO, 32, 1.0), (CAMDM, 32, 2.3), (T64, 64, 1.6), (FNO, 64, 1.0))},
+        {"training_time": training((T64, 32, 2.0), (FNO, 32, 1.0), (CAMDM, 32, 2.3), (T64, 64, 1.0), (FNO, 64, 1.0))},
+    ),
+    "Q19": (
+        {"quality": quality(CAMDM) + quality("CAMDM published", steps=4, window=45, harm=1.01)},
+        {"quality": quality(CAMDM) + quality("CAMDM published", steps=4, window=45, harm=2.0)},
+    ),
+    "T6": (recipe_errors(1.0, 1.1), recipe_errors(0.5, 0.6)),
     "Q18": (graded((1, 2, 3), (1, 3, 2)), graded((3, 1, 2), (1, 2, 3))),
     "T4": (
         x0_errors((1, 1, 1, 1.2, 1.5), (1, 1, 1, 1.2, 1.5), (0.1, 0.5, 1, 2, 3)),

@@ -11,8 +11,9 @@ decide a statement:
   cannot be told apart.
 - **Alike.** A range around 1.
 
-The thresholds, here and in `claims.toml`, were chosen before our numbers were known, and are the
-same for all claims and for the paper's own tables.
+The thresholds, here and in `claims.toml`, are the same for all claims and for the paper's own tables.
+Those of the first ledger have not changed since; it was written when a first quality table of ours
+was known, and nothing else.
 """
 
 from __future__ import annotations
