@@ -97,7 +97,7 @@ def shipped_digests():
 
 
 STALE = {"corruptions", "settling", "precision"}
-"""Committed records of earlier weights or another classifier, not measured again yet; each is marked where it is read."""
+"""Committed records of earlier weights or another classifier; each is marked where it is read."""
 
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.stem)
