@@ -36,18 +36,20 @@ class Data:
       data: synthetic, bandai, 100style or folder.
       profile: smoke, laptop or gpu.
       source: folder or archive, for data sets that need one.
+      window: future frames, 32 or 64.
     """
 
     data: str = "synthetic"
     profile: str = "laptop"
     source: str | None = None
+    window: int | None = None
 
     def open(self, **overrides):
         """Return the data set, prepared, and the profile with those values replaced that are given."""
         from f3amd_lib.ground.profiles import load_profile
         from f3amd_lib.training.pipeline import prepare
 
-        given = {name: value for name, value in overrides.items() if value is not None}
+        given = {name: value for name, value in (overrides | {"window": self.window}).items() if value is not None}
         profile = load_profile(self.profile, self.data, **given)
         return prepare(profile, path=self.source), profile
 
@@ -134,7 +136,6 @@ def train(
     minutes: float | None = None,
     steps: int | None = None,
     batch_size: int | None = None,
-    window: int | None = None,
     seed: int | None = None,
     out: Path | None = None,
     all_devices: bool = False,
@@ -150,7 +151,6 @@ def train(
       minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
       steps: optimiser steps; by default the profile's.
       batch_size: windows a step.
-      window: future frames, 32 or 64.
       seed: of weights, batches and noise.
       out: folder for the model instead of runs/DATA/PROFILE/models.
       all_devices: share each batch among the devices JAX sees.
@@ -169,7 +169,7 @@ def train(
         raise ValueError("--cluster finds the processes itself: leave the three others out")
     if cluster or named:
         parallel.join_processes(*together)
-    prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed, window=window)
+    prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
     runs = train_family(
         prepared,
         profile,
@@ -401,15 +401,19 @@ def bench(
         log.info("training     %s", measurements.measure_training_time(prepared, profile))
 
 
-def measure(names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = ()) -> None:
+def measure(
+    names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = (), published: Path | None = None
+) -> None:
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
       names: learning, quality, walking and so on; all if none.
       model: this preset; repeatable.
+      published: CAMDM's published weights as safetensors, one more row of quality.
     """
     from f3amd_lib.experiments.measure import MEASUREMENTS
     from f3amd_lib.ground.names import nearest_hint
+    from f3amd_lib.ground.profiles import load_profile
     from f3amd_lib.networks import presets
 
     for name in names:
@@ -417,8 +421,12 @@ def measure(names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Rep
             raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
     models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
+    other_window = profile.window != load_profile(profile.name, profile.dataset).window
+    if (other_window or published) and set(names) != {"quality"}:
+        raise ValueError("--window and --published are for quality alone: measure it by name")
+    extra = {"published": published} if published else {}
     for name in names or MEASUREMENTS:
-        log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models))
+        log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **extra))
 
 
 def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> int:

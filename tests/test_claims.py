@@ -255,6 +255,17 @@ def x0_errors(fno, ve, vp):
     }
 
 
+def recipe_errors(*errors):
+    """Joint errors with the scaled loss at 8 steps and at 1; without it they are 1 cm."""
+    return {
+        "recipes": [
+            {"recipe": recipe, "steps": steps, "joint_error_cm": error if recipe != "paper" else 1.0}
+            for recipe in ("paper", "low-noise-weighting")
+            for steps, error in zip((8, 1), errors, strict=True)
+        ]
+    }
+
+
 def gradient(values):
     return {
         "gradient_norm": [
@@ -472,6 +483,15 @@ CASES = {
             quality("CAMDM published", trajectory_error=0.01, direction_error=1.0, IRD=1.0),
         ),
     ),
+    "E18": (
+        {"training_time": training((T64, 32, 1.0), (FNO, 32, 1.0), (CAMDM, 32, 2.3), (T64, 64, 1.6), (FNO, 64, 1.0))},
+        {"training_time": training((T64, 32, 2.0), (FNO, 32, 1.0), (CAMDM, 32, 2.3), (T64, 64, 0.9), (FNO, 64, 1.0))},
+    ),
+    "Q19": (
+        {"quality": quality(CAMDM) + quality("CAMDM published", steps=4, window=45, harm=1.01)},
+        {"quality": quality(CAMDM) + quality("CAMDM published", steps=4, window=45, harm=2.0)},
+    ),
+    "T6": (recipe_errors(1.0, 1.1), recipe_errors(0.5, 0.6)),
     "Q18": (graded((1, 2, 3), (1, 3, 2)), graded((3, 1, 2), (1, 2, 3))),
     "T4": (
         x0_errors(exact, exact, lambda sigma: 1.5 * exact(sigma) if sigma < 5 else exact(sigma)),
@@ -949,8 +969,8 @@ def test_unknown_names_and_smoke_runs_are_refused(tmp_path):
         claims.judge_claims(tmp_path, profile="smoke")
     with pytest.raises(ValueError, match="unknown data set 'bandi'; did you mean 'bandai'"):
         claims.judge_claims(tmp_path, dataset="bandi")
-    with pytest.raises(ValueError, match="f3amd/claims.toml: unknown claim 'E18'"):
-        claims.find_claim("E18")
+    with pytest.raises(ValueError, match="f3amd/claims.toml: unknown claim 'E99'"):
+        claims.find_claim("E99")
 
 
 # ------------------------------------------------------------------------------ the file of claims
@@ -1151,8 +1171,8 @@ def test_the_committed_page_is_up_to_date(committed):
 
 def test_the_ledger_has_all_claims(committed):
     frame = claims.ledger(committed)
-    ids = [f"E{i}" for i in range(1, 18)] + [f"Q{i}" for i in range(1, 19)]
-    assert frame["id"].tolist() == [*ids, *(f"T{i}" for i in range(1, 6))]
+    ids = [f"E{i}" for i in range(1, 19)] + [f"Q{i}" for i in range(1, 20)]
+    assert frame["id"].tolist() == [*ids, *(f"T{i}" for i in range(1, 7))]
     assert set(frame["verdict"]) | set(frame["paper_verdict"]) <= set(VERDICTS)
     assert (frame[["claim", "where", "decided_by", "ours"]] != "").all(axis=None)
     measured = frame[frame["verdict"] != UNMEASURED]

@@ -1,11 +1,22 @@
 """Committed tables that notebooks draw from are checked, and say where they come from."""
 
 import pandas as pd
+import pytest
 from builders import refused
 
 from f3amd_lib.ground import stored
-from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.ground.profiles import load_profile, repository_root
+from f3amd_lib.ground.records import (
+    ON_WEIGHTS,
+    THROUGH_CLASSIFIER,
+    folder_reason,
+    read_table,
+    run_record,
+    stale_reason,
+    write_table,
+)
+from f3amd_lib.training.checkpoints import load_model, weights_digest
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 
 def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
@@ -34,3 +45,66 @@ def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_p
         assert found["value"].tolist() == [value]
         assert found.attrs["dataset"] == dataset
         assert f"data {dataset}, profile laptop" in sentence
+
+
+# -------------------------------------------------------------------------- what a record was measured with
+
+REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weights": "cc"}
+
+
+@pytest.mark.parametrize(
+    ("name", "record", "reason"),
+    [
+        ("walking", {"weights_digests": {"A": ["aa"], "real": [""]}}, ""),
+        ("walking", {"weights_digests": {"B": ["bb"]}}, ""),
+        ("walking", {"weights_digests": {"A": ["ab"]}}, "was measured with other weights of A (ab, now aa)"),
+        ("walking", {"weights_digests": {"A": ["aa", "ab"]}}, "was measured with other weights of A (aa, ab, now aa)"),
+        ("walking", {}, "does not say which weights it was measured with"),
+        ("corruptions", {"classifier_weights": "cc"}, ""),
+        ("corruptions", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
+        ("corruptions", {}, "was seen through another style classifier (None, now cc)"),
+        ("training_time", {}, ""),
+    ],
+)
+def test_a_record_of_other_weights_or_another_classifier_is_stale(name, record, reason):
+    assert stale_reason(name, record, REFERENCE) == reason
+    assert stale_reason(name, record, {}) == ""
+
+
+def test_a_stale_table_is_marked_for_notebooks(tmp_path, monkeypatch):
+    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
+    folder = tmp_path / "paper_figures/bandai/laptop/records"
+    record = run_record(profile="laptop", dataset="bandai", seed=0)
+    write_table(folder / "quality.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": ["aa"]}})
+    for digest, stale in (("aa", False), ("ab", True)):
+        write_table(
+            folder / "walking.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": [digest]}}
+        )
+        assert stored.measured_table("bandai", "walking", "walking")[1].startswith("**Stale: ") is stale
+
+
+COMMITTED = [
+    path
+    for path in sorted((repository_root() / "paper_figures").glob("*/*/records/*.csv"))
+    if path.stem in ON_WEIGHTS | THROUGH_CLASSIFIER
+]
+
+
+@pytest.fixture(scope="module")
+def shipped_digests():
+    weights = sorted(PRETRAINED_DIR.glob("*/*.safetensors"))
+    return {(path.parent.name, path.stem): weights_digest(load_model(path).params) for path in weights}
+
+
+STALE = {"corruptions", "settling", "precision"}
+"""Committed records of earlier weights or another classifier; each is marked where it is read."""
+
+
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.stem)
+def test_committed_records_are_of_the_weights_that_ship_or_are_marked(path, shipped_digests):
+    """Of the weights that ship, and seen through the classifier of the quality table."""
+    _, record = read_table(path)
+    assert bool(folder_reason(path, record)) == (path.stem in STALE)
+    for model, digests in (record.get("weights_digests") or {}).items():
+        if (record["dataset"], model) in shipped_digests:
+            assert digests == [shipped_digests[record["dataset"], model]], model

@@ -162,15 +162,25 @@ def _iree(workload: Workload) -> Round:
 
 
 def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas") -> Round:
-    _check_outside_of_jax(workload, "PyTorch")
+    on_gpu = device_name() == "GPU" and workload.precision != "bfloat16" and runtime != "onnx" and products == "blas"
+    if not on_gpu:
+        _check_outside_of_jax(workload, "PyTorch")
     from f3amd_lib.benchmarking import torch_camdm
 
     started = time.perf_counter()
     module = torch_camdm.torch_camdm(_network(workload), products=products)
-    run = torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime)
     condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters))
-    run(condition)
-    return Round(lambda: run(condition), time.perf_counter() - started)
+    wait = lambda: None
+    if on_gpu:
+        module, condition, wait = torch_camdm.on_gpu(module, condition, tf32=workload.precision == "tf32")
+    run = torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime)
+
+    def call():
+        run(condition)
+        wait()
+
+    call()
+    return Round(call, time.perf_counter() - started)
 
 
 IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Workload], Round]]] = {
@@ -211,11 +221,11 @@ def framework_probe(framework: str, precision: str):
     """Return a framework's own matrix product to time: (function that multiplies, its operations).
 
     Args:
-      framework: "jax" or "torch", the latter in float32.
+      framework: "jax" or "torch"; the latter on a CPU in float32, on a GPU as `torch_camdm.on_gpu` set it.
       precision: of `machine.PRECISIONS`.
     """
     if framework == "jax":
         return matmul_probe(precision)
     from f3amd_lib.benchmarking.torch_camdm import torch_matmul_probe
 
-    return torch_matmul_probe()
+    return torch_matmul_probe("cuda" if device_name() == "GPU" else "cpu")

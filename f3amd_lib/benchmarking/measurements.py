@@ -182,10 +182,16 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
             "epoch_windows": windows,
             "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0,
             "peak_memory_mib": memory[name] / 2**20,
+            **_circumstances(),
         }
         for name, timing in timings.items()
     ]
-    return _write(prepared, profile, "training_time", pd.DataFrame(rows), steps=steps, chunk=chunk)
+    path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
+    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
+    # Rows of other windows and models stay.
+    table = pd.concat([kept_rows(path, record), pd.DataFrame(rows)])
+    table = table.drop_duplicates(["model", "window_frames", "device", "batch_size"], keep="last")
+    return write_table(path, table, record)
 
 
 def _write(prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, **extra) -> Path:

@@ -312,7 +312,7 @@ def torch_round(
     for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
         if given not in known:
             raise ValueError(f"unknown {what} {given!r} of PyTorch{nearest_hint(given, known)}")
-    config, sigmas = module.config, np.array(sigmas, np.float32)
+    config, device, sigmas = module.config, module.code.device, np.array(sigmas, np.float32)
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")
     scales, features = tell_levels(config, sigmas[:-1])
@@ -324,8 +324,8 @@ def torch_round(
         for name, given, wanted in (("noise", noise, shape), ("step_noise", step_noise, (len(scales), *shape))):
             if given is not None and given.shape != wanted:
                 raise ValueError(f"{name} must have shape {wanted}, got {tuple(given.shape)}")
-        draw = lambda: torch.randn(shape, generator=generator)
-        context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features))
+        draw = lambda: torch.randn(shape, generator=generator, device=device)
+        context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features).to(device))
         x_noisy = sigmas[0] * (draw() if noise is None else noise)
         for number, scale in enumerate(scales):
             sigma, sigma_next = sigmas[number : number + 2]
@@ -342,15 +342,41 @@ def torch_round(
     return run
 
 
-def torch_matmul_probe(size: int = 2048) -> tuple[Callable[[], object], int]:
+def on_gpu(module: TorchCAMDM, condition: Condition, *, tf32: bool) -> tuple[TorchCAMDM, Condition, Callable]:
+    """Move a network and a condition to the GPU.
+
+    Args:
+      module: from `torch_camdm`, with products by BLAS.
+      condition: of `torch_condition`.
+      tf32: whether matrix products may have mantissas of 10 bits, as JAX has them there.
+
+    Returns:
+      (network, condition, function that waits until all that was asked for is done).
+
+    Raises:
+      RuntimeError: where PyTorch sees no GPU.
+    """
+    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    return module.to("cuda"), Condition(*(part.to("cuda") for part in condition)), torch.cuda.synchronize
+
+
+def torch_matmul_probe(device: str = "cpu", size: int | None = None) -> tuple[Callable[[], object], int]:
     """Return a product of two square matrices to time, by BLAS: what PyTorch can do here at best.
 
     Args:
-      size: rows of a matrix.
+      device: "cpu" or "cuda".
+      size: rows of a matrix; by default what fills the device.
 
     Returns:
-      (function that multiplies, its operations 2 size^3).
+      (function that multiplies and waits, its operations 2 size^3).
     """
     torch.set_num_threads(usable_cores())
-    matrix = torch.randn(size, size, generator=torch.Generator().manual_seed(0))
-    return lambda: torch.mm(matrix, matrix), 2 * size**3
+    size = size or (2048 if device == "cpu" else 8192)
+    matrix = torch.randn(size, size, generator=torch.Generator().manual_seed(0)).to(device)
+
+    def multiply():
+        torch.mm(matrix, matrix)
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    return multiply, 2 * size**3

@@ -25,8 +25,14 @@ import pandas as pd
 
 from f3amd_lib.experiments import literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
-from f3amd_lib.experiments.denoising import held_out_condition, input_use, window_row, x0_error_by_sigma
-from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves
+from f3amd_lib.experiments.denoising import (
+    gradient_norm_by_sigma,
+    held_out_condition,
+    input_use,
+    window_row,
+    x0_error_by_sigma,
+)
+from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves, snapshot
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.protocol import (
     REFERENCE_MODELS,
@@ -44,11 +50,15 @@ from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
+from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
+from f3amd_lib.training.published import NAME as PUBLISHED
+from f3amd_lib.training.published import published_model
+from f3amd_lib.training.recipe import profile_recipe
 
 log = logging.getLogger("f3amd")
 
@@ -67,6 +77,9 @@ WALKING_SEEDS = 3
 PRECISION_SEEDS = 5
 """Seeds of path and noise in `measure_precision`."""
 
+SNAPSHOTS = 10
+"""Measurements on the way of a training in `measure_quality_by_epoch`."""
+
 _PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
 
 
@@ -80,6 +93,11 @@ def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
 
 def _names(models: Iterable[str] | None) -> list[str]:
     return [presets.find_preset(name).name for name in models or ()]
+
+
+def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
+    if models:
+        raise ValueError(f"{reason}: leave --model out")
 
 
 def _models_with_weights(profile: Profile) -> list[str]:
@@ -107,9 +125,7 @@ def _protocol(prepared: PreparedData, profile: Profile, measurement: str) -> tup
     packed = prepared.packed
     classifier, _ = obtain_classifier(packed, profile)
     protocol = Protocol(
-        tuple(_styles(prepared, profile)),
-        num_frames=profile.rollout_rounds * profile.window,
-        **_PROTOCOL.get(profile.name, {}),
+        tuple(_styles(prepared, profile)), num_frames=profile.rollout_frames, **_PROTOCOL.get(profile.name, {})
     )
     fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
     protocol = dataclasses.replace(protocol, windows_per_style=fitting)
@@ -142,10 +158,13 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     return records.path("learning")
 
 
-def measure_quality(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+def measure_quality(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, published=None
+) -> Path:
     """Run the evaluation protocol: real and broken motion, and models at 8, 4, 2 and 1 steps.
 
     See `experiments.protocol`. A row takes about a minute on 2 cores; its seconds are in the table.
+    `published` is the file of CAMDM's published weights (`training.published`), measured beside them.
 
     Returns:
       The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
@@ -155,6 +174,8 @@ def measure_quality(prepared: PreparedData, profile: Profile, models: Iterable[s
     classifier, protocol, record = _protocol(prepared, profile, "quality")
     held_out = prepared.windows(prepared.held_out_split)
     trained = _trained(prepared, profile, asked or available_models(profile))
+    if published is not None:
+        trained |= {PUBLISHED: published_model(published, packed)}
     if not trained:
         log.warning(
             "no trained model of %s at %s: only real motion is measured; name models with --model",
@@ -207,7 +228,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     """
     packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
     styles = _styles(prepared, profile)
-    num_frames = max(2, profile.rollout_rounds // 4) * profile.window
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     record = run_record(
         profile=profile, dataset=packed, seed=profile.seed, measurement="walking",
         num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles,
@@ -280,18 +301,31 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Ask the metrics themselves (see `experiments.sensitivity`), some minutes in all.
 
-    Whether FID and EMD order graded corruptions, how many windows they need before they settle, and
-    how lively feet are in each band of frequency, real and generated with the profile's steps.
+    Whether FID and EMD order graded corruptions, and how many windows they need before they settle.
 
     Returns:
-      The table `records/corruptions.csv`; beside it `settling.csv` and `foot_spectrum.csv`. All
-      three are measured anew.
+      The table `records/corruptions.csv`; beside it `settling.csv`. Both are measured anew.
+
+    Raises:
+      ValueError: if models are named.
     """
-    packed = prepared.packed
+    _refuse_models(models, "the metrics are asked about real motion")
     classifier, protocol, record = _protocol(prepared, profile, "sensitivity")
-    graded = sensitivity.graded_corruptions(packed, classifier, protocol, progress=True)
-    styles = list(protocol.styles)
-    paths = evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed)
+    graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
+    tables = {"settling": sensitivity.settling(classifier), "corruptions": sensitivity.summarise_corruptions(graded)}
+    for name, table in tables.items():
+        path = write_table(_records_dir(profile) / f"{name}.csv", table, record)
+    return path
+
+
+def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure how lively feet are in each band of frequency, real and generated with the profile's steps.
+
+    Returns:
+      The table `records/foot_spectrum.csv` (see `sensitivity.foot_spectrum`), measured anew.
+    """
+    packed, styles, seed = prepared.packed, _styles(prepared, profile), profile.seed
+    paths = evaluation_paths(packed, styles, profile.rollout_frames, seed=seed)
     clips = reference_clips(packed, styles, window=profile.window)
     feet = {
         ("real", profile.window, 0): [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
@@ -299,18 +333,15 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     trained = _trained(prepared, profile, _names(models) or available_models(profile))
     for name, model in trained.items():
         log.info("foot spectrum of %s", name)
-        rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=protocol.path_seed)
+        rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
         motions = [rollout.motion(character) for character in range(len(styles))]
         feet[name, profile.window, profile.num_steps] = list(zip(styles, motions, strict=True))
-    record["weights_digests"] = _digests(trained)
-    tables = {
-        "corruptions": sensitivity.summarise_corruptions(graded),
-        "settling": sensitivity.settling(classifier),
-        "foot_spectrum": sensitivity.foot_spectrum(feet),
-    }
-    for name, table in tables.items():
-        write_table(_records_dir(profile) / f"{name}.csv", table, record)
-    return _records_dir(profile) / "corruptions.csv"
+    record = run_record(
+        profile=profile, dataset=packed, seed=seed, measurement="foot_spectrum",
+        num_frames=profile.rollout_frames, styles=styles,
+        weights_digests={name: [digest] for name, digest in _digests(trained).items()},
+    )  # fmt: skip
+    return write_table(_records_dir(profile) / "foot_spectrum.csv", sensitivity.foot_spectrum(feet), record)
 
 
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -421,6 +452,59 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
     return records.path("noise_use")
 
 
+def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure the gradient of the loss that is not scaled against the noise level, at trained weights (claim T5).
+
+    Returns:
+      The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), measured anew.
+
+    Raises:
+      ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
+    """
+    names = _names(models) or ["F3AMD-FNO-96"]
+    if len(names) > 1:
+        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(names)}: name one with --model")
+    trained = _trained(prepared, profile, names)[names[0]]
+    task = prepared.task(trained.name, profile_recipe(profile, trained.name))
+    held_out = prepared.windows(prepared.held_out_split)
+    table = gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="gradient_norm",
+        weights_digests={trained.name: [weights_digest(trained.params)]},
+    )  # fmt: skip
+    return write_table(_records_dir(profile) / "gradient_norm.csv", table.assign(model=trained.name), record)
+
+
+def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Train anew by the profile's recipe, and measure on the way (claim E13); long.
+
+    Ten snapshots of each model, one rollout of each style at each, with the steps of the profile.
+
+    Returns:
+      The table `records/quality_by_epoch.csv`: the nine metrics of Table 3 and the held-out loss,
+      against epochs over the training windows. By default of `F3AMD-FNO-96` and `CAMDM`.
+    """
+    classifier, protocol, record = _protocol(prepared, profile, "quality_by_epoch")
+    protocol = dataclasses.replace(protocol, num_seeds=1)
+    held_out = prepared.windows(prepared.held_out_split)
+    names, asked = _names(models) or ["F3AMD-FNO-96", "CAMDM"], _names(models)
+    folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
+    keys = ["model", "snapshot"]
+    records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
+
+    def score(row: Mapping) -> dict:
+        steps = max(1, round(profile.train_steps * row["snapshot"] / SNAPSHOTS))
+        trained, epoch, loss = snapshot(prepared, profile, row["model"], steps, folder=folder)
+        generator = MotionGenerator(trained, profile.num_steps)
+        rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out)
+        rows = rows[rows["metric"].isin([metric.name for metric in SHOWN["paper"]])][["metric", "value"]]
+        rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
+        return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
+
+    records.measure([{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)], score)
+    return records.path("quality_by_epoch")
+
+
 def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Train `F3AMD-FNO-96` with one change each, for a short while (see `experiments.recipes`).
 
@@ -433,8 +517,7 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
     Raises:
       ValueError: if models are named.
     """
-    if models:
-        raise ValueError("recipes are rows of their own: leave --model out")
+    _refuse_models(models, "recipes are rows of their own")
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="recipes",
         num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size,
@@ -467,7 +550,7 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     )  # fmt: skip
 
     def compare(row: Mapping) -> dict:
-        frames = profile.rollout_rounds * profile.window
+        frames = profile.rollout_frames
         model = trained[row["model"]]
         table = compare_precisions(model, packed, styles, steps=row["steps"], num_frames=frames, seeds=seeds)
         return {"precision": table}
@@ -486,10 +569,13 @@ MEASUREMENTS: dict[str, Callable] = {
     "literal_update": measure_literal_update,
     "posterior": measure_posterior,
     "noise_use": measure_noise_use,
+    "gradient_norm": measure_gradient_norm,
     "recipes": measure_recipes,
     "quality": measure_quality,
+    "quality_by_epoch": measure_quality_by_epoch,
     "walking": measure_walking,
     "trained": measure_trained,
+    "foot_spectrum": measure_foot_spectrum,
     "sensitivity": measure_sensitivity,
 }
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""

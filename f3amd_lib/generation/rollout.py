@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.data.features import bend_path, center_window, orthonormalise, path_condition, turn_frames
+from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition, turn_frames
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.generation.blending import blend_rollout
@@ -217,7 +217,7 @@ class MotionGenerator:
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
             history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
-        shape = (batch, config.num_history, config.channels)
+        shape = (batch, config.num_history, num_channels(trained.skeleton))
         history = finite_array("history", history, shape, np.float32)
         rollout = Rollout(
             skeleton=trained.skeleton,

@@ -24,7 +24,7 @@ def load_paper_file(name: str, paper: str = "f3amd") -> dict:
     """Return a file of a paper's folder; callers must not change it.
 
     Args:
-      name: "paper", "claims" or "readings".
+      name: "paper", "claims", "commands" or "readings".
       paper: its folder, one of `paper_folders`.
 
     Raises:

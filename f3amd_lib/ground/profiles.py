@@ -46,7 +46,7 @@ class Profile:
       num_steps: network evaluations a round (paper: 8, 4, 2 or 1).
       num_styles: keep only so many styles of the data set; None keeps all.
       seconds_per_style: motion made per style, seconds; `synthetic` only.
-      rollout_rounds: rounds of the long rollout (paper: 80 rounds of 32 frames, 2,560 frames).
+      rollout_rounds: rounds of 32 frames of the long rollout (paper: 80, 2,560 frames).
       num_characters: most characters rolled out together, a style each.
       evaluation_styles: labels that are rolled out and measured; empty takes the data set's
         primary styles, up to num_characters.
@@ -69,6 +69,11 @@ class Profile:
     num_characters: int
     evaluation_styles: tuple[str, ...]
     seed: int
+
+    @property
+    def rollout_frames(self) -> int:
+        """Length of the long rollout, frames; windows of 64 make half as many rounds of it (section 4.4)."""
+        return 32 * self.rollout_rounds
 
 
 # Type of a field -> what its values are instances of, and what they are called.

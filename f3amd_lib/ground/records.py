@@ -37,6 +37,17 @@ _CIRCUMSTANCES = (
     "not_possible weights_digests table"
 ).split()
 
+ON_WEIGHTS = frozenset(
+    "quality quality_by_seed quality_by_round literal_update literal_update_by_seed literal_update_windows noise_use "
+    "x0_by_sigma posterior precision walking foot_spectrum gradient_norm".split()
+)
+"""Tables that were measured on trained models: what they say goes with the weights."""
+
+THROUGH_CLASSIFIER = frozenset(
+    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling".split()
+)
+"""Tables with FID or EMD: what they say goes with the style classifier."""
+
 
 def run_record(*, profile, dataset, seed: int, **extra) -> dict:
     """Describe a run: what was asked for, on which data, code and machine.
@@ -268,6 +279,39 @@ def _num_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def stale_reason(name: str, record: dict, reference: dict) -> str:
+    """Say why a table does not belong with the quality table of its folder.
+
+    Args:
+      name: of the table, without ending; times and short trainings have no weights to go by.
+      record: of the table.
+      reference: of the folder's `quality.csv`; where that names nothing, nothing can be said.
+
+    Returns:
+      The reason, such as "was measured with other weights of CAMDM (a1b2, now c3d4)"; "" if there is none.
+    """
+    now, there = (
+        {model: set(digests) - {""} for model, digests in (of.get("weights_digests") or {}).items()}
+        for of in (reference, record)
+    )
+    if name in ON_WEIGHTS and now and not there:
+        return "does not say which weights it was measured with"
+    for model in now.keys() & there.keys() if name in ON_WEIGHTS else ():
+        if there[model] and there[model] != now[model]:
+            earlier, later = (", ".join(sorted(of[model])) for of in (there, now))
+            return f"was measured with other weights of {model} ({earlier}, now {later})"
+    seen, by = (of.get("classifier_weights") for of in (record, reference))
+    if name in THROUGH_CLASSIFIER and by and seen != by:
+        return f"was seen through another style classifier ({seen}, now {by})"
+    return ""
+
+
+def folder_reason(path, record: dict) -> str:
+    """Return the `stale_reason` of a table beside the quality table that lies in its folder; "" without one."""
+    reference = Path(path).with_name("quality.json")
+    return stale_reason(Path(path).stem, record, _read_record(path, reference)) if reference.exists() else ""
 
 
 def set_aside_table(path) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.records import folder_reason, read_table
 
 
 def committed_table(dataset: str, name: str, *, profile: str = "laptop") -> tuple[pd.DataFrame, dict] | None:
@@ -17,13 +17,18 @@ def committed_table(dataset: str, name: str, *, profile: str = "laptop") -> tupl
       profile: whose results.
 
     Returns:
-      (table, record), or None if nothing is committed for this data set.
+      (table, record), or None if nothing is committed for this data set. `table.attrs["stale"]`
+      says why it does not belong with the quality table beside it, "" if it does.
 
     Raises:
       ValueError: if the table is not the one that its record describes.
     """
     path = repository_root() / "paper_figures" / dataset / profile / "records" / f"{name}.csv"
-    return read_table(path) if path.exists() else None
+    if not path.exists():
+        return None
+    table, record = read_table(path)
+    table.attrs["stale"] = folder_reason(path, record)
+    return table, record
 
 
 def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
@@ -49,4 +54,6 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
         f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}. "
         f"{record['dataset_credit'] or ''}"
     )
+    if table.attrs["stale"]:
+        sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
     return table, sentence.strip()

@@ -116,7 +116,8 @@ def support_changes_per_s(positions, skeleton: Skeleton, fps: float = 30.0):
       fps: frame rate of `positions`.
 
     Returns:
-      Changes per second, one a character. In records it is called foot_alternation.
+      Changes per second, one a character: a foot that skates never rests and reads 0, so that this
+      is no stepping rate. In records it keeps its first name, foot_alternation.
 
     Source: ours.
     """
@@ -233,7 +234,7 @@ def walking_checks(real: Mapping, measured: Mapping[tuple[str, int], Mapping]) -
             metric = METRICS[name]
             wanted, value = (float(np.mean(np.asarray(side[metric.key]))) for side in (real, values))
             ratio = value / wanted if wanted > 0 else float("nan")
-            row = {"label": row_label(model, steps), "measure": name.replace("_", " "), "unit": metric.unit}
+            row = {"label": row_label(model, steps), "measure": metric.heading, "unit": metric.unit}
             row |= {"real": wanted, "value": value, "ratio": ratio, "factor": factor}
             rows.append(row | {"within": bool(1.0 / factor <= ratio <= factor)})
     return pd.DataFrame(rows)

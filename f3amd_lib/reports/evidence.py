@@ -18,7 +18,7 @@ import pandas as pd
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
-from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.records import folder_reason, read_table
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 
@@ -149,9 +149,15 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     "trained": ("model", "window_frames", "metric"),
     "walking": ("model", "steps", "metric"),
     "input_use": ("model", "metric"),
+    "recipes": ("recipe", "steps"),
 }
-"""Tables that claims are judged by -> columns that name a row. Each also has `value` (the last one
-`x0_error`) and, where it was repeated, `low` and `high`."""
+"""Tables that claims are judged by -> columns that name a row. Each also has `value` (in the last two
+a column of another name) and, where it was repeated, `low` and `high`."""
+
+_LEAST_STEPS = 10_000
+"""Optimiser steps below which a comparison of recipes decides nothing."""
+
+_VALUES = {"x0_by_sigma": "x0_error", "recipes": "joint_error_cm"}
 
 NINE_METRICS = {
     row.metric: (row.unit, row.better)
@@ -286,8 +292,11 @@ class Evidence:
         raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")
 
     def quality(self, setting: Setting, metric: str) -> Figure:
-        """Return a metric of a model."""
-        return self.figure("quality", **setting.columns, metric=metric)
+        """Return a metric of a model; the published one has a window and a number of steps of its own."""
+        columns = setting.columns
+        if setting.model == PUBLISHED_CAMDM and (rows := self.rows("quality", model=setting.model))["steps"].size:
+            columns = rows.loc[rows["steps"].idxmax(), list(columns)].to_dict()
+        return self.figure("quality", **columns, metric=metric)
 
     def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
         """Return the time of a round in ms; by default in the framework of this evidence."""
@@ -352,7 +361,7 @@ def _with_interval_of_median(table: pd.DataFrame) -> pd.DataFrame:
 def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
     """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken."""
     keys = list(SCHEMAS[name])
-    table = table.rename(columns={"x0_error": "value"})
+    table = table.rename(columns={_VALUES.get(name, "value"): "value"})
     if name == "walking" and "metric" not in table:  # a row per style and seed, its figures side by side
         means = table.groupby(["model", "steps"])[[check for check in CHECKS if check in table]].mean()
         table = means.melt(var_name="metric", ignore_index=False).reset_index()
@@ -399,7 +408,8 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
       profile: "laptop" or "gpu"; a smoke run is a check and decides nothing.
 
     Returns:
-      Evidence that reads `<root>/<data set>/<profile>/records/` when it is asked.
+      Evidence that reads `<root>/<data set>/<profile>/records/` when it is asked. A table of other
+      weights, or of another classifier, than `quality.csv` beside it is not measured.
 
     Raises:
       ValueError: for an unknown data set or profile; later, for a table without a run record, one
@@ -419,6 +429,10 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         for key, here in (("dataset", dataset), ("profile", profile)):
             if record.get(key) != here:
                 raise ValueError(f"{path}: is a record of {key} {record.get(key)!r}, yet lies among those of {here!r}")
+        if reason := folder_reason(path, record):
+            raise NotMeasured(f"{name}.csv {reason}: measure it again")
+        if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
+            raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
         table = _checked(name, table, str(path))
         if "device" in table and record.get("device_platform") == "cpu":
             # PyTorch finds its own device; the record tells that of JAX.

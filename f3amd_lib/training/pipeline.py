@@ -235,22 +235,27 @@ def train(
     history = pd.DataFrame(rows)
     if int(state.step) < config.num_steps:
         return None, history
-    trained = TrainedModel(
-        name=preset,
-        config=task.model_config,
-        params=state.averaged,
-        normaliser=task.normaliser,
-        skeleton=task.skeleton,
-        styles=prepared.packed.styles,
-        diffusion=config.diffusion,
-        start_poses=starting_poses(prepared.packed, num_history=prepared.num_history),
-        record=record,
-    )
+    trained = as_trained(prepared, task, preset, state.averaged, record)
     if parallel.is_first_process():
         save_model(files.model, trained)
         trained = load_model(files.model)  # in the precision of the file
     parallel.wait_for_all("wrote the model")
     return trained, history
+
+
+def as_trained(prepared: PreparedData, task: DenoisingTask, preset: str, params, record: dict) -> TrainedModel:
+    """Return weights of a task, finished or on their way, with all that is needed to use them."""
+    return TrainedModel(
+        name=preset,
+        config=task.model_config,
+        params=params,
+        normaliser=task.normaliser,
+        skeleton=task.skeleton,
+        styles=prepared.packed.styles,
+        diffusion=task.config.diffusion,
+        start_poses=starting_poses(prepared.packed, num_history=prepared.num_history),
+        record=record,
+    )
 
 
 def _begun(files: ModelFiles, task: DenoisingTask, mesh: Mesh | None) -> tuple[TrainingState | None, list[dict]]:

@@ -1,0 +1,191 @@
+"""The weights that CAMDM's authors published, as a model of ours (claim Q17).
+
+Their release holds the network twice: as an ONNX graph, which we do not read, and as a PyTorch
+checkpoint, which is a pickle and is opened by nobody here. `docs/training.md` shows how PyTorch
+itself, told to read weights only, writes the arrays into a safetensors file; this module reads that.
+Names, shapes and conventions are those of the released code (AIGAnimation/CAMDM, network/models.py).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors.numpy import load_file
+
+from f3amd_lib.data.features import num_channels, split_frames
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import starting_poses
+from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
+from f3amd_lib.training.checkpoints import TrainedModel
+
+NAME = "CAMDM published"
+"""Of the row in tables; no preset of ours."""
+
+WINDOW, NUM_HISTORY = 45, 10
+"""Future and past frames of the release; no array tells them."""
+
+_UNUSED = re.compile(r"(.*\.)?(pe|style_feature_process\.(weight|bias))")
+"""A table of sinusoids, which is computed here, and a layer that the released forward pass never calls."""
+
+_LINEAR = {
+    "noise_first": "embed_timestep.time_embed.0",
+    "noise_second": "embed_timestep.time_embed.2",
+    "path.0": "traj_trans_process.poseEmbedding",
+    "path.1": "traj_pose_process.poseEmbedding",
+    "history": "past_motion_process.poseEmbedding",
+    "future": "future_motion_process.poseEmbedding",
+    "output": "output_process.poseFinal",
+}
+_IN_BLOCK = {"hidden": "linear1", "output": "linear2", "attention.output": "self_attn.out_proj"}
+_NORMS = {"attention_norm": "norm1", "output_norm": "norm2"}
+_BLOCK = "seqEncoder.layers.{}"
+
+
+class PublishedFeatures:
+    """Our frames as the released network has them, and back; in the place of a `Normaliser`.
+
+    A frame is six numbers a joint, the first two rows of its rotation, then the root's position and
+    three zeros: 6 (J + 1) channels, in metres, not normalised.
+    """
+
+    def normalise(self, frames):
+        """Map frames [..., 6 J + 3] to the released channels, [..., 6 (J + 1)]."""
+        root, rotations = split_frames(frames)
+        rows = matrix_from_rotation_6d(rotations)[..., :2, :].reshape(*frames.shape[:-1], -1)
+        return jnp.concatenate([rows, root, jnp.zeros_like(root)], axis=-1)
+
+    def denormalise(self, x):
+        """Map released channels back to frames, [..., 6 J + 3]; the three padding numbers are dropped."""
+        rows = x[..., :-6].reshape(*x.shape[:-1], -1, 6)
+        rotations = rotation_6d_from_matrix(jnp.swapaxes(matrix_from_rotation_6d(rows), -1, -2))
+        return jnp.concatenate([x[..., -6:-3], rotations.reshape(*x.shape[:-1], -1)], axis=-1)
+
+    def normalise_path(self, path):
+        """Map a path condition [..., 8] to displacement and the first two rows of the facing."""
+        rows = matrix_from_rotation_6d(path[..., 2:])[..., :2, :].reshape(*path.shape[:-1], 6)
+        return jnp.concatenate([path[..., :2], rows], axis=-1)
+
+
+def published_arrays(path) -> dict[str, np.ndarray]:
+    """Read the arrays of a checkpoint that was converted to safetensors or npz.
+
+    Raises:
+      ValueError: for a file of another kind, such as the pickle itself.
+    """
+    path = Path(path)
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            return dict(arrays)
+    raise ValueError(
+        f"{path}: a PyTorch checkpoint is a pickle, which may run code and is not opened here: "
+        "write its arrays to a .safetensors or .npz file first, as docs/training.md shows"
+    )
+
+
+def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CAMDM:
+    """Return the released network: 4 noise levels, window 45, 10 frames of history.
+
+    Args:
+      arrays: of its state dict, by name.
+      where: the file, for messages.
+
+    Raises:
+      ValueError: for an array that is missing, unknown or of another shape.
+    """
+    left = {name: array for name, array in arrays.items() if not _UNUSED.fullmatch(name)}
+
+    def take(name: str) -> np.ndarray:
+        if name not in left:
+            raise ValueError(f"{where}: has no array {name!r}; is it the released Transformer encoder?")
+        return np.asarray(left.pop(name), np.float32)
+
+    flat: dict[str, np.ndarray] = {"style.kernel": take("embed_style.action_embedding")}
+
+    def linear(ours: str, weight, bias) -> None:
+        flat[f"{ours}.kernel"], flat[f"{ours}.bias"] = weight.T, bias
+
+    for ours, theirs in _LINEAR.items():
+        linear(ours, take(f"{theirs}.weight"), take(f"{theirs}.bias"))
+    depth = 0
+    while any(name.startswith(f"{_BLOCK.format(depth)}.") for name in left):
+        mine, theirs = f"blocks.{depth}", _BLOCK.format(depth)
+        for ours, name in _IN_BLOCK.items():
+            linear(f"{mine}.{ours}", take(f"{theirs}.{name}.weight"), take(f"{theirs}.{name}.bias"))
+        # Query, key and value lie in one array, one below the other.
+        packed = (np.split(take(f"{theirs}.self_attn.in_proj_{part}"), 3) for part in ("weight", "bias"))
+        for role, weight, bias in zip(("query", "key", "value"), *packed, strict=True):
+            linear(f"{mine}.attention.{role}", weight, bias)
+        for ours, name in _NORMS.items():
+            flat[f"{mine}.{ours}.scale"], flat[f"{mine}.{ours}.bias"] = (
+                take(f"{theirs}.{name}.{part}") for part in ("weight", "bias")
+            )
+        depth += 1
+    if not depth:
+        take(f"{_BLOCK.format(0)}.linear1.weight")
+    if left:
+        raise ValueError(f"{where}: has an array {min(left)!r} that the released network has not")
+    num_styles, width = flat["style.kernel"].shape
+    released = presets.find_preset("CAMDM-K4")
+    config = CAMDMConfig.from_dict(
+        {
+            **released.network,
+            **presets.find_preset("CAMDM-code").network,
+            "noise_levels": released.network["noise_levels"],
+            "channels": flat["history.kernel"].shape[0],
+            "num_styles": num_styles,
+            "latent_width": width,
+            "depth": depth,
+            "feed_forward_factor": flat["blocks.0.hidden.kernel"].shape[1] // width,
+            "window": WINDOW,
+            "num_history": NUM_HISTORY,
+        }
+    )
+    network = presets.build_from_config(config, jax.random.key(0))
+    for keys, leaf in nnx.to_flat_state(nnx.state(network)):
+        name = ".".join(map(str, keys))
+        if flat[name].shape != leaf.shape:
+            raise ValueError(f"{where}: {name} must have the shape {leaf.shape}, got {flat[name].shape}")
+        leaf[...] = jnp.asarray(flat[name])
+    return network
+
+
+def published_model(path, packed: PackedMotion) -> TrainedModel:
+    """Return the published network, ready to walk where a data set walks.
+
+    Args:
+      path: of the converted arrays.
+      packed: 100STYLE on the skeleton of the release, all its styles.
+
+    Raises:
+      ValueError: for another skeleton or other styles, or as `published_network`.
+    """
+    network = published_network(published_arrays(path), str(path))
+    config, joints = network.config, packed.skeleton.num_joints
+    if config.channels != num_channels(packed.skeleton) + 3 or config.num_styles != len(packed.styles):
+        raise ValueError(
+            f"{path}: moves {config.channels // 6 - 1} joints in {config.num_styles} styles, and the data set has "
+            f"{joints} joints and {len(packed.styles)} styles: it takes 100STYLE retargeted as the release does"
+        )
+    if list(packed.styles) != sorted(packed.styles):
+        raise ValueError(f"{path}: numbers the styles in the order of their sorted names; the data set does not")
+    return TrainedModel(
+        name=NAME,
+        config=config,
+        params=nnx.state(network),
+        normaliser=PublishedFeatures(),
+        skeleton=packed.skeleton,
+        styles=packed.styles,
+        diffusion=presets.find_preset("CAMDM-K4").diffusion,
+        start_poses=starting_poses(packed, num_history=NUM_HISTORY),
+        record={"dataset": packed.dataset, "dataset_licence": packed.licence, "dataset_credit": packed.credit},
+    )
