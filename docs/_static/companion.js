@@ -33,6 +33,8 @@ addEventListener("DOMContentLoaded", () => {
       const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
       const texts = [];
       while (walker.nextNode()) texts.push(walker.currentNode);
+      // An interval stays whole, unless there are so many columns that it would push the last ones out.
+      if (names.length < 10) for (const text of texts) text.data = text.data.replaceAll("± ", "±\u00a0");
       for (const text of texts.filter((node) => /[_/]\w/.test(node.data) && !node.parentElement.closest(".math"))) {
         const pieces = text.data.split(/(?<=[_/])(?=\w)/).flatMap((piece) => [piece, document.createElement("wbr")]);
         text.replaceWith(...pieces.slice(0, -1));
