@@ -404,7 +404,7 @@ def write_gif(
         raise ValueError(f"motions of one picture need one frame rate, got {sorted(rates)}")
     fps = rates.pop()
     if fps / every > 30.0 + 1e-6:
-        raise ValueError(f"{fps / every:g} frames a second are too many: raise every to {np.ceil(fps / 30.0):.0f}")
+        raise ValueError(f"{fps / every:g} frames a second are too many here: raise every to {np.ceil(fps / 30.0):.0f}")
     last = max(motion.num_frames for motion in motions)
     if max_seconds is not None:
         last = min(last, max(1, round(max_seconds * fps)))
