@@ -1,14 +1,16 @@
 """Where the camera puts things, what covers what, and that colours tell rows apart."""
 
+import hashlib
+
 import numpy as np
 from builders import straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 from matplotlib.colors import same_color
 
 from f3amd_lib.drawing.diagrams import arrow, boxes, influence_maps
-from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure, poses_beside
+from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, body_lines, drawn_points
-from f3amd_lib.drawing.style import model_style, new_figure
+from f3amd_lib.drawing.style import keep_figure, model_style, new_figure
 from f3amd_lib.measures.corruptions import CORRUPTIONS
 from f3amd_lib.motion.synthetic import synthesize
 
@@ -48,7 +50,8 @@ def test_poses_stand_in_a_row_and_a_panel_may_stay_empty():
     assert [len(bodies(axis)) for axis in figure.axes] == [3, 0, 3, 0]
     # The hips of the stiff figure stand where the poses stand.
     middles = [np.concatenate(body.get_segments())[:, 0].mean() for body in bodies(figure.axes[2])]
-    np.testing.assert_allclose(np.diff(middles), 0.95, atol=1e-6)
+    np.testing.assert_allclose(np.diff(middles), SLOT, atol=1e-6)
+    assert [text.get_text() for text in figure.axes[0].texts] == ["0.0 s", "0.2 s", "0.3 s"]
 
 
 def test_broken_motion_has_colours_that_no_network_has():
@@ -84,6 +87,40 @@ def test_near_bodies_cover_far_ones_and_are_drawn_larger():
         assert (np.array(outline.get_linewidths()) > np.array(fill.get_linewidths())).all()
 
 
+def test_a_crowd_is_shown_whole():
+    # The farthest and the nearest stand alone at the edges: neither heads nor feet are cut off.
+    places = [(0.0, -9.0), (0.0, 9.0), (-9.0, 0.0), (9.0, 0.0), (1.0, 1.0)]
+    figure = crowd_figure({"": ([standing_at(*place, seed=k) for k, place in enumerate(places)], ["#542788"] * 5)}, 10)
+    (left, right), (low, high) = figure.axes[0].get_xlim(), figure.axes[0].get_ylim()
+    drawn = np.concatenate([np.concatenate(body.get_segments()) for body in bodies(figure.axes[0])])
+    assert left < drawn[:, 0].min() and drawn[:, 0].max() < right
+    assert low < drawn[:, 1].min() and drawn[:, 1].max() < high
+    assert drawn[:, 0].max() - drawn[:, 0].min() > 0.8 * (right - left)  # and no room is wasted
+
+
+def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_slide():
+    walk = synthesize("Neutral", seconds=3.0)
+    glide = walk.root_position.copy()
+    glide[:, [0, 2]] += np.outer(np.arange(len(glide)) / 30.0, [0.0, 0.5])  # half a metre a second
+    length = {}
+    for name, motion in (("stands", walk), ("slides", walk.replace(root_position=glide))):
+        axis = crowd_figure({"": ([motion], ["#542788"])}, 60).axes[0]
+        prints = [line.get_xydata() for line in axis.lines]
+        steps = np.concatenate([np.linalg.norm(np.diff(line, axis=0), axis=1) for line in prints])
+        assert len(prints) == 2 and np.isnan(steps).any()  # a foot each, with gaps where it swings
+        length[name] = np.nansum(steps)
+    assert length["slides"] > 2.0 * length["stands"]
+
+
+def test_crowds_have_titles_notes_and_empty_panels():
+    crowd = ([standing_at(0.0, 0.0), standing_at(2.0, 1.0, seed=1)], ["#542788", "#F1A340"])
+    figure = crowd_figure({"One\nnote": crowd, "Two\nnote": crowd, "Three": crowd}, 10)
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["One", "Two", "Three", ""]
+    texts = [text.get_text() for axis in figure.axes for text in axis.texts]
+    assert texts.count("note") == 2
+    assert not bodies(figure.axes[3])
+
+
 # --- diagrams ----------------------------------------------------------------------------------
 
 
@@ -110,3 +147,15 @@ def test_influence_maps_share_a_scale():
         assert figure.axes[0].get_ylabel() == "there"
         # An arrow on the colour bar where something lies beyond it.
         assert figure.axes[-1]._colorbar.extend == ("max" if end < 3 else "neither")
+
+
+def test_a_kept_figure_names_its_data_set_and_its_light_copy_the_file_in_full_size(tmp_path):
+    figure, _ = new_figure(3.0, 2.0)
+    shown = keep_figure(figure, tmp_path, "01_any", data="bandai")
+    assert [text.get_text() for text in figure.texts] == ["data: bandai"]
+    file = tmp_path / "figures" / "01_any.png"
+    assert shown.metadata["full"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert len(shown.data) < file.stat().st_size
+    theory, _ = new_figure(3.0, 2.0)
+    keep_figure(theory, tmp_path, "02_any")
+    assert not theory.texts

@@ -3,7 +3,9 @@
 Nothing is built here; `make site` does that, and checks its own links with what is tested below.
 """
 
+import base64
 import fnmatch
+import hashlib
 import importlib.util
 import json
 import re
@@ -11,11 +13,13 @@ import runpy
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 import yaml
 from builders import refused
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from PIL import Image
 from test_environment import LOCK, read_hashed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -170,6 +174,47 @@ def test_a_player_is_linked_where_it_is_copied_to(tmp_path, monkeypatch):
     text = pages.moving_markdown("bandai")
     assert 'href="../../players/bandai/laptop/media/05_rollout.html"' in text
     assert "/paper_figures/bandai/laptop/media/05_rollout.png" in text
+
+
+def test_a_player_needs_a_picture_and_takes_a_figure_of_its_name(tmp_path, monkeypatch):
+    folder = tmp_path / "paper_figures" / "bandai" / "laptop"
+    for name in ("media", "figures"):
+        (folder / name).mkdir(parents=True)
+    (folder / "media" / "14_crowd.html").write_text("<p>player</p>")
+    record = {"dataset_licence": "CC BY-NC 4.0", "dataset_credit": "Somebody."}
+    (folder / "media" / "14_crowd.json").write_text(json.dumps(record))
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    with pytest.raises(ValueError, match="14_crowd.html: a player needs a picture"):
+        pages.moving_markdown("bandai")
+    (folder / "figures" / "14_crowd.png").write_bytes(b"")
+    text = pages.moving_markdown("bandai")
+    assert "/paper_figures/bandai/laptop/figures/14_crowd.png" in text
+    assert ":target: ../../players/bandai/laptop/media/14_crowd.html" in text
+
+
+def test_setup_is_folded_and_only_the_very_same_figure_is_shown_in_full_size():
+    folder = ROOT / "paper_figures" / "synthetic" / "laptop" / "figures"
+    full = (folder / "00_road_map.png").read_bytes()
+    data = {"image/png": base64.b64encode(b"light").decode()}
+    outputs = [
+        nbformat.v4.new_output("display_data", data, metadata={"image/png": {"full": digest}})
+        for digest in (hashlib.sha256(full).hexdigest(), hashlib.sha256(b"another run").hexdigest())
+    ]
+    notebook = nbformat.v4.new_notebook(
+        cells=[
+            nbformat.v4.new_markdown_cell("# 00\n\n**Question.** Why?"),
+            nbformat.v4.new_code_cell("seed = 0", metadata={"tags": ["parameters"]}),
+            nbformat.v4.new_code_cell("import numpy as np\n\nx = np.ones(3)"),
+            nbformat.v4.new_code_cell("print(x)  # no import here", outputs=outputs),
+        ]
+    )
+    cells = pages.read_notebook(nbformat.writes(notebook)).cells
+    assert ["hide-input" in cell.metadata.get("tags", ()) for cell in cells] == [False, True, True, False]
+    same, other = cells[3].outputs
+    assert base64.b64decode(same.data["image/png"]) == full
+    with Image.open(folder / "00_road_map.png") as figure:
+        assert same.metadata["image/png"]["width"] == round(96 * figure.width / 150)
+    assert other.data == data and "width" not in other.metadata["image/png"]
 
 
 def test_a_figure_has_the_heading_under_which_its_notebook_draws_it():

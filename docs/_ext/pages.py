@@ -12,6 +12,9 @@ Markdown while the site is built:
 
 from __future__ import annotations
 
+import base64
+import functools
+import hashlib
 import json
 import re
 import textwrap
@@ -136,11 +139,12 @@ def words(name: str) -> str:
     return re.sub(r"^\d\d_", "", name).replace("_", " ")
 
 
-def picture(path: Path, alt: str, caption: str, *, classes: str = "") -> str:
-    """Return Markdown of one figure in a grid."""
+def picture(path: Path, alt: str, caption: str, *, classes: str = "", target: str = "") -> str:
+    """Return Markdown of one figure in a grid, which leads to its target, if it has one."""
+    leads = f":target: {target}\n" if target else ""
     return (
         f"::::{{grid-item}}\n:::{{figure}} /{relative(path)}\n:alt: {alt}\n:loading: lazy\n"
-        f":class: gallery {classes}\n\n{caption}\n:::\n::::\n"
+        f"{leads}:class: gallery {classes}\n\n{caption}\n:::\n::::\n"
     )
 
 
@@ -150,7 +154,7 @@ def grid(items: list[str]) -> str:
 
 
 def moving_markdown(dataset: str = "", *, with_credit: bool = True) -> str:
-    """Return animations (GIF) and players (HTML, its film strip beside it), with their terms."""
+    """Return animations (GIF) and players (HTML, behind a picture of what they play), with their terms."""
     items = []
     for folder in result_folders(dataset or "*"):
         credit = credit_line(folder) if with_credit else label_of(folder)
@@ -158,17 +162,17 @@ def moving_markdown(dataset: str = "", *, with_credit: bool = True) -> str:
             notebook = notebooks_by_number().get(path.name[:2])
             source = f" From [notebook {path.name[:2]}](/{relative(notebook)})." if notebook else ""
             title = f"{words(path.stem).capitalize()} ({folder.parent.name})"
-            strip = path.with_suffix(".png")
+            posters = (path.with_suffix(".png"), folder / "figures" / f"{path.stem}.png")
             if path.suffix == ".gif":
                 caption = f"**{title}.**{source} {credit}"
                 items.append(picture(path, f"Animation: {title}", caption, classes="moving"))
             else:
-                link = f'<a class="player" href="../../{player_address(path)}">Play: {title}</a>'
-                caption = f"{link}.{source} {credit}"
-                if strip.is_file():
-                    items.append(picture(strip, f"Film strip: {title}", caption))
-                else:
-                    items.append(f"::::{{grid-item}}\n{caption}\n::::\n")
+                target = f"../../{player_address(path)}"
+                caption = f'<a class="player" href="{target}">▶ Play: {title}</a>.{source} {credit}'
+                poster = next((file for file in posters if file.is_file()), None)
+                if poster is None:
+                    raise ValueError(f"{relative(path)}: a player needs a picture, {posters[0].name}, beside it")
+                items.append(picture(poster, f"Play: {title}", caption, target=target))
     return grid(items) if items else ""
 
 
@@ -207,6 +211,43 @@ def relative(path: Path) -> str:
 
 
 # Notebooks ----------------------------------------------------------------------------------------
+
+
+def read_notebook(text: str):
+    """Read a notebook for the site: parameters and imports folded, figures in full size where there are some.
+
+    The copy of a figure in a notebook is light. It carries the SHA-256 of the file in full size; where exactly
+    that file is committed among the results, it is shown instead, at the size of its inches.
+
+    Args:
+      text: of the .ipynb file.
+
+    Returns:
+      The notebook, version 4.
+    """
+    notebook = nbformat.reads(text, as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type != "code":
+            continue
+        tags = set(cell.metadata.get("tags", ()))
+        if "parameters" in tags or re.search(r"^(import|from) ", cell.source, re.M):
+            cell.metadata["tags"] = sorted(tags | {"hide-input"})
+        for output in cell.outputs:
+            about = output.get("metadata", {}).get("image/png", {})
+            file = full_figures().get(about.get("full"))
+            if file:
+                content = file.read_bytes()
+                output.data["image/png"] = base64.b64encode(content).decode()
+                inches = int.from_bytes(content[16:20], "big") / 150  # a PNG's width, at the dots an inch of results
+                about["width"] = round(96 * inches)
+    return notebook
+
+
+@functools.cache
+def full_figures() -> dict[str, Path]:
+    """Return the committed figures by their SHA-256."""
+    paths = sorted((ROOT / "paper_figures").glob("*/*/**/figures/*.png"))
+    return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in paths}
 
 
 def notebooks_markdown(folder: str = "") -> str:

@@ -8,6 +8,7 @@ face +Z, and no facing is drawn.
 from __future__ import annotations
 
 import itertools
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -88,13 +89,18 @@ def _facing(motion: Motion) -> np.ndarray | None:
         return None
 
 
-def _toes_down(motion: Motion, frames) -> list | None:
-    """Toes in contact at each frame that is asked for, or None where toes are not known."""
+def _toes(motion: Motion) -> list[int]:
+    """Left and right toe, or none where they are not known."""
     try:
-        toes = np.array(motion.skeleton.toes)
+        return list(motion.skeleton.toes)
     except ValueError:
-        return None
-    return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]]
+        return []
+
+
+def _toes_down(motion: Motion, frames) -> list:
+    """Toes in contact at each frame that is asked for."""
+    toes = np.array(_toes(motion))
+    return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]] if len(toes) else [()] * len(frames)
 
 
 def _beside_each_other(motions, paths, titles) -> list[tuple]:
@@ -152,12 +158,13 @@ def film_strip(
         _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
-    keys = [axes[0, 0].plot([], [], color=LIMB_COLORS[s], linewidth=3, label=s)[0] for s in ("left", "right")]
-    if any(_toes_down(motion, [0]) is not None for motion, *_ in rows):
-        keys += axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
+    for side in ("left", "right"):
+        axes[0, 0].plot([], [], color=LIMB_COLORS[side], linewidth=3, label=side)
+    if any(_toes(motion) for motion, *_ in rows):
+        axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
     small = {"fontsize": 8, "handlelength": 1.2, "columnspacing": 1.2, "borderaxespad": 0.2}
     # Below everything: titles may be as long as the strip.
-    figure.legend(handles=keys, loc="outside lower left", ncols=3, **small)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3, **small)
     axes[0, 1].set_title("from above", fontsize=9, fontweight="normal")
     if rows[0][1] is not None:
         axes[0, 1].legend(fontsize=7, loc="best", handlelength=1.6)
@@ -180,8 +187,10 @@ def write_film_strip(path, motions, **options) -> Path:
     return save_figure(film_strip(motions, **options), path)
 
 
-def _draw_poses(axis, motion: Motion, chosen, around: float) -> None:
-    slot = 1.15  # metres of page a pose
+SLOT = 1.15  # metres of page a pose
+
+
+def _draw_poses(axis, motion: Motion, chosen, around: float, *, scale: float = 60.0, numbered: bool = True) -> None:
     points = drawn_points(motion, chosen)
     yaw, touching = _facing(motion), _toes_down(motion, chosen)
     facing = np.zeros(len(chosen))
@@ -190,12 +199,12 @@ def _draw_poses(axis, motion: Motion, chosen, around: float) -> None:
     axis.axhline(0.0, color="#B8B8B8", linewidth=1.0, zorder=0)
     for place, frame in enumerate(chosen):
         camera = Camera(facing[place] - around, np.deg2rad(6.0), points[place, 0] * [1.0, 0.0, 1.0])
-        toes = touching[place] if touching else ()
-        _draw_body(axis, motion.skeleton, points[place], camera, 60.0, left=place * slot, touching=toes)
-        center = {"ha": "center", "va": "top", "fontsize": 8}
-        axis.text(place * slot, -0.14, f"{place + 1}", fontweight="bold", **center)
-        axis.text(place * slot, -0.32, f"{frame / motion.fps:.1f} s", color="#666666", **center)
-    axis.set_xlim(-0.55 * slot, (len(chosen) - 0.45) * slot)
+        _draw_body(axis, motion.skeleton, points[place], camera, scale, left=place * SLOT, touching=touching[place])
+        center = {"ha": "center", "va": "top", "fontsize": 8 if numbered else 7}
+        if numbered:
+            axis.text(place * SLOT, -0.14, f"{place + 1}", fontweight="bold", **center)
+        axis.text(place * SLOT, -0.32 if numbered else -0.1, f"{frame / motion.fps:.1f} s", color="#666666", **center)
+    axis.set_xlim(-0.55 * SLOT, (len(chosen) - 0.45) * SLOT)
     axis.set_ylim(-0.5, max(1.7, points[..., 1].max() + 0.2))
     axis.set_aspect("equal", adjustable="box", anchor="W")
     axis.axis("off")
@@ -238,8 +247,10 @@ def frame_from_above(axis, points: np.ndarray, half: float) -> None:
 
 
 @plot_style()
-def poses_beside(motions: Mapping[str, Motion | None], frames: Sequence[int], *, width: float = 7.2):
-    """Draw the same frames of several motions, a panel each, poses side by side.
+def poses_beside(
+    motions: Mapping[str, Motion | None], frames: Sequence[int], *, width: float = 7.2, below: float = 0.4
+):
+    """Draw the same frames of several motions, a panel each, timed poses side by side.
 
     Every pose is seen from the character's own front right, wherever it goes.
 
@@ -247,22 +258,19 @@ def poses_beside(motions: Mapping[str, Motion | None], frames: Sequence[int], *,
       motions: title -> motion, or None where a panel is to stay empty.
       frames: which, in this order.
       width: of the figure, inches.
+      below: room under the ground of each panel, metres, where a notebook may draw on; poses stand `SLOT` apart.
     """
-    rows, across = -(-len(motions) // 2), 0.95 * len(frames)
+    rows, panel = -(-len(motions) // 2), width / 2 - 0.15
     # As high as its panels are at equal scale, and a line for the title.
-    height = 0.4 + (width / 2 - 0.15) * 1.93 / across
-    figure, axes = new_figure(width, height * rows, rows, 2, squeeze=False)
+    inches = panel / (SLOT * len(frames))  # a metre
+    figure, axes = new_figure(width, (0.4 + inches * (1.85 + below)) * rows, rows, 2, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
     for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
-        if motion is None:
-            continue
-        for place, points in enumerate(drawn_points(motion, np.asarray(frames))):
-            camera = Camera(motion.yaw[frames[place]] - np.pi / 3, 0.0, points[0] * [1.0, 0.0, 1.0])
-            _draw_body(axis, motion.skeleton, points, camera, 40.0, left=0.95 * place)
-        axis.axhline(0.0, color=PALETTE["grey"], linewidth=0.8, zorder=0)
-        axis.set(xlim=(-0.5, across - 0.4), ylim=(-0.08, 1.85), aspect="equal")
-        axis.set_title(title, color=model_style(title).color)
+        if motion is not None:
+            _draw_poses(axis, motion, np.asarray(frames), np.pi / 3, scale=72 * inches, numbered=False)
+            axis.set_ylim(-below, 1.85)
+            axis.set_title(title, color=model_style(title).color)
     return figure
 
 
@@ -285,41 +293,39 @@ def crowd_colors(labels: Sequence[str]) -> list[str]:
 
 
 @plot_style()
-def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, width: float = 9.0, aspect: float = 2.0):
-    """Draw crowds in perspective, a panel each, all seen from where the first one fills its panel.
+def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, width: float = 12.0):
+    """Draw crowds in perspective, a panel each, all seen from where the whole of the first one fills its panel.
 
     Bodies have the thickness of a person's, far ones come first and paler. Nearer limbs cover those
-    behind them by an outline in white, which keeps bodies apart in grey print too.
+    behind them by an outline in white, which keeps bodies apart in grey print too. On the ground lies
+    where the lower toe was in the last second and a half: feet that stand leave dots, feet that slide strokes.
 
     Args:
       crowds: title (a second line stands smaller below it) -> (motions, a colour for each).
       frame: of the motions.
       columns: panels in a row.
       width: of the figure, inches.
-      aspect: width over height of a panel.
 
     Returns:
       A matplotlib Figure.
     """
     columns = min(columns, len(crowds))
     rows, panel = -(-len(crowds) // columns), width / columns
-    height = rows * (panel / aspect + (0.42 if any(crowds) else 0.0))
-    figure, axes = new_figure(width, height, rows, columns, squeeze=False)
     roots = np.array([motion.root_position[frame, [0, 2]] for motion in next(iter(crowds.values()))[0]], float)
-    x, z = middle = np.median(roots, axis=0)
-    reach = np.quantile(np.linalg.norm(roots - middle, axis=-1), 0.9)
-    camera = Camera(np.deg2rad(25.0), np.deg2rad(20.0), (x, 0.9, z), max(6.0, 1.7 * reach + 3.0))
-    # The sides leave out the outermost tenth; nobody near the lower edge is cut off at the legs.
-    feet = camera.project(_on_ground(roots))
-    feet = feet[camera.distance - feet[:, 2] > 1.5]
-    half = max(np.quantile(np.abs(feet[:, 0]), 0.9), 0.1 * camera.distance) + 0.8
-    low = feet[np.abs(feet[:, 0]) < half, 1].min() - 0.5
-    scale = 72.0 * 0.97 * panel / (2.0 * half)
+    x, z = middle = 0.5 * (roots.min(axis=0) + roots.max(axis=0))
+    reach = np.linalg.norm(roots - middle, axis=-1).max()
+    camera = Camera(np.deg2rad(25.0), np.deg2rad(20.0), (x, 0.9, z), 6.0 + 2.0 * reach)
+    # Room around everybody: an arm's length to the sides, from the ground to above the head.
+    around = np.array(list(itertools.product((-0.8, 0.8), (0.0, 2.0), (-0.8, 0.8))))
+    seen = camera.project(_on_ground(roots)[:, None] + around)[..., :2].reshape(-1, 2)
+    (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
+    height = rows * (panel * (high - low) / (right - left) + (0.42 if any(crowds) else 0.0))
+    figure, axes = new_figure(width, height, rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
     for axis, (title, (motions, colors)) in zip(axes.flat, crowds.items(), strict=False):
-        axis.set(xlim=(-half, half), ylim=(low, low + 2.0 * half / aspect), aspect="equal")
-        _draw_crowd(axis, motions, colors, frame, camera, scale)
+        axis.set(xlim=(left, right), ylim=(low, high), aspect="equal")
+        _draw_crowd(axis, motions, colors, frame, camera, 72.0 * 0.97 * panel / (right - left))
         heading, _, note = title.partition("\n")
         if heading:
             axis.set_title(heading, pad=16 if note else 6)
@@ -330,19 +336,18 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
 def _draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) -> None:
     bodies = [drawn_points(motion, np.array([frame]))[0] for motion in motions]
     depths = camera.distance - camera.project([points[0] for points in bodies])[:, 2]
-    seen = [k for k in np.argsort(-depths) if depths[k] > 1.5]
-    far, near = depths[seen[0]], depths[seen[-1]]
     axis.add_collection(_ground_lines(camera, 2.0, 8.0 * camera.distance, "#E6E6E6"))
-    for k in seen:
+    for k in np.argsort(-depths):
         motion, color = motions[k], np.array(to_rgb(colors[k]))
-        paler = 0.4 * (depths[k] - near) / max(far - near, 1e-6)
+        paler = 0.4 * (depths[k] - depths.min()) / max(np.ptp(depths), 1e-6)
         tints = {"left": color + 0.22 * (1 - color), "right": 0.82 * color, "middle": color, "head": color}
         tints = {side: tint + paler * (1 - tint) for side, tint in tints.items()}
-        # The last second and a half of the way.
-        walked = motion.root_position[max(0, frame - round(1.5 * motion.fps)) : frame + 1, [0, 2]]
-        walked = gaussian_filter1d(np.asarray(walked, float), 0.15 * motion.fps, axis=0, mode="nearest")
-        trail = camera.project(_on_ground(walked))[:, :2]
-        axis.plot(*trail.T, color=tints["middle"], alpha=0.55, linewidth=1.1, zorder=2)
+        past = motion.positions[max(0, frame - round(1.5 * motion.fps)) : frame + 1, _toes(motion)]
+        for foot in range(past.shape[1]):
+            lower = past[:, foot, 1] <= past[..., 1].min(axis=1)
+            prints = np.where(lower[:, None], past[:, foot][:, [0, 2]], np.nan)
+            look = {"color": tints["middle"], "alpha": 0.6, "linewidth": 0.1 * scale * camera.distance / depths[k]}
+            axis.plot(*camera.project(_on_ground(prints))[:, :2].T, solid_capstyle="round", zorder=2, **look)
         _draw_body(axis, motion.skeleton, bodies[k], camera, scale, thick=_STOUT, colors=tints, rim=1.2)
 
 
@@ -399,8 +404,7 @@ def write_gif(
         raise ValueError(f"motions of one picture need one frame rate, got {sorted(rates)}")
     fps = rates.pop()
     if fps / every > 30.0 + 1e-6:
-        least = int(np.ceil(fps / 30.0))
-        raise ValueError(f"{fps / every:g} frames a second are too many for a GIF (30 at most); raise every to {least}")
+        raise ValueError(f"{fps / every:g} frames a second are too many here: raise every to {np.ceil(fps / 30.0):.0f}")
     last = max(motion.num_frames for motion in motions)
     if max_seconds is not None:
         last = min(last, max(1, round(max_seconds * fps)))
@@ -453,10 +457,9 @@ def _gif_panel(axis, motion: Motion, target, title: str, frames, size, around: f
                 near = np.linalg.norm(line - [x, z], axis=-1, keepdims=True) < 3.0
                 seen = np.where(near, camera.project(_on_ground(line))[:, :2], np.nan)
                 axis.plot(*seen.T, color=color, linewidth=thick, zorder=2)
-        toes = touching[place] if touching else ()
-        _draw_body(axis, motion.skeleton, points[place], camera, 0.72 * pixels, touching=toes)
+        _draw_body(axis, motion.skeleton, points[place], camera, 0.72 * pixels, touching=touching[place])
         corner = {"transform": axis.transAxes, "fontsize": 8.5}
-        axis.text(0.03, 0.97, title, va="top", color="#1A1A1A", **corner)
+        axis.text(0.03, 0.97, textwrap.fill(title, size[0] // 7), va="top", color="#1A1A1A", **corner)
         axis.text(0.97, 0.03, f"{frames[place] / motion.fps:.1f} s", ha="right", color="#666666", **corner)
 
     return draw

@@ -5,6 +5,7 @@ Colours keep apart for colour-blind readers and, by lightness and marker, in gre
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from dataclasses import dataclass
@@ -16,8 +17,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-
-DPI = 150
 
 PALETTE = {
     "black": "#1A1A1A",
@@ -140,7 +139,7 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
         return figure, figure.subplots(nrows, ncols, **grid)
 
 
-def save_figure(figure: Figure, path, *, dpi: int = DPI) -> Path:
+def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
     """Write a figure as PNG whose bytes depend on the drawing alone.
 
     No date and no software version is written, so that an unchanged figure is an unchanged file.
@@ -165,13 +164,14 @@ def save_figure(figure: Figure, path, *, dpi: int = DPI) -> Path:
     return path
 
 
-def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
+def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):
     """Return the figure as an image that Jupyter shows when it is a cell's last value.
 
     Args:
       figure: what to show.
       dpi: dots an inch.
       colors: keep this many; a third of the bytes, of which a notebook has few.
+      full: of a light copy, the SHA-256 of the file in full size, by which the site finds it.
     """
     from IPython.display import Image as Shown
 
@@ -180,10 +180,10 @@ def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
     whole, small = Image.open(io.BytesIO(_png(figure, dpi))).convert("RGB"), io.BytesIO()
     few = whole.quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     few.save(small, "png", optimize=True)
-    return Shown(data=small.getvalue())
+    return Shown(data=small.getvalue(), metadata={"full": full} if full else None)
 
 
-def keep_figure(figure: Figure, results, name: str, colors: int = 64):
+def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str = ""):
     """Save a figure as `<results>/figures/<name>.png` and return a light copy for the notebook.
 
     Args:
@@ -191,12 +191,15 @@ def keep_figure(figure: Figure, results, name: str, colors: int = 64):
       results: from `profiles.results_dir`.
       name: without folder and ending.
       colors: of the copy.
+      data: the data set that is shown or measured, to be named in the lower right corner; none in theory.
 
     Returns:
       An image for a cell's last line: smaller, and in few colours.
     """
-    save_figure(figure, Path(results) / "figures" / f"{name}.png")
-    return show_figure(figure, dpi=76, colors=colors)
+    if data:
+        figure.supxlabel(f"data: {data}", x=0.995, ha="right", fontsize=7, color=PALETTE["grey"])
+    file = save_figure(figure, Path(results) / "figures" / f"{name}.png")
+    return show_figure(figure, dpi=76, colors=colors, full=hashlib.sha256(file.read_bytes()).hexdigest())
 
 
 def _png(figure: Figure, dpi: int) -> bytes:

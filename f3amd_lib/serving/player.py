@@ -34,7 +34,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import html
-import io
 import json
 import re
 import string
@@ -44,7 +43,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.stick_figures import (
@@ -296,19 +294,8 @@ def show_player(
     if not height >= 200:
         raise ValueError(f"height must be 200 or more pixels, got {height}")
     page = player_page(scenes, autoplay=autoplay, **options)
-    image = _small_image(scenes_strip(scenes), strip_dpi) if strip else None
+    image = show_figure(scenes_strip(scenes), dpi=strip_dpi, colors=128) if strip else None
     return Player(page, int(height), image)
-
-
-def _small_image(figure, dpi: int):
-    """A figure as an image of 128 colours: a third of the bytes, which a notebook has few of."""
-    from IPython.display import Image as Shown
-
-    whole = Image.open(io.BytesIO(show_figure(figure, dpi=dpi).data)).convert("RGB")
-    small = io.BytesIO()
-    few = whole.quantize(128, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(small, format="PNG", optimize=True)
-    return Shown(data=small.getvalue())
 
 
 # ---------------------------------------------------------------------------------- what comes in

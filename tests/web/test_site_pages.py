@@ -32,6 +32,14 @@ const wide = [...document.querySelectorAll(".bd-article *")].find(
 return `${extra} px: ${wide ? wide.outerHTML.slice(0, 120) : "?"}`;
 """
 
+# Tables that are wider than what shows them.
+CUT_OFF = """
+return [...document.querySelectorAll(".bd-article table")].filter((table) => {
+  for (let up = table; up && up.tagName != "ARTICLE"; up = up.parentElement)
+    if (up.scrollWidth > up.clientWidth + 1 && getComputedStyle(up).overflowX != "visible") return true;
+}).map((table) => table.rows[0].innerText);
+"""
+
 # What MathJax leaves where it does not understand: a message, or the unknown command in red.
 NOT_UNDERSTOOD = '[data-mml-node="merror"], mjx-merror, [fill="red"]'
 
@@ -101,6 +109,36 @@ def test_every_notebook_is_whole_on_a_phone(browser):
         assert page.script(SIDEWAYS) == "", name
         assert page.errors() == [] and page.outside() == [], name
     assert equations > 100
+
+
+def test_no_table_is_cut_off_on_a_small_laptop(browser):
+    browser.resize(1280, 800)
+    tables = 0
+    for name in [*notebooks(), "paper_figures/claims.html"]:
+        page = browser.open(SITE / name)
+        tables += page.script("return document.querySelectorAll('.bd-article table').length")
+        assert page.script(CUT_OFF) == [], name
+    assert tables > 50
+
+
+def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots):
+    browser.resize(*PHONE, phone=True)
+    page = browser.open(SITE / "paper_figures/claims.html")
+    cell = "const td = document.querySelector('#claims-ledger table:has(th:nth-child(8)) td:nth-child(4)');"
+    assert page.script(cell + "return getComputedStyle(td).display") == "block"
+    assert page.script(cell + "return getComputedStyle(td, '::before').content") == '"ours: "'
+    page.screenshot(screenshots / "site_claims_phone.png")
+    browser.resize(1280, 800)
+    page = browser.open(SITE / "paper_figures/claims.html")
+    assert page.script(cell + "return getComputedStyle(td).display") == "table-cell"
+
+
+def test_a_notebook_opens_with_its_question_and_folded_imports(browser):
+    page = browser.open(SITE / "notebooks/05_rollout.html")
+    assert page.script("return document.querySelector('.bd-article p').textContent").startswith("Question.")
+    assert page.script("return document.querySelector('.bd-article .cell details') !== null")
+    shown = "return [...document.querySelectorAll('.cell pre')].find((e) => e.checkVisibility()).textContent"
+    assert "import numpy" not in page.script(shown)
 
 
 def test_what_equations_are_written_with_is_understood(browser):
