@@ -165,6 +165,29 @@ class TextMotions:
 _LISTS = ("names", "captions", "splits", "pairs")
 
 
+def text_motions(clips, *, skeleton: Skeleton, **about) -> TextMotions:
+    """Put a data set together from motions, each moved to its canonical start.
+
+    Args:
+      clips: (name, motion, captions, split, pair) of each.
+      skeleton: of all of them.
+      **about: other attributes of `TextMotions`.
+    """
+    names, motions, captions, splits, pairs = zip(*clips, strict=True)
+    positions = [canonical_start(skeleton, motion.positions).astype(np.float32) for motion in motions]
+    start = np.cumsum([0, *map(len, positions)])
+    return TextMotions(
+        skeleton=skeleton,
+        positions=np.concatenate(positions),
+        start=start,
+        names=names,
+        captions=captions,
+        splits=splits,
+        pairs=pairs,
+        **about,
+    )
+
+
 def evaluation_classes(data: TextMotions, least: int = CLASS_CLIPS) -> list[str]:
     """Return the pairs that have enough clips to evaluate on, sorted."""
     pairs, counts = np.unique(data.pairs, return_counts=True)
@@ -210,22 +233,8 @@ def bandai_text_motions(packed: PackedMotion, *, mirrored: bool = True, held_out
         if mirrored:
             swapped, seen = tuple(map(other_side, captions)), Motion.from_positions(motion.skeleton, motion.positions)
             clips.append((f"M{name}", mirror(seen), swapped, splits[name], f"{other_side(content)}, {style}"))
-    names, motions, captions, splits, pairs = zip(*clips, strict=True)
-    positions = [canonical_start(packed.skeleton, motion.positions).astype(np.float32) for motion in motions]
-    return TextMotions(
-        name="bandai",
-        skeleton=packed.skeleton,
-        fps=FPS,
-        positions=np.concatenate(positions),
-        start=np.cumsum([0, *map(len, positions)]),
-        names=names,
-        captions=captions,
-        splits=splits,
-        pairs=pairs,
-        licence=packed.licence,
-        credit=packed.credit,
-        skipped=tuple(skipped),
-    )
+    about = {name: getattr(packed, name) for name in ("skeleton", "licence", "credit")}
+    return text_motions(clips, name="bandai", fps=FPS, skipped=tuple(skipped), **about)
 
 
 # ------------------------------------------------------------------------------------------ batches
