@@ -18,6 +18,7 @@ import hashlib
 import importlib.util
 import os
 import re
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -280,7 +281,7 @@ def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddi
                 kept = TextEmbeddings(*(file[name] for name in TextEmbeddings._fields))
             if len(kept.tokens) == len(captions) and np.isfinite(kept.tokens).all():
                 return kept
-        except (OSError, ValueError, KeyError, EOFError):
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             pass  # a damaged cache file is written anew
     parts = [encoder(captions[first : first + 256]) for first in range(0, len(captions), 256)]
     pieces = [row[kept] for part in parts for row, kept in zip(part.tokens, part.mask, strict=True)]

@@ -21,7 +21,7 @@ from f3amd_lib.data.captions import CAPTIONED, compose_captions, other_side, pla
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.motion.redundant import canonical_start, redundant_from_positions
+from f3amd_lib.motion.redundant import canonical_start, essential_features, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
 FPS = 20.0
@@ -154,12 +154,21 @@ class TextMotions:
         """
         if self.vectors is not None:
             return self.vectors
-        made = []
-        for number in range(self.num_clips):
-            clip = self.clip(number).astype(np.float64)
-            clip = np.concatenate([clip, 2 * clip[-1:] - clip[-2:-1]])
-            made.append(redundant_from_positions(self.skeleton, clip).astype(np.float32))
-        return np.concatenate(made)
+        return self._of_each(redundant_from_positions)
+
+    def essential_features(self) -> np.ndarray:
+        """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
+        return self._of_each(essential_features)
+
+    def _of_each(self, features) -> np.ndarray:
+        clips = (self.clip(number) for number in range(self.num_clips))
+        return np.concatenate([features(self.skeleton, going_on(clip)).astype(np.float32) for clip in clips])
+
+
+def going_on(positions) -> np.ndarray:
+    """Return positions [L, J, 3] with one more frame, a step as the last: [L + 1, J, 3], float64."""
+    positions = np.asarray(positions, np.float64)
+    return np.concatenate([positions, 2 * positions[-1:] - positions[-2:-1]])
 
 
 _LISTS = ("names", "captions", "splits", "pairs")
