@@ -155,7 +155,7 @@ def load_wordllama() -> WordLlama:
     found = importlib.util.find_spec("wordllama")
     if found is None:
         raise ImportError(
-            'the text encoder wordllama is not installed; install it: pip install "wordllama>=0.2.2,<0.3"'
+            'the text encoder wordllama is not installed; install it: pip install "wordllama>=0.2.2,<0.2.3"'
         )
     from safetensors.numpy import load_file
     from tokenizers import Tokenizer

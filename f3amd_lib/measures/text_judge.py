@@ -182,7 +182,8 @@ def train_judge(
     training = training or EvaluatorTraining()
     task, normaliser = judge_task(data, encoder, training, **sizes)
     state, history = optimise(task, checkpoint=checkpoint, progress=progress)
-    record = run_record(profile="none", dataset=data, seed=training.seed, **task.identity(), history=history)
+    identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}
+    record = run_record(profile="none", dataset=data, seed=training.seed, **identity, history=history)
     return TextJudge(task.network, state.params, normaliser, data.skeleton, encoder.identity, record)
 
 
