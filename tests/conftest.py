@@ -24,7 +24,6 @@ REMEDY = {
     "sphinx": "make site-tools",
     "selenium": "make web-tools",
     "node": "your system's package manager",
-    "transformers": "pip install transformers torch",
     "wordllama": "make install",
     "tokenizers": "make install",
 }

@@ -14,6 +14,7 @@ from f3amd_lib.data import captions, text_motions
 from f3amd_lib.data.packed import pack
 from f3amd_lib.data.sources import assign_splits, open_dataset
 from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
+from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.motion.redundant import positions_from_redundant
 from f3amd_lib.motion.skeleton import Motion, Skeleton, turn
 
@@ -209,12 +210,19 @@ def test_bandai_clips_say_what_they_show(some_bandai):
     assert made.fps == 20.0 and made.num_clips == 2 * some_bandai.num_clips
     assert made.lengths.max() <= 199 and np.all(made.lengths % 4 == 0)
     assert np.allclose(made.positions[made.start[:-1], 0, ::2], 0, atol=1e-6)
+    assert film_strip(made.motion(0)) is not None  # positions alone can be drawn
     for number, several in enumerate(made.captions):
         motion = made.motion(number)
         yaw = np.degrees(np.unwrap(motion.yaw))
         side = {-1: "right", 1: "left"}[int(np.sign(yaw[-1] - yaw[0]))]
         hips = motion.positions[:, 0, 1]
+        way = motion.positions[-1, 0] - motion.positions[0, 0]
         for caption in several:
+            if "diagonally" in caption or "ahead and to" in caption:
+                beside = way[0] if "left" in caption else -way[0]
+                assert 0.2 * way[2] < beside < 2.0 * way[2], (made.names[number], caption)
+            if "backwards" in caption:
+                assert way[2] < -1.0
             if "turn" in caption:
                 assert side in caption and abs(yaw[-1] - yaw[0]) > 45, (made.names[number], caption)
             for hand in ("left", "right"):

@@ -207,7 +207,7 @@ def _load_transformers(kind: str, folder) -> TransformersEncoder:
     if folder == Path() or not (folder / "config.json").is_file():
         raise ValueError(f"{kind}: {folder}/config.json is missing; give the folder of its weights (save_pretrained)")
     if importlib.util.find_spec("transformers") is None or importlib.util.find_spec("torch") is None:
-        raise ImportError(f"the text encoder {kind} needs transformers and torch: pip install transformers torch")
+        raise ImportError(f"the text encoder {kind} needs transformers and torch: make bench-tools")
     import torch
     import transformers
 

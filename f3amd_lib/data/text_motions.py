@@ -186,7 +186,7 @@ def text_motions(clips, *, skeleton: Skeleton, **about) -> TextMotions:
     positions = [canonical_start(skeleton, motion.positions).astype(np.float32) for motion in motions]
     start = np.cumsum([0, *map(len, positions)])
     return TextMotions(
-        skeleton=skeleton,
+        skeleton=dataclasses.replace(skeleton, end_sites=()),  # the tips of limbs would need rotations
         positions=np.concatenate(positions),
         start=start,
         names=names,
