@@ -117,6 +117,33 @@ def data(motion: Data) -> None:
         log.info("%-12s %s", name, fact)
 
 
+def dataset(
+    captions: Path, source: str | None = None, data: str = "folder", fps: float = 20.0, out: Path = Path("out/dataset")
+) -> None:
+    """Write motions with captions as a data set in HumanML3D's layout, for text-to-motion code.
+
+    Args:
+      captions: CSV file with columns file and caption, one line a caption.
+      source: folder or zip of BVH files of one skeleton.
+      data: another data set instead of a folder: synthetic, bandai, 100style.
+      fps: frames per second to write.
+      out: folder to write to; must be empty or not there yet.
+    """
+    from f3amd_lib.data.humanml3d import captioned_motions, read_caption_table, write_humanml3d
+    from f3amd_lib.data.sources import SPLITS, open_dataset
+
+    written = captioned_motions(open_dataset(data, path=source), read_caption_table(captions), fps=fps)
+    folder = write_humanml3d(out, written)
+    for clip, reason in written.skipped:
+        log.info("left out     %s: %s", clip, reason)
+    log.info("split        %s", ", ".join(f"{written.splits.count(split)} {split}" for split in SPLITS))
+    log.info(
+        "joints       %d, so vectors of %d numbers", written.skeleton.num_joints, 12 * written.skeleton.num_joints - 1
+    )
+    log.info("terms        %s", written.licence)
+    log.info("wrote        %s: %d clips", folder, written.num_clips)
+
+
 def presets(channels: int = 141, styles: int = 100) -> None:
     """List the models with their sizes.
 
@@ -477,7 +504,7 @@ def cards() -> int:
     return model_cards.main()
 
 
-COMMANDS = (data, presets, train, rollout, crowd, export, bench, measure, figures, claims, cards)
+COMMANDS = (data, dataset, presets, train, rollout, crowd, export, bench, measure, figures, claims, cards)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

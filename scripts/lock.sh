@@ -15,7 +15,7 @@ echo "Installing uv into a folder that is removed afterwards ..."
 
 # No header and no index addresses: the file names packages and hashes, never where they came from.
 "$tools/bin/uv" pip compile pyproject.toml --quiet --no-config \
-  --extra notebooks --extra tests --group build --universal --python-version 3.11 \
+  --extra notebooks --extra tests --extra text --group build --universal --python-version 3.11 \
   --generate-hashes --no-header --no-emit-index-url --no-emit-find-links \
   "$@" --output-file requirements.lock
 echo "requirements.lock is written. Next: git diff requirements.lock, then make test."

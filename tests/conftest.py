@@ -20,7 +20,13 @@ import pytest
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 
-REMEDY = {"sphinx": "make site-tools", "selenium": "make web-tools", "node": "your system's package manager"}
+REMEDY = {
+    "sphinx": "make site-tools",
+    "selenium": "make web-tools",
+    "node": "your system's package manager",
+    "wordllama": "make install",
+    "tokenizers": "make install",
+}
 """What brings an optional part of the tests, where it is not `make bench-tools`."""
 
 

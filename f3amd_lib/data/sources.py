@@ -137,14 +137,15 @@ def open_dataset(
     return dataset if num_styles is None else _keep_styles(dataset, num_styles)
 
 
-def assign_splits(strata: Iterable[tuple[str, object]]) -> dict[str, str]:
-    """Share clips out over train, validation and test: 80, 10 and 10 % of each stratum.
+def assign_splits(strata: Iterable[tuple[str, object]], percent: tuple[int, int] = (10, 10)) -> dict[str, str]:
+    """Share clips out over train, validation and test: 80, 10 and 10 % of each stratum by default.
 
     A stratum's clips are ordered by the SHA-256 of their names, so that the answer depends on names
     alone and is the same on every machine. Three clips or more give at least one to each split.
 
     Args:
       strata: (clip name, stratum) pairs; a stratum is a style or anything else hashable.
+      percent: shares of validation and test.
 
     Returns:
       Split by clip name.
@@ -155,9 +156,9 @@ def assign_splits(strata: Iterable[tuple[str, object]]) -> dict[str, str]:
     splits = {}
     for names in members.values():
         ranked = sorted(names, key=lambda name: hashlib.sha256(name.encode("utf-8")).digest())
-        held_out = max(1, (len(ranked) + 5) // 10) if len(ranked) >= 3 else 0
+        shares = [max(1, (len(ranked) * share + 50) // 100) if len(ranked) >= 3 else 0 for share in percent]
         for rank, name in enumerate(ranked):
-            splits[name] = SPLITS[1 if rank < held_out else 2 if rank < 2 * held_out else 0]
+            splits[name] = SPLITS[1 if rank < shares[0] else 2 if rank < sum(shares) else 0]
     return splits
 
 

@@ -145,6 +145,30 @@ def euler_from_matrix(order: str, matrix: np.ndarray) -> np.ndarray:
     return rotation.as_euler(order, degrees=True).reshape(*matrix.shape[:-2], 3)
 
 
+def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation that carries one direction to another (numpy only).
+
+    Args:
+      start, end: directions of any length but 0, [..., 3].
+
+    Returns:
+      Rotation matrices, [..., 3, 3]. Of opposite directions one of the many half turns.
+    """
+    start, end = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
+    start, end = np.broadcast_arrays(start, end)
+    # A half turn about the middle direction, after one about the start, is the turn from start to end.
+    middle = start + end
+    opposite = np.linalg.norm(middle, axis=-1) < 1e-9
+    across = np.cross(start, np.eye(3)[np.argmin(np.abs(start), axis=-1)])
+    middle = np.where(opposite[..., None], across, middle)
+    middle = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
+
+    def half_turn(axis):
+        return 2.0 * axis[..., :, None] * axis[..., None, :] - np.eye(3)
+
+    return half_turn(middle) @ half_turn(start)
+
+
 def slerp_matrices(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Interpolate rotations along the shortest arc (numpy only).
 

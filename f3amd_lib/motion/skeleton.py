@@ -21,10 +21,15 @@ CONTACT_SPEED = 0.01
 
 # What the conventions at hand call the joints we must find. First match wins.
 _ROLE_NAMES = {
-    "left_hip": ("UpperLeg_L", "LeftHip", "LeftUpLeg", "mixamorig:LeftUpLeg"),
-    "right_hip": ("UpperLeg_R", "RightHip", "RightUpLeg", "mixamorig:RightUpLeg"),
-    "left_toe": ("Toes_L", "LeftToe", "LeftToeBase", "mixamorig:LeftToeBase"),
-    "right_toe": ("Toes_R", "RightToe", "RightToeBase", "mixamorig:RightToeBase"),
+    "left_hip": ("UpperLeg_L", "LeftHip", "LeftUpLeg", "mixamorig:LeftUpLeg", "left_hip"),
+    "right_hip": ("UpperLeg_R", "RightHip", "RightUpLeg", "mixamorig:RightUpLeg", "right_hip"),
+    "left_toe": ("Toes_L", "LeftToe", "LeftToeBase", "mixamorig:LeftToeBase", "left_toe", "left_foot"),
+    "right_toe": ("Toes_R", "RightToe", "RightToeBase", "mixamorig:RightToeBase", "right_toe", "right_foot"),
+    "left_shoulder": ("UpperArm_L", "LeftArm", "mixamorig:LeftArm", "LeftShoulder", "left_shoulder"),
+    "right_shoulder": ("UpperArm_R", "RightArm", "mixamorig:RightArm", "RightShoulder", "right_shoulder"),
+    "left_wrist": ("Hand_L", "LeftHand", "mixamorig:LeftHand", "LeftWrist", "left_wrist"),
+    "head": ("Head", "mixamorig:Head", "head"),
+    "right_wrist": ("Hand_R", "RightHand", "mixamorig:RightHand", "RightWrist", "right_wrist"),
 }
 
 
@@ -101,12 +106,16 @@ class Skeleton:
             raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}") from None
 
     def role(self, role: str) -> int:
-        """Return the joint that plays a role: left_hip, right_hip, left_toe or right_toe."""
+        """Return the joint that plays a role: head, or left_ or right_ hip, toe, shoulder or wrist."""
         for name in _ROLE_NAMES[role]:
             if name in self.names:
                 return self.names.index(name)
         wanted = ", ".join(_ROLE_NAMES[role])
         raise ValueError(f"no joint is known as its {role}; looked for {wanted} among {', '.join(self.names)}")
+
+    def has_role(self, role: str) -> bool:
+        """Say whether a joint is known to play a role."""
+        return any(name in self.names for name in _ROLE_NAMES[role])
 
     @property
     def toes(self) -> tuple[int, int]:

@@ -1,0 +1,291 @@
+"""Captions as vectors: one interface for text encoders, and a cache so that no training runs one.
+
+| name | what | tokens, width | where its weights are |
+|---|---|---|---|
+| `wordllama` | a vector a word piece, pooled by their mean | 256 | in its package: works offline |
+| `clip` | CLIP ViT-B/32, the choice of ACMDM | 512 | a folder of yours |
+| `t5` | Sentence-T5 (large), the choice of MotionPCM | 1024, pooled 768 | a folder of yours |
+
+The last two run in PyTorch by way of `transformers`; a folder is that of the published model, with weights
+as safetensors.
+`wordllama` is a mean of word vectors, so that "left hand up, right hand down" and the other way
+round are one to its pooled vector; the token vectors keep their order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import re
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import pooch
+
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.names import nearest_hint
+
+MOST_TOKENS = 32
+"""Longer captions are refused: what was cut off could not be seen in the motion."""
+
+
+class TextEmbeddings(NamedTuple):
+    """Captions as vectors.
+
+    Attributes:
+      tokens: [captions, tokens, width], float32; 0 beyond a caption's end.
+      mask: true for tokens, [captions, tokens].
+      pooled: one vector a caption, [captions, pooled width], float32.
+    """
+
+    tokens: np.ndarray
+    mask: np.ndarray
+    pooled: np.ndarray
+
+
+class TextEncoder(Protocol):
+    """What turns captions into vectors.
+
+    Attributes:
+      identity: name and state of the weights: embeddings of two identities do not mix.
+      width: of token vectors.
+    """
+
+    identity: str
+    width: int
+
+    def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
+        """Embed captions that `check_captions` has passed."""
+
+
+def check_captions(captions: Sequence[str]) -> None:
+    """Refuse what no motion could follow.
+
+    Raises:
+      ValueError: for a caption that is empty, or has no letters, saying which.
+    """
+    if isinstance(captions, str):
+        raise ValueError(f"captions must be a list of texts, got the one text {captions!r}; put it into a list")
+    for number, caption in enumerate(captions, 1):
+        if not isinstance(caption, str) or not caption.strip():
+            raise ValueError(f"caption {number} of {len(captions)} is empty; say what the person does")
+        if not re.search(r"[^\W\d_]", caption):
+            raise ValueError(f"caption {caption!r} holds no word; say what the person does")
+
+
+def check_words(caption: str, known: Sequence[str]) -> None:
+    """Refuse words that a model has never seen in its captions.
+
+    Args:
+      caption: what was asked for.
+      known: captions that the model was trained with.
+
+    Raises:
+      ValueError: naming the words, and the nearest known one of the first.
+    """
+    vocabulary = sorted(set(_words(" ".join(known))))
+    if unknown := [word for word in _words(caption) if word not in vocabulary]:
+        hint = nearest_hint(unknown[0], vocabulary, most=0)
+        raise ValueError(f"caption {caption!r}: the model never saw {', '.join(map(repr, unknown))}{hint}")
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[^\W\d_]+(?:['-][^\W\d_]+)*", text.lower())
+
+
+def _padded(pieces: Sequence[np.ndarray], pooled) -> TextEmbeddings:
+    """Put token vectors of unlike numbers side by side."""
+    count = max(len(piece) for piece in pieces)
+    tokens = np.zeros((len(pieces), count, pieces[0].shape[-1]), np.float32)
+    for row, piece in zip(tokens, pieces, strict=True):
+        row[: len(piece)] = piece
+    mask = np.arange(count) < np.array([len(piece) for piece in pieces])[:, None]
+    return TextEmbeddings(tokens, mask, np.asarray(pooled, np.float32))
+
+
+def _refuse_long(captions, pieces) -> None:
+    for caption, piece in zip(captions, pieces, strict=True):
+        if len(piece) > MOST_TOKENS:
+            raise ValueError(
+                f"caption {caption!r} has {len(piece)} word pieces of at most {MOST_TOKENS}; say it shorter"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class WordLlama:
+    """Word-piece vectors of the package `wordllama`, read from its own files; vectors have a mean length of 1.
+
+    Attributes:
+      identity, width: as in `TextEncoder`.
+      tokenizer: of the package `tokenizers`.
+      vectors: of all pieces, [pieces, width].
+    """
+
+    identity: str
+    width: int
+    tokenizer: object
+    vectors: np.ndarray
+
+    def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
+        encoded = [self.tokenizer.encode(caption, add_special_tokens=False) for caption in captions]
+        for caption, pieces in zip(captions, encoded, strict=True):
+            # What the vocabulary does not know is spelled out in bytes.
+            if strange := [piece for piece in pieces.tokens if re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece)]:
+                raise ValueError(
+                    f"caption {caption!r} holds characters unknown to wordllama ({strange[0]}); use English"
+                )
+        pieces = [self.vectors[pieces.ids] for pieces in encoded]
+        _refuse_long(captions, pieces)
+        return _padded(pieces, [piece.mean(axis=0) for piece in pieces])
+
+
+def load_wordllama() -> WordLlama:
+    """Read wordllama's 32,000 vectors of 256 numbers (16 MB) from the installed package, offline.
+
+    Raises:
+      ImportError: if the package is not installed.
+      ValueError: if its files are not those expected.
+    """
+    found = importlib.util.find_spec("wordllama")
+    if found is None:
+        raise ImportError(
+            'the text encoder wordllama is not installed; install it: pip install "wordllama>=0.2.2,<0.2.3"'
+        )
+    from safetensors.numpy import load_file
+    from tokenizers import Tokenizer
+
+    folder = Path(found.origin).parent
+    try:
+        vectors = load_file(folder / "weights" / "l2_supercat_256.safetensors")["embedding.weight"].astype(np.float32)
+        tokenizer = Tokenizer.from_file(str(folder / "tokenizers" / "l2_supercat_tokenizer_config.json"))
+    except Exception as error:  # tokenizers raises Exception itself
+        raise ValueError(
+            f"{folder}: wordllama's files are not those of version 0.2 ({error}); install it again"
+        ) from error
+    vectors = vectors / np.linalg.norm(vectors, axis=-1).mean()
+    return WordLlama("wordllama-l2-supercat-256", vectors.shape[1], tokenizer, vectors)
+
+
+@dataclass(frozen=True, eq=False)
+class TransformersEncoder:
+    """CLIP's or Sentence-T5's text side, by way of `transformers`, frozen.
+
+    Attributes:
+      identity, width: as in `TextEncoder`.
+      tokenizer, model: of `transformers`.
+      pool: function of the model's output and the mask that gives one vector a caption.
+    """
+
+    identity: str
+    width: int
+    tokenizer: object
+    model: object
+    pool: object
+
+    def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
+        import torch
+
+        given = self.tokenizer(list(captions), padding=True, return_tensors="pt")
+        with torch.no_grad():
+            output = self.model(**given)
+        mask = given["attention_mask"].bool()
+        tokens = output.last_hidden_state.float().numpy()
+        pieces = [row[kept] for row, kept in zip(tokens, mask.numpy(), strict=True)]
+        _refuse_long(captions, pieces)
+        return _padded(pieces, self.pool(output, mask).float().numpy())
+
+
+def _load_transformers(kind: str, folder) -> TransformersEncoder:
+    """Read a text model from a folder of the user; ValueError names what is missing."""
+    folder = Path(folder or "").expanduser()
+    if folder == Path() or not (folder / "config.json").is_file():
+        raise ValueError(f"{kind}: {folder}/config.json is missing; give the folder of its weights (save_pretrained)")
+    if importlib.util.find_spec("transformers") is None or importlib.util.find_spec("torch") is None:
+        raise ImportError(f"the text encoder {kind} needs transformers and torch: make bench-tools")
+    import torch
+    import transformers
+
+    offline = {"local_files_only": True, "use_safetensors": True}  # never a pickle
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, local_files_only=True)
+    if kind == "clip":
+        model = transformers.CLIPTextModelWithProjection.from_pretrained(folder, **offline)
+        pool = lambda output, mask: output.text_embeds
+        width = model.config.hidden_size
+    else:
+        model = transformers.T5EncoderModel.from_pretrained(folder, **offline)
+        dense = torch.from_numpy(_sentence_layer(folder))
+        pool = lambda output, mask: _sentence_vectors(torch, output.last_hidden_state, mask, dense)
+        width = model.config.d_model
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*.safetensors")):
+        digest.update(file.read_bytes())
+    return TransformersEncoder(f"{kind}-{digest.hexdigest()[:12]}", width, tokenizer, model.eval(), pool)
+
+
+def _sentence_layer(folder: Path) -> np.ndarray:
+    """Read the linear layer that Sentence-T5 has after its mean."""
+    from safetensors.numpy import load_file
+
+    path = folder / "2_Dense" / "model.safetensors"
+    if not path.is_file():
+        raise ValueError(f"t5: {path} is missing; give the folder of a Sentence-T5, not of a plain T5")
+    return load_file(path)["linear.weight"].astype(np.float32)
+
+
+def _sentence_vectors(torch, tokens, mask, dense):
+    """Return Sentence-T5's vectors: the mean of the tokens through one linear layer, of length 1."""
+    weights = mask[..., None].to(tokens.dtype)
+    return torch.nn.functional.normalize((tokens * weights).sum(1) / weights.sum(1) @ dense.T, dim=-1)
+
+
+ENCODERS = ("wordllama", "clip", "t5")
+
+
+def load_text_encoder(name: str = "wordllama", folder=None) -> TextEncoder:
+    """Return a text encoder by name.
+
+    Args:
+      name: "wordllama", "clip" or "t5".
+      folder: of the weights, for the last two.
+
+    Raises:
+      ValueError: for an unknown name, or weights that are not there.
+      ImportError: naming the package that is missing.
+    """
+    if name not in ENCODERS:
+        raise ValueError(f"unknown text encoder {name!r}{nearest_hint(name, ENCODERS)}")
+    return load_wordllama() if name == "wordllama" else _load_transformers(name, folder)
+
+
+def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddings:
+    """Return captions as vectors, from the cache if they were embedded before.
+
+    The cache (F3AMD_CACHE_DIR overrides its place) has one file for each encoder and list of captions.
+
+    Raises:
+      ValueError: for a caption that is empty, too long, or that the encoder cannot read.
+    """
+    check_captions(captions)
+    key = hashlib.sha256("\n".join([encoder.identity, *captions]).encode()).hexdigest()[:16]
+    folder = Path(os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed")
+    path = folder / f"captions-{encoder.identity}-{key}.npz"
+    if path.exists():
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                kept = TextEmbeddings(*(file[name] for name in TextEmbeddings._fields))
+            if len(kept.tokens) == len(captions) and np.isfinite(kept.tokens).all():
+                return kept
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            pass  # a damaged cache file is written anew
+    parts = [encoder(captions[first : first + 256]) for first in range(0, len(captions), 256)]
+    pieces = [row[kept] for part in parts for row, kept in zip(part.tokens, part.mask, strict=True)]
+    embedded = _padded(pieces, np.concatenate([part.pooled for part in parts]))
+    with whole_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
+        np.savez(file, **embedded._asdict())
+    return embedded

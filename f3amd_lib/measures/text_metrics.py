@@ -1,0 +1,172 @@
+"""Metrics of text to motion: between embeddings of a judge, and on joints that were to be controlled.
+
+Embeddings are [N, D], texts and motions of one judge. What a figure means depends on that judge, so
+that figures of different ones are never compared; orderings are. FID is `distributions.frechet_distance`.
+
+Source: Guo et al. 2022 (HumanML3D) and its released code; ACMDM, section 4.1 and its released code.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from f3amd_lib.motion.skeleton import Skeleton
+
+GROUP = 32
+"""Texts that are ranked together: 1 right motion and 31 others."""
+
+
+def groups_of_unlike_pairs(pairs, generator: np.random.Generator, size: int = GROUP) -> np.ndarray:
+    """Draw groups of clips in which no two show the same, as many as there are without using a clip twice.
+
+    Args:
+      pairs: what each clip shows, [N].
+      generator: what draws.
+      size: of a group.
+
+    Returns:
+      Clip numbers, [G, size].
+
+    Raises:
+      ValueError: if fewer pairs than `size` are there.
+    """
+    order = generator.permutation(len(pairs))
+    left = {pair: [k for k in order if pairs[k] == pair] for pair in np.unique(np.asarray(pairs)[order])}
+    if len(left) < size:
+        raise ValueError(f"groups of {size} need as many pairs of content and style, got {len(left)}")
+    groups = []
+    while len(left) >= size:
+        # The fullest first, so that as many groups as possible are made.
+        fullest = sorted(left, key=lambda pair: (-len(left[pair]), generator.random()))[:size]
+        groups.append([left[pair].pop() for pair in fullest])
+        left = {pair: clips for pair, clips in left.items() if clips}
+    return np.array(groups)
+
+
+def _distances(text, motion) -> np.ndarray:
+    """Return [G, texts, motions] of Euclidean distances within groups [G, size, D]."""
+    text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
+    if text.shape != motion.shape or text.ndim != 3:
+        raise ValueError(f"texts {text.shape} and motions {motion.shape} must both be [groups, size, D]")
+    return np.linalg.norm(text[:, :, None] - motion[:, None], axis=-1)
+
+
+def r_precision(text, motion, most: int = 3) -> np.ndarray:
+    """Share of texts whose own motion is among the k nearest of its group, for k = 1 to `most`.
+
+    Args:
+      text, motion: embeddings in groups, [G, size, D]; row i of a group belongs to row i.
+
+    Returns:
+      [most]; guessing gives k / size. A motion as near as the right one counts as nearer, so that
+      a judge that sees nothing scores 0.
+    """
+    distance = _distances(text, motion)
+    own = np.diagonal(distance, axis1=1, axis2=2)
+    rank = np.sum(distance <= own[..., None], axis=-1) - 1
+    return np.array([np.mean(rank < k) for k in range(1, most + 1)])
+
+
+def matching_distance(text, motion) -> float:
+    """Mean distance of a text to its own motion; embeddings as in `r_precision`, in groups or not."""
+    return float(np.linalg.norm(np.asarray(text, np.float64) - motion, axis=-1).mean())
+
+
+def clip_score(text, motion) -> float:
+    """Mean cosine of a text and its own motion, [..., D] each."""
+    text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
+    lengths = np.linalg.norm(text, axis=-1) * np.linalg.norm(motion, axis=-1)
+    return float(np.mean(np.sum(text * motion, axis=-1) / lengths))
+
+
+def embedding_diversity(motion, generator: np.random.Generator, count: int = 300) -> float:
+    """Mean distance between two draws of motions without replacement; near that of real motion is good.
+
+    Args:
+      motion: [N, D].
+      generator: what draws.
+      count: pairs; half of N where that is less.
+    """
+    motion = np.asarray(motion, np.float64)
+    count = min(count, len(motion) // 2)
+    if count < 1:
+        raise ValueError(f"diversity needs at least 2 motions, got {len(motion)}")
+    order = generator.permutation(len(motion))
+    return float(np.linalg.norm(motion[order[:count]] - motion[order[count : 2 * count]], axis=-1).mean())
+
+
+def multimodality(motion, generator: np.random.Generator, count: int = 10) -> float:
+    """Mean distance between motions of one caption.
+
+    Args:
+      motion: samples of each caption, [captions, samples, D].
+      generator: what draws.
+      count: pairs of each caption.
+    """
+    motion = np.asarray(motion, np.float64)
+    if motion.ndim != 3 or motion.shape[1] < 2:
+        raise ValueError(
+            f"multimodality needs at least 2 samples a caption, [captions, samples, D]; got {motion.shape}"
+        )
+    captions, samples, _ = motion.shape
+    first = generator.integers(0, samples, (captions, count))
+    second = (first + generator.integers(1, samples, (captions, count))) % samples
+    rows = np.arange(captions)[:, None]
+    return float(np.linalg.norm(motion[rows, first] - motion[rows, second], axis=-1).mean())
+
+
+# ------------------------------------------------------------------------------------------ joints
+
+
+def foot_skating_ratio(skeleton: Skeleton, positions, fps: float = 20.0) -> float:
+    """Share of steps from frame to frame in which a toe glides on the floor.
+
+    A toe glides where it is under 5 cm in both frames, moves over the ground at more than 0.5 m/s, and
+    so does its mean over 5 steps. Either toe counts.
+
+    Args:
+      skeleton: whose toes are known.
+      positions: [L, J, 3], L >= 2, metres, the floor at 0.
+      fps: frames per second.
+
+    Source: ACMDM's released evaluation, on the clip's true length.
+    """
+    toes = np.asarray(positions, np.float64)[:, list(skeleton.toes)]
+    if len(toes) < 2:
+        raise ValueError("foot skating needs at least 2 frames")
+    low = toes[..., 1] < 0.05
+    speed = np.linalg.norm(np.diff(toes[..., ::2], axis=0), axis=-1) * fps
+    window = min(5, len(speed))
+    mean = np.stack([np.convolve(foot, np.ones(window) / window, mode="same") for foot in speed.T], axis=-1)
+    glides = low[1:] & low[:-1] & (speed > 0.5) & (mean > 0.5)
+    return float(glides.any(axis=-1).mean())
+
+
+def control_errors(positions, wanted, given, threshold: float = 0.5) -> dict[str, float]:
+    """Compare joints with where they were told to be.
+
+    Args:
+      positions, wanted: [clips, L, J, 3], metres.
+      given: true where a joint of a frame was told, [clips, L, J]; in every clip somewhere.
+      threshold: metres beyond which a point is missed.
+
+    Returns:
+      control_trajectory_error: share of clips with any point missed;
+      control_location_error: share of points missed;
+      control_average_error: mean distance at the points, metres.
+
+    Raises:
+      ValueError: for unlike shapes, or a clip without a point.
+    """
+    positions, wanted, given = np.asarray(positions), np.asarray(wanted), np.asarray(given, bool)
+    if positions.shape != wanted.shape or positions.shape[:-1] != given.shape or positions.ndim != 4:
+        raise ValueError(f"positions {positions.shape}, wanted {wanted.shape} and given {given.shape} do not agree")
+    if not given.any(axis=(1, 2)).all():
+        raise ValueError(f"clip {int(np.argmin(given.any(axis=(1, 2))))} has no controlled point")
+    distance = np.linalg.norm(positions - wanted, axis=-1)
+    missed = (distance > threshold) & given
+    return {
+        "control_trajectory_error": float(missed.any(axis=(1, 2)).mean()),
+        "control_location_error": float(missed.sum() / given.sum()),
+        "control_average_error": float(distance[given].mean()),
+    }

@@ -1,0 +1,167 @@
+"""What the judge of text to motion is trained to do: lay a motion and its caption together, others apart."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+
+from f3amd_lib.data.text_encoders import TextEmbeddings
+from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, ClipTable, MotionBatch, draw_clips
+from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
+from f3amd_lib.training.optimise import TrainingState
+
+
+@dataclass(frozen=True)
+class EvaluatorTraining:
+    """How the judge is trained.
+
+    Attributes:
+      num_steps, batch_size: optimiser steps, and pairs in each.
+      learning_rate: of Adam at first; it falls to 0 on a cosine.
+      seed: of weights, batches and dropout.
+      num_frames: that motions are padded to.
+    """
+
+    ema_decay: ClassVar[None] = None
+
+    num_steps: int = 3000
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    seed: int = 0
+    num_frames: int = MOST_FRAMES // UNIT * UNIT
+
+    def __post_init__(self):
+        if self.num_steps < 1 or self.batch_size < 2:
+            raise ValueError(f"a judge needs at least 1 step and batches of 2, got {self}")
+
+
+class Captions(NamedTuple):
+    """Embedded captions, and what each of them tells.
+
+    Attributes:
+      tokens, mask: as in `TextEmbeddings`, [C, T, width] and [C, T].
+      pair: number of the pair of content and style that each describes, [C].
+    """
+
+    tokens: jax.Array
+    mask: jax.Array
+    pair: jax.Array
+
+
+class EvaluatorBatch(NamedTuple):
+    """Motions with the captions drawn for them, one each."""
+
+    motion: MotionBatch
+    captions: Captions
+
+
+def contrastive_loss(text, motion, pair):
+    """Return how badly texts find their motions and motions their texts among the batch.
+
+        mean over i of -log softmax_j(-|t_i - m_j|^2 / sqrt(D))_i, and the same for columns.
+
+    Another sample of the same pair would be right too, and is no rival.
+
+    Args:
+      text, motion: [B, D].
+      pair: numbers of the pairs, [B].
+
+    Returns:
+      (loss, share of texts whose own motion is the nearest), scalars.
+    """
+    distance = jnp.sum((text[:, None] - motion[None]) ** 2, axis=-1) / np.sqrt(text.shape[-1])
+    rival = (pair[:, None] != pair[None]) | jnp.eye(len(pair), dtype=bool)
+    score = jnp.where(rival, -distance, -jnp.inf)
+    own = jnp.arange(len(pair))
+    both = [optax.softmax_cross_entropy_with_integer_labels(s, own).mean() for s in (score, score.T)]
+    return sum(both) / 2, jnp.mean(jnp.argmax(score, axis=1) == own)
+
+
+@functools.lru_cache(maxsize=8)
+def blank_evaluator(config: TextMotionConfig):
+    """Return the network's structure and the shapes of its weights."""
+    return nnx.split(nnx.eval_shape(lambda: TextMotionNetwork(config, rngs=nnx.Rngs(0))), nnx.Param, ...)
+
+
+def evaluator_network(config: TextMotionConfig, params) -> TextMotionNetwork:
+    """Return the network with the given weights."""
+    graph, _, rest = blank_evaluator(config)
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, params), rest)
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("clips", "captions"),
+    meta_fields=("dataset_fingerprint", "text_encoder", "network", "config"),
+)
+@dataclass(frozen=True, eq=False)
+class EvaluatorTask:
+    """A judge to train (a `training.optimise.Task`).
+
+    Attributes:
+      dataset_fingerprint, text_encoder, network, config: what decides the weights.
+      clips: of the training split, features in network units.
+      captions: of these clips.
+    """
+
+    name: ClassVar[str] = "text-to-motion judge"
+
+    dataset_fingerprint: str
+    text_encoder: str
+    network: TextMotionConfig
+    config: EvaluatorTraining
+    clips: ClipTable
+    captions: Captions
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with a warm-up, gradients clipped."""
+        steps = self.config.num_steps
+        rate = optax.warmup_cosine_decay_schedule(0.0, self.config.learning_rate, min(100, steps // 5 + 1), steps + 1)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        settings = {"evaluator": dataclasses.asdict(self.network), "training": dataclasses.asdict(self.config)}
+        return {"dataset_fingerprint": self.dataset_fingerprint, "text_encoder": self.text_encoder, **settings}
+
+    def init(self, key):
+        """Return initial weights."""
+        return nnx.split(TextMotionNetwork(self.network, rngs=nnx.Rngs(key)), nnx.Param, ...)[1], None
+
+    def draw(self, state: TrainingState | None, key):
+        """Draw a batch; return (batch, key of the dropout)."""
+        key_draw, key_dropout = jax.random.split(key)
+        motion = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
+        return EvaluatorBatch(motion, jax.tree.map(lambda rows: rows[motion.caption], self.captions)), key_dropout
+
+    def loss(self, params, statistics, batch: EvaluatorBatch, key):
+        """Return (loss, (loss and in-batch accuracy, None))."""
+        network = evaluator_network(self.network, params)
+        text = network.embed_text(batch.captions.tokens, batch.captions.mask)
+        motion = network.embed_motion(batch.motion.motion, batch.motion.length, key)
+        loss, accuracy = contrastive_loss(text, motion, batch.captions.pair)
+        return loss, ({"loss": loss, "accuracy": accuracy}, None)
+
+    def held_out_terms(self, params, statistics, held_out: EvaluatorBatch, key) -> dict:
+        """Return the terms on a batch of another split, without dropout."""
+        return self.loss(params, statistics, held_out, None)[1][0]
+
+
+def embedded_captions(embedded: TextEmbeddings, pairs) -> Captions:
+    """Return captions on the device.
+
+    Args:
+      embedded: C captions.
+      pairs: what each of them tells, [C] of str.
+    """
+    numbers = np.unique(np.asarray(pairs), return_inverse=True)[1]
+    return Captions(jnp.asarray(embedded.tokens), jnp.asarray(embedded.mask), jnp.asarray(numbers, jnp.int32))

@@ -1,0 +1,215 @@
+"""HumanML3D's layout: a tree that the test writes by hand, broken in many ways, and BVH files on their way there."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+
+from f3amd_lib.__main__ import main
+from f3amd_lib.data import humanml3d
+from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.data.text_motions import TextMotions
+from f3amd_lib.motion import redundant, synthetic
+from f3amd_lib.motion.bvh import write_bvh
+from f3amd_lib.motion.rotations import matrix_from_euler
+from f3amd_lib.motion.skeleton import forward_kinematics, resample, turn
+
+LENGTHS = {"000001": 60, "M000001": 60, "000002": 120, "000003": 30, "000004": 250}
+TEXTS = {
+    "000001": "a man walks.#a/DET man/NOUN walk/VERB#0.0#0.0\nsomeone strolls#someone/PRON stroll/VERB#0.0#nan\n",
+    "M000001": "a man walks back.#a/DET man/NOUN walk/VERB back/ADV#0.0#0.0\n",
+    "000002": "he turns#he/PRON turn/VERB#0.0#0.0\nhe stands#he/PRON#2.0#5.0\nhe waits#he/PRON#2.0#5.0\n",
+    "000003": "too short#too/ADV short/ADJ#0.0#0.0\n",
+    "000004": "too long#too/ADV long/ADJ#0.0#0.0\n",
+}
+SPLITS = {"train": ["000001", "M000001"], "val": ["000003", "000004"], "test": ["000002"]}
+
+
+def positions(skeleton, frames, seed=0):
+    """Anything that moves on a skeleton, [L, J, 3]."""
+    generator = np.random.default_rng(seed)
+    angle = 0.3 * np.cumsum(generator.normal(size=(frames, skeleton.num_joints, 3)), axis=0) / 10
+    rotations = matrix_from_euler("ZXY", np.degrees(angle))
+    root = np.cumsum(generator.normal(size=(frames, 3)), axis=0) / 50 + [0, 1, 0]
+    return redundant.canonical_start(skeleton, forward_kinematics(skeleton, root, rotations))
+
+
+def write_tree(folder, layout="humanml3d"):
+    """A tiny data set, as its authors' code would leave it."""
+    skeleton = humanml3d.layout_skeleton(layout)
+    for part in ("new_joints", "new_joint_vecs", "texts"):
+        (folder / part).mkdir(parents=True)
+    for seed, (name, frames) in enumerate(LENGTHS.items()):
+        clip = positions(skeleton, frames + 1, seed)
+        np.save(folder / "new_joints" / f"{name}.npy", clip[:-1].astype(np.float32))
+        vectors = redundant.redundant_from_positions(skeleton, clip)
+        np.save(folder / "new_joint_vecs" / f"{name}.npy", vectors.astype(np.float32))
+        (folder / "texts" / f"{name}.txt").write_text(TEXTS[name], encoding="utf-8")
+    for split, names in SPLITS.items():
+        (folder / f"{split}.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("layout, joints, fps, clips", [("humanml3d", 22, 20.0, 4), ("kit", 21, 12.5, 5)])
+def test_both_published_layouts_are_read(tmp_path, layout, joints, fps, clips):
+    data = humanml3d.read_humanml3d(write_tree(tmp_path, layout), vectors=True)
+    assert (data.name, data.fps, data.skeleton.num_joints, data.num_clips) == (layout, fps, joints, clips)
+    assert data.vectors.shape == (len(data.positions), 12 * joints - 1)
+    first = data.names.index("000001")
+    assert data.captions[first] == ("a man walks.", "someone strolls") and data.splits[first] == "train"
+    # A caption with times is a clip of its own, cut at int(begin fps) and int(end fps).
+    part = data.names.index("000002@2-5")
+    assert data.captions[part] == ("he stands", "he waits") and data.splits[part] == "test"
+    whole = np.load(tmp_path / "new_joints" / "000002.npy")
+    assert np.array_equal(data.clip(part), whole[int(2 * fps) : int(5 * fps)])
+    assert data.captions[data.names.index("000002")] == ("he turns",)
+    assert ("000004", "250 frames, not") in [(name, why[:15]) for name, why in data.skipped]
+    assert ("000003" in data.names) is (layout == "kit")  # 30 frames: KIT-ML begins at 24, HumanML3D at 40
+
+
+def test_vectors_and_positions_tell_the_same(tmp_path):
+    data = humanml3d.read_humanml3d(write_tree(tmp_path), vectors=True)
+    for number, name in enumerate(data.names):
+        if "@" not in name:
+            vectors = data.vectors[data.start[number] : data.start[number + 1]].astype(np.float64)
+            assert np.abs(redundant.positions_from_redundant(vectors) - data.clip(number)).max() < 1e-5
+
+
+def append(path, text):
+    path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
+
+
+BROKEN = {
+    "a pickle": (
+        lambda f: np.save(f / "new_joints" / "000002.npy", np.array([{}], dtype=object), allow_pickle=True),
+        r"000002\.npy: cannot be read .* without pickles",
+    ),
+    "cut short": (lambda f: (f / "new_joints" / "000002.npy").write_bytes(b"\x93NUMPY"), r"000002\.npy: cannot be"),
+    "a joint less": (lambda f: np.save(f / "new_joints" / "000002.npy", np.zeros((50, 21, 3))), r"shape \(50, 21, 3\)"),
+    "not finite": (
+        lambda f: np.save(f / "new_joints" / "000002.npy", np.full((50, 22, 3), np.nan)),
+        r"000002\.npy: is not finite in frame 0",
+    ),
+    "unlike vectors": (lambda f: np.save(f / "new_joint_vecs" / "000002.npy", np.zeros((9, 263))), "9 vectors for 120"),
+    "no text": (lambda f: (f / "texts" / "000001.txt").unlink(), r"000001\.txt: cannot be read as text"),
+    "empty text": (lambda f: (f / "texts" / "000001.txt").write_text(""), r"000001\.txt: holds no caption"),
+    "few parts": (lambda f: append(f / "texts" / "000001.txt", "a man#0.0\n"), r"000001\.txt, line 3: has 2 parts"),
+    "no caption": (lambda f: append(f / "texts" / "000001.txt", "#x#0.0#0.0\n"), r"line 3: the caption is empty"),
+    "words for times": (lambda f: append(f / "texts" / "000001.txt", "a#b#now#0.0\n"), r"line 3: begin 'now'"),
+    "falling times": (lambda f: append(f / "texts" / "000001.txt", "a#b#2.0#1.0\n"), r"line 3: begin 2.0 and end 1.0"),
+    "after the end": (lambda f: append(f / "texts" / "000001.txt", "a#b#7.0#9.0\n"), r"line 3: begins at 7.0 s"),
+    "twice": (lambda f: append(f / "test.txt", "000001\n"), r"test\.txt, line 2: '000001' is listed before, in train"),
+    "no id": (lambda f: append(f / "test.txt", "../000001\n"), r"test\.txt, line 2: .* is no plain id"),
+    "no split": (lambda f: (f / "val.txt").unlink(), r"val\.txt: cannot be read as text"),
+    "all too short": (
+        lambda f: [(f / f"{split}.txt").write_text("000003\n" * (split == "test")) for split in SPLITS] and
+        shutil.copy(f / "new_joints/000003.npy", f / "new_joints/none.npy"),
+        "no clip of 40 to 199 frames",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_what_is_broken_is_refused_by_file_and_line(tmp_path, what):
+    breaking, words = BROKEN[what]
+    breaking(write_tree(tmp_path))
+    with pytest.raises(ValueError, match=words):
+        humanml3d.read_humanml3d(tmp_path, vectors=True)
+
+
+def test_another_number_of_joints_needs_its_skeleton(tmp_path):
+    write_tree(tmp_path)
+    np.save(tmp_path / "new_joints" / "000001.npy", np.zeros((50, 30, 3)))
+    with pytest.raises(ValueError, match="has 30 joints"):
+        humanml3d.read_humanml3d(tmp_path)
+    with pytest.raises(ValueError, match="unknown layout 'kit-ml'; did you mean 'kit'"):
+        humanml3d.read_humanml3d(tmp_path, layout="kit-ml")
+
+
+def test_caption_lines_are_read_as_they_were_written():
+    line = humanml3d.write_caption_line("A man's self-assured walk, twice.")
+    assert (
+        line
+        == "A man's self-assured walk, twice.#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
+    )
+    assert humanml3d.read_caption_line(line, "here") == ("A man's self-assured walk, twice.", 0.0, 0.0)
+
+
+# ------------------------------------------------------------------------ from BVH files with a table
+
+
+@pytest.fixture(scope="module")
+def bvh_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bvh")
+    rows = [("file", "caption")]
+    for seed in range(7):
+        motion = synthetic.synthesize(synthetic.STYLES[seed], seconds=4.0, seed=seed)
+        write_bvh(folder / f"take{seed}.bvh", turn(motion, 0.5 * seed))
+        rows += [(f"take{seed}.bvh", f"a person walks in way {seed}"), (f"take{seed}", "someone walks")]
+    rows += [("take6.bvh", "someone turns left")]
+    write_bvh(folder / "without.bvh", motion)
+    with (folder / "captions.csv").open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return folder
+
+
+def test_bvh_files_with_a_table_become_a_data_set(bvh_folder, tmp_path, caplog):
+    out = tmp_path / "made"
+    assert (
+        main(
+            ["dataset", "--source", str(bvh_folder), "--captions", str(bvh_folder / "captions.csv"), "--out", str(out)]
+        )
+        == 0
+    )
+    data = humanml3d.read_humanml3d(out, vectors=True)
+    assert data.skeleton == synthetic.synthesize(synthetic.STYLES[0], seconds=2.0, seed=0).skeleton and data.fps == 20.0
+    # The one whose caption names a side has no mirrored twin.
+    assert sorted(data.names) == sorted([f"take{k}" for k in range(7)] + [f"Mtake{k}" for k in range(6)])
+    split = dict(zip(data.names, data.splits, strict=True))
+    assert all(split[f"M{name}"] == split[name] for name in split if f"M{name}" in split)
+    assert set(split.values()) == {"train", "validation", "test"}
+    number = data.names.index("take3")
+    assert data.captions[number] == ("a person walks in way 3", "someone walks")
+    source = resample(open_dataset("folder", path=bvh_folder).clips[3].loader(), 20.0)
+    expected = redundant.canonical_start(data.skeleton, source.positions[:80])[:-1]
+    assert np.abs(data.clip(number) - expected).max() < 1e-5
+    twin = data.clip(data.names.index("Mtake3"))[:, list(data.skeleton.mirror_permutation)] * [-1, 1, 1]
+    assert np.abs(redundant.canonical_start(data.skeleton, twin)[:20] - data.clip(number)[:20]).max() < 0.02
+    mean, deviation = np.load(out / "Mean.npy"), np.load(out / "Std.npy")
+    training = data.select(data.members("train"))
+    assert mean.shape == deviation.shape == (275,)
+    assert np.allclose(mean, training.vectors.mean(axis=0), atol=1e-5)
+    lines = (out / "all.txt").read_text().split()
+    both = (out / "train_val.txt").read_text().split() + (out / "test.txt").read_text().split()
+    assert sorted(lines) == sorted(both) == sorted(data.names)
+    assert data.licence == "as its owner says"
+
+
+@pytest.mark.parametrize(
+    "table, words",
+    [
+        ("file,caption\ntake0,\n", "line 2: needs a file and a caption"),
+        ("name,text\ntake0,walks\n", "line 2: needs a file and a caption"),
+        ("file,caption\ntake0,walks #1\n", "line 2: # parts the fields"),
+        ("file,caption\n", "holds no caption"),
+        ("file,caption\ntaek0,walks\n", "no motion, such as those of 'taek0'; did you mean 'take0'"),
+    ],
+)
+def test_a_bad_table_is_refused(bvh_folder, tmp_path, table, words):
+    path = tmp_path / "bad.csv"
+    path.write_text(table, encoding="utf-8")
+    with pytest.raises(ValueError, match=words):
+        humanml3d.captioned_motions(
+            open_dataset("folder", path=bvh_folder), humanml3d.read_caption_table(path), progress=False
+        )
+
+
+def test_nothing_is_written_over(bvh_folder, tmp_path):
+    data = humanml3d.captioned_motions(
+        open_dataset("folder", path=bvh_folder), {"take0": ("a walk",), "take1": ("a walk",)}, progress=False
+    )
+    assert isinstance(data, TextMotions)
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(ValueError, match="is not empty; choose another folder"):
+        humanml3d.write_humanml3d(tmp_path, data)

@@ -1,0 +1,153 @@
+"""Text encoders: the offline one as installed, the interface and its cache with one of the test's own."""
+
+import json
+import socket
+
+import numpy as np
+import pytest
+
+from f3amd_lib.data import text_encoders
+from f3amd_lib.data.text_encoders import TextEmbeddings, check_words, embed_captions, load_text_encoder
+
+
+class Letters:
+    """Every letter is a token: its place in the alphabet, twice."""
+
+    identity, width = "letters", 2
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, captions) -> TextEmbeddings:
+        self.calls += 1
+        pieces = [np.array([[ord(c), ord(c)] for c in caption], np.float32) for caption in captions]
+        return text_encoders._padded(pieces, [piece.mean(axis=0) for piece in pieces])
+
+
+def test_captions_of_unlike_lengths_are_padded_and_masked(cache_dir):
+    embedded = embed_captions(["ab", "abcd"], Letters())
+    assert embedded.tokens.shape == (2, 4, 2) and embedded.mask.tolist() == [[True, True, False, False], [True] * 4]
+    assert np.all(embedded.tokens[0, 2:] == 0) and embedded.tokens[1, 3, 0] == ord("d")
+    assert embedded.pooled[0, 0] == pytest.approx(ord("a") + 0.5)
+
+
+def test_what_was_embedded_is_not_embedded_again(cache_dir):
+    encoder, captions = Letters(), ["ab", "abcd"]
+    first = embed_captions(captions, encoder)
+    again = embed_captions(captions, encoder)
+    assert encoder.calls == 1
+    assert all(np.array_equal(mine, theirs) for mine, theirs in zip(first, again, strict=True))
+    embed_captions(captions[::-1], encoder)
+    assert encoder.calls == 2
+    for file in cache_dir.iterdir():
+        file.write_bytes(file.read_bytes()[:50])
+    assert np.array_equal(embed_captions(captions, encoder).tokens, first.tokens) and encoder.calls == 3
+
+
+def test_many_captions_come_back_in_order(cache_dir):
+    captions = ["a" * (1 + k % 9) for k in range(600)]
+    embedded = embed_captions(captions, Letters())
+    assert embedded.mask.sum(axis=1).tolist() == [len(caption) for caption in captions]
+
+
+@pytest.mark.parametrize(
+    "captions, words",
+    [
+        (["a walk", "  "], "caption 2 of 2 is empty"),
+        (["..."], "holds no word"),
+        (["12 34"], "holds no word"),
+        ("a walk", "put it into a list"),
+    ],
+)
+def test_an_empty_caption_is_refused(cache_dir, captions, words):
+    with pytest.raises(ValueError, match=words):
+        embed_captions(captions, Letters())
+
+
+def test_words_that_a_model_never_saw_are_named():
+    known = ["a person raises the left hand", "an elderly person walks"]
+    check_words("An elderly person raises the hand.", known)
+    with pytest.raises(ValueError, match="never saw 'walsk', 'happily'; did you mean 'walks'"):
+        check_words("a person walsk happily", known)
+
+
+def test_unknown_encoders_and_missing_weights_are_named(tmp_path):
+    with pytest.raises(ValueError, match="unknown text encoder 'wordlama'; did you mean 'wordllama'"):
+        load_text_encoder("wordlama")
+    for name in ("clip", "t5"):
+        with pytest.raises(ValueError, match=rf"{name}: .*config.json is missing; give the folder"):
+            load_text_encoder(name, tmp_path)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setattr(text_encoders.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="wordllama is not installed"):
+        load_text_encoder()
+
+
+# ----------------------------------------------------------------------------------- the real ones
+
+
+@pytest.fixture(scope="module")
+def wordllama():
+    return load_text_encoder("wordllama")
+
+
+@pytest.mark.needs("wordllama", "tokenizers")
+def test_wordllama_works_without_a_network(monkeypatch, cache_dir):
+    def refuse(*args, **kwargs):
+        pytest.fail("the network was touched")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    embedded = embed_captions(["a person raises the left hand"], load_text_encoder())
+    assert embedded.tokens.shape == (1, 7, 256) and embedded.tokens.dtype == np.float32
+    assert np.allclose(embedded.pooled, embedded.tokens.mean(axis=1), atol=1e-6)
+
+
+@pytest.mark.needs("wordllama", "tokenizers")
+def test_wordllama_tells_actions_apart(wordllama):
+    def cosine(first, second):
+        a, b = wordllama([first, second]).pooled
+        return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+    wave = "a person waves goodbye"
+    assert cosine(wave, "a person says goodbye by waving the right hand") > 0.6
+    assert cosine(wave, "someone kicks a ball") < 0.4
+    # A mean of words knows no order: what its page says, and why token vectors go with it.
+    swapped = "left hand up and right hand down", "right hand up and left hand down"
+    assert cosine(*swapped) > 0.999
+    tokens = wordllama(swapped).tokens
+    assert np.abs(tokens[0] - tokens[1]).max() > 0.1
+
+
+@pytest.mark.needs("wordllama", "tokenizers")
+def test_wordllama_refuses_what_it_cannot_read(wordllama):
+    with pytest.raises(ValueError, match="characters unknown to wordllama"):
+        wordllama(["a person \U0001f6b6 walks"])
+    with pytest.raises(ValueError, match="at most 32; say it shorter"):
+        wordllama(["a person walks " * 20])
+
+
+@pytest.mark.needs("transformers", "torch")
+def test_clip_by_way_of_transformers(tmp_path, cache_dir):
+    """A CLIP of random weights with a vocabulary of letters: the road, not the quality."""
+    import torch
+    import transformers
+
+    letters = [chr(code) for code in range(ord("a"), ord("z") + 1)]
+    pieces = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
+    (tmp_path / "vocab.json").write_text(json.dumps({piece: k for k, piece in enumerate(pieces)}))
+    (tmp_path / "merges.txt").write_text("#version: 0.2\n")
+    tokenizer = transformers.CLIPTokenizer(str(tmp_path / "vocab.json"), str(tmp_path / "merges.txt"))
+    tokenizer.save_pretrained(tmp_path)
+    torch.manual_seed(0)
+    sizes = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    ends = {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
+    config = transformers.CLIPTextConfig(vocab_size=len(pieces), projection_dim=12, **sizes, **ends)
+    transformers.CLIPTextModelWithProjection(config).save_pretrained(tmp_path)
+    encoder = load_text_encoder("clip", tmp_path)
+    embedded = embed_captions(["walk", "he runs"], encoder)
+    assert encoder.width == 16 and embedded.tokens.shape[::2] == (2, 16) and embedded.pooled.shape == (2, 12)
+    assert embedded.mask.sum(axis=1).tolist() == [6, 8]
+    alone = encoder(["walk"])
+    assert np.allclose(alone.pooled, embedded.pooled[:1], atol=1e-5)  # padding changes nothing

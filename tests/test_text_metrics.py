@@ -1,0 +1,139 @@
+"""Every metric of text to motion, by hand: what must be good is good, what must be bad is bad."""
+
+import numpy as np
+import pytest
+
+from f3amd_lib.measures import registry, text_metrics
+from f3amd_lib.motion.skeleton import Skeleton
+
+SKELETON = Skeleton(("Hips", "LeftToe", "RightToe"), (-1, 0, 0), [[0, 0, 0], [0.1, -0.9, 0], [-0.1, -0.9, 0]])
+
+
+def embeddings(seed=0, groups=40, size=32, width=16):
+    return np.random.default_rng(seed).normal(size=(groups, size, width))
+
+
+def test_every_figure_is_registered():
+    names = registry.SHOWN["text"] + registry.SHOWN["control"]
+    assert len(names) == 12 and all(metric.definition for metric in names)
+
+
+# ---------------------------------------------------------------------------------- retrieval
+
+
+def test_r_precision_of_an_oracle_and_of_guessing():
+    text = embeddings()
+    assert np.array_equal(text_metrics.r_precision(text, text), [1, 1, 1])
+    guess = text_metrics.r_precision(text, embeddings(seed=1, groups=40))
+    assert np.allclose(guess, np.arange(1, 4) / 32, atol=0.03)
+    # Right motion under another caption, and a judge that sees nothing at all.
+    assert text_metrics.r_precision(text, np.roll(text, 1, axis=1)).max() < 0.1
+    assert np.array_equal(text_metrics.r_precision(0 * text, 0 * text), [0, 0, 0])
+
+
+def test_r_precision_by_hand():
+    text = np.array([[[0.0], [1.0], [10.0], [20.0]]])
+    motion = np.array([[[0.0], [7.0], [9.5], [19.0]]])
+    # The second text is nearer to the first motion (1) than to its own (6), and to no other.
+    assert np.allclose(text_metrics.r_precision(text, motion), [3 / 4, 1, 1])
+
+
+def test_groups_hold_no_pair_twice():
+    pairs = np.repeat([f"pair {k}" for k in range(40)], np.random.default_rng(0).integers(1, 9, 40))
+    groups = text_metrics.groups_of_unlike_pairs(pairs, np.random.default_rng(1))
+    assert len(groups) >= 3 and len(np.unique(groups)) == groups.size
+    assert all(len(set(pairs[group])) == 32 for group in groups)
+    again = text_metrics.groups_of_unlike_pairs(pairs, np.random.default_rng(2))
+    assert not np.array_equal(groups, again)
+    with pytest.raises(ValueError, match="groups of 32 need as many pairs of content and style, got 5"):
+        text_metrics.groups_of_unlike_pairs(["a", "b", "c", "d", "e"] * 9, np.random.default_rng(0))
+
+
+def test_matching_and_score():
+    text = embeddings()
+    assert text_metrics.matching_distance(text, text) == 0
+    assert text_metrics.matching_distance(text, text + [3.0, 4.0, *[0.0] * 14]) == pytest.approx(5.0)
+    assert text_metrics.clip_score(text, 7.0 * text) == pytest.approx(1.0)
+    assert text_metrics.clip_score(text, -text) == pytest.approx(-1.0)
+    assert abs(text_metrics.clip_score(text, embeddings(seed=1))) < 0.05
+
+
+def test_diversity_of_a_cloud_and_of_a_point():
+    generator = np.random.default_rng(0)
+    cloud = generator.normal(size=(2000, 16))
+    # Two draws of a normal distribution are sqrt(2) times a chi of 16 apart.
+    assert text_metrics.embedding_diversity(cloud, generator) == pytest.approx(np.sqrt(2) * 3.937, rel=0.03)
+    assert text_metrics.embedding_diversity(np.ones((50, 16)), generator) == 0
+    assert text_metrics.embedding_diversity([[0.0], [3.0]], generator) == 3
+    with pytest.raises(ValueError, match="at least 2 motions"):
+        text_metrics.embedding_diversity(np.ones((1, 4)), generator)
+
+
+def test_multimodality_looks_within_a_caption():
+    generator = np.random.default_rng(0)
+    far_apart = 100.0 * np.arange(5)[:, None, None] + np.zeros((5, 30, 4))
+    assert text_metrics.multimodality(far_apart, generator) == 0  # many captions, one motion each
+    two_ways = np.zeros((5, 2, 4))
+    two_ways[:, 1, 0] = 3.0
+    assert text_metrics.multimodality(two_ways, generator) == 3  # never a motion with itself
+    with pytest.raises(ValueError, match="at least 2 samples a caption"):
+        text_metrics.multimodality(np.zeros((5, 1, 4)), generator)
+
+
+# ------------------------------------------------------------------------------------- joints
+
+
+def sliding(speed, height=0.02, frames=40, fps=20.0):
+    """A rigid figure that moves over the ground, [L, 3, 3]."""
+    pose = np.array([[0, 0.9, 0], [0.1, height, 0], [-0.1, height, 0]])
+    return pose + (speed / fps * np.arange(frames))[:, None, None] * [0, 0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "positions, ratio",
+    [(sliding(1.0), 1.0), (sliding(0.4), 0.0), (sliding(1.0, height=0.06), 0.0), (sliding(0.0), 0.0)],
+)
+def test_skating_is_fast_and_low(positions, ratio):
+    # The 5-step mean sees zeros beyond the ends, as in the released code: two steps at each end may drop out.
+    assert text_metrics.foot_skating_ratio(SKELETON, positions) == pytest.approx(ratio, abs=0.06)
+
+
+def test_one_foot_is_enough_and_one_jerk_is_not():
+    one = sliding(0.0)
+    one[:, 2] = sliding(2.0)[:, 2]
+    assert text_metrics.foot_skating_ratio(SKELETON, one) > 0.9
+    jerk = sliding(0.0)
+    jerk[20:] += [0, 0, 0.05]  # 1 m/s for one step: 0.2 m/s in the mean
+    assert text_metrics.foot_skating_ratio(SKELETON, jerk) == 0
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        text_metrics.foot_skating_ratio(SKELETON, one[:1])
+
+
+def test_control_errors_by_hand():
+    wanted = np.zeros((2, 10, 3, 3))
+    given = np.zeros((2, 10, 3), bool)
+    given[:, [2, 5, 7, 9], 1] = True
+    made = wanted + [0.3, 0.4, 0.0]  # half a metre off everywhere, which is not more than half a metre
+    exact = text_metrics.control_errors(wanted, wanted, given)
+    assert set(exact.values()) == {0.0} and set(exact) <= set(registry.METRICS)
+    near = text_metrics.control_errors(made, wanted, given, threshold=0.51)
+    assert near == {
+        "control_trajectory_error": 0.0,
+        "control_location_error": 0.0,
+        "control_average_error": pytest.approx(0.5),
+    }
+    made[0, 5, 1] = [2.0, 0.0, 0.0]
+    made[1, :, 0] = 99.0  # a joint that nobody asked for
+    one_off = text_metrics.control_errors(made, wanted, given, threshold=0.51)
+    assert one_off["control_trajectory_error"] == 0.5 and one_off["control_location_error"] == 1 / 8
+    assert one_off["control_average_error"] == pytest.approx((7 * 0.5 + 2.0) / 8)
+
+
+def test_control_without_a_point_is_refused():
+    wanted = np.zeros((2, 4, 3, 3))
+    given = np.zeros((2, 4, 3), bool)
+    given[0, 0, 0] = True
+    with pytest.raises(ValueError, match="clip 1 has no controlled point"):
+        text_metrics.control_errors(wanted, wanted, given)
+    with pytest.raises(ValueError, match="do not agree"):
+        text_metrics.control_errors(wanted, wanted[:, :3], given)
