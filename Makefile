@@ -19,7 +19,7 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke measure bench bench-tools test test-slow test-all test-extras test-web web-tools lint \
+.PHONY: help install figures smoke measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools lint \
   lab clean site site-tools
 
 help: ## Show this list
@@ -59,7 +59,7 @@ bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 
 	  -q -r requirements-bench.txt
 
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
-	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow" $(PYTEST_OPTIONS)
+	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
@@ -67,7 +67,10 @@ test: lint ## Lint, run the tests but the slow ones, check the notebooks' commit
 test-slow: $(INSTALLED) ## Run the slow tests that `make test` leaves out
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m slow --ignore tests/web $(PYTEST_OPTIONS)
 
-test-all: test test-slow test-extras site test-web ## All tests there are, with the site and the browser
+test-long: $(INSTALLED) ## Rehearse each command of the ledger at smoke size, and the notebooks with other seeds
+	$(PYTEST) tests $(SIDE_BY_SIDE) -m long --ignore tests/web $(PYTEST_OPTIONS)
+
+test-all: test test-slow test-long test-extras site test-web ## All tests there are, with the site and the browser
 
 # What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
 # the marker `needs`.

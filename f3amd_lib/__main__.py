@@ -456,6 +456,50 @@ def measure(
         log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **extra))
 
 
+def campaign(
+    motion: Data,
+    minutes: float | None = None,
+    batch_size: int = 128,
+    only: Repeatable = (),
+    packed: Path | None = None,
+    out: Path | None = None,
+) -> int:
+    """Train and measure the long queue of real motion in legs; a killed leg goes on where it stopped.
+
+    Args:
+      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
+      batch_size: windows a step; the paper's is 512.
+      only: this preset of the queue; repeatable.
+      packed: the data set as its packed cache file, instead of its source.
+      out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
+    """
+    from f3amd_lib.data.packed import load_packed
+    from f3amd_lib.experiments.campaign import run_campaign
+    from f3amd_lib.experiments.measure import protocol_of
+    from f3amd_lib.ground.profiles import load_profile, runs_dir
+    from f3amd_lib.training.pipeline import PreparedData
+
+    if packed is None:
+        prepared, profile = motion.open()
+    else:
+        profile = load_profile(motion.profile, motion.data)
+        prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
+    classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
+    state = "measured"
+    for name, windows, state in run_campaign(
+        prepared,
+        profile,
+        classifier,
+        protocol,
+        folder=out or runs_dir(profile.dataset, profile.name) / "campaign",
+        batch_size=batch_size,
+        only=only,
+        budget_s=None if minutes is None else 60.0 * minutes,
+    ):
+        log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
+    return UNFINISHED if state == "unfinished" else 0
+
+
 def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> int:
     """Run the numbered notebooks in order; results go under paper_figures/.
 
@@ -504,7 +548,7 @@ def cards() -> int:
     return model_cards.main()
 
 
-COMMANDS = (data, dataset, presets, train, rollout, crowd, export, bench, measure, figures, claims, cards)
+COMMANDS = (data, dataset, presets, train, rollout, crowd, export, bench, measure, campaign, figures, claims, cards)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -94,6 +94,10 @@ def tables(run: str) -> dict[str, list[dict]]:
     return {}
 
 
+OUT_OF_REACH = {"E11": ("IREE, GPU",)}
+"""Statements that nothing here can measure: `bench` runs IREE on a CPU alone."""
+
+
 @pytest.mark.parametrize("claim", claims.load_claims(), ids=lambda claim: claim.id)
 def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
     """All that the commands would write, and nothing else, is enough to judge every statement."""
@@ -106,10 +110,13 @@ def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
         record = {"dataset": data, "profile": profile, "seed": 0, "device_platform": "gpu", "device_kind": "Test"}
         write_table(tmp_path / data / profile / "records" / f"{name}.csv", pd.DataFrame(rows), record)
     # Times on a GPU and on a CPU come from two data sets: statements may rest on either.
-    evidences = [recorded_evidence(tmp_path, data, profile) for data, profile in {key[:2] for key in left}]
+    evidences = [recorded_evidence(tmp_path, *key) for key in dict.fromkeys(key[:2] for key in left)]
     evidences = evidences or [recorded_evidence(tmp_path, "bandai", "gpu")]
     judgement = claims.judge_claim(claim, {"bandai": evidences})
-    assert [statement.figure for statement in judgement.ours if statement.verdict == UNMEASURED] == []
+    beyond = OUT_OF_REACH.get(claim.id, ())
+    missing = [statement for statement in judgement.ours if statement.verdict == UNMEASURED]
+    assert [one.figure for one in missing if not one.says.startswith(beyond)] == []
+    assert len({one.says for one in missing}) == 2 * len(beyond)
 
 
 def test_every_claim_has_a_command_that_the_ledger_prints():
@@ -157,7 +164,7 @@ def test_a_window_of_another_length_is_for_quality_alone(capsys, monkeypatch):
 SMALL = "F3AMD-FNO-32"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "table"),
     [

@@ -248,7 +248,8 @@ def second_paper(tmp_path, monkeypatch):
         'decided_by = "FID"\n[[claim.statement]]\nsays = "CAMDM is worse"\nkind = "worse"\nmodel = "CAMDM"\n'
         'against = "F3AMD-FNO-96"\nmetric = "FID"\n'
     )
-    caches = (papers.load_paper_file, _patterns, claims.load_claims, evidence.paper_evidence)
+    (tmp_path / "other/commands.toml").write_text('[[command]]\nrun = "f3amd measure quality"\nclaims = ["Q1"]\n')
+    caches = (papers.load_paper_file, _patterns, claims.load_claims, claims.load_commands, evidence.paper_evidence)
     monkeypatch.setattr(papers, "_FOLDER", tmp_path)
     for cached in caches:
         cached.cache_clear()
@@ -276,7 +277,7 @@ def test_a_second_paper_has_its_own_map_and_claims(second_paper, tmp_path):
     (judgement,) = claims.judge_claims(tmp_path, paper=second_paper)
     assert judgement.verdict == judgement.paper_verdict == "not measured"
     page = claims.ledger_markdown([judgement])
-    assert "1 claims of the OTHER-2 paper" in page and "## Quality" in page
+    assert "1 claims of the OTHER-2 paper" in page and "## Quality" in page and "f3amd measure quality" in page
 
 
 def test_a_broken_folder_of_a_paper_is_refused(second_paper, tmp_path):

@@ -32,7 +32,7 @@ TRAIN_TOYS = ("02", "10", "11", "12")
 RUNS = [(path, 1) for path in NOTEBOOKS] + [(path, 2) for path in NOTEBOOKS if path.name.startswith(TRAIN_TOYS)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("path", "seed"), RUNS, ids=lambda value: getattr(value, "stem", value))
 def test_notebooks_run_with_any_seed(copy, path, seed, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(copy))

@@ -28,7 +28,7 @@ from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.classifier import train_classifier
-from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -93,7 +93,10 @@ def measured(generator, packed, prepared, classifier):
     return measure_model(generator, packed, classifier, SMALL, prepared.windows("validation"))
 
 
-PROTOCOL_METRICS = set(METRICS) - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
+TEXT_METRICS = {metric.name for table in ("text", "control") for metric in SHOWN[table]}
+PROTOCOL_METRICS = (
+    set(METRICS) - TEXT_METRICS - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
+)
 """All but what `measure walking` measures."""
 
 
@@ -284,7 +287,7 @@ def test_the_metrics_own_sensitivity_is_measured(prepared, classifier, generator
     graded, record = read_table(measure.measure_sensitivity(prepared, profile))
     assert set(graded["corruption"]) == set(REFERENCE_MODELS[1:])
     assert {0.0, 1.0} <= set(graded["strength"]) and record["measurement"] == "sensitivity"
-    feet, _ = read_table(tmp_path / "synthetic" / "smoke" / "records" / "foot_spectrum.csv")
+    feet, _ = read_table(measure.measure_foot_spectrum(prepared, profile))
     assert set(feet["model"]) == {"real", name}
     settled, _ = read_table(tmp_path / "synthetic" / "smoke" / "records" / "settling.csv")
     assert {"FID", "EMD"} <= set(settled["metric"])

@@ -4,8 +4,9 @@ asked, in short runs all alike, whether each of them learns.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -13,12 +14,11 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import run_record
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise, restore_state
 from f3amd_lib.training.pipeline import PreparedData, as_trained, finished_model, model_files, train
-from f3amd_lib.training.recipe import profile_recipe, short_recipe
+from f3amd_lib.training.recipe import TrainingConfig, short_recipe
 
 SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
 """What all runs have in common; enough to see a loss fall, far from enough to walk."""
@@ -76,35 +76,47 @@ def train_family(
 
 
 def snapshot(
-    prepared: PreparedData, profile: Profile, preset: str, steps: int, *, folder, progress: bool = True
-) -> tuple[TrainedModel, float, float]:
-    """Train a preset by the profile's recipe up to a step, going on from an earlier snapshot of the folder.
+    prepared: PreparedData,
+    preset: str,
+    recipe: TrainingConfig,
+    steps: int,
+    record: dict,
+    *,
+    folder,
+    network: Mapping | None = None,
+    stop_at: float | None = None,
+    progress: bool = True,
+) -> tuple[TrainedModel | None, float]:
+    """Train up to a step, going on from an earlier snapshot of the folder.
 
     Args:
-      prepared, profile, preset: the data, the recipe and the model.
+      prepared, preset, recipe: the data, the model, and how a whole run is trained.
       steps: at most those of the recipe.
+      record: from `run_record`; what the model is told of its training.
       folder: where the training state is kept.
+      network: fields of the preset's network to change.
+      stop_at: see `optimise`.
       progress: show a progress bar.
 
     Returns:
-      (model with the moving average of the weights, epochs done, held-out loss).
+      (model with the moving average of the weights, held-out loss); the model is None where `stop_at` came first.
 
     Raises:
       ValueError: if the state that lies there is of other settings.
     """
-    recipe = profile_recipe(profile, preset)
-    task, file = prepared.task(preset, recipe), Path(folder) / f"{preset}.state.safetensors"
+    task, file = prepared.task(preset, recipe, network=network), Path(folder) / f"{preset}.state.safetensors"
     state = restore_state(file, task) if file.exists() else None
     if state is None or int(state.step) > steps:
         state = initial_state(task)
     state, _ = optimise(
-        task, state, checkpoint=file, checkpoint_every=steps, chunk=max(1, min(50, steps)), stop_after=steps,
-        progress=progress,
+        task, state, checkpoint=file, checkpoint_every=min(steps, 400), chunk=min(50, steps), stop_after=steps,
+        stop_at=stop_at, progress=progress,
     )  # fmt: skip
+    if int(state.step) < steps:
+        return None, math.nan
     loss = held_out_terms(task, state, prepared.windows(prepared.held_out_split))["loss"]
-    record = run_record(profile=profile, dataset=prepared.packed, seed=recipe.seed, training=recipe.to_dict())
-    epochs = steps * recipe.batch_size / prepared.windows("train").num_windows
-    return as_trained(prepared, task, preset, state.averaged, record), epochs, loss
+    record = {**record, "training": recipe.to_dict(), "windows_seen": steps * recipe.batch_size}
+    return as_trained(prepared, task, preset, state.averaged, record), loss
 
 
 def learning_curve(

@@ -120,7 +120,7 @@ def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
     return {name: weights_digest(model.params) for name, model in trained.items()}
 
 
-def _protocol(prepared: PreparedData, profile: Profile, measurement: str) -> tuple[StyleClassifier, Protocol, dict]:
+def protocol_of(prepared: PreparedData, profile: Profile, measurement: str) -> tuple[StyleClassifier, Protocol, dict]:
     """Return the style classifier, the protocol of a profile and the record of a measurement."""
     packed = prepared.packed
     classifier, _ = obtain_classifier(packed, profile)
@@ -171,7 +171,7 @@ def measure_quality(
       `quality_by_round.csv`.
     """
     packed, asked = prepared.packed, _names(models)
-    classifier, protocol, record = _protocol(prepared, profile, "quality")
+    classifier, protocol, record = protocol_of(prepared, profile, "quality")
     held_out = prepared.windows(prepared.held_out_split)
     trained = _trained(prepared, profile, asked or available_models(profile))
     if published is not None:
@@ -310,7 +310,7 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
       ValueError: if models are named.
     """
     _refuse_models(models, "the metrics are asked about real motion")
-    classifier, protocol, record = _protocol(prepared, profile, "sensitivity")
+    classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
     graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
     tables = {"settling": sensitivity.settling(classifier), "corruptions": sensitivity.summarise_corruptions(graded)}
     for name, table in tables.items():
@@ -359,7 +359,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     Raises:
       ValueError: for a model asked for by name whose sampler is not DDIM.
     """
-    classifier, protocol, record = _protocol(prepared, profile, "literal_update")
+    classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
     held_out = prepared.windows(prepared.held_out_split)
     asked = _names(models)
     trained = _trained(prepared, profile, asked or _models_with_weights(profile))
@@ -484,7 +484,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
       The table `records/quality_by_epoch.csv`: the nine metrics of Table 3 and the held-out loss,
       against epochs over the training windows. By default of `F3AMD-FNO-96` and `CAMDM`.
     """
-    classifier, protocol, record = _protocol(prepared, profile, "quality_by_epoch")
+    classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     held_out = prepared.windows(prepared.held_out_split)
     names, asked = _names(models) or ["F3AMD-FNO-96", "CAMDM"], _names(models)
@@ -493,8 +493,10 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
     records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
 
     def score(row: Mapping) -> dict:
-        steps = max(1, round(profile.train_steps * row["snapshot"] / SNAPSHOTS))
-        trained, epoch, loss = snapshot(prepared, profile, row["model"], steps, folder=folder)
+        recipe = profile_recipe(profile, row["model"])
+        steps = max(1, round(recipe.num_steps * row["snapshot"] / SNAPSHOTS))
+        trained, loss = snapshot(prepared, row["model"], recipe, steps, record, folder=folder)
+        epoch = steps * recipe.batch_size / prepared.windows("train").num_windows
         generator = MotionGenerator(trained, profile.num_steps)
         rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out)
         rows = rows[rows["metric"].isin([metric.name for metric in SHOWN["paper"]])][["metric", "value"]]

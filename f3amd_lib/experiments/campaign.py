@@ -1,0 +1,184 @@
+"""The long queue: all that is trained on real motion, in order, in legs that go on where the last one stopped.
+
+The queue stands in `papers/f3amd/campaign.toml`. Every run follows the paper's text, whose learning
+rate hardly falls, so that each snapshot of a long run is a fair row at its length. Snapshots are
+kept as weights, measured by the protocol of `experiments.protocol` with one seed, and gathered in
+one table, `records/campaign.csv`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+import tomllib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pandas as pd
+
+from f3amd_lib.experiments.learning_curves import snapshot
+from f3amd_lib.experiments.protocol import Protocol, measure_model
+from f3amd_lib.experiments.recipes import find_recipe
+from f3amd_lib.experiments.runner import Records
+from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.classifier import StyleClassifier
+from f3amd_lib.networks import presets
+from f3amd_lib.training.checkpoints import save_model, weights_digest
+from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
+
+log = logging.getLogger("f3amd")
+
+EPOCHS = 100
+"""Of the whole run that the recipe is made for (section 4.5); snapshots come long before."""
+
+STEPS_MEASURED = (8, 1)
+"""Denoising steps with which a snapshot is measured."""
+
+_QUEUE = Path(__file__).parents[1] / "papers" / "f3amd" / "campaign.toml"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training of the queue.
+
+    Attributes:
+      preset: the model.
+      recipe: row of `recipes.toml` that it is trained by; "paper" for the paper's text.
+      window: frames of a window.
+      seed: of weights and batches.
+    """
+
+    preset: str
+    recipe: str = "paper"
+    window: int = 32
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """A name for files and tables: what differs from the usual is in it."""
+        parts = [self.preset, "" if self.recipe == "paper" else self.recipe]
+        parts += ["" if self.window == 32 else f"{self.window}frames", f"seed{self.seed}"]
+        return "-".join(filter(None, parts))
+
+    def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
+        """Return the training config of `EPOCHS` epochs over so many windows."""
+        steps = EPOCHS * num_windows // batch_size
+        if self.recipe != "paper":
+            return find_recipe(self.recipe).config(steps, batch_size, self.seed)
+        return paper_recipe(self.preset, steps, batch_size=batch_size, seed=self.seed)
+
+
+def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
+    """Return (run, windows seen) of every snapshot, in the order in which they are to be trained.
+
+    Raises:
+      ValueError: for an unknown preset or recipe.
+    """
+    snapshots = []
+    for row in tomllib.loads(Path(path).read_text(encoding="utf-8"))["run"]:
+        runs = [("paper", presets.find_preset(name).name) for name in row.get("presets", ())]
+        runs += [(name, find_recipe(name).preset) for name in row.get("recipes", ())]
+        for recipe, preset in runs:
+            for seed in row.get("seeds", [0]):
+                run = Run(preset, recipe, row.get("window", 32), seed)
+                snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
+    return snapshots
+
+
+def run_campaign(
+    prepared: PreparedData,
+    profile: Profile,
+    classifier: StyleClassifier,
+    protocol: Protocol,
+    *,
+    folder,
+    batch_size: int = 128,
+    only: Iterable[str] = (),
+    budget_s: float | None = None,
+    snapshots: list[tuple[Run, int]] | None = None,
+    progress: bool = True,
+) -> Iterator[tuple[str, int, str]]:
+    """Train and measure what the queue still lacks, until it is done or the time is over.
+
+    Args:
+      prepared, profile: the data, and where records go.
+      classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
+      folder: where training states and weights lie, a folder a run.
+      batch_size: windows a step (the paper's is 512, for a GPU).
+      only: names of presets; all by default.
+      budget_s: seconds; the run under way stops with a checkpoint when they are over.
+      snapshots: see `queue`, which is the default.
+      progress: show progress bars.
+
+    Yields:
+      (run, windows, state) for each snapshot: "measured before", "measured", or "unfinished", which is the last.
+
+    Raises:
+      ValueError: if `only` names no preset of the queue.
+    """
+    snapshots, only = queue() if snapshots is None else snapshots, list(only)
+    for name in only:
+        if name not in (known := {run.preset for run, _ in snapshots}):
+            raise ValueError(f"the queue has no {name!r}{nearest_hint(name, known)}")
+    protocol = dataclasses.replace(protocol, num_seeds=1)
+    stop_at = None if budget_s is None else time.monotonic() + budget_s
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement="campaign",
+        batch_size=batch_size,
+        protocol=dataclasses.asdict(protocol), classifier_weights=weights_digest(classifier.params),
+    )  # fmt: skip
+    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {"campaign": ["run", "windows"]})
+    for run, windows in snapshots:
+        key = {"run": run.name, "windows": windows}
+        if only and run.preset not in only:
+            continue
+        if records.has("campaign", key):
+            yield run.name, windows, "measured before"
+            continue
+        if stop_at is not None and time.monotonic() >= stop_at:
+            yield run.name, windows, "unfinished"
+            return
+        rows = _measured(prepared, classifier, protocol, run, windows, batch_size, record, folder, stop_at, progress)
+        if rows is None:
+            yield run.name, windows, "unfinished"
+            return
+        records.put("campaign", key, rows)
+        yield run.name, windows, "measured"
+
+
+def _measured(
+    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, record, folder, stop_at, progress
+) -> pd.DataFrame | None:
+    """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
+    data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
+    num_windows = data.windows("train").num_windows
+    network = find_recipe(run.recipe).network if run.recipe != "paper" else None
+    steps, folder = max(1, windows // batch_size), Path(folder) / run.name
+    trained, loss = snapshot(
+        data, run.preset, run.config(num_windows, batch_size), steps, record,
+        folder=folder, network=network, stop_at=stop_at, progress=progress,
+    )  # fmt: skip
+    if trained is None:
+        return None
+    save_model(folder / f"{windows}.safetensors", trained, jnp.bfloat16)
+    log.info("measuring %s after %s windows", run.name, f"{windows:,}")
+    held_out = data.windows(data.held_out_split)
+    tables = [
+        measure_model(MotionGenerator(trained, count), data.packed, classifier, protocol, held_out)[0]
+        for count in STEPS_MEASURED
+    ]
+    tables.append(pd.DataFrame([{"steps": 0, "metric": "held_out_loss", "value": loss}]))
+    told = {
+        "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
+        "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
+        "device": jax.devices()[0].device_kind,
+    }  # fmt: skip
+    return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**told)

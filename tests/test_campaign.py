@@ -1,0 +1,131 @@
+"""The long queue: what it holds, that each run is trained as its row says, and that a stopped leg loses nothing."""
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from builders import packed_from, refused
+
+from f3amd_lib.experiments.campaign import Run, queue, run_campaign
+from f3amd_lib.experiments.protocol import Protocol
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.networks import presets
+from f3amd_lib.training import checkpoints
+from f3amd_lib.training.pipeline import PreparedData
+
+STYLES = ("Neutral", "Old")
+PROFILE = load_profile("smoke", "synthetic")
+
+
+@pytest.fixture(scope="module")
+def packed():
+    splits = (0, 0, 1, 2, 2)
+    return packed_from(
+        [(synthesize(s, 4.0, k), n, split) for n, s in enumerate(STYLES) for k, split in enumerate(splits)],
+        styles=STYLES,
+    )
+
+
+@pytest.fixture(scope="module")
+def judges(packed):
+    sizes = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
+    classifier = train_classifier(packed, num_steps=60, batch_size=32, progress=False, **sizes)
+    return classifier, Protocol(STYLES, num_frames=66, num_diversity_seeds=2, windows_per_style=1)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Networks of one narrow block."""
+    build = presets.build_config
+    monkeypatch.setattr(presets, "build_config", lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8}))
+
+
+def run(packed, judges, folder, snapshots, monkeypatch, **settings):
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(folder / "results"))
+    states = list(
+        run_campaign(
+            PreparedData(packed, 32, 10), PROFILE, *judges, folder=folder / "runs", batch_size=4, snapshots=snapshots,
+            progress=False, **settings,
+        )
+    )  # fmt: skip
+    path = folder / "results" / "synthetic" / "smoke" / "records" / "campaign.csv"
+    return states, read_table(path) if path.exists() else None
+
+
+# ----------------------------------------------------------------------------------- the queue
+
+
+def test_the_queue_names_each_snapshot_once_and_holds_what_the_tables_need():
+    snapshots = queue()
+    names = [(run.name, windows) for run, windows in snapshots]
+    assert len(set(names)) == len(names)
+    asked = {(run.preset, run.window) for run, _ in snapshots}
+    for preset in ("F3AMD-DCT-96", "F3AMD-FNO-96-m4", "F3AMD-FNO-96-AdaLN-zero", "CAMDM-VE", "F3AMD-FNO-96-no-IRD"):
+        assert (preset, 32) in asked, preset
+    assert {("F3AMD-FNO-96", 64), ("CAMDM", 64)} <= asked
+    assert names[0][0] == "F3AMD-FNO-96-seed0" and names[-1] == ("F3AMD-FNO-96-seed0", 19_400_000)
+
+
+def test_names_tell_apart_what_differs():
+    runs = [Run("A"), Run("A", seed=1), Run("A", window=64), Run("A", recipe="mixed-noise"), Run("B")]
+    assert len({each.name for each in runs}) == len(runs)
+
+
+def test_snapshots_of_one_run_are_trained_alike_whatever_comes_after_them():
+    short, long = Run("F3AMD-FNO-96").config(1000, 8), Run("F3AMD-FNO-96").config(1000, 8)
+    assert short == long and short.num_steps == 100 * 1000 // 8 and short.schedule == "inverse_square"
+    assert Run("F3AMD-FNO-96", recipe="mixed-noise").config(1000, 8).noise == "mixed" != short.noise
+    assert Run("F3AMD-FNO-96", seed=2).config(1000, 8).seed == 2
+
+
+def test_a_queue_with_a_misspelt_row_is_refused(tmp_path):
+    file = tmp_path / "campaign.toml"
+    for line, told in (('presets = ["F3AMD-FNO-69"]', "F3AMD-FNO-69"), ('recipes = ["mixed-nose"]', "mixed-noise")):
+        file.write_text(f"[[run]]\n{line}\nwindows = [1]\n")
+        refused(told, queue, file)
+
+
+# --------------------------------------------------------------------------------------- legs
+
+
+@pytest.mark.slow
+def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing_twice(
+    packed, judges, small, tmp_path, monkeypatch
+):
+    snapshots = [(Run("F3AMD-FNO-32"), 8), (Run("F3AMD-FNO-32"), 16), (Run("F3AMD-FNO-32", "mixed-noise", seed=1), 8)]
+    whole, (table, record) = run(packed, judges, tmp_path / "whole", snapshots, monkeypatch)
+    assert [state for *_, state in whole] == ["measured"] * 3
+    assert record["batch_size"] == 4 and set(table["steps"]) == {0, 1, 8}
+    weights = table.groupby(["run", "windows"])["weights"].unique()
+    assert weights.map(len).eq(1).all() and len(set(weights.map(lambda values: values[0]))) == 3
+    for each, windows in snapshots:
+        kept = checkpoints.load_model(tmp_path / "whole" / "runs" / each.name / f"{windows}.safetensors")
+        assert kept.record["training"]["seed"] == each.seed
+    # Stopped at once, then after the first snapshot, then to the end.
+    legs = tmp_path / "legs"
+    stopped, nothing = run(packed, judges, legs, snapshots, monkeypatch, budget_s=0.0)
+    assert [state for *_, state in stopped] == ["unfinished"] and nothing is None
+    run(packed, judges, legs, snapshots[:1], monkeypatch)
+    rest, (again, _) = run(packed, judges, legs, snapshots, monkeypatch)
+    assert [state for *_, state in rest] == ["measured before", "measured", "measured"]
+    pd.testing.assert_frame_equal(table, again)
+    # A nonsense must show: another seed gives other weights.
+    _, (other, _) = run(packed, judges, tmp_path / "other", [(Run("F3AMD-FNO-32", seed=5), 8)], monkeypatch)
+    assert other["weights"][0] not in set(table["weights"])
+
+
+@pytest.mark.slow
+def test_windows_of_64_frames_and_only_one_preset(packed, judges, small, tmp_path, monkeypatch):
+    snapshots = [(Run("F3AMD-FNO-32"), 4), (Run("F3AMD-FNO-48", window=64), 4)]
+    states, (table, _) = run(packed, judges, tmp_path, snapshots, monkeypatch, only=["F3AMD-FNO-48"])
+    assert [name for name, *_ in states] == ["F3AMD-FNO-48-64frames-seed0"]
+    assert set(table["window_frames"]) == {64} and np.isfinite(table.query("metric == 'held_out_loss'")["value"]).all()
+    assert table["device"].unique().tolist() == [jax.devices()[0].device_kind]
+
+
+def test_a_preset_that_is_not_in_the_queue_is_refused(packed, judges, tmp_path, monkeypatch):
+    call = lambda: run(packed, judges, tmp_path, [(Run("F3AMD-FNO-32"), 4)], monkeypatch, only=["F3AMD-FNO-23"])
+    refused("F3AMD-FNO-32", call)
