@@ -142,7 +142,7 @@ def measurement(tmp_path, monkeypatch):
 
     walk = lambda *arguments, **settings: walk_windows(*arguments, **settings, **FEW)
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    monkeypatch.setattr(measure, "_protocol", protocol)
+    monkeypatch.setattr(measure, "protocol_of", protocol)
     monkeypatch.setattr(measure, "measure_model", measure_model)
     monkeypatch.setattr(measure, "obtain_model", lambda *a, preset: (models[preset], None, ""))
     monkeypatch.setattr(measure, "available_models", lambda profile: list(models))
