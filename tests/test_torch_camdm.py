@@ -233,7 +233,7 @@ def test_compiled_code_gives_the_numbers_of_jax():
 
 
 def test_probe_multiplies_and_counts():
-    multiply, operations = torch_camdm.torch_matmul_probe(48)
+    multiply, operations = torch_camdm.torch_matmul_probe(size=48)
     matrix = torch.randn(48, 48, generator=torch.Generator().manual_seed(0)).numpy()
     np.testing.assert_allclose(multiply().numpy(), matrix @ matrix, atol=1e-4)
     assert operations == 2 * 48**3

@@ -176,8 +176,9 @@ def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas"
     run = torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime)
 
     def call():
-        run(condition)
+        frames = run(condition)
         wait()
+        return frames
 
     call()
     return Round(call, time.perf_counter() - started)

@@ -375,8 +375,9 @@ def torch_matmul_probe(device: str = "cpu", size: int | None = None) -> tuple[Ca
     matrix = torch.randn(size, size, generator=torch.Generator().manual_seed(0)).to(device)
 
     def multiply():
-        torch.mm(matrix, matrix)
+        product = torch.mm(matrix, matrix)
         if device == "cuda":
             torch.cuda.synchronize()
+        return product
 
     return multiply, 2 * size**3
