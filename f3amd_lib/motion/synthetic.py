@@ -19,9 +19,8 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import tomllib
 from dataclasses import dataclass, make_dataclass
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -29,6 +28,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
 from f3amd_lib.motion.rotations import matrix_from_yaw
@@ -39,7 +39,7 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 def _read_skeleton() -> Skeleton:
     """Read `walker_skeleton.csv`: a T-pose that faces +Z with the left at +X; rows without a name are tips."""
-    with (resources.files("f3amd_lib.motion") / "walker_skeleton.csv").open(encoding="utf-8", newline="") as file:
+    with Path(__file__).with_name("walker_skeleton.csv").open(encoding="utf-8", newline="") as file:
         rows = [(row["joint"], row["parent"], [float(row[axis]) for axis in "xyz"]) for row in csv.DictReader(file)]
     names = [joint for joint, _, _ in rows if joint]
     return Skeleton(
@@ -77,7 +77,7 @@ def _symmetric(style) -> bool:
     )
 
 
-_STYLE_TABLE = tomllib.loads((resources.files("f3amd_lib.motion") / "styles.toml").read_text(encoding="utf-8"))
+_STYLE_TABLE = read_toml(Path(__file__).with_name("styles.toml"))
 _NEUTRAL, _NEUTRAL_ARM = _STYLE_TABLE["Neutral"], _STYLE_TABLE["Neutral"].pop("arms")
 
 # What a parameter means stands beside its number, in [Neutral] of styles.toml.
