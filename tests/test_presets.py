@@ -34,7 +34,7 @@ def test_every_row_of_every_table_has_a_preset(number):
         preset = presets.find_preset(name)
         assert window in preset.windows, (name, window)
         assert preset.source != "ours"
-    assert {presets.find_preset(name).name for name in table["model"]} <= set(presets.PRESETS)
+    assert {presets.find_preset(name).name for name in table["model"]} <= set(presets.of_paper())
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_table_is_the_committed_one():
     table = presets.table(channels=141, num_styles=100)
     committed = pd.read_csv(COMMITTED_TABLE)
     pd.testing.assert_frame_equal(table, committed, check_dtype=False)
-    assert len(presets.PRESETS) >= 30 and set(table["model"]) == set(presets.PRESETS)
+    assert len(presets.of_paper()) >= 30 and set(table["model"]) == set(presets.of_paper())
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_unknown_names_are_refused_with_the_nearest():
 
 
 def test_configs_of_every_family_survive_json():
-    for name in presets.PRESETS:
+    for name in presets.of_paper():
         config = presets.build_config(name, **SIZE)
         assert presets.config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
     values = presets.build_config("CAMDM", **SIZE).to_dict()
@@ -269,7 +269,7 @@ def two_training_steps(config, recipe_json: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", presets.PRESETS)
+@pytest.mark.parametrize("name", presets.of_paper())
 def test_every_preset_answers_and_takes_a_training_step(name):
     # Compiling is what takes time here, and depth, width, how many heads (if not one) and how many
     # modes there are (if not one) change nothing in kind: presets that differ in size alone share

@@ -206,6 +206,10 @@ def test_variance_preserving_levels_rise_and_fit_together(schedule):
         (3, "uniform", [7, 4, 2]),  # 7, 4.33, 1.67
         (4, "uniform", [7, 5, 3, 1]),
         (8, "uniform", [7, 6, 5, 4, 3, 2, 1, 0]),
+        (1, "leading", [0]),
+        (2, "leading", [4, 0]),
+        (3, "leading", [4, 2, 0]),
+        (8, "leading", [7, 6, 5, 4, 3, 2, 1, 0]),
     ],
 )
 def test_respaced_grids_visit_levels_that_were_trained(num_steps, spacing, levels):
@@ -230,6 +234,8 @@ def test_respaced_grids_start_at_the_noisiest_level_and_take_none_twice(spacing)
 def test_impossible_grids_are_refused(schedule):
     if schedule.levels is not None:
         refused(f"{len(schedule.levels)} noise levels", schedule.grid, len(schedule.levels) + 1)
+    else:
+        refused("'leading' counts levels", schedule.grid, 4, "leading")
     refused("num_steps=0", schedule.grid, 0)
     refused("'endpoint'.*'endpoints'", schedule.grid, 4, "endpoint")
 

@@ -1,6 +1,6 @@
 """What a network predicts: noise or velocity, told as the clean estimate that samplers ask for; and guidance.
 
-Each function takes callables of (x_noisy, sigma), the variance-exploding state, and returns a denoiser. All of them
+Wrappers take callables of (x_noisy, sigma), the variance-exploding state, and return a denoiser. All of them
 describe one and the same walk: with an exact network every kind of prediction gives the same samples.
 """
 
@@ -11,6 +11,31 @@ import jax.numpy as jnp
 from f3amd_lib.diffusion.samplers import Denoiser
 from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma
 
+OBJECTIVES = ("x0", "eps", "v")
+"""What a network may be trained to predict from a state alpha x0 + sigma eps: the motion, the noise, or v = x0 - eps,
+the velocity of flow matching towards the data."""
+
+
+def prediction_target(objective: str, x0, noise):
+    """Return what a network of an objective should answer (ACMDM Eqs 1 and 2, and the text after them)."""
+    return {"x0": x0, "eps": noise, "v": x0 - noise}[objective]
+
+
+def clean_estimate(objective: str, prediction, state, alpha, sigma):
+    """Return the motion that a prediction stands for; the inverse of `prediction_target`.
+
+    Args:
+      objective: of `OBJECTIVES`.
+      prediction: the network's answer, of the state's shape.
+      state: alpha x0 + sigma eps, on the path's own scale.
+      alpha, sigma: shares of signal and noise, broadcasting; alpha > 0 for "eps".
+    """
+    if objective == "x0":
+        return prediction
+    if objective == "eps":
+        return (state - sigma * prediction) / alpha
+    return (state + sigma * prediction) / (alpha + sigma)
+
 
 def from_noise(predict) -> Denoiser:
     """Return the denoiser of a network that predicts the noise, eps = (x_noisy - x0) / sigma (Ho et al. 2020)."""
@@ -18,7 +43,7 @@ def from_noise(predict) -> Denoiser:
 
 
 def from_velocity(predict) -> Denoiser:
-    """Return the denoiser of a network that predicts v = sqrt(ab) eps - sqrt(1 - ab) x0.
+    """Return the denoiser of a network that predicts v = sqrt(ab) eps - sqrt(1 - ab) x0, not the v of a flow.
 
     Source: Salimans and Ho 2022, Appendix D, with ab = alpha_bar.
     """
@@ -41,5 +66,22 @@ def guided(denoise: Denoiser, unconditional: Denoiser, scale: float) -> Denoiser
     def estimate(x_noisy, sigma):
         free = unconditional(x_noisy, sigma)
         return free + scale * (denoise(x_noisy, sigma) - free)
+
+    return estimate
+
+
+def guided_twice(full, without_first, without_second, first_scale: float, second_scale: float) -> Denoiser:
+    """Return an estimate pushed in two directions: away from what each of two conditions alone would miss.
+
+    At scales 1 and 1 this is `full`; at a second scale of 1 it is `guided(full, without_first, first_scale)`. Denoisers
+    or velocities, as long as all three are of a kind.
+
+    Source: ACMDM's released code, with the caption first and the control second.
+    """
+
+    def estimate(x_noisy, sigma):
+        best = full(x_noisy, sigma)
+        first = (first_scale - 1.0) * (best - without_first(x_noisy, sigma))
+        return best + first + (second_scale - 1.0) * (best - without_second(x_noisy, sigma))
 
     return estimate

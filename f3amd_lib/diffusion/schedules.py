@@ -69,27 +69,30 @@ class NoiseSchedule:
         """Return the times at which an N-step sampler asks the network.
 
         With fewer steps than levels a schedule of K levels is respaced: the network sees only levels that it
-        was trained on. The first is always the noisiest, also for N = 1, because a sampler starts
-        from noise alone. Respacing rules in use for diffusion models count their strides from level
-        0, and a single stride then ends where it starts: at the least noisy level, where the
-        network would be told that pure noise is almost clean motion.
+        was trained on. The first is the noisiest, also for N = 1, because a sampler starts from noise alone.
+        "leading" is the exception: a respacing rule in use for diffusion models, whose strides count from level
+        0. A single stride then ends where it starts: at the least noisy level, where the network is told
+        that pure noise is almost clean motion.
 
         Args:
           num_steps: network evaluations N; at most K where there are K levels.
           spacing: "endpoints" takes t = linspace(0, 1, N), so that the last evaluation is at the lowest level (our
             reading: the paper does not say); "uniform" takes t = i / N, whose last is higher. K levels are
             counted alike, and rounded to whole ones. Where no noise is left at t = 1, both are "uniform".
+            "leading" takes every (K // N)-th of K levels, counted from the least noisy one.
 
         Returns:
           [N] float64, rising from 0.
 
         Raises:
-          ValueError: for num_steps outside 1 ... K, or an unknown spacing.
+          ValueError: for num_steps outside 1 ... K, an unknown spacing, or "leading" without levels to count.
         """
         if num_steps < 1:
             raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
-        if spacing not in ("endpoints", "uniform"):
-            raise ValueError(f"unknown spacing {spacing!r}: use 'endpoints' or 'uniform'")
+        if spacing not in ("endpoints", "uniform", "leading"):
+            raise ValueError(f"unknown spacing {spacing!r}: use 'endpoints', 'uniform' or 'leading'")
+        if spacing == "leading" and self.levels is None:
+            raise ValueError(f"spacing 'leading' counts levels, and {self.kind} is continuous: use 'endpoints'")
         if self.levels is None:
             to_the_end = spacing == "endpoints" and self.sigma_min > 0.0
             return np.linspace(0.0, 1.0, num_steps) if to_the_end else np.arange(num_steps) / num_steps
@@ -99,35 +102,43 @@ class NoiseSchedule:
                 f"this schedule has {num_levels} noise levels and no more steps than that, "
                 f"got num_steps={num_steps}: take fewer, or train with more levels"
             )
-        last = 0.0 if spacing == "endpoints" else num_levels / num_steps - 1.0
-        return 1.0 - (np.rint(np.linspace(num_levels - 1.0, last, num_steps)) + 1.0) / num_levels
+        last = num_levels / num_steps - 1.0 if spacing == "uniform" else 0.0
+        first = num_levels // num_steps * (num_steps - 1.0) if spacing == "leading" else num_levels - 1.0
+        return 1.0 - (np.rint(np.linspace(first, last, num_steps)) + 1.0) / num_levels
 
     def grid(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
         """Return the noise levels at `times`, then 0: what a sampler of the variance-exploding state visits.
 
         Returns:
-          [N + 1] float64, falling, first sigma_max, last 0.
+          [N + 1] float64, falling, last 0; first sigma_max, but for "leading".
 
         Raises:
           ValueError: as `times`.
         """
-        t = self.times(num_steps, spacing)
-        if self.levels is not None:
-            return np.append(self.levels[_rank(t, len(self.levels)) - 1], 0.0)
         with np.errstate(divide="ignore"):  # the straight path begins at an infinite level
-            return np.append(self.sigma(t) / self.alpha(t), 0.0)
+            return np.append(self.level(self.times(num_steps, spacing)), 0.0)
 
     def scaled_grid(self, num_steps: int, spacing: str = "endpoints") -> tuple[np.ndarray, np.ndarray]:
         """Return (alphas, sigmas) at `times`, then (1, 0), each [N + 1]: what a sampler of z_t itself visits."""
         t = self.times(num_steps, spacing)
         return np.append(self.alpha(t), 1.0), np.append(self.sigma(t), 0.0)
 
-    def draw(self, key, shape: tuple[int, ...]):
-        """Draw noise levels to train on, float32: t uniform, or every one of K levels as likely as the next."""
+    def level(self, t):
+        """Return the noise level sigma(t) / alpha(t), any shape; of K levels the one that t stands for."""
         if self.levels is None:
-            t = jax.random.uniform(key, shape, jnp.float32)
             return self.sigma(t) / self.alpha(t)
-        return jnp.asarray(self.levels, jnp.float32)[jax.random.randint(key, shape, 0, len(self.levels))]
+        return array_module(t).asarray(self.levels)[_rank(t, len(self.levels)) - 1]
+
+    def draw_times(self, key, shape: tuple[int, ...]):
+        """Draw times to train on, float32: t uniform in [0, 1), or every one of K levels as likely as the next."""
+        if self.levels is None:
+            return jax.random.uniform(key, shape, jnp.float32)
+        num_levels = len(self.levels)
+        return 1.0 - (jax.random.randint(key, shape, 0, num_levels) + jnp.float32(1)) / num_levels
+
+    def draw(self, key, shape: tuple[int, ...]):
+        """Draw noise levels to train on, float32, at times of `draw_times`."""
+        return self.level(self.draw_times(key, shape)).astype(jnp.float32)
 
 
 def variance_exploding(sigma_max: float = 128.0, sigma_min: float = 0.01, rho: float = 3.0) -> NoiseSchedule:
@@ -149,20 +160,17 @@ def variance_exploding(sigma_max: float = 128.0, sigma_min: float = 0.01, rho: f
         )
     high, low = sigma_max ** (1.0 / rho), sigma_min ** (1.0 / rho)
     return NoiseSchedule(
-        "variance_exploding",
-        (("sigma_max", sigma_max), ("sigma_min", sigma_min), ("rho", rho)),
-        sampler="ddim",
-        alpha=lambda t: array_module(t).ones_like(t),
-        sigma=lambda t: (high + t * (low - high)) ** rho,
-        sigma_min=sigma_min,
-        sigma_max=sigma_max,
-    )
+        "variance_exploding", (("sigma_max", sigma_max), ("sigma_min", sigma_min), ("rho", rho)), sampler="ddim",
+        alpha=lambda t: array_module(t).ones_like(t), sigma=lambda t: (high + t * (low - high)) ** rho,
+        sigma_min=sigma_min, sigma_max=sigma_max,
+    )  # fmt: skip
 
 
 def straight() -> NoiseSchedule:
     """Return the straight path of flow matching: alpha = t and sigma = 1 - t (Liu et al. 2023; Lipman et al. 2023).
 
-    At t = 0 nothing is left of the data, the level is infinite, and a sampler walks in z_t itself (`scaled_grid`).
+    It is ACMDM Eq. 2, whose t is our 1 - t. At t = 0 nothing is left of the data, the level is infinite, and a sampler
+    walks in z_t itself (`scaled_grid`).
     """
     return NoiseSchedule(
         "straight", (), sampler="ddim", alpha=lambda t: t, sigma=lambda t: 1.0 - t, sigma_min=0.0, sigma_max=np.inf
@@ -285,16 +293,10 @@ def _variance_preserving(
         return array_module(t).asarray(shares)[_rank(t, num_levels)]
 
     return NoiseSchedule(
-        kind,
-        tuple(settings.items()),
-        sampler="ddpm",
-        alpha=lambda t: alpha_bar(t) ** 0.5,
-        sigma=lambda t: (1.0 - alpha_bar(t)) ** 0.5,
-        sigma_min=float(levels[0]),
-        sigma_max=float(levels[-1]),
-        levels=levels,
-        alpha_bars=alpha_bars,
-    )
+        kind, tuple(settings.items()), sampler="ddpm", alpha=lambda t: alpha_bar(t) ** 0.5,
+        sigma=lambda t: (1.0 - alpha_bar(t)) ** 0.5, sigma_min=float(levels[0]), sigma_max=float(levels[-1]),
+        levels=levels, alpha_bars=alpha_bars,
+    )  # fmt: skip
 
 
 def _rank(t, num_levels: int):

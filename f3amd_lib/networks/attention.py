@@ -63,26 +63,30 @@ def check_num_heads(width: int, num_heads: int) -> None:
         raise ValueError(f"num_heads must divide the width {width}, got {num_heads}")
 
 
-def attention_weights(query, key):
+def attention_weights(query, key, mask=None):
     """Return how much each query takes from each key, softmax(Q K^T / sqrt(width per head)).
 
     Args:
       query: [B, T, heads, width per head].
       key: [B, S, heads, width per head].
+      mask: keys that may be seen, [B, S]; all by default.
 
     Returns:
       [B, heads, T, S]; the last axis sums to 1.
     """
     scores = jnp.einsum("bthd,bshd->bhts", query, key) / np.sqrt(query.shape[-1])
+    if mask is not None:
+        scores = jnp.where(mask[:, None, None, :], scores, -jnp.inf)
     return jax.nn.softmax(scores, axis=-1)
 
 
-def attention(query, key, value, *, dropout_rate: float = 0.0, dropout_key=None):
+def attention(query, key, value, *, mask=None, dropout_rate: float = 0.0, dropout_key=None):
     """Return the values, averaged by the attention weights of each query.
 
     Args:
       query: [B, T, heads, width per head].
       key, value: [B, S, heads, width per head].
+      mask: keys that may be seen, [B, S], one at least; all by default.
       dropout_rate: share of the weights that is dropped, if there is a `dropout_key`.
       dropout_key: random key, in training; without one nothing is dropped.
 
@@ -92,25 +96,25 @@ def attention(query, key, value, *, dropout_rate: float = 0.0, dropout_key=None)
     Source: Vaswani et al. 2017, section 3.2.1.
     """
     if dropout_key is None:
-        return jax.nn.dot_product_attention(query, key, value)
-    weights = dropout(attention_weights(query, key), dropout_rate, dropout_key)
+        return jax.nn.dot_product_attention(query, key, value, mask=None if mask is None else mask[:, None, None, :])
+    weights = dropout(attention_weights(query, key, mask), dropout_rate, dropout_key)
     return jnp.einsum("bhts,bshd->bthd", weights, value)
 
 
-def attend(query, key, value, num_heads: int, **dropout):
+def attend(query, key, value, num_heads: int, **options):
     """Let several heads attend side by side, each to its own neighbouring channels.
 
     Args:
       query: [B, T, D].
       key, value: [B, S, D].
       num_heads: must divide D.
-      **dropout: dropout_rate and dropout_key, of `attention`.
+      **options: mask, dropout_rate and dropout_key, of `attention`.
 
     Returns:
       [B, T, D].
     """
     heads = (z.reshape(*z.shape[:-1], num_heads, -1) for z in (query, key, value))
-    return attention(*heads, **dropout).reshape(query.shape)
+    return attention(*heads, **options).reshape(query.shape)
 
 
 class MultiHeadAttention(nnx.Module):
@@ -134,20 +138,20 @@ class MultiHeadAttention(nnx.Module):
         self.value = nnx.Linear(answering_width, width, rngs=rngs)
         self.output = nnx.Linear(width, width, rngs=rngs)
 
-    def __call__(self, asking, answering=None, **dropout):
+    def __call__(self, asking, answering=None, **options):
         """Let every frame of one sequence ask all frames of another, or of its own.
 
         Args:
           asking: [B, T, D].
           answering: [B, S, answering_width]; `asking` itself by default.
-          **dropout: dropout_rate and dropout_key, of `attention`.
+          **options: mask, dropout_rate and dropout_key, of `attention`.
 
         Returns:
           [B, T, D].
         """
         answering = asking if answering is None else answering
         key, value = self.key(answering), self.value(answering)
-        return self.output(attend(self.query(asking), key, value, self.num_heads, **dropout))
+        return self.output(attend(self.query(asking), key, value, self.num_heads, **options))
 
 
 class TransformerBlock(nnx.Module):
@@ -161,6 +165,7 @@ class TransformerBlock(nnx.Module):
       num_heads: must divide D (Appendix A).
       hidden_width: between the two layers.
       dropout: rate after attention, inside and after the two layers, and of the attention weights.
+      crossing: after its own sequence the block asks another one, `memory` (a decoder's block).
 
     Raises:
       ValueError: if the number of heads does not divide D.
@@ -168,28 +173,39 @@ class TransformerBlock(nnx.Module):
     Source: section 3.4.1; Vaswani et al. 2017, section 3.
     """
 
-    def __init__(self, width: int, num_heads: int, hidden_width: int, dropout: float = 0.0, *, rngs: nnx.Rngs):
+    def __init__(
+        self, width: int, num_heads: int, hidden_width: int, dropout: float = 0.0, *, crossing: bool = False, rngs
+    ):
         self.dropout = dropout
         self.attention = MultiHeadAttention(width, num_heads, rngs=rngs)
         self.attention_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
+        if crossing:
+            self.crossing = MultiHeadAttention(width, num_heads, rngs=rngs)
+            self.crossing_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
         self.hidden = nnx.Linear(width, hidden_width, rngs=rngs)
         self.output = nnx.Linear(hidden_width, width, rngs=rngs)
         self.output_norm = nnx.LayerNorm(width, epsilon=1e-5, rngs=rngs)
 
-    def __call__(self, z, key=None):
+    def __call__(self, z, key=None, mask=None, memory=None):
         """Map [B, T, D] to [B, T, D].
 
         Args:
           z: [B, T, D].
           key: random key for dropout, in training; without one nothing is dropped.
+          mask: frames that may be seen, [B, T], one at least; all by default.
+          memory: the sequence that a crossing block asks, [B, S, D].
         """
         keys = [None] * 4 if key is None else jax.random.split(key, 4)
 
         def drop(x, place: int):
             return x if key is None else dropout(x, self.dropout, keys[place])
 
-        answer = self.attention(z, dropout_rate=self.dropout, dropout_key=keys[0])
+        answer = self.attention(z, mask=mask, dropout_rate=self.dropout, dropout_key=keys[0])
         z = self.attention_norm(z + drop(answer, 1))
+        if memory is not None:
+            inside, after = [None] * 2 if key is None else jax.random.split(jax.random.fold_in(key, 4))
+            answer = self.crossing(z, memory, dropout_rate=self.dropout, dropout_key=inside)
+            z = self.crossing_norm(z + (answer if key is None else dropout(answer, self.dropout, after)))
         # PyTorch's GELU is the exact one; JAX's default is an approximation by tanh.
         hidden = drop(jax.nn.gelu(self.hidden(z), approximate=False), 2)
         return self.output_norm(z + drop(self.output(hidden), 3))

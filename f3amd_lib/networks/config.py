@@ -16,51 +16,23 @@ _TYPES = {"int": int, "float": float, "bool": bool, "str": str}
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
-    """What decides the shape of a denoiser, of any family.
-
-    A family adds its own fields and checks, and `condition_shapes(batch)`: what `encode` takes, any
-    tree, with a `jax.ShapeDtypeStruct` for each array.
-
-    Attributes:
-      channels: C, features a frame (6 J + 3).
-      window: T, future frames a round makes (32 or 64).
-      latent_width: D (section 4.2).
-      depth: N, blocks (section 4.5).
-      input_scaling: multiply the noisy input by c_in = 1 / sqrt(sigma^2 + sigma_data^2); the paper
-        does not say. Without it the first layer meets numbers up to sigma_max = 128. With
-        sigma_data = 1 the scaled input is the variance-preserving state.
-      normalise: features have mean 0 and deviation 1 per channel; the paper does not say.
-      sigma_data: deviation of the clean features in network units.
-      dropout: share of numbers that Transformer blocks drop in training; not in the paper, 0 here.
+class CheckedConfig:
+    """A config that refuses what makes no sense and survives JSON: fields, and what they may be.
 
     Raises:
-      ValueError: for a value of the wrong type, a size that is not positive, an unknown choice.
+      ValueError: for a value of the wrong type, a number that is not positive, an unknown choice.
     """
 
     family: ClassVar[str] = ""
     choices: ClassVar[dict[str, tuple[str, ...]]] = {}
     """For each field that names a variant: the names there are."""
 
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
-
-    channels: int
-    window: int = 32
-    latent_width: int = 96
-    depth: int = 6
-    input_scaling: bool = True
-    normalise: bool = True
-    sigma_data: float = 1.0
-    dropout: float = 0.0
+    may_be_zero: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
             if field.type in _TYPES:
                 self._check(field.name, _TYPES[field.type])
-        if self.window < 2:
-            raise ValueError(f"window must be at least 2 frames, got {self.window}")
-        if self.dropout >= 1.0:
-            raise ValueError(f"dropout must be below 1, got {self.dropout}")
 
     def _check(self, name: str, wanted: type) -> None:
         value = getattr(self, name)
@@ -79,7 +51,7 @@ class NetworkConfig:
         return {"family": self.family, **dataclasses.asdict(self)}
 
     @classmethod
-    def from_dict(cls, values: dict) -> NetworkConfig:
+    def from_dict(cls, values: dict) -> CheckedConfig:
         """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
         values = dict(values)
         family = values.pop("family", cls.family)
@@ -90,6 +62,52 @@ class NetworkConfig:
         if missing := needed - values.keys():
             raise ValueError(f"model settings lack {', '.join(sorted(missing))}")
         return cls(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig(CheckedConfig):
+    """What decides the shape of a denoiser of windows, of any family.
+
+    A family adds its own fields and checks, and `condition_shapes(batch)`: what `encode` takes, any
+    tree, with a `jax.ShapeDtypeStruct` for each array.
+
+    Attributes:
+      channels: C, features a frame (6 J + 3).
+      window: T, future frames a round makes (32 or 64).
+      latent_width: D (section 4.2).
+      depth: N, blocks (section 4.5).
+      input_scaling: multiply the noisy input by c_in = 1 / sqrt(sigma^2 + sigma_data^2); the paper
+        does not say. Without it the first layer meets numbers up to sigma_max = 128. With
+        sigma_data = 1 the scaled input is the variance-preserving state.
+      normalise: features have mean 0 and deviation 1 per channel; the paper does not say.
+      sigma_data: deviation of the clean features in network units.
+      dropout: share of numbers that Transformer blocks drop in training; not in the paper, 0 here.
+
+    Raises:
+      ValueError: as `CheckedConfig`, and for a window of less than 2 frames or a dropout of all.
+    """
+
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+
+    channels: int
+    window: int = 32
+    latent_width: int = 96
+    depth: int = 6
+    input_scaling: bool = True
+    normalise: bool = True
+    sigma_data: float = 1.0
+    dropout: float = 0.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.window < 2:
+            raise ValueError(f"window must be at least 2 frames, got {self.window}")
+        if self.dropout >= 1.0:
+            raise ValueError(f"dropout must be below 1, got {self.dropout}")
+
+    def state_shape(self, batch: int) -> tuple[int, ...]:
+        """Return the shape of a noisy state, [B, T, C]."""
+        return batch, self.window, self.channels
 
     def check_state(self, x_noisy) -> None:
         """Raise ValueError unless a noisy state is [B, T, C] of this config."""
@@ -109,6 +127,21 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
         return x_noisy
     scale = (sigma**2 + config.sigma_data**2) ** -0.5
     return x_noisy * scale.reshape(-1, 1, 1)
+
+
+class LayerKeys:
+    """Keys for the layers of one network: the numbers of `nnx.Rngs(params=key)`, counted in Python.
+
+    Under a trace `nnx.Rngs` counts in the trace, and with every layer looks through all that was traced before it.
+    """
+
+    def __init__(self, key):
+        self.key, self.dealt = key, 0
+
+    def params(self):
+        """Return the next key."""
+        self.dealt += 1
+        return jax.random.fold_in(self.key, self.dealt - 1)
 
 
 class DenoisingNetwork(nnx.Module):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +18,34 @@ import jax.numpy as jnp
 import pandas as pd
 from flax import nnx
 
+from f3amd_lib.diffusion.flow import default_sampler
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
-from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
+from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
+from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
+from f3amd_lib.networks.motionpcm import (
+    Discriminator,
+    DiscriminatorConfig,
+    LatentAutoencoder,
+    LatentAutoencoderConfig,
+    LatentDenoiser,
+    LatentDenoiserConfig,
+)
 
-FAMILIES = {"F3AMD": (F3AMDConfig, F3AMD), "CAMDM": (CAMDMConfig, CAMDM)}
+FAMILIES = {
+    config.family: (config, network)
+    for config, network in (
+        (F3AMDConfig, F3AMD), (CAMDMConfig, CAMDM), (ACMDMConfig, ACMDM), (MaskedACMDMConfig, MaskedACMDM),
+        (AutoencoderConfig, MotionAutoencoder), (LatentAutoencoderConfig, LatentAutoencoder),
+        (LatentDenoiserConfig, LatentDenoiser), (DiscriminatorConfig, Discriminator),
+    )
+}  # fmt: skip
 """Config and network of each family."""
 
 
@@ -38,12 +57,14 @@ class Preset:
       name: ours, fit for file names and command lines; the paper's own where it is that.
       paper: folder of the paper in `papers`.
       family: a key of `FAMILIES`.
-      diffusion: the noise it is trained with; names the sampler it is meant for.
+      diffusion: the noise it is trained with; names the sampler it is meant for. An autoencoder has no use for it.
       network: fields of the family's config that differ from its defaults.
       training: fields of the training config that differ, whatever the length of the run.
       source: where the paper has it, or "ours".
       paper_names: how the paper's tables call it, where that is not `name`.
-      windows: window lengths that the paper trains it with, frames.
+      windows: window lengths that the paper trains it with, frames (of the latent where there is one).
+      latent: the preset of the autoencoder whose latent it makes, "" where it makes motion itself; of a form, what
+        follows that preset's name.
     """
 
     name: str
@@ -55,6 +76,7 @@ class Preset:
     source: str
     paper_names: tuple[str, ...] = ()
     windows: tuple[int, ...] = (32,)
+    latent: str = ""
 
 
 def laid_over(lower: Mapping, upper: Mapping) -> dict:
@@ -69,13 +91,15 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
     # CAMDM is told the number of a level, and so must know the levels of its schedule.
     if family == "CAMDM" and schedule.levels is not None:
         network = {"noise_levels": tuple(schedule.levels.tolist()), **network}
+    window = network.get("window", getattr(FAMILIES[family][0], "window", 0))
+    own = {"windows": [window], **own}
     own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return Preset(name, paper, family, schedule, network, training or {}, **own)
 
 
 def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
     """Return the presets of a paper's file by name, and its forms by what follows a name."""
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    table = read_toml(path)
     rows, named = {}, {"forms": {}, "presets": {}}
     for kind in named:
         for name, row in table.get(kind, {}).items():
@@ -127,31 +151,36 @@ def _formed(base: Preset, suffix: str, form: Preset) -> Preset:
         only = f"only the paper's {form.family} with the paper's losses have"
         raise ValueError(f"{base.name} has no {suffix!r} form: {only}")
     name, network = base.name + suffix, laid_over(base.network, form.network)
+    latent = base.latent + form.latent if base.latent else ""
     return dataclasses.replace(
-        base, name=name, network=network, training=form.training, source=form.source, paper_names=()
+        base, name=name, network=network, training=form.training, source=form.source, paper_names=(), latent=latent
     )
 
 
-def build_config(name: str, *, channels: int, num_styles: int, window: int = 32, **overrides) -> NetworkConfig:
+def of_paper(paper: str = "f3amd") -> dict[str, Preset]:
+    """Return the presets of one paper's folder by name; ValueError names the nearest folder if there is none."""
+    if found := {name: preset for name, preset in PRESETS.items() if preset.paper == paper}:
+        return found
+    raise ValueError(f"no presets of paper {paper!r}{nearest_hint(paper, {p.paper: p for p in PRESETS.values()})}")
+
+
+def build_config(name: str, **settings) -> CheckedConfig:
     """Return the config of a preset.
 
     Args:
       name: see `find_preset`.
-      channels: C, features a frame.
-      num_styles: S.
-      window: T; all modes are kept unless the preset or `num_kept_modes` says otherwise (section
-        4.5).
-      **overrides: fields of the family's config to change.
+      **settings: fields of the family's config that the data decide, such as `channels` and `num_styles` of F3AMD
+        and CAMDM or `num_joints` and `text_width` of ACMDM, and any others to change. F3AMD keeps all modes of a
+        `window` unless the preset or `num_kept_modes` says otherwise (section 4.5).
 
     Raises:
-      ValueError: for an unknown name (with the nearest ones) or field.
+      ValueError: for an unknown name (with the nearest ones) or field, or one that is needed and missing.
     """
     preset = find_preset(name)
-    values = {"channels": channels, "num_styles": num_styles, "window": window}
-    return FAMILIES[preset.family][0].from_dict({**values, **preset.network, **overrides})
+    return FAMILIES[preset.family][0].from_dict({**preset.network, **settings})
 
 
-def config_from_dict(values: Mapping) -> NetworkConfig:
+def config_from_dict(values: Mapping) -> CheckedConfig:
     """Build a config of any family from its `to_dict`.
 
     Raises:
@@ -169,30 +198,31 @@ def build(name: str, *, key, **settings) -> nnx.Module:
     Args:
       name: see `find_preset`.
       key: JAX random key of the initial weights.
-      **settings: as for `build_config` (channels and num_styles are needed).
+      **settings: as for `build_config`.
     """
     return build_from_config(build_config(name, **settings), key)
 
 
-def build_from_config(config: NetworkConfig, key) -> nnx.Module:
+def build_from_config(config: CheckedConfig, key) -> nnx.Module:
     """Return a freshly initialised network of a config."""
-    return FAMILIES[config.family][1](config, rngs=nnx.Rngs(params=key))
+    return FAMILIES[config.family][1](config, rngs=LayerKeys(key))
 
 
-def _abstract(config: NetworkConfig):
+@functools.lru_cache(maxsize=2)
+def _abstract(config: CheckedConfig):
     return nnx.eval_shape(lambda: build_from_config(config, jax.random.key(0)))
 
 
-def count_parameters(config: NetworkConfig) -> int:
+def count_parameters(config: CheckedConfig) -> int:
     """Return the number of learned numbers, without building arrays."""
     return sum(leaf.size for leaf in jax.tree.leaves(nnx.state(_abstract(config), nnx.Param)))
 
 
-def count_model_flops(config: NetworkConfig) -> tuple[int, int]:
+def count_model_flops(config: CheckedConfig) -> tuple[int, int]:
     """Count the operations of one character's round.
 
     Args:
-      config: of the network.
+      config: of a denoiser.
 
     Returns:
       (operations of encoding the condition, once a round; operations of one evaluation of the
@@ -200,7 +230,7 @@ def count_model_flops(config: NetworkConfig) -> tuple[int, int]:
     """
     graph, state = nnx.split(_abstract(config))
     condition = config.condition_shapes(1)
-    x_noisy = jax.ShapeDtypeStruct((1, config.window, config.channels), jnp.float32)
+    x_noisy = jax.ShapeDtypeStruct(config.state_shape(1), jnp.float32)
     sigma = jax.ShapeDtypeStruct((1,), jnp.float32)
     encode = lambda state, condition: nnx.merge(graph, state).encode(condition)
     denoise = lambda state, *inputs: nnx.merge(graph, state)(*inputs)
@@ -209,12 +239,12 @@ def count_model_flops(config: NetworkConfig) -> tuple[int, int]:
     return once, count_flops(denoise, state, x_noisy, sigma, context)
 
 
-def table(*, channels: int, num_styles: int) -> pd.DataFrame:
-    """List all presets, with a row for every window length that the paper trains them with.
+def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
+    """List a paper's denoisers, with a row for every window length that the paper trains them with.
 
     Args:
-      channels: C, features a frame.
-      num_styles: S.
+      paper: its folder.
+      **settings: of the data, as for `build_config`.
 
     Returns:
       Columns model, window, latent_width, depth, parameters, mflop_per_evaluation (of one
@@ -222,10 +252,14 @@ def table(*, channels: int, num_styles: int) -> pd.DataFrame:
     """
     columns = "model window latent_width depth parameters mflop_per_evaluation diffusion sampler source"
     rows = []
-    for preset in PRESETS.values():
+    for preset in of_paper(paper).values():
+        if not hasattr(FAMILIES[preset.family][0], "state_shape"):  # an autoencoder denoises nothing
+            continue
         for window in preset.windows:
-            config = build_config(preset.name, channels=channels, num_styles=num_styles, window=window)
+            config = build_config(preset.name, **settings, window=window)
             mflop = round(count_model_flops(config)[1] / 1e6, 2)
             sizes = window, config.latent_width, config.depth, count_parameters(config), mflop
-            rows.append((preset.name, *sizes, preset.diffusion.kind, preset.diffusion.sampler, preset.source))
+            sampler = getattr(config, "sampler", None)
+            sampler = sampler or default_sampler(getattr(config, "objective", "x0"), preset.diffusion)
+            rows.append((preset.name, *sizes, preset.diffusion.kind, sampler, preset.source))
     return pd.DataFrame(rows, columns=columns.split())

@@ -1,0 +1,97 @@
+"""From noise to data through a network of any objective on any schedule; and a flow's solver that chooses its steps.
+
+A denoiser of `diffusion.samplers` gives a clean estimate; a network gives x0, eps or v, from the state
+alpha x0 + sigma eps itself and a time. On the straight path a DDIM step is Euler's step of the flow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from f3amd_lib.diffusion.predictions import clean_estimate
+from f3amd_lib.diffusion.samplers import SAMPLERS, sample
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.names import nearest_hint
+
+DORMAND_PRINCE = "dormand_prince"
+"""Name of the solver that is no walk of `diffusion.samplers`: see `integrate`."""
+
+
+def default_sampler(objective: str, schedule: NoiseSchedule) -> str:
+    """Return what a network is meant for: Dormand and Prince for velocities (released code), else the schedule's."""
+    return DORMAND_PRINCE if objective == "v" and schedule.kind == "straight" else schedule.sampler
+
+
+def told_time(schedule: NoiseSchedule, t):
+    """Return what a network is told of schedule time, any shape: t, or of K levels the number, 0 the least noisy."""
+    return t if schedule.levels is None else len(schedule.levels) * (1.0 - t) - 1.0
+
+
+def solve(
+    predict: Callable, objective: str, schedule: NoiseSchedule, noise, *, sampler=None, num_steps: int = 50, key=None
+):
+    """Walk from noise to a clean state (ACMDM Eqs 1 and 2, backwards).
+
+    Args:
+      predict: `predict(state, time)`, the state alpha x0 + sigma eps and what `told_time` tells, a scalar.
+      objective: what it answers, of `predictions.OBJECTIVES`.
+      schedule: that it was trained on.
+      noise: standard normal, [B, ...].
+      sampler: "dormand_prince", for velocities on the straight path, or a name of `samplers.SAMPLERS`; on the straight
+        path that is "ddim". `default_sampler` by default.
+      num_steps: of all but Dormand and Prince.
+      key: JAX random key, for samplers that draw noise.
+
+    Raises:
+      ValueError: for an unknown sampler or one that does not fit objective and schedule, or for noise predicted where
+        nothing is left of the signal, which says nothing of the signal.
+    """
+    sampler = sampler or default_sampler(objective, schedule)
+    if sampler == DORMAND_PRINCE:
+        if default_sampler(objective, schedule) != sampler:
+            raise ValueError(f"{sampler!r} follows v on the straight path, not {objective!r} on {schedule.kind!r}")
+        return integrate(predict, noise)
+    if sampler not in SAMPLERS:
+        raise ValueError(f"unknown sampler {sampler!r}{nearest_hint(sampler, [DORMAND_PRINCE, *SAMPLERS])}")
+    (alphas, sigmas), levels = schedule.scaled_grid(num_steps), schedule.grid(num_steps)
+    endless = bool(np.isinf(levels[0]))
+    if endless and objective == "eps":
+        raise ValueError(f"the first step of {schedule.kind!r} sees noise alone: predict 'x0' or 'v' there, not 'eps'")
+    told = jnp.asarray(told_time(schedule, np.append(schedule.times(num_steps), 1.0)))
+    alphas, sigmas = jnp.asarray(alphas), jnp.asarray(sigmas)
+    visited = sigmas if endless else levels
+
+    def denoise(x_noisy, level):
+        # A walk asks at places of its grid alone.
+        place = jnp.argmin(jnp.abs(visited - level))
+        alpha, sigma = alphas[place], sigmas[place]
+        state = x_noisy if endless else alpha * x_noisy
+        return clean_estimate(objective, predict(state, told[place]), state, alpha, sigma)
+
+    return sample(sampler, denoise, visited[0] * noise, visited, alphas=alphas if endless else None, key=key)
+
+
+def integrate(velocity: Callable, noise, *, relative: float = 1e-3, absolute: float = 1e-6):
+    """Follow a flow from noise to data by Dormand and Prince's method of order 5, which chooses its steps.
+
+    Args:
+      velocity: `velocity(state, t)`, x0 - eps on the straight path; t comes as a scalar.
+      noise: state at t = 0, standard normal, any shape.
+      relative, absolute: tolerances (the defaults are the released code's).
+
+    Returns:
+      State at t = 1.
+
+    Raises:
+      RuntimeError: if a thousand steps do not reach the end.
+    """
+    # It takes most of a second to import, and no other sampler needs it.
+    from diffrax import Dopri5, ODETerm, PIDController, SaveAt, diffeqsolve
+
+    return diffeqsolve(
+        ODETerm(lambda t, state, _: velocity(state, t)), Dopri5(), 0.0, 1.0, None, noise,
+        stepsize_controller=PIDController(rtol=relative, atol=absolute), saveat=SaveAt(t1=True), max_steps=1000,
+    ).ys[0]  # fmt: skip

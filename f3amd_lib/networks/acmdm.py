@@ -1,0 +1,377 @@
+"""The ACMDM network: a diffusion Transformer over patches of joints (ACMDM section 3.1, Figure 2a).
+
+    state [B, l, J, C] -> patches of joints -> n blocks under time and text -> [B, l, J, C]
+
+The joint axis stays an axis: raw positions have three channels a joint, the latent of a motion
+autoencoder has four, and a redundant feature vector is one joint with many. What the answer means
+(x0, eps or v) is the config's `objective`; `diffusion.predictions` turns it into a clean estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from f3amd_lib.diffusion.predictions import OBJECTIVES
+from f3amd_lib.networks.attention import check_num_heads
+from f3amd_lib.networks.config import CheckedConfig
+
+TIME_FEATURES = 256
+
+
+class TextCondition(NamedTuple):
+    """What a motion is made from.
+
+    Attributes:
+      pooled: one embedding a caption, [B, W]; zeros stand for no text.
+      mask: True where a frame of the state is motion and not padding, [B, l]; each sample needs one.
+    """
+
+    pooled: jax.Array
+    mask: jax.Array
+
+    def without_text(self) -> TextCondition:
+        """Return the condition of the same frames and no caption: the zero vector before the text layer."""
+        return self._replace(pooled=jnp.zeros_like(self.pooled))
+
+
+class TextContext(NamedTuple):
+    """A condition after `encode`: text in network width, [B, d], and the mask of frames, [B, l]."""
+
+    text: jax.Array
+    mask: jax.Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ACMDMConfig(CheckedConfig):
+    """Everything that decides the shape of an ACMDM network (ACMDM section 3.1).
+
+    Attributes:
+      num_joints: J of the state; 1 for a redundant feature vector.
+      channels: C of a joint: 3 raw, 4 latent.
+      window: l, most frames of a state: 49 latent ones of 196, or 196 raw.
+      patch: joints a token: "whole" is J, "half" J / 2 and "pair" 2 (the paper's 22, 11, 2 of 22
+        joints). A last patch that J does not fill is filled with zeros.
+      latent_width: d; the paper has 64 a head.
+      depth, num_heads: blocks and attention heads, which the paper keeps equal.
+      text_width: W of the caption's embedding: 512 for CLIP ViT-B/32.
+      conditioning: "adaln", or "concatenation": time and text are two tokens before the frames (the
+        paper says no more).
+      objective: what the answer is: "v", "eps" or "x0".
+      block_frames: frames of a block that sees itself and earlier blocks alone (noisy-condition
+        autoregression); 0: all frames see each other.
+
+    Raises:
+      ValueError: for a size or choice that makes no sense, or blocks together with concatenation,
+        whose tokens know no block.
+    """
+
+    family: ClassVar[str] = "ACMDM"
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {
+        "patch": ("whole", "half", "pair"),
+        "conditioning": ("adaln", "concatenation"),
+        "objective": OBJECTIVES,
+    }
+    may_be_zero: ClassVar[tuple[str, ...]] = ("block_frames",)
+
+    num_joints: int
+    channels: int = 4
+    window: int = 49
+    patch: str = "whole"
+    latent_width: int = 512
+    depth: int = 8
+    num_heads: int = 8
+    text_width: int = 512
+    conditioning: str = "adaln"
+    objective: str = "v"
+    block_frames: int = 0
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_num_heads(self.latent_width, self.num_heads)
+        if self.latent_width // self.num_heads % 2:
+            raise ValueError(f"a head turns pairs of channels, got {self.latent_width // self.num_heads} of them")
+        if self.block_frames and self.conditioning == "concatenation":
+            raise ValueError("block_frames needs conditioning 'adaln': tokens before the frames belong to no block")
+
+    @property
+    def patch_joints(self) -> int:
+        """P, joints of a token."""
+        sizes = {"whole": self.num_joints, "half": math.ceil(self.num_joints / 2), "pair": min(2, self.num_joints)}
+        return sizes[self.patch]
+
+    @property
+    def num_patches(self) -> int:
+        """Tokens a frame."""
+        return math.ceil(self.num_joints / self.patch_joints)
+
+    def state_shape(self, batch: int) -> tuple[int, ...]:
+        """Return the shape of the largest state, [B, l, J, C]."""
+        return batch, self.window, self.num_joints, self.channels
+
+    def condition_shapes(self, batch: int) -> TextCondition:
+        """Return what `encode` takes, as shapes."""
+        single = jax.ShapeDtypeStruct
+        return TextCondition(single((batch, self.text_width), jnp.float32), single((batch, self.window), jnp.bool_))
+
+    def check_condition(self, condition: TextCondition) -> None:
+        """Raise ValueError unless text and mask fit each other and the config."""
+        pooled, mask = condition
+        if pooled.ndim != 2 or pooled.shape[1] != self.text_width:
+            raise ValueError(f"pooled text must be [B, {self.text_width}], got {pooled.shape}")
+        if mask.ndim != 2 or len(mask) != len(pooled) or not 0 < mask.shape[1] <= self.window:
+            raise ValueError(f"mask must be [{len(pooled)}, at most {self.window} frames], got {mask.shape}")
+
+
+def rotary_base(num_tokens: int) -> int:
+    """Return the base of the rotary code for sequences of at most so many tokens: 100 (floor(8 N / pi) // 100 + 1)."""
+    return 100 * (int(8 * num_tokens / math.pi) // 100 + 1)
+
+
+def rotary_angles(positions, half_width: int, base: float):
+    """Return by how much each pair of channels turns, [T, half_width], radians.
+
+    Exponents run evenly from 0 to 1, both included, where Su et al. 2021 stop before 1 (the released code).
+    """
+    return jnp.asarray(positions)[:, None] * base ** -jnp.linspace(0.0, 1.0, half_width)
+
+
+def rotated(x, angles):
+    """Turn channel i with channel i + width / 2: rotary position embedding (Su et al. 2021).
+
+    Args:
+      x: [B, T, heads, width].
+      angles: [T, width / 2].
+    """
+    first, second = jnp.split(x, 2, axis=-1)
+    cosine, sine = jnp.cos(angles)[:, None], jnp.sin(angles)[:, None]
+    return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
+
+
+def time_features(time):
+    """Return 128 cosines and then 128 sines of a time, [...] -> [..., 256], from one radian a unit downwards."""
+    half = TIME_FEATURES // 2
+    angle = jnp.asarray(time)[..., None] * 10000.0 ** (-jnp.arange(half) / half)
+    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def block_causal(num_queries: int, num_keys: int, tokens_per_block: int) -> np.ndarray:
+    """Return which keys the last queries may see: those of their own block and of earlier ones, [Q, K]."""
+    block = np.arange(num_keys) // tokens_per_block
+    return block[-num_queries:, None] >= block[None, :]
+
+
+def linear(width_in: int, width_out: int, rngs: nnx.Rngs, *, zero: bool = False) -> nnx.Linear:
+    """Return a linear layer as the released code starts it: Xavier uniform, or all zeros; bias 0."""
+    start = nnx.initializers.zeros_init() if zero else nnx.initializers.xavier_uniform()
+    return nnx.Linear(width_in, width_out, kernel_init=start, rngs=rngs)
+
+
+def root_mean_square_norm(width: int, rngs: nnx.Rngs) -> nnx.RMSNorm:
+    """Return an RMSNorm with a learned scale, as all norms of this network are."""
+    return nnx.RMSNorm(width, epsilon=1e-6, rngs=rngs)
+
+
+def modulated(x, shift, scale):
+    """Return x (1 + scale) + shift: adaptive normalisation (Peebles and Xie 2023)."""
+    return x * (1.0 + scale) + shift
+
+
+class ACMDMBlock(nnx.Module):
+    """Attention and a gated feed-forward layer, each added to its input (ACMDM section 3.1).
+
+    Under "adaln" c shifts, scales and gates both, from zero on, so that a fresh block is the
+    identity; under "concatenation" it has no way in but the tokens.
+    """
+
+    def __init__(self, config: ACMDMConfig, *, rngs: nnx.Rngs):
+        width, self.num_heads = config.latent_width, config.num_heads
+        hidden = int(2 * 4 * width / 3)
+        self.attention_norm = root_mean_square_norm(width, rngs)
+        self.query_key_value = linear(width, 3 * width, rngs)
+        self.query_norm = root_mean_square_norm(width // self.num_heads, rngs)
+        self.key_norm = root_mean_square_norm(width // self.num_heads, rngs)
+        self.attention_output = linear(width, width, rngs)
+        self.feed_forward_norm = root_mean_square_norm(width, rngs)
+        self.feed_forward_input = linear(width, 2 * hidden, rngs)
+        self.feed_forward_output = linear(hidden, width, rngs)
+        if config.conditioning == "adaln":
+            self.modulation = linear(width, 6 * width, rngs, zero=True)
+
+    def __call__(self, x, c, angles, mask, past=None):
+        """Map tokens to tokens.
+
+        Args:
+          x: [B, T, d].
+          c: condition, [B, 1, d] or [B, T, d].
+          angles: of the rotary code, [T, width of a head / 2].
+          mask: which keys may be seen, broadcasting to [B, heads, T, keys].
+          past: keys and values of earlier tokens, [B, S, heads, width of a head] each.
+
+        Returns:
+          (tokens [B, T, d], keys and values of earlier and these tokens).
+        """
+        adaptive = hasattr(self, "modulation")
+        if adaptive:
+            shift, scale, gate, *feed_forward = jnp.split(self.modulation(jax.nn.silu(c)), 6, axis=-1)
+        normal = self.attention_norm(x)
+        update, past = self._attend(modulated(normal, shift, scale) if adaptive else normal, angles, mask, past)
+        x = x + gate * update if adaptive else x + update
+        normal = self.feed_forward_norm(x)
+        if not adaptive:
+            return x + self._feed_forward(normal), past
+        shift, scale, gate = feed_forward
+        return x + gate * self._feed_forward(modulated(normal, shift, scale)), past
+
+    def _attend(self, x, angles, mask, past):
+        heads = self.query_key_value(x).reshape(*x.shape[:2], 3, self.num_heads, -1)
+        query, key, value = (heads[:, :, part] for part in range(3))
+        query, key = rotated(self.query_norm(query), angles), rotated(self.key_norm(key), angles)
+        if past is not None:
+            key, value = (jnp.concatenate([old, new], axis=1) for old, new in zip(past, (key, value), strict=True))
+        answer = jax.nn.dot_product_attention(query, key, value, mask=mask)
+        return self.attention_output(answer.reshape(x.shape)), (key, value)
+
+    def _feed_forward(self, x):
+        gate, value = jnp.split(self.feed_forward_input(x), 2, axis=-1)
+        return self.feed_forward_output(jax.nn.silu(gate) * value)
+
+
+class Trunk(nnx.Module):
+    """What the network and its control branch share: patches, time, text and blocks."""
+
+    def __init__(self, config: ACMDMConfig, *, rngs: nnx.Rngs):
+        self.config = config
+        width = config.latent_width
+        # As a convolution starts in PyTorch, but for its bias.
+        start = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+        self.patch = nnx.Linear(config.patch_joints * config.channels, width, kernel_init=start, rngs=rngs)
+        narrow = nnx.initializers.normal(0.02)
+        self.time_first = nnx.Linear(TIME_FEATURES, width, kernel_init=narrow, rngs=rngs)
+        self.time_second = nnx.Linear(width, width, kernel_init=narrow, rngs=rngs)
+        self.text = linear(config.text_width, width, rngs)
+        self.blocks = nnx.List([ACMDMBlock(config, rngs=rngs) for _ in range(config.depth)])
+
+    def encode(self, condition: TextCondition) -> TextContext:
+        """Encode a condition once for all evaluations.
+
+        Raises:
+          ValueError: if its shapes do not fit the config.
+        """
+        self.config.check_condition(condition)
+        return TextContext(self.text(condition.pooled), condition.mask)
+
+    def tokens(self, state):
+        """Cut a state [B, l, J, C] into patches, frame after frame: [B, l * patches, P * C]."""
+        config = self.config
+        batch, frames, joints, channels = state.shape
+        missing = config.num_patches * config.patch_joints - joints
+        state = jnp.pad(state, ((0, 0), (0, 0), (0, missing), (0, 0)))
+        return state.reshape(batch, frames * config.num_patches, config.patch_joints * channels)
+
+    def from_tokens(self, tokens):
+        """Lay patches together again: the inverse of `tokens`."""
+        config = self.config
+        joints = config.num_patches * config.patch_joints
+        state = tokens.reshape(len(tokens), -1, joints, tokens.shape[-1] // config.patch_joints)
+        return state[:, :, : config.num_joints]
+
+    def conditioned(self, time, context: TextContext):
+        """Return (time, text) in network width: [B, 1, d] each, or [B, tokens, d] for a time of its own a frame."""
+        time = self.time_second(jax.nn.silu(self.time_first(time_features(time))))
+        if time.ndim == 2:
+            return time[:, None], context.text[:, None]
+        return jnp.repeat(time, self.config.num_patches, axis=1), context.text[:, None]
+
+    def seen(self, context: TextContext, num_tokens: int):
+        """Return which keys each token of the last frames may see, broadcasting to [B, heads, T, keys]."""
+        config = self.config
+        mask = jnp.repeat(context.mask, config.num_patches, axis=1)
+        if config.conditioning == "concatenation":
+            mask = jnp.pad(mask, ((0, 0), (2, 0)), constant_values=True)
+        mask = mask[:, None, None, :]
+        if config.block_frames:
+            mask = mask & block_causal(num_tokens, mask.shape[-1], config.block_frames * config.num_patches)
+        return mask
+
+    def angles(self, first: int, num_tokens: int):
+        """Return the rotary angles of tokens first ... first + num_tokens - 1; frames begin at 0."""
+        config = self.config
+        base = rotary_base(config.window * config.num_patches)
+        half_width = config.latent_width // config.num_heads // 2
+        return rotary_angles(np.arange(first, first + num_tokens), half_width, base)
+
+
+class ACMDM(Trunk):
+    """Network of Meng et al. 2025: a noisy state, a time and a caption in, the objective's prediction out."""
+
+    def __init__(self, config: ACMDMConfig, *, rngs: nnx.Rngs):
+        super().__init__(config, rngs=rngs)
+        width = config.latent_width
+        self.output_norm = root_mean_square_norm(width, rngs)
+        self.output = linear(width, config.patch_joints * config.channels, rngs, zero=True)
+        if config.conditioning == "adaln":
+            self.output_modulation = linear(width, 2 * width, rngs, zero=True)
+
+    def __call__(self, state, time, context: TextContext, *, residuals=None, past=None):
+        """Predict x0, eps or v, as `config.objective` says.
+
+        Args:
+          state: noisy motion alpha x0 + sigma eps, [B, l, J, C], at most `window` frames.
+          time: what `flow.told_time` tells, [B], or [B, l] for a time of its own a frame.
+          context: from `encode`; its mask has the frames of `past`, too.
+          residuals: what a control branch adds after each block, [B, tokens, d] each.
+          past: what `remember` made of the frames before the state.
+
+        Returns:
+          [B, l, J, C]; what it says of padding means nothing.
+
+        Raises:
+          ValueError: if the state does not fit the config, or the mask does not fit the frames.
+        """
+        return self._run(state, time, context, residuals, past)[0]
+
+    def remember(self, clean, context: TextContext, past=None):
+        """Return keys and values of clean frames (time 1), for the blocks that come after them.
+
+        Args:
+          clean: whole blocks of frames, [B, l, J, C].
+          context: from `encode`; its mask has the frames of `past` and of `clean`.
+          past: of the frames before.
+        """
+        return self._run(clean, jnp.ones(len(clean)), context, None, past)[1]
+
+    def _run(self, state, time, context, residuals, past):
+        config = self.config
+        before = 0 if past is None else past[0][0].shape[1]
+        frames = state.shape[1] + before // config.num_patches
+        if state.ndim != 4 or state.shape[2:] != (config.num_joints, config.channels) or frames > config.window:
+            wanted = f"[B, at most {config.window}, {config.num_joints}, {config.channels}]"
+            raise ValueError(f"state must be {wanted}, got {state.shape} after {before // config.num_patches} frames")
+        if context.mask.shape != (len(state), frames):
+            raise ValueError(f"the mask must be [{len(state)}, {frames}], got {context.mask.shape}")
+        x = self.patch(self.tokens(state))
+        num_tokens = x.shape[1]
+        time = jnp.asarray(time, x.dtype)
+        if time.ndim == 2 and config.conditioning == "concatenation":
+            raise ValueError("a time for each frame needs conditioning 'adaln': concatenation has one token for it")
+        time, text = self.conditioned(jnp.broadcast_to(time, state.shape[: max(1, time.ndim)]), context)
+        angles, c = self.angles(before, num_tokens), time + text
+        if config.conditioning == "concatenation":
+            x, angles = jnp.concatenate([time, text, x], axis=1), self.angles(-2, num_tokens + 2)
+        mask, now = self.seen(context, num_tokens), []
+        for number, block in enumerate(self.blocks):
+            x, kept = block(x, c, angles, mask, None if past is None else past[number])
+            now.append(kept)
+            if residuals is not None:
+                x = x + residuals[number]
+        x = self.output_norm(x[:, -num_tokens:])
+        if config.conditioning == "adaln":
+            x = modulated(x, *jnp.split(self.output_modulation(jax.nn.silu(c)), 2, axis=-1))
+        return self.from_tokens(self.output(x)), tuple(now)

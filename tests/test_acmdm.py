@@ -1,0 +1,413 @@
+"""The ACMDM network, its control branch, and its masked form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.acmdm import (
+    ACMDM,
+    ACMDMConfig,
+    TextCondition,
+    block_causal,
+    rotary_angles,
+    rotary_base,
+    rotated,
+    time_features,
+)
+from f3amd_lib.networks.acmdm_control import Control, control_branch, controlled
+from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig, draw_hidden, frames_known, spoil
+
+SIZE = {"num_joints": 5, "channels": 4, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 6}
+BATCH = 2
+
+
+def config_of(family=ACMDMConfig, **settings):
+    return family(**{**SIZE, **settings})
+
+
+def stirred(network, seed=0):
+    """The network with random weights in place of its zeros."""
+    graph, state = nnx.split(network)
+    keys = iter(jax.random.split(jax.random.key(seed), len(jax.tree.leaves(state))))
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf + 0.2 * jax.random.normal(next(keys), leaf.shape), state))
+
+
+def fresh(config, seed=0):
+    family = MaskedACMDM if isinstance(config, MaskedACMDMConfig) else ACMDM
+    return family(config, rngs=nnx.Rngs(seed))
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def condition(lengths=(8, 8), frames=8):
+    return TextCondition(normal(9, BATCH, 6), jnp.arange(frames) < jnp.asarray(lengths)[:, None])
+
+
+STATE = normal(1, BATCH, 8, 5, 4)
+TIME = jnp.asarray([0.3, 0.8])
+
+
+# ------------------------------------------------------------------------------------------------- against the facts
+
+
+@pytest.mark.parametrize(
+    ("size", "million"),
+    [
+        ("S", 39.1), ("B", 130.1), pytest.param("L", 306.4, marks=pytest.mark.slow),
+        pytest.param("XL", 596.4, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_parameters_are_those_of_the_released_sizes(size, million):
+    config = presets.build_config(f"ACMDM-{size}-PS22", num_joints=22)
+    assert presets.count_parameters(config) / 1e6 == pytest.approx(million, abs=0.05)
+    assert config.latent_width == 64 * config.depth and config.depth == config.num_heads
+
+
+@pytest.mark.parametrize(("tokens", "base"), [(49, 200), (98, 300), (539, 1400), (196, 500), (15, 100), (50, 200)])
+def test_rotary_bases_are_the_released_ones(tokens, base):
+    assert rotary_base(tokens) == base
+
+
+def test_patches_are_the_papers_at_22_joints_and_fill_up_at_21():
+    for joints, sizes in ((22, (22, 11, 2)), (21, (21, 11, 2)), (1, (1, 1, 1))):
+        configs = [config_of(num_joints=joints, patch=patch) for patch in ("whole", "half", "pair")]
+        assert tuple(config.patch_joints for config in configs) == sizes
+    assert [config_of(num_joints=22, patch=patch).num_patches for patch in ("whole", "half", "pair")] == [1, 2, 11]
+    assert config_of(num_joints=21, patch="pair").num_patches == 11
+
+
+@pytest.mark.parametrize("patch", ["whole", "half", "pair"])
+def test_patches_put_together_again_are_the_state(patch):
+    network = fresh(config_of(patch=patch))
+    tokens = network.tokens(STATE)
+    assert tokens.shape == (BATCH, 8 * network.config.num_patches, network.config.patch_joints * 4)
+    np.testing.assert_array_equal(network.from_tokens(tokens), STATE)
+    # Frame after frame, then patch; in a patch joint, then channel.
+    joint = network.config.patch_joints - 1
+    np.testing.assert_array_equal(tokens[:, network.config.num_patches, 4 * joint : 4 * joint + 4], STATE[:, 1, joint])
+
+
+def test_time_has_cosines_first():
+    features = time_features(jnp.asarray([0.0, 0.5]))
+    assert features.shape == (2, 256)
+    np.testing.assert_allclose(features[0], np.repeat([1.0, 0.0], 128))
+    np.testing.assert_allclose(features[1, [0, 128]], [np.cos(0.5), np.sin(0.5)], rtol=1e-6)
+
+
+def test_rotary_code_depends_on_distance_alone():
+    query, key = normal(2, 1, 1, 1, 8), normal(3, 1, 1, 1, 8)
+    product = lambda p, q: float(
+        jnp.vdot(rotated(query, rotary_angles([p], 4, 100)), rotated(key, rotary_angles([q], 4, 100)))
+    )
+    assert product(3, 1) == pytest.approx(product(12, 10), abs=1e-5)
+    assert abs(product(3, 1) - product(1, 3)) > 1e-2
+    angles = rotary_angles([1], 32, 200.0)
+    np.testing.assert_allclose(angles[0, [0, -1]], [1.0, 1 / 200.0], rtol=1e-5)  # exponents 0 and 1, both
+
+
+# ----------------------------------------------------------------------------------------------- what it may not see
+
+
+FORMS = {
+    "adaln": config_of(),
+    "pairs": config_of(patch="pair"),
+    "concatenation": config_of(conditioning="concatenation"),
+    "blocks": config_of(block_frames=4),
+}
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def network(request):
+    return stirred(fresh(FORMS[request.param]))
+
+
+@nnx.jit
+def answer(network, state, time, condition):
+    return network(state, time, network.encode(condition))
+
+
+def test_an_untrained_network_answers_zero():
+    for config in FORMS.values():
+        assert float(jnp.abs(answer(fresh(config), STATE, TIME, condition())).max()) == 0.0
+
+
+def test_padding_changes_nothing_and_frames_do(network):
+    told = condition((5, 8))
+    first = answer(network, STATE, TIME, told)
+    assert first.shape == STATE.shape and bool(jnp.isfinite(first).all())
+    noise = 5.0 * normal(4, *STATE.shape)
+    padded = answer(network, jnp.where(told.mask[..., None, None], STATE, noise), TIME, told)
+    np.testing.assert_allclose(padded[0, :5], first[0, :5], atol=2e-5)
+    np.testing.assert_allclose(padded[1], first[1], atol=2e-5)
+    if not network.config.block_frames:  # the same clip without its padding
+        short = answer(network, STATE[:, :5], TIME, condition((5, 5), 5))
+        np.testing.assert_allclose(short[0], first[0, :5], atol=2e-5)
+    touched = answer(network, STATE.at[0, 2].add(1.0), TIME, told)
+    assert float(jnp.abs(touched[0, 3] - first[0, 3]).max()) > 1e-3
+    np.testing.assert_allclose(touched[1], first[1], atol=2e-5)
+
+
+def test_text_and_time_reach_the_answer(network):
+    told = condition()
+    first = answer(network, STATE, TIME, told)
+    for other in (
+        answer(network, STATE, TIME, told.without_text()),
+        answer(network, STATE, TIME + 0.1, told),
+        answer(network, STATE[:, ::-1], TIME, told)[:, ::-1],  # frames have an order
+    ):
+        assert float(jnp.abs(other - first).max()) > 1e-3
+    assert float(jnp.abs(told.without_text().pooled).max()) == 0.0
+
+
+def test_joints_that_fill_a_patch_up_are_no_joints():
+    """The sixth joint of three pairs: the weights that meet it, and what comes out there, do not matter."""
+    network = stirred(fresh(config_of(patch="pair")))
+    first = answer(network, STATE, TIME, condition())
+    other = stirred(fresh(config_of(patch="pair", num_joints=6)))
+    wide = jnp.pad(STATE, ((0, 0), (0, 0), (0, 1), (0, 0)))
+    np.testing.assert_allclose(answer(other, wide, TIME, condition())[:, :, :5], first, atol=2e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------- blocks
+
+
+def test_one_block_is_full_attention():
+    blocks = stirred(fresh(config_of(block_frames=8)))
+    full = stirred(fresh(config_of()))
+    np.testing.assert_allclose(
+        answer(blocks, STATE, TIME, condition()), answer(full, STATE, TIME, condition()), atol=1e-6
+    )
+    assert block_causal(8, 8, 8).all() and not block_causal(8, 8, 4).all()
+    np.testing.assert_array_equal(block_causal(4, 8, 4), np.ones((4, 8)))
+    np.testing.assert_array_equal(block_causal(2, 2, 1), [[1, 0], [1, 1]])
+
+
+def test_later_blocks_change_nothing_before_them():
+    network, told = stirred(fresh(config_of(block_frames=4, patch="pair"))), condition()
+    times = jnp.repeat(jnp.asarray([[0.2, 0.7], [0.5, 0.1]]), 4, axis=1)
+    first = answer(network, STATE, times, told)
+    later = answer(network, STATE.at[:, 5].add(1.0), times.at[:, 4:].add(0.1), told)
+    np.testing.assert_allclose(later[:, :4], first[:, :4], atol=2e-5)
+    assert float(jnp.abs(later[:, 4] - first[:, 4]).max()) > 1e-3
+    earlier = answer(network, STATE.at[:, 1].add(1.0), times, told)
+    assert float(jnp.abs(earlier[:, 0] - first[:, 0]).max()) > 1e-3  # of its own block
+    assert float(jnp.abs(earlier[:, 6] - first[:, 6]).max()) > 1e-4
+
+
+def test_a_cache_stands_for_the_clean_blocks_before():
+    network, told = stirred(fresh(config_of(block_frames=4, patch="pair"))), condition((8, 6))
+    context = network.encode(told)
+    past = network.remember(STATE[:, :4], context._replace(mask=told.mask[:, :4]))
+    cached = network(STATE[:, 4:], TIME, context, past=past)
+    times = jnp.concatenate([jnp.ones((BATCH, 4)), jnp.repeat(TIME[:, None], 4, axis=1)], axis=1)
+    np.testing.assert_allclose(cached, answer(network, STATE, times, told)[:, 4:], atol=2e-5)
+    stale = answer(network, STATE, times.at[:, :4].set(0.5), told)[:, 4:]
+    assert float(jnp.abs(cached - stale).max()) > 1e-3
+
+
+# ----------------------------------------------------------------------------------------------------- control branch
+
+
+@pytest.fixture(scope="module", params=["whole", "pair"])
+def control_pair(request):
+    base = stirred(fresh(config_of(patch=request.param)))
+    return base, control_branch(base, 4, jax.random.key(5))
+
+
+def some_control(joint=2):
+    asked = jnp.zeros((BATCH, 32, 5)).at[:, 9, joint].set(1.0)
+    return Control.of(normal(6, BATCH, 32, 5, 3), asked)
+
+
+@nnx.jit
+def answer_with(base, branch, condition, control):
+    return controlled(base, branch, condition, control)(STATE, TIME)
+
+
+def test_a_fresh_branch_changes_nothing_and_copies_the_blocks(control_pair):
+    base, branch = control_pair
+    told = condition((8, 6))
+    np.testing.assert_array_equal(answer_with(base, branch, told, some_control()), answer(base, STATE, TIME, told))
+    for mine, its in zip(
+        jax.tree.leaves(nnx.state(branch.blocks)), jax.tree.leaves(nnx.state(base.blocks)), strict=True
+    ):
+        np.testing.assert_array_equal(mine, its)
+    assert float(jnp.abs(branch.text.kernel[...] - base.text.kernel[...]).max()) > 0  # fresh
+
+
+def test_a_trained_branch_hears_control_in_its_place_and_time(control_pair):
+    base, branch = control_pair
+    branch = stirred(branch, 3)
+    told, control = condition(), some_control()
+    first = answer_with(base, branch, told, control)
+    assert float(jnp.abs(first - answer(base, STATE, TIME, told)).max()) > 1e-3
+    for other in (
+        control.dropped(),
+        some_control(joint=4),
+        control._replace(positions=jnp.roll(control.positions, 4, 1)),
+    ):
+        assert float(jnp.abs(answer_with(base, branch, told, other) - first).max()) > 1e-4
+    # Only positions are shown: what is not asked is zero, and a dropped control hides all of it.
+    hidden = control._replace(positions=7.0 * control.positions).dropped()
+    np.testing.assert_array_equal(
+        answer_with(base, branch, told, hidden), answer_with(base, branch, told, control.dropped())
+    )
+    tokens = branch.control_tokens(control) - branch.control_tokens(control._replace(positions=0.0 * control.positions))
+    patches = base.config.num_patches
+    there = np.flatnonzero(np.abs(tokens[0]).max(axis=-1) > 1e-6)
+    # Frame 9 of motion is in frame 2 of the latent; joint 2 is in the second pair.
+    assert there.tolist() == [2 * patches + (1 if patches > 1 else 0)]
+
+
+# --------------------------------------------------------------------------------------------------------- masked form
+
+
+def test_a_masked_network_does_not_look_at_hidden_frames():
+    config = config_of(MaskedACMDMConfig)
+    network, told = stirred(fresh(config)), condition((8, 6))
+    hidden = jnp.zeros((BATCH, 8), bool).at[:, 3:5].set(True)
+
+    @nnx.jit
+    def run(network, state, hidden, noisy):
+        return network(noisy, TIME, network.look(state, hidden, network.encode(told)))
+
+    noisy = normal(7, *STATE.shape)
+    first = run(network, STATE, hidden, noisy)
+    np.testing.assert_array_equal(run(network, STATE.at[:, 3].add(1.0), hidden, noisy), first)
+    assert float(jnp.abs(run(network, STATE.at[:, 1].add(1.0), hidden, noisy)[:, 3] - first[:, 3]).max()) > 1e-4
+    # The head denoises each frame for itself.
+    one = run(network, STATE, hidden, noisy.at[:, 4].add(1.0))
+    np.testing.assert_array_equal(one[:, 3], first[:, 3])
+    assert float(jnp.abs(one[:, 4] - first[:, 4]).max()) > 1e-4
+    # Padding: the second sample has six frames.
+    np.testing.assert_allclose(run(network, STATE.at[1, 7].add(9.0), hidden, noisy)[1, :6], first[1, :6], atol=2e-5)
+    assert float(jnp.abs(run(fresh(config), STATE, hidden, noisy)).max()) == 0.0
+
+
+def test_hidden_frames_follow_the_cosine_and_stay_within_the_clip():
+    mask = jnp.arange(40) < jnp.repeat(jnp.asarray([40, 10]), 2000)[:, None]
+    hidden = draw_hidden(jax.random.key(0), mask)
+    assert not bool((hidden & ~mask).any()) and int(hidden.sum(axis=1).min()) == 1
+    share = np.asarray(hidden.sum(axis=1) / mask.sum(axis=1))[:2000]
+    assert share.mean() == pytest.approx(2 / np.pi, abs=0.02) and share.max() == 1.0
+    spoilt, vector = spoil(jax.random.key(1), jnp.zeros((4000, 40, 1, 1)), hidden)
+    replaced = spoilt[..., 0, 0] != 0.0
+    assert not bool((replaced & ~hidden).any()) and not bool((vector & replaced).any())
+    assert float(replaced.sum() / hidden.sum()) == pytest.approx(0.1, abs=0.01)
+    assert float(vector.sum() / hidden.sum()) == pytest.approx(0.9 * 0.88, abs=0.01)
+
+
+def test_rounds_reveal_few_frames_first_and_all_at_last():
+    known = np.asarray(frames_known(jnp.asarray([49, 6]), 18))
+    assert known.shape == (18, 2) and known[-1].tolist() == [49, 6]
+    steps = np.diff(known[:, 0])
+    assert (steps >= 0).all() and steps[:5].sum() < steps[-5:].sum()
+
+
+# --------------------------------------------------------------------------------------------------- presets, refusals
+
+
+def test_presets_are_found_across_papers_and_keep_to_their_own():
+    assert {preset.paper for preset in presets.PRESETS.values()} == {"f3amd", "acmdm", "motionpcm"}
+    assert set(presets.of_paper()) & set(presets.of_paper("acmdm")) == set()
+    # "-raw" ends names of both papers: in one it is a form, in the other a row.
+    assert presets.find_preset("F3AMD-FNO-32-raw").network["input_scaling"] is False
+    raw = presets.find_preset("ACMDM-S-PS22-raw")
+    assert raw.network["channels"] == 3 and raw.latent == "" and raw.source == "Table 1"
+    small = presets.find_preset("ACMDM-S-PS22-raw-eps-n4")
+    assert (small.source, small.latent, small.network["latent_width"]) == ("ours", "", 256)
+    assert presets.find_preset("ACMDM-B-PS2-n2").latent == "ACMDM-causal-AE-w64"
+    with pytest.raises(ValueError, match="did you mean 'acmdm'"):
+        presets.of_paper("acmd")
+    with pytest.raises(ValueError, match="only the paper's ACMDM"):
+        presets.find_preset("CAMDM-n4")
+    for preset in presets.of_paper("acmdm").values():
+        assert preset.latent in ("", *presets.PRESETS), preset.name
+
+
+def test_windows_are_frames_of_the_latent_or_of_motion():
+    windows = {name: presets.find_preset(name).windows for name in presets.of_paper("acmdm")}
+    assert windows["ACMDM-XL-PS2"] == windows["ACMDM-S-PS22-eps"] == (49,)
+    assert windows["ACMDM-S-PS22-raw"] == windows["ACMDM-S-PS22-redundant-x0"] == (196,)
+    assert windows["ACMDM-S-PS2-prefix"] == (15,) and windows["ACMDM-n4-PS22-noisy-condition"] == (50,)
+
+
+def test_table_1_has_a_row_for_every_combination():
+    size = {"num_joints": 22}
+    base = presets.build_config("ACMDM-S-PS22", **size).to_dict()
+    for label, differs, diffusion, latent in (
+        ("absolute, AdaLN, causal AE, v", {}, "straight", "ACMDM-causal-AE"),
+        ("absolute, AdaLN, non-causal VAE, v", {}, "straight", "ACMDM-non-causal-VAE"),
+        ("absolute, AdaLN, causal AE, x0", {"objective": "x0"}, "variance_preserving_betas", "ACMDM-causal-AE"),
+        (
+            "absolute, AdaLN, none, eps",
+            {"channels": 3, "window": 196, "objective": "eps"}, "variance_preserving_betas", "",
+        ),
+        (
+            "absolute+redundancy, concat, none, v",
+            {"channels": 13, "window": 196, "conditioning": "concatenation"}, "straight", "",
+        ),
+    ):  # fmt: skip
+        preset = presets.find_preset(f"ACMDM-S-PS22 ({label})")
+        values = presets.build_config(preset.name, **size).to_dict()
+        assert {name: values[name] for name in values if values[name] != base[name]} == differs
+        assert (preset.diffusion.kind, preset.latent) == (diffusion, latent)
+
+
+def test_every_preset_of_acmdm_survives_json_and_is_counted():
+    for name, preset in presets.of_paper("acmdm").items():
+        size = {} if preset.family == "motion autoencoder" else {"num_joints": 21, "text_width": 256}
+        config = presets.build_config(name, **size)
+        assert presets.config_from_dict(config.to_dict()) == config
+    config = config_of(depth=1)
+    tokens, width, hidden = 8, 16, 42
+    block = 6 * width * width + tokens * (4 * width * width + 3 * width * hidden) + 2 * tokens * tokens * width
+    ends = 2 * (tokens * 20 * width) + 256 * width + width * width + 2 * width * width
+    text, evaluation = presets.count_model_flops(config)
+    assert (text, evaluation) == (2 * 6 * width, 2 * (block + ends))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"patch": "pairs"}, "did you mean 'pair'"),
+        ({"objective": "velocity"}, "unknown objective"),
+        ({"num_heads": 3}, "must divide the width"),
+        ({"latent_width": 18, "num_heads": 2}, "pairs of channels"),
+        ({"block_frames": 4, "conditioning": "concatenation"}, "adaln"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        config_of(**settings)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    network = fresh(config_of())
+    context = network.encode(condition())
+    for state, message in (
+        (STATE[:, :, :3], "state must be"),
+        (normal(0, 2, 9, 5, 4), "at most 8"),
+        (STATE[:, :4], "mask"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            network(state, TIME, context)
+    for broken in (condition()._replace(pooled=jnp.ones((2, 7))), condition()._replace(mask=jnp.ones((2, 9), bool))):
+        with pytest.raises(ValueError):
+            network.encode(broken)
+    with pytest.raises(ValueError, match="adaln"):
+        fresh(config_of(conditioning="concatenation"))(STATE, jnp.ones((2, 8)), context)
+    blocks = fresh(config_of(block_frames=4))
+    with pytest.raises(ValueError, match="block_frames 0"):
+        control_branch(blocks, 4, jax.random.key(0))
+    with pytest.raises(ValueError, match="control must be"):
+        control_branch(network, 4, jax.random.key(0)).control_tokens(
+            Control.of(jnp.ones((2, 30, 5, 3)), jnp.ones((2, 30, 5)))
+        )
+    with pytest.raises(ValueError, match="masked autoregression"):
+        config_of(MaskedACMDMConfig, block_frames=4)

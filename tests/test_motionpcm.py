@@ -1,0 +1,150 @@
+"""MotionPCM's networks: sizes of the paper, what each input changes, and a student that begins as its teacher."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.motionpcm import (
+    Discriminator,
+    DiscriminatorConfig,
+    LatentAutoencoder,
+    LatentAutoencoderConfig,
+    LatentDenoiser,
+    LatentDenoiserConfig,
+    SkipTransformer,
+    SkipTransformerConfig,
+    student_of,
+    waves,
+)
+
+SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32}
+RNGS = nnx.Rngs(0)
+TEACHER = LatentDenoiser(LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=RNGS)
+CODER = LatentAutoencoder(LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), rngs=RNGS)
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def numbers(module):
+    return sum(leaf.size for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
+
+
+# --------------------------------------------------------------------------------------------------------------- sizes
+
+
+def test_sizes_are_the_papers():
+    blank = lambda make: nnx.eval_shape(lambda: make(nnx.Rngs(0)))
+    config = SkipTransformerConfig()
+    assert round(numbers(blank(lambda rngs: SkipTransformer(config, rngs=rngs))) / 1e6, 2) == 7.63
+    assert round(numbers(blank(lambda rngs: SkipTransformer(config, crossing=True, rngs=rngs))) / 1e6, 2) == 10.01
+    teacher, student = (
+        presets.count_parameters(presets.build_config(f"MotionPCM-{name}")) for name in ("teacher", "M1")
+    )
+    assert round(teacher / 1e6, 2) == 8.24 and student - teacher == 256 * 768  # 0.20 M
+    config = presets.build_config("MotionPCM-VAE", features=263)
+    assert (config.window, config.channels, config.depth) == (16, 32, 9)
+
+
+def test_presets_name_every_row_of_the_paper_and_survive_json():
+    found = presets.of_paper("motionpcm")
+    for name in found:
+        config = presets.build_config(name)
+        assert presets.config_from_dict(config.to_dict()) == config
+    student = presets.find_preset("MotionPCM (4-step)")
+    assert (student.name, student.training, student.latent) == ("MotionPCM-M4", {"num_phases": 4}, "MotionPCM-VAE")
+    small = presets.find_preset("MotionPCM-M2-small")
+    assert small.latent == "MotionPCM-VAE-small" and small.network["guidance_features"] == 256
+    assert {preset.latent for preset in found.values()} <= {"", *found}
+    table = presets.table("motionpcm", text_width=256).set_index("model")
+    assert "MotionPCM-VAE" not in table.index and set(table["sampler"]) == {"ddim"}
+    assert table.loc["MotionPCM-M1-small", "parameters"] < 1.5e6
+    with pytest.raises(ValueError, match="depth must be odd"):
+        SkipTransformerConfig(depth=4)
+
+
+# --------------------------------------------------------------------------------------------------------- autoencoder
+
+
+def test_a_latent_has_one_size_and_padding_changes_nothing():
+    clip, mask = normal(0, 2, 12, 7), jnp.arange(12) < jnp.asarray([[12], [8]])
+    mean, log_variance = CODER.encode(clip, mask)
+    assert mean.shape == log_variance.shape == (2, 4, 3)
+    spoilt = jnp.where(mask[..., None], clip, 1e3)
+    np.testing.assert_allclose(CODER.encode(spoilt, mask)[0], mean, atol=1e-5)
+    np.testing.assert_allclose(CODER.encode(clip[1:, :8], mask[1:, :8])[0], mean[1:], atol=1e-5)
+    assert np.abs(CODER.encode(clip.at[1, 7].add(1.0), mask)[0] - mean)[1].max() > 1e-4
+    made = CODER.decode(mean, mask)
+    assert made.shape == clip.shape and not made[1, 8:].any() and made[1, :8].all()
+    np.testing.assert_allclose(CODER.decode(mean[1:], mask[1:, :8]), made[1:, :8], atol=1e-5)
+    # Every frame hears the latent, and is a frame of its own.
+    assert np.abs(CODER.decode(mean + 1.0, mask) - made)[0].max(axis=-1).min() > 1e-3
+    assert np.abs(np.diff(made[0], axis=0)).max(axis=-1).min() > 1e-3
+    with pytest.raises(ValueError, match="at most 32, 7"):
+        CODER.encode(normal(0, 1, 33, 7), jnp.ones((1, 33), bool))
+
+
+def test_the_second_half_is_handed_the_first_in_reverse():
+    config = SkipTransformerConfig(**{**SMALL, "depth": 5})
+    body = SkipTransformer(config, rngs=nnx.Rngs(1))
+    outputs = list(body.outputs(normal(0, 1, 4, 16)))
+    assert len(outputs) == 5
+    joined = lambda number, kept, z: body.blocks[number](body.joins[number - 3](jnp.concatenate([z, kept], -1)))
+    np.testing.assert_allclose(joined(3, outputs[1], outputs[2]), outputs[3], atol=1e-5)
+    np.testing.assert_allclose(joined(4, outputs[0], outputs[3]), outputs[4], atol=1e-5)
+    assert np.abs(joined(4, outputs[1], outputs[3]) - outputs[4]).max() > 1e-3
+
+
+# -------------------------------------------------------------------------------------------------- teacher and student
+
+
+def test_waves_are_those_of_the_released_code():
+    np.testing.assert_allclose(waves(3.0, 4, 2.0), [*np.cos([3.0, 0.03]), *np.sin([3.0, 0.03])], rtol=1e-5)
+    told = waves(3.0, 4, 1.0, sine_first=True)
+    np.testing.assert_allclose(told, [*np.sin([3.0, 3e-4]), *np.cos([3.0, 3e-4])], rtol=1e-5)
+
+
+def test_a_student_is_its_teacher_at_first_whatever_it_is_told():
+    state, context = normal(1, 3, 4, 3), TEACHER.encode(normal(2, 3, 5))
+    time, told = jnp.asarray([999, 499, 99]), jnp.asarray([0.0, 5.0, 15.0])
+    student, answer = student_of(TEACHER, jax.random.key(9)), TEACHER(state, time, context)
+    np.testing.assert_array_equal(student(state, time, context, told), answer)
+    student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
+    moved = student(state, time, context, told)
+    assert np.abs(moved - answer).max(axis=(1, 2)).min() > 1e-4
+    # It still is where nothing is told, and one guidance is not another.
+    np.testing.assert_array_equal(student(state, time, context), answer)
+    assert np.abs(student(state, time, context, told + 1.0) - moved).max() > 1e-4
+    assert dataclasses.replace(student.config, guidance_features=0) == TEACHER.config
+
+
+@pytest.mark.parametrize("change", ["state", "time", "text"])
+def test_each_input_moves_the_answer(change):
+    inputs = {"state": normal(1, 1, 4, 3), "time": jnp.asarray([499.0]), "text": normal(2, 1, 5)}
+    answer = lambda state, time, text: TEACHER(state, time, TEACHER.encode(text))
+    moved = {**inputs, change: inputs[change] + 1.0}
+    assert np.abs(answer(**moved) - answer(**inputs)).max() > 1e-4
+    with pytest.raises(ValueError, match=r"state must be \[B, 4, 3\]"):
+        answer(**{**inputs, "state": normal(1, 1, 5, 3)})
+
+
+# ------------------------------------------------------------------------------------------------------- discriminator
+
+
+def test_a_discriminator_reads_every_block_and_lets_the_gradient_through():
+    critic = Discriminator(DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4))
+    context = TEACHER.encode(normal(2, 2, 5))
+    scores = lambda state: critic(TEACHER.features(state, jnp.asarray([199, 499]), context))
+    state = normal(1, 2, 4, 3)
+    assert scores(state).shape == (2, 3, 2, 4)
+    assert np.abs(jax.grad(lambda z: scores(z).mean())(state)).min() > 0
+    features = TEACHER.features(state, jnp.asarray([199, 499]), context)
+    spoilt = [features[0] + normal(5, 2, 4, 16), *features[1:]]
+    changed = np.abs(critic(spoilt) - scores(state)).max(axis=(0, 2, 3))
+    assert changed[0] > 1e-3 and not changed[1:].any()

@@ -1,0 +1,260 @@
+"""Phased consistency: where phases end, the jump to an end, and what a perfect student would do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from f3amd_lib.diffusion.oracles import GaussianMixture
+from f3amd_lib.diffusion.phases import (
+    LATENT_CONSISTENCY_TIMES,
+    consistency_scales,
+    cut_phases,
+    ddim_times,
+    follow,
+    guided_noise,
+    hinge,
+    jump,
+    latent_consistency_end,
+    noise_travel,
+    pseudo_huber,
+    sample_latent_consistency,
+    shares,
+    target_end,
+    visit,
+)
+from f3amd_lib.diffusion.schedules import variance_preserving_betas
+
+SCHEDULE = variance_preserving_betas()
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+# --------------------------------------------------------------------------------------------------------------- phases
+
+
+def test_alpha_bars_are_the_published_schedules():
+    alpha_bar = SCHEDULE.alpha_bars[[0, 99, 199, 299, 399, 499, 599, 699, 799, 899, 999]]
+    wanted = "999150 895463 755238 592183 426086 277670 161753 083128 037195 014299 004660".split()
+    np.testing.assert_allclose(alpha_bar, [float(f"0.{digits}") for digits in wanted], atol=5e-7)
+    alpha, sigma = shares(SCHEDULE, np.array([0, 499, 999]), np)
+    np.testing.assert_allclose(alpha, [0.99957, 0.52694, 0.06826], atol=6e-6)
+    np.testing.assert_allclose(sigma, [0.02915, 0.84990, 0.99767], atol=6e-6)
+
+
+@pytest.mark.parametrize(
+    "skip, ends",
+    [
+        (100, {1: [0], 2: [0, 499], 4: [0, 199, 499, 699]}),
+        (50, {1: [0], 2: [0, 499], 4: [0, 249, 499, 749]}),
+        (20, {1: [0], 2: [0, 499], 4: [0, 239, 499, 739]}),
+    ],
+)
+def test_phases_end_where_they_should(skip, ends):
+    for num_phases, wanted in ends.items():
+        phases = cut_phases(1000, skip, num_phases)
+        assert phases.edges.tolist() == [*wanted, 999] and phases.visited.tolist() == [999, *wanted[::-1]]
+        assert len(phases.times) == 1000 // skip and phases.times[-1] == 999 and phases.before[0] == 0
+        # Every point lies in its phase, the solver never leaves it, and only a phase's first point reaches its end.
+        low, high = phases.edges[phases.phase], phases.edges[phases.phase + 1]
+        assert (low < phases.times).all() and (phases.times <= high).all() and (low <= phases.before).all()
+        assert ((phases.before == low) == phases.first).all() and phases.first.sum() == num_phases
+
+
+def test_a_cut_that_makes_no_sense_is_refused():
+    for skip, num_phases in ((30, 1), (100, 11), (100, 0), (0, 1)):
+        with pytest.raises(ValueError, match="phases need a skip that divides"):
+            cut_phases(1000, skip, num_phases)
+
+
+# ----------------------------------------------------------------------------------------------------------------- jump
+
+
+def test_motionpcm_eq08_to_eq10_a_jump_is_ddims_step_and_the_identity_at_its_own_end():
+    state, eps, time = normal(0, 3, 4, 2), normal(1, 3, 4, 2), jnp.asarray([999, 499, 1])
+    np.testing.assert_allclose(jump(SCHEDULE, state, eps, time, time), state, atol=2e-6)
+    # It lands where one x0 and one noise say, whatever the noise: every point of the line jumps to the same end.
+    x0, edge = normal(2, 3, 4, 2), jnp.asarray([499, 199, 0])
+    on_line = lambda t: perturbed(x0, eps, t)
+    np.testing.assert_allclose(jump(SCHEDULE, on_line(time), eps, time, edge), on_line(edge), atol=3e-5)
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(jump(SCHEDULE, on_line(time), -eps, time, edge), on_line(edge), atol=3e-5)
+
+
+def perturbed(x0, eps, time):
+    alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, time))
+    return alpha * x0 + sigma * eps
+
+
+def gaussian_noise(state, time, mean=0.3, variance=0.6):
+    """The exact noise estimate of one Gaussian, numpy."""
+    alpha, sigma = shares(SCHEDULE, time, np)
+    return sigma * (state - alpha * mean) / (alpha**2 * variance + sigma**2)
+
+
+@pytest.mark.parametrize("skip, wanted", [(100, 1.4150), (50, 1.5023), (20, 1.5600), (1, 1.6001)])
+def test_jumps_through_a_gaussian_end_where_the_sheet_says(skip, wanted):
+    phases, state = cut_phases(1000, skip), np.asarray(1.7)
+    for time, before in zip(phases.times[::-1], phases.before[::-1], strict=True):
+        state = jump(SCHEDULE, state, gaussian_noise(state, time), time, before)
+    assert state == pytest.approx(wanted, abs=6e-5)
+    # The exact flow keeps the quantile: 1.6024.
+    spread = lambda t: np.sqrt(SCHEDULE.alpha_bars[t] * 0.6 + 1 - SCHEDULE.alpha_bars[t])
+    alpha = np.sqrt(SCHEDULE.alpha_bars)
+    exact = alpha[0] * 0.3 + (1.7 - alpha[999] * 0.3) * spread(0) / spread(999)
+    assert exact == pytest.approx(1.6024, abs=5e-5) and abs(state - exact) > 1e-3
+
+
+def test_motionpcm_eq11_no_guidance_is_the_condition_alone_and_noise_and_estimate_agree():
+    e_c, e_null, state, w = normal(0, 4, 3), normal(1, 4, 3), normal(2, 4, 3), jnp.asarray([0.0, 1.0, 5.0, 15.0])
+    eps = guided_noise(e_c, e_null, w)
+    np.testing.assert_array_equal(eps[0], e_c[0])
+    np.testing.assert_allclose(eps[2], 6 * e_c[2] - 5 * e_null[2], rtol=1e-5)
+    time, end = jnp.full(4, 799), jnp.full(4, 699)
+    both = [jump(SCHEDULE, state, e, time, end) for e in (e_c, e_null)]
+    # Guiding states and guiding noise are one thing, since a jump is linear (Algorithm 1, line 9).
+    np.testing.assert_allclose(jump(SCHEDULE, state, eps, time, end), guided_noise(*both, w), atol=2e-4)
+
+
+def test_a_target_at_its_phases_end_is_the_identity_and_jumps_elsewhere():
+    phases = cut_phases(1000, 100, 4)
+    before, edge = jnp.asarray(phases.before), jnp.asarray(phases.edges[phases.phase])
+    state, eps = normal(0, 10, 3), 1e3 * normal(1, 10, 3)
+    end = target_end(SCHEDULE, state, eps, before, edge)
+    np.testing.assert_array_equal(end[phases.first], state[phases.first])
+    assert (np.abs(end - state)[~phases.first] > 1).any(axis=1).all()
+
+
+def test_noise_travel_keeps_the_marginal():
+    alpha_bar = SCHEDULE.alpha_bars
+    for start, end in ((0, 0), (0, 499), (199, 499), (699, 999)):
+        # Of a state at `start`, what is left of the data and how much noise there is at `end`.
+        signal = noise_travel(SCHEDULE, jnp.float32(np.sqrt(alpha_bar[start]))[None], start, end, jnp.zeros(1))[0]
+        fresh = noise_travel(SCHEDULE, jnp.zeros(1), start, end, jnp.ones(1))[0]
+        kept = noise_travel(SCHEDULE, jnp.ones(1), start, end, jnp.zeros(1))[0]
+        assert signal**2 == pytest.approx(alpha_bar[end], abs=1e-5)
+        assert kept**2 * (1 - alpha_bar[start]) + fresh**2 == pytest.approx(1 - alpha_bar[end], abs=1e-5)
+
+
+# --------------------------------------------------------------------------------------------------------------- losses
+
+
+def test_motionpcm_eq12_the_loss_is_square_near_zero_and_straight_far_away():
+    assert pseudo_huber(jnp.asarray(0.0), 0.5) == 0.0
+    assert pseudo_huber(jnp.asarray(1e-2), 0.5) == pytest.approx(1e-4, rel=1e-2)
+    assert pseudo_huber(jnp.asarray(-100.0), 0.5) == pytest.approx(99.5, rel=1e-4)
+
+
+def test_motionpcm_eq13_the_discriminators_loss_is_2_at_0_and_0_at_the_margins():
+    scores = jnp.zeros(5)
+    assert hinge(scores, scores) == 2.0
+    assert hinge(scores + 1, scores - 1) == hinge(scores + 7, scores - 3) == 0.0
+    assert hinge(scores - 1, scores + 1) == 4.0  # what Eq. 13 prints would be 0 here
+
+
+def test_latent_consistency_is_the_identity_at_time_0_and_the_clean_estimate_elsewhere():
+    assert [float(x) for x in consistency_scales(0)] == [1.0, 0.0]
+    c_skip, c_out = consistency_scales(1)
+    assert (float(c_skip), float(c_out)) == pytest.approx((0.25 / 100.25, 10 / np.sqrt(100.25)))
+    x0, eps, time = normal(0, 2, 3, 1), normal(1, 2, 3, 1), jnp.asarray([299, 699])
+    end = latent_consistency_end(SCHEDULE, perturbed(x0, eps, time), eps, time)
+    np.testing.assert_allclose(end, x0, atol=2e-5)
+
+
+# ------------------------------------------------------------------------------------------------------------- sampling
+
+
+def test_a_teachers_times_by_both_spacings():
+    assert ddim_times(1000, 10).tolist() == [*range(999, 0, -100), 0]
+    assert ddim_times(1000, 1).tolist() == [999, 0] and ddim_times(1000, 4).tolist() == [999, 749, 499, 249, 0]
+    fifty = ddim_times(1000, 50, "leading")
+    assert fifty[:2].tolist() == [981, 961] and fifty[-2:].tolist() == [1, 0]
+    assert ddim_times(1000, 1, "leading").tolist() == [1, 0] and ddim_times(1000, 2, "leading").tolist() == [501, 1, 0]
+    with pytest.raises(ValueError, match="did you mean 'leading'"):
+        ddim_times(1000, 5, "leadin")
+    with pytest.raises(ValueError, match="1 to 1000 steps"):
+        ddim_times(1000, 0)
+
+
+MIXTURE = GaussianMixture([-1.0, 0.5], 0.2, [0.3, 0.7])
+
+
+def exact_noise(state, time):
+    """The mixture's exact noise estimate of a VP state, JAX."""
+    alpha, sigma = shares(SCHEDULE, time)
+    return (state - alpha * MIXTURE.denoise(state / alpha, sigma / alpha)) / sigma
+
+
+def exact_flow(state, time, time_next):
+    """Where the mixture's flow carries VP states, numpy."""
+    alpha, sigma = shares(SCHEDULE, np.array([time, time_next]), np)
+    return alpha[1] * MIXTURE.flow(np.asarray(state, np.float64) / alpha[0], *(sigma / alpha))
+
+
+def perfect_student(phases):
+    """The noise that a perfectly distilled student answers: the one whose jump lands on the flow's own end."""
+
+    def predict(state, time):
+        time = int(time)
+        edge = int(phases.edges[np.searchsorted(phases.edges, time, side="left") - 1])
+        alpha, sigma = shares(SCHEDULE, np.array([time, edge]), np)
+        end, state = exact_flow(state, time, edge), np.asarray(state, np.float64)
+        # alpha' (z - sigma e) / alpha + sigma' e = end, solved for e.
+        ratio = alpha[1] / alpha[0]
+        return (end - ratio * state) / (sigma[1] - ratio * sigma[0])
+
+    return predict
+
+
+@pytest.mark.parametrize("num_phases", [1, 2, 4])
+def test_a_perfect_student_walks_the_oracles_flow_from_edge_to_edge(num_phases):
+    phases, noise = cut_phases(1000, 100, num_phases), np.asarray(normal(3, 64, 1), np.float64)
+    student, state = perfect_student(phases), noise
+    for time, edge in zip(phases.visited[:-1], phases.visited[1:], strict=True):
+        state = jump(SCHEDULE, state, student(state, time), time, edge)
+        np.testing.assert_allclose(state, exact_flow(noise, 999, edge), atol=1e-9)
+    # And from anywhere in a phase it says the same end: what "consistent" means (MotionPCM Eqs 4 and 5).
+    for time, number in zip(phases.times, phases.phase, strict=True):
+        here, edge = exact_flow(noise, 999, time), int(phases.edges[number])
+        end = jump(SCHEDULE, here, student(here, time), int(time), edge)
+        np.testing.assert_allclose(end, exact_flow(noise, 999, edge), atol=1e-9)
+    # The teacher's own estimate, jumping as far, does not.
+    naive = jump(SCHEDULE, jnp.asarray(noise, jnp.float32), exact_noise(jnp.asarray(noise, jnp.float32), 999), 999, 0)
+    assert np.abs(naive - exact_flow(noise, 999, 0)).mean() > 0.3
+
+
+def test_a_walk_is_its_jumps_and_draws_no_noise():
+    noise, times = normal(3, 64, 1), ddim_times(1000, 20)
+    made = follow(exact_noise, SCHEDULE, noise, times)
+    state = noise
+    for time, time_next in zip(times[:-1], times[1:], strict=True):
+        state = jump(SCHEDULE, state, exact_noise(state, time), time, time_next)
+    np.testing.assert_allclose(made, state, atol=2e-5)
+    states = visit(exact_noise, SCHEDULE, noise, times)
+    assert len(states) == 21
+    np.testing.assert_allclose(states[-1].x_noisy, made, atol=2e-5)
+    # More steps come nearer to the flow.
+    error = lambda steps: np.abs(follow(exact_noise, SCHEDULE, noise, ddim_times(1000, steps)) - exact).mean()
+    exact = exact_flow(noise, 999, 0)
+    assert error(50) < error(10) < error(2) and error(50) < 0.05
+
+
+def test_leading_times_ask_one_step_the_wrong_question():
+    """Asked at level 1, even an exact teacher leaves noise as it is: what one step of Table 4 may show."""
+    noise = normal(3, 256, 1)
+    leading = follow(exact_noise, SCHEDULE, noise, ddim_times(1000, 1, "leading"))
+    np.testing.assert_allclose(leading, noise, atol=0.5)
+    assert np.abs(leading - noise).mean() < 0.05
+
+
+def test_latent_consistency_samples_with_fresh_noise():
+    noise, key = normal(3, 512, 1), jax.random.key(0)
+    draw = lambda steps, key: sample_latent_consistency(
+        exact_noise, SCHEDULE, noise, LATENT_CONSISTENCY_TIMES[steps], key
+    )
+    np.testing.assert_array_equal(draw(1, key), draw(1, jax.random.key(1)))
+    assert np.abs(draw(2, key) - draw(2, jax.random.key(1))).max() > 0.1
+    # Told the conditional mean, one step returns to the middle, and four steps spread out again.
+    assert draw(1, key).std() < draw(4, key).std()
