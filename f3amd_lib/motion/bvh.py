@@ -28,6 +28,14 @@ _FRAMES_LINE = re.compile(r"frames\s*:\s*(.*)", re.IGNORECASE)
 _FRAME_TIME_LINE = re.compile(r"frame\s*time\s*:\s*(.*)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _CHANNELS = {f"{axis}{kind}".lower(): (axis, kind) for axis in "XYZ" for kind in ("position", "rotation")}
+LARGEST_NUMBER = 1e8
+"""Largest number of a file, either way: 1,000 km in centimetres, and as many degrees."""
+
+FRAME_TIMES = (1e-5, 1.0)
+"""Shortest and longest time between frames, seconds."""
+
+_LONGEST_WORD = 200
+
 _BRACES = "check that every '{' has its '}'"
 
 
@@ -149,6 +157,7 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         lines.append(f"{indent}OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset))
 
     def add_joint(joint, depth):
+        """Add all of a joint but its children and the brace that closes it."""
         depth_first.append(joint)
         outer, inner = "\t" * depth, "\t" * (depth + 1)
         lines.extend([f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"])
@@ -157,18 +166,27 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         if depth == 0:
             channels = ["Xposition", "Yposition", "Zposition", *channels]
         lines.append(f"{inner}CHANNELS {len(channels)} {' '.join(channels)}")
-        children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
-        for child in children:
-            add_joint(child, depth + 1)
+
+    def end_joint(joint, depth):
+        outer, inner = "\t" * depth, "\t" * (depth + 1)
         tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
         # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
-        for tip in tips or ([] if children else [(0.0, 0.0, 0.0)]):
+        for tip in tips or ([] if children[joint] else [(0.0, 0.0, 0.0)]):
             lines.extend([f"{inner}End Site", f"{inner}{{"])
             add_offset(inner + "\t", tip)
             lines.append(f"{inner}}}")
         lines.append(f"{outer}}}")
 
-    add_joint(0, 0)
+    children = [[] for _ in skeleton.names]
+    for child, parent in enumerate(skeleton.parents[1:], 1):
+        children[parent].append(child)
+    steps = [(add_joint, 0, 0)]  # a stack, not a recursion: chains of thousands of joints can be written
+    while steps:
+        step, joint, depth = steps.pop()
+        step(joint, depth)
+        if step is add_joint:
+            steps.append((end_joint, joint, depth))
+            steps += [(add_joint, child, depth + 1) for child in reversed(children[joint])]
     lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
     with warnings.catch_warnings():
         # At gimbal lock any of the equal answers will do: the matrix is the same.
@@ -200,7 +218,7 @@ class _Joint:
 def _clean(text: str | bytes, name: str) -> bytes:
     """Return the file as bytes with LF or CRLF line ends, or say why it is no text."""
     if isinstance(text, str):
-        data = text.encode("utf-8")
+        data = text.encode("utf-8", "surrogatepass")  # half a character is found, with its line, by the reader
     elif isinstance(text, bytes | bytearray | memoryview):
         data = bytes(text)
     else:
@@ -218,8 +236,13 @@ def _clean(text: str | bytes, name: str) -> bytes:
 
 def _finite_number(word: str) -> float | None:
     """Return a word as a float, or None if it is no finite decimal number."""
-    value = float(word) if _NUMBER.fullmatch(word) else np.nan
-    return value if np.isfinite(value) else None
+    value = float(word) if len(word) <= _LONGEST_WORD and _NUMBER.fullmatch(word) else np.nan
+    return value if abs(value) <= LARGEST_NUMBER else None
+
+
+def _count(word: str) -> int | None:
+    """Return a word as a whole number of nine digits at most, or None."""
+    return int(word) if len(word) <= 9 and word.isdecimal() else None
 
 
 class _Tokens:
@@ -235,7 +258,11 @@ class _Tokens:
                 words = raw.decode("utf-8")
             except UnicodeDecodeError:
                 raise _Broken(line, "holds bytes that are not UTF-8 text; is it a BVH file?") from None
-            self.items += [(word, line) for word in words.replace("{", " { ").replace("}", " } ").split()]
+            words = words.replace("{", " { ").replace("}", " } ").split()
+            if max(map(len, words), default=0) > _LONGEST_WORD:
+                what = f"holds a word of {max(map(len, words))} characters"
+                raise _Broken(line, f"{what}, longer than {_LONGEST_WORD}; is it a BVH file?")
+            self.items += [(word, line) for word in words]
 
     def peek(self) -> tuple[str, int]:
         """Return the next word, "" at the end, and its line."""
@@ -341,10 +368,10 @@ def _parse_hierarchy(data: bytes):
 def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, str]]:
     """Return (axis, kind) of a CHANNELS line, its keyword already taken."""
     count, _ = tokens.take("the number of channels")
-    if not count.isdecimal():
+    if _count(count) is None:
         raise _Broken(line, f"CHANNELS needs a count first, found {count!r}")
     channels = []
-    for _ in range(int(count)):
+    for _ in range(_count(count)):
         label, label_line = tokens.take(f"channel names of {joint!r}")
         channel = _CHANNELS.get(label.lower())
         if channel is None:
@@ -374,13 +401,13 @@ def _parse_motion_head(data: bytes, line: int):
             raise _Broken(line, f"expected a line like {example!r} here, {there}")
         answers.append((match.group(1).strip(), line))
     (count, count_line), (seconds, _) = answers
-    if not count.isdecimal() or int(count) == 0:
-        raise _Broken(count_line, f"Frames: must be a whole number above 0, found {count!r}")
+    if not _count(count):
+        raise _Broken(count_line, f"Frames: must be a whole number above 0, found {count[:40]!r}")
     frame_time = _finite_number(seconds)
-    if frame_time is None or frame_time <= 0:
-        what = f"Frame Time: must be a positive number of seconds, found {seconds!r}"
+    if frame_time is None or not FRAME_TIMES[0] <= frame_time <= FRAME_TIMES[1]:
+        what = f"Frame Time: must be a positive number of seconds, at most {FRAME_TIMES[1]:g}, found {seconds[:40]!r}"
         raise _Broken(line, f"{what}; 30 frames per second are 0.0333333")
-    return (int(count), count_line), frame_time, rest, line + 1
+    return (_count(count), count_line), frame_time, rest, line + 1
 
 
 def _parse_rows(rows: bytes, first_line: int, joints, num_frames) -> np.ndarray:
@@ -392,12 +419,13 @@ def _parse_rows(rows: bytes, first_line: int, joints, num_frames) -> np.ndarray:
     count, count_line = num_frames
     columns = sum(len(joint.channels) for joint in joints)
     values = np.empty((0, columns))
-    if rows.strip():
+    first = rows.lstrip().partition(b"\n")[0].split(None, columns)
+    if len(first) == columns:  # else there is no need to read the rest
         try:
             values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
         except ValueError:  # UnicodeDecodeError is one, too
             pass
-    if values.shape == (count, columns) and np.isfinite(values).all():
+    if values.shape == (count, columns) and (np.abs(values) <= LARGEST_NUMBER).all():
         return values
     _explain_rows(rows, first_line, joints, columns)
     what = f"Frames: says {count}, but {len(values)} rows of numbers follow"
@@ -416,11 +444,12 @@ def _explain_rows(rows: bytes, first_line: int, joints, columns: int):
     """Raise for the first row that is not `columns` finite numbers; return if there is none."""
     labels = [f"{axis}{kind} of {joint.name}" for joint in joints for axis, kind in joint.channels]
     for frame, (line, words) in enumerate(_rows_with_lines(rows, first_line)):
-        for column, word in enumerate(words):
+        for column, word in enumerate(words[: columns + 1]):
             if _finite_number(word) is None:
                 what = labels[column] if column < columns else "beyond the last channel"
                 place = f"number {column + 1} of frame {frame}, {what}"
-                raise _Broken(line, f"{word[:40]!r} ({place}) is not a finite number; mend it or export again")
+                how = f"is not a finite number of at most {LARGEST_NUMBER:g}"
+                raise _Broken(line, f"{word[:40]!r} ({place}) {how}; mend it or export again")
         if len(words) != columns:
             how = "cut off" if len(words) < columns else "too long"
             what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} channels"

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
 
 from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import checked_seed, nearest_hint
 from f3amd_lib.motion.curves import smoothstep
 from f3amd_lib.motion.skeleton import Motion
 
@@ -26,6 +26,12 @@ NAMES = ("straight", "circle", "figure-eight", "slalom", "square", "spiral", "co
 
 MAX_STEP = 0.5
 """Longest step between two rows of a path file, metres (15 m/s at 30 fps: nobody runs so fast)."""
+
+MAX_DISTANCE = 1e4
+"""Largest number in a path file: 10 km from the origin, where single precision still tells millimetres."""
+
+MAX_ROWS = 30 * 3600
+MAX_LINE = 1000
 
 _SUBSTEPS = 8  # integration steps a frame; leaves about 1e-6 of a path's length in error
 
@@ -130,7 +136,7 @@ def named_path(
         raise ValueError(f"speed must lie between 0 and {MAX_STEP * 30.0:g} m/s, got {speed}")
     if not (np.isfinite(ramp_seconds) and ramp_seconds >= 0):
         raise ValueError(f"ramp_seconds must be 0 or more, got {ramp_seconds}")
-    num_frames = int(num_frames)
+    num_frames, seed = int(num_frames), checked_seed(seed)
 
     fine_time = np.arange((num_frames - 1) * _SUBSTEPS + 1) / (_SUBSTEPS * fps)
     if name == "complex":
@@ -256,14 +262,21 @@ def read_path_csv(path) -> RootPath:
 
     Raises:
       ValueError: naming file and line, for a missing, repeated or unknown column, a row of the
-        wrong length, a cell that is not a finite number, a step over 0.5 m, or fewer than 2 rows.
+        wrong length, a cell that is not a finite number of at most 10,000, a step over 0.5 m, or fewer
+        than 2 rows or more than an hour's.
     """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
-    reader = csv.reader(text.splitlines())
+    lines = text.splitlines()
+    if long := next((line for line, row in enumerate(lines, 1) if len(row) > MAX_LINE), None):
+        raise ValueError(f"{path}: line {long}: is longer than {MAX_LINE} characters; a row holds 2 or 3 numbers")
+    if len(lines) > MAX_ROWS + 1:
+        raise ValueError(f"{path}: line {MAX_ROWS + 2}: more than {MAX_ROWS} rows, an hour at 30 fps; cut the path up")
+    # With quotes a cell could run over lines; numbers and the three headings need none.
+    reader = csv.reader(text.replace('"', "").splitlines())
     header = [cell.strip() for cell in next(reader, [])]
     if sorted(header) not in (["x", "z"], ["x", "yaw_deg", "z"]):
         raise ValueError(f"{path}: line 1: the header must be x,z or x,z,yaw_deg, it is {','.join(header) or 'empty'}")
@@ -282,6 +295,8 @@ def read_path_csv(path) -> RootPath:
                 row[column] = np.nan
             if not np.isfinite(row[column]):
                 raise ValueError(f"{where} {column} is {cell.strip()!r}, not a finite number")
+            if abs(row[column]) > MAX_DISTANCE:
+                raise ValueError(f"{where} {column} is {cell.strip()!r}: at most {MAX_DISTANCE:g} either way")
         jump = np.hypot(row["x"] - rows[-1]["x"], row["z"] - rows[-1]["z"]) if rows else 0.0
         if jump > MAX_STEP:
             limit = f"at most {MAX_STEP} m at 30 fps"

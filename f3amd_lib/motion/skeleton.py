@@ -10,27 +10,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
 CONTACT_SPEED = 0.01
 """A toe that moves less than this, metres in a frame at 30 fps, is in contact (CAMDM's rule)."""
 
-# What the conventions at hand call the joints we must find. First match wins.
-_ROLE_NAMES = {
-    "left_hip": ("UpperLeg_L", "LeftHip", "LeftUpLeg", "mixamorig:LeftUpLeg", "left_hip"),
-    "right_hip": ("UpperLeg_R", "RightHip", "RightUpLeg", "mixamorig:RightUpLeg", "right_hip"),
-    "left_toe": ("Toes_L", "LeftToe", "LeftToeBase", "mixamorig:LeftToeBase", "left_toe", "left_foot"),
-    "right_toe": ("Toes_R", "RightToe", "RightToeBase", "mixamorig:RightToeBase", "right_toe", "right_foot"),
-    "left_shoulder": ("UpperArm_L", "LeftArm", "mixamorig:LeftArm", "LeftShoulder", "left_shoulder"),
-    "right_shoulder": ("UpperArm_R", "RightArm", "mixamorig:RightArm", "RightShoulder", "right_shoulder"),
-    "left_wrist": ("Hand_L", "LeftHand", "mixamorig:LeftHand", "LeftWrist", "left_wrist"),
-    "head": ("Head", "mixamorig:Head", "head"),
-    "right_wrist": ("Hand_R", "RightHand", "mixamorig:RightHand", "RightWrist", "right_wrist"),
-}
+_ROLE_NAMES = read_toml(Path(__file__).with_name("joint_roles.toml"))
 
 
 def _other_side(name: str) -> str | None:
@@ -106,7 +97,7 @@ class Skeleton:
             raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}") from None
 
     def role(self, role: str) -> int:
-        """Return the joint that plays a role: head, or left_ or right_ hip, toe, shoulder or wrist."""
+        """Return the joint that plays a role: head, or left_ or right_ hip, toe, clavicle, shoulder or wrist."""
         for name in _ROLE_NAMES[role]:
             if name in self.names:
                 return self.names.index(name)
@@ -275,7 +266,7 @@ def _compose(first, second):
     return sum(first[..., :, k, None] * second[..., None, k, :] for k in range(3))
 
 
-def _walk(skeleton: Skeleton, root_position, rotations):
+def walk_tree(skeleton: Skeleton, root_position, rotations):
     """Carry rotations and positions down the tree, one level at a time."""
     xp = array_module(root_position, rotations)
     offsets = skeleton.offsets.astype(rotations.dtype)
@@ -305,29 +296,36 @@ def forward_kinematics(skeleton: Skeleton, root_position, rotations):
     Returns:
       Global positions, [..., J, 3], metres; numpy in, numpy out, JAX in, JAX out.
     """
-    return _walk(skeleton, root_position, rotations)[0]
+    return walk_tree(skeleton, root_position, rotations)[0]
 
 
 def global_rotations(skeleton: Skeleton, rotations):
     """Turn local rotation matrices [..., J, 3, 3] into global ones of the same shape."""
     xp = array_module(rotations)
-    return _walk(skeleton, xp.zeros_like(rotations[..., 0, :, 0]), rotations)[1]
+    return walk_tree(skeleton, xp.zeros_like(rotations[..., 0, :, 0]), rotations)[1]
 
 
-def facing_yaw(skeleton: Skeleton, positions):
-    """Return the yaw of cross(left hip - right hip, +Y).
+def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
+    """Return the yaw of cross(a, +Y), a = left hip - right hip.
 
     Args:
       skeleton: the joints.
       positions: global positions, [..., J, 3].
+      shoulders: take a = unit(left clavicle - right clavicle) + unit(left hip - right hip), as CAMDM's
+        evaluation does; a skeleton without these joints faces where its hips do.
 
     Returns:
       Radians, [...]; 0 faces +Z, positive turns left.
     """
     xp = array_module(positions)
-    left = positions[..., skeleton.role("left_hip"), :]
-    right = positions[..., skeleton.role("right_hip"), :]
-    across = left - right
+
+    def between(part):
+        return positions[..., skeleton.role(f"left_{part}"), :] - positions[..., skeleton.role(f"right_{part}"), :]
+
+    across = between("hip")
+    if shoulders and skeleton.has_role("left_clavicle") and skeleton.has_role("right_clavicle"):
+        unit = lambda vector: vector / xp.maximum(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
+        across = unit(across) + unit(between("clavicle"))
     # cross(a, +Y) = (-a_z, 0, a_x)
     forward = xp.stack([-across[..., 2], xp.zeros_like(across[..., 0]), across[..., 0]], axis=-1)
     return yaw_from_direction(forward)

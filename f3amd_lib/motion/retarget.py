@@ -1,0 +1,130 @@
+"""Motion of one humanoid on the skeleton of another: directions of its bones, lengths and twists of ours.
+
+Joints are matched by role (`anatomy.joint_roles`), a spine of another number of joints by its length. Each bone of
+ours is turned, from where a reference pose of our skeleton has it, to where the other one's bone points; hips and
+chest, from which several bones go, by the rotation that fits them best. What bones do not show, the twist of head and
+hands, stays as in the reference. The root's path is scaled by the length of the legs, and the lowest toe put where
+the reference has it.
+
+Source: ours; the fit is that of W. Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from f3amd_lib.motion.anatomy import joint_roles
+from f3amd_lib.motion.curves import unit
+from f3amd_lib.motion.rotations import shortest_turn
+from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
+
+_SIDES = ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist")
+NEEDED = ("neck", "head", *(f"{side}_{part}" for side in ("left", "right") for part in _SIDES))
+"""Roles that both skeletons must have, beside the hips."""
+
+
+@dataclass(frozen=True, eq=False)
+class Retargeted:
+    """What came out.
+
+    Attributes:
+      motion: on our skeleton.
+      scale: our legs' length beside theirs.
+      error: how far joints of shared roles are from theirs, times the scale and seen from the hips, centimetres, [T].
+    """
+
+    motion: Motion
+    scale: float
+    error: np.ndarray
+
+
+def retarget(motion: Motion, reference: Motion) -> Retargeted:
+    """Put a motion on another skeleton.
+
+    Args:
+      motion: of any humanoid whose joints we can name.
+      reference: an everyday pose of the wanted skeleton, with rotations: its first frame gives the twists, its lowest
+        toe the floor.
+
+    Returns:
+      The motion on the reference's skeleton, at its own frame rate.
+
+    Raises:
+      ValueError: naming the roles for which either skeleton has no joint.
+    """
+    skeleton = reference.skeleton
+    theirs, ours = joint_roles(motion.skeleton), joint_roles(skeleton)
+    for whose, roles in ((motion, theirs), (reference, ours)):
+        missing = [role for role in NEEDED if role not in roles]
+        if missing:
+            names = ", ".join(whose.skeleton.names)
+            raise ValueError(f"motion {whose.name!r}: no joint is known as {', '.join(missing)}; it has {names}")
+    wanted = _wanted_points(motion, theirs, skeleton, ours)
+    above = np.asarray(reference.needed_rotations("retargeting"), np.float64)[:1]
+    rest = global_rotations(skeleton, above)[0]
+    turned = np.tile(np.eye(3), (motion.num_frames, skeleton.num_joints, 1, 1))
+    for joint, parent in enumerate(skeleton.parents):
+        children = [child for child in wanted if skeleton.parents[child] == joint]
+        before = turned[:, parent] if parent >= 0 else turned[:, 0]
+        if joint not in wanted or not children:
+            turned[:, joint] = before
+            continue
+        was = unit(skeleton.offsets[children] @ rest[joint].T)
+        shall = unit(np.stack([wanted[child] - wanted[joint] for child in children], axis=1))
+        if len(children) > 1:
+            turned[:, joint] = _best_turn(was, shall)
+        else:
+            turned[:, joint] = shortest_turn(before @ was[0], shall[:, 0]) @ before
+    whole = turned @ rest
+    local = whole.copy()
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            local[:, joint] = np.swapaxes(whole[:, parent], -1, -2) @ whole[:, joint]
+    scale = _leg(skeleton, ours) / _leg(motion.skeleton, theirs)
+    made = Motion(skeleton, scale * motion.root_position, local, motion.fps, motion.name)
+    floor = reference.positions[:, list(skeleton.toes), 1].min() - made.positions[:, list(skeleton.toes), 1].min()
+    made = made.replace(root_position=made.root_position + [0.0, floor, 0.0])
+    shared = [role for role in theirs if role in ours and "spine" not in role]
+    there, here = (
+        motion.positions[:, [theirs[role] for role in shared]],
+        made.positions[:, [ours[role] for role in shared]],
+    )
+    apart = (here - here[:, :1]) - scale * (there - there[:, :1])
+    return Retargeted(made, float(scale), 100.0 * np.linalg.norm(apart, axis=-1).mean(axis=-1))
+
+
+def _leg(skeleton: Skeleton, roles) -> float:
+    return float(np.linalg.norm(skeleton.offsets[[roles["left_knee"], roles["left_ankle"]]], axis=-1).sum())
+
+
+def _wanted_points(motion: Motion, theirs, skeleton: Skeleton, ours) -> dict[int, np.ndarray]:
+    """Return for each joint of ours that has a role where the other one has it, [T, 3], in their lengths."""
+    place = {role: motion.positions[:, joint] for role, joint in theirs.items()}
+    spine = sorted((role for role in theirs if role.startswith("spine_")), key=lambda role: int(role[6:]))
+    line = np.stack([place[role] for role in ("hips", *spine, "neck")])
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=-1).mean(axis=-1))])
+    own = sorted((role for role in ours if role.startswith("spine_")), key=lambda role: int(role[6:]))
+    lengths = np.cumsum([np.linalg.norm(skeleton.offsets[ours[role]]) for role in (*own, "neck")])
+    points = {}
+    for role, joint in ours.items():
+        if role in own:
+            along = walked[-1] * lengths[own.index(role)] / lengths[-1]
+            after = min(max(int(np.searchsorted(walked, along)), 1), len(line) - 1)
+            share = (along - walked[after - 1]) / max(walked[after] - walked[after - 1], 1e-9)
+            points[joint] = (1.0 - share) * line[after - 1] + share * line[after]
+        elif role in place:
+            points[joint] = place[role]
+        elif role.endswith("collar"):  # theirs has none: a third of the way to the shoulder
+            shoulder = place[role.replace("collar", "shoulder")]
+            points[joint] = (2.0 * place["neck"] + shoulder) / 3.0
+    return points
+
+
+def _best_turn(was: np.ndarray, shall: np.ndarray) -> np.ndarray:
+    """Return the rotations [T, 3, 3] that bring directions [K, 3] nearest to others, [T, K, 3]."""
+    left, _, right = np.linalg.svd(np.einsum("tka,kb->tab", shall, was))
+    side = np.linalg.det(left @ right)
+    left[..., 2] *= side[:, None]
+    return left @ right

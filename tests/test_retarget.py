@@ -1,0 +1,112 @@
+"""Motion of one humanoid on another's bones: directions theirs, lengths ours; and rollouts that begin with it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders import CHANNELS, HISTORY, refused, tiny_trained, wandering_motion
+from test_skeleton import BANDAI
+
+from f3amd_lib.data.features import frame_positions, frame_yaw, motion_from_frames
+from f3amd_lib.generation.start_poses import start_history
+from f3amd_lib.motion.anatomy import joint_roles
+from f3amd_lib.motion.retarget import retarget
+from f3amd_lib.motion.root_paths import named_path
+from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.training.checkpoints import load_model
+from f3amd_lib.training.pipeline import find_model
+
+
+@pytest.fixture(scope="module")
+def bandai() -> Motion:
+    """A stored pose of real motion on Bandai's rig, whose frames are turned as no other's are."""
+    trained = load_model(find_model("bandai"))
+    pose = next(iter(trained.start_poses.values()))[0]
+    return motion_from_frames(trained.skeleton, pose, name="bandai")
+
+
+@pytest.fixture(scope="module")
+def walk() -> Motion:
+    return synthesize("Neutral", 2.0)
+
+
+def longer(motion: Motion, share: float) -> Motion:
+    """The same motion of a larger person."""
+    skeleton = dataclasses.replace(motion.skeleton, offsets=share * motion.skeleton.offsets)
+    return motion.replace(skeleton=skeleton, root_position=share * motion.root_position)
+
+
+def test_a_walk_on_another_rig_keeps_its_directions_and_the_rigs_bones(walk, bandai):
+    made = retarget(walk, bandai)
+    ours, theirs = joint_roles(bandai.skeleton), joint_roles(walk.skeleton)
+    assert made.motion.skeleton is bandai.skeleton
+    for side in ("left", "right"):
+        for upper, lower in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist")):
+            bones = []
+            for motion, roles in ((made.motion, ours), (walk, theirs)):
+                one, other = roles[f"{side}_{upper}"], roles[f"{side}_{lower}"]
+                bones.append(motion.positions[:, other] - motion.positions[:, one])
+            lengths = [np.linalg.norm(bone, axis=-1) for bone in bones]
+            cosine = (bones[0] * bones[1]).sum(axis=-1) / (lengths[0] * lengths[1])
+            assert cosine.min() > 1 - 1e-6, (side, upper)
+            own = np.linalg.norm(bandai.skeleton.offsets[ours[f"{side}_{lower}"]])
+            np.testing.assert_allclose(lengths[0], own, rtol=1e-6)
+    assert made.error.mean() < 8.0  # of shoulders, hips and head, which are where our bones put them
+    np.testing.assert_allclose(np.linalg.det(made.motion.rotations), 1.0, atol=1e-6)
+    apart = np.angle(np.exp(1j * (made.motion.yaw - walk.yaw)))
+    assert np.abs(apart).max() < np.deg2rad(10)
+    toes = list(bandai.skeleton.toes)
+    assert made.motion.positions[:, toes, 1].min() == pytest.approx(bandai.positions[:, toes, 1].min())
+
+
+def test_the_same_person_in_another_size_comes_back_to_the_millimetre(walk):
+    made = retarget(longer(walk, 1.25), walk)
+    assert made.scale == pytest.approx(0.8)
+    assert made.error.max() < 0.1  # cm
+    shift = made.motion.positions - walk.positions
+    assert np.abs(shift - shift[:, :1]).max() < 1e-3
+
+
+def test_an_error_is_seen_where_there_is_one(walk):
+    bent = Skeleton(
+        walk.skeleton.names,
+        walk.skeleton.parents,
+        walk.skeleton.offsets * np.array([2.5, 1, 1]),
+        walk.skeleton.end_sites,
+    )
+    reference = walk.replace(skeleton=bent)
+    assert retarget(walk, reference).error.mean() > 10.0
+
+
+def test_who_lacks_joints_is_told_which(walk):
+    refused("no joint is known as neck, head.*left_knee", retarget, wandering_motion(5), walk)
+    refused("'wandering 0': no joint is known as", retarget, walk, wandering_motion(5))
+    assert BANDAI.num_joints == len(joint_roles(BANDAI))
+
+
+def test_a_rollout_begins_where_a_file_of_the_models_skeleton_ends():
+    trained = tiny_trained()
+    motion = wandering_motion(40, 5)
+    path = named_path("circle", 16)
+    history, note = start_history(trained, motion, path)
+    assert history.shape == (1, HISTORY, CHANNELS) and "own skeleton" in note
+    last = motion.positions[-HISTORY:]
+    seen = frame_positions(trained.skeleton, history[0])
+    inner = lambda one: np.linalg.norm(one[:, :, None] - one[:, None], axis=-1)  # shape of a pose, wherever it stands
+    np.testing.assert_allclose(inner(seen), inner(last), atol=1e-4)
+    assert frame_yaw(trained.skeleton, history[0])[-1] == pytest.approx(path.yaw[0], abs=1e-4)
+    np.testing.assert_allclose(history[0, -1, [0, 2]], 2 * path.position[0] - path.position[1], atol=1e-5)
+    faster = resample(motion, 60.0)
+    again, _ = start_history(trained, faster, path)
+    assert np.abs(frame_positions(trained.skeleton, again[0]) - seen).max() < 0.1
+    refused("2 frames at 30 fps; a start needs 4", start_history, trained, motion.slice(0, 2), path)
+
+
+def test_a_file_of_another_skeleton_is_retargeted_and_the_user_told(walk):
+    trained = load_model(find_model("bandai"))
+    history, note = start_history(trained, walk, named_path("straight", 30))
+    assert history.shape == (1, trained.config.num_history, 3 + 6 * 21)
+    assert "another skeleton (23 joints, the model's has 21)" in note and "cm on average" in note
+    assert np.isfinite(history).all()
+    assert 0.7 < history[0, :, 1].mean() < 1.1  # hips as high as people's
