@@ -97,21 +97,6 @@ def test_a_finished_model_without_its_state_is_not_overwritten(trained_once, sam
     assert files.model.read_bytes() == before
 
 
-def test_models_of_an_earlier_version_are_set_aside(trained_once, same_runs, monkeypatch):
-    _, prepared, profile, _ = trained_once
-    files = pipeline.model_files(profile)
-    kept = files.model.with_name(f"{profile.preset}.old1.safetensors")
-
-    def outdated(path):
-        raise pipeline.OutdatedFile(f"{path}: written by version 0.1")
-
-    monkeypatch.setattr(pipeline, "load_model", outdated)
-    monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
-    *_, origin = pipeline.obtain_model(prepared, profile, progress=False)
-    assert origin == "trained now" and kept.exists() and not files.model.exists()
-    put_back(files)
-
-
 def test_presets_may_be_called_by_the_papers_names(trained_once):
     profile = trained_once[2]
     name = "F3AMD-FNO-96, m=14"

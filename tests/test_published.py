@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from builders import evaluate
 from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf
@@ -120,7 +121,7 @@ def test_it_computes_what_the_released_forward_pass_computes(step):
     sigma = network.config.noise_levels[step]
     # Theirs is the variance-preserving state: ours times 1 / sqrt(1 + sigma^2).
     x_noisy = (x * np.sqrt(1.0 + sigma**2))[None].astype(np.float32)
-    found = network(x_noisy, np.float32(sigma), network.encode(condition))[0]
+    found = evaluate(network, x_noisy, np.float32(sigma), condition)[0]
     np.testing.assert_allclose(found, by_hand(arrays, x, step, past, trans, pose, 3), atol=2e-4)
 
 

@@ -31,10 +31,6 @@ from f3amd_lib.networks.presets import build_from_config, config_from_dict
 FORMAT = "f3amd-1"
 
 
-class OutdatedFile(ValueError):
-    """A whole file of an earlier version of this project; the message names it and the fix."""
-
-
 def _named_leaves(tree) -> dict:
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
@@ -47,13 +43,19 @@ def save_tree(path: Path, tree: Any, metadata: dict) -> None:
       path: file to write; replaced as a whole if it exists.
       tree: any JAX tree of arrays.
       metadata: JSON-ready values.
+
+    Raises:
+      OSError: naming the file, if it cannot be written.
     """
     arrays = {name: jnp.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     description = json.dumps(metadata)
     checksum = _checksum(arrays, description)
     header = {"format": FORMAT, "description": description, "sha256": checksum}
     with whole_file(path, overwrite=True) as temporary:
-        save_file(arrays, temporary, header)
+        try:
+            save_file(arrays, temporary, header)
+        except SafetensorError as error:
+            raise OSError(f"{path}: cannot be written ({error}); make room on the disk, then go on") from None
 
 
 def _checksum(arrays: dict, description: str) -> str:
@@ -74,15 +76,19 @@ def _read(path: Path) -> tuple[dict, dict]:
         with safe_open(path, framework="flax") as file:
             header = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, MemoryError) as error:
         raise ValueError(
             f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, delete it or restore a copy"
         ) from None
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: not written by this project (format {header.get('format')!r})")
-    if header.get("sha256") != _checksum(arrays, header["description"]):
+    if header.get("sha256") != _checksum(arrays, header.get("description", "")):
         raise ValueError(f"{path}: content does not match its checksum; restore a whole copy")
-    return arrays, json.loads(header["description"])
+    with errors_name(path):
+        description = json.loads(header["description"])
+        if not isinstance(description, dict):
+            raise ValueError("its description is not a JSON object; restore a whole copy")
+    return arrays, description
 
 
 def describe(path: Path) -> dict:
@@ -106,7 +112,8 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
     """
     arrays, metadata = _read(path)
     if callable(template):
-        template = template(metadata)
+        with errors_name(path):
+            template = template(metadata)
     wanted = _named_leaves(template)
     if wanted.keys() != arrays.keys():
         odd = sorted(wanted.keys() ^ arrays.keys())
@@ -128,12 +135,11 @@ def errors_name(path: Path):
     """Let whatever goes wrong inside, reading a file's description, be an error that names it."""
     try:
         yield
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: description lacks or garbles {error}") from None
+    except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError, MemoryError) as error:
+        raise ValueError(f"{path}: description lacks or garbles {error}; restore a whole copy") from None
     except ValueError as error:
         text = str(error)
-        named = text if text.startswith(str(path)) else f"{path}: {text}"
-        raise (OutdatedFile if isinstance(error, OutdatedFile) else ValueError)(named) from None
+        raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
 def describe_skeleton(skeleton: Skeleton) -> dict:
@@ -230,6 +236,33 @@ def _is_packed(leaf) -> bool:
     return isinstance(leaf, dict) and "eight_bits" in leaf
 
 
+def packed_weights(params: Any, dtype) -> Any:
+    """Return weights as files keep them: in a type, or in 8 bits with scales (`jnp.int8`)."""
+    eight = jnp.dtype(dtype) == jnp.int8
+    return jax.tree.map(_in_eight_bits if eight else lambda leaf: leaf.astype(dtype), params)
+
+
+def packed_shapes(shapes: Any, weights: str | None) -> Any:
+    """Return the shapes that `packed_weights` leaves in a file, of a type's name."""
+    if weights != "int8":
+        return shapes
+    packed = jax.eval_shape(lambda tree: jax.tree.map(_in_eight_bits, tree), shapes)
+    # Scales of earlier files have single precision; both are read as what they are.
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32) if leaf.dtype == jnp.float16 else leaf, packed
+    )
+
+
+def unpacked_weights(packed: Any) -> Any:
+    """Return the weights that `packed_weights` packed."""
+    return jax.tree.map(_from_eight_bits, packed, is_leaf=_is_packed)
+
+
+def weights_shapes(config: NetworkConfig) -> Any:
+    """Return the shapes of a network's weights."""
+    return _blank(config)[1]
+
+
 def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
     """Write a trained model.
 
@@ -240,13 +273,10 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         large matrices become whole numbers times a scale for each column, off by at most 1/254 of
         the column's largest weight.
     """
-    eight = jnp.dtype(dtype) == jnp.int8
-    pack = _in_eight_bits if eight else lambda leaf: leaf.astype(dtype)
-    params = jax.tree.map(pack, trained.params)
     # Half precision places a joint to half a millimetre: enough for a pose to start from.
-    poses = jnp.float16 if eight else jnp.float32
+    poses = jnp.float16 if jnp.dtype(dtype) == jnp.int8 else jnp.float32
     tree = {
-        "params": params,
+        "params": packed_weights(trained.params, dtype),
         "normaliser": trained.normaliser._asdict(),
         "seeds": {name: jnp.asarray(frames, poses) for name, frames in trained.start_poses.items()},
         "offsets": jnp.asarray(trained.skeleton.offsets, jnp.float32),
@@ -276,7 +306,7 @@ def load_model(path: Path) -> TrainedModel:
         return TrainedModel(
             name=metadata["name"],
             config=config_from_dict(metadata["model"]),
-            params=jax.tree.map(_from_eight_bits, tree["params"], is_leaf=_is_packed),
+            params=unpacked_weights(tree["params"]),
             normaliser=Normaliser(**tree["normaliser"]),
             skeleton=described_skeleton(metadata, tree["offsets"]),
             styles=tuple(metadata["styles"]),
@@ -290,21 +320,10 @@ def _model_template(metadata: dict) -> dict:
     """Return the shapes that a trained model's description speaks of."""
     if metadata.get("kind") != "trained model":
         raise ValueError(f"holds a {metadata.get('kind')}, not a trained model")
-    if "family" not in metadata["model"] or "diffusion" not in metadata:
-        raise OutdatedFile(
-            "written by version 0.1 of this project, before models named their family and noise; "
-            "train it again (the file can stay under another name)"
-        )
     single = jax.ShapeDtypeStruct
     config = config_from_dict(metadata["model"])
-    params = _blank(config)[1]
-    if metadata.get("weights") == "int8":
-        params = jax.eval_shape(lambda tree: jax.tree.map(_in_eight_bits, tree), params)
-        # Scales of earlier files have single precision; both are read as what they are.
-        wide = lambda leaf: single(leaf.shape, jnp.float32) if leaf.dtype == jnp.float16 else leaf
-        params = jax.tree.map(wide, params)
     return {
-        "params": params,
+        "params": packed_shapes(weights_shapes(config), metadata.get("weights")),
         "normaliser": {
             "mean": single((config.channels,), jnp.float32),
             "deviation": single((config.channels,), jnp.float32),

@@ -223,15 +223,9 @@ class DenoisingTask:
         drops = training and self.model_config.dropout > 0
         x0_hat = model(x_noisy, sigma, model.encode(condition), key=key_dropout if drops else None)
         terms = loss_terms(
-            self.skeleton,
-            x0_hat,
-            x0,
-            self.normaliser.denormalise(x0_hat),
-            batch.future,
-            batch.history[:, -1],
-            self.config.loss.ird_form,
-            noise_weights(sigma, self.config) if training else None,
-        )
+            self.skeleton, x0_hat, x0, self.normaliser.denormalise(x0_hat), batch.future, batch.history[:, -1],
+            self.config.loss.ird_form, noise_weights(sigma, self.config) if training else None,
+        )  # fmt: skip
         return {"loss": total_loss(terms, self.config.loss), **terms}
 
     def _disturbed(self, condition: Condition, key) -> Condition:
@@ -255,14 +249,9 @@ class DenoisingTask:
 
 
 def denoising_task(
-    model_config: NetworkConfig,
-    config: TrainingConfig,
-    skeleton: Skeleton,
-    normaliser: Normaliser,
-    windows: WindowSet,
-    *,
-    dataset_fingerprint: str = "",
-) -> DenoisingTask:
+    model_config: NetworkConfig, config: TrainingConfig, skeleton: Skeleton, normaliser: Normaliser,
+    windows: WindowSet, *, dataset_fingerprint: str = "",
+) -> DenoisingTask:  # fmt: skip
     """Lay out what a denoiser is trained on.
 
     Args:

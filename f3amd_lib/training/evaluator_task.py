@@ -15,6 +15,7 @@ from flax import nnx
 
 from f3amd_lib.data.text_encoders import TextEmbeddings
 from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, ClipTable, MotionBatch, draw_clips
+from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
 from f3amd_lib.training.optimise import TrainingState
 
@@ -88,7 +89,9 @@ def contrastive_loss(text, motion, pair):
 @functools.lru_cache(maxsize=8)
 def blank_evaluator(config: TextMotionConfig):
     """Return the network's structure and the shapes of its weights."""
-    return nnx.split(nnx.eval_shape(lambda: TextMotionNetwork(config, rngs=nnx.Rngs(0))), nnx.Param, ...)
+    return nnx.split(
+        nnx.eval_shape(lambda: TextMotionNetwork(config, rngs=LayerKeys(jax.random.key(0)))), nnx.Param, ...
+    )
 
 
 def evaluator_network(config: TextMotionConfig, params) -> TextMotionNetwork:
@@ -135,7 +138,7 @@ class EvaluatorTask:
 
     def init(self, key):
         """Return initial weights."""
-        return nnx.split(TextMotionNetwork(self.network, rngs=nnx.Rngs(key)), nnx.Param, ...)[1], None
+        return nnx.split(TextMotionNetwork(self.network, rngs=LayerKeys(key)), nnx.Param, ...)[1], None
 
     def draw(self, state: TrainingState | None, key):
         """Draw a batch; return (batch, key of the dropout)."""

@@ -96,6 +96,11 @@ def loss_terms(
 
     Raises:
       ValueError: for an unknown `ird_form`.
+
+    Source: paper section 4.1 and Appendix B. CAMDM's released code, which the paper builds on, differs in
+    three ways: it leaves the root's position out of the feature velocity, its contact mask looks at the
+    toes' end joints where ours looks at the toe joints, which every skeleton here has, and it counts a step of exactly
+    1 cm as contact. The F3AMD text says none of the three; ours is the plain reading of Eq. 13.
     """
     _check_ird_form(ird_form)
 

@@ -224,19 +224,10 @@ def differences(identity: dict, description: dict) -> list[str]:
 
 
 def optimise(
-    task: Task,
-    state: TrainingState | None = None,
-    *,
-    checkpoint: Path | None = None,
-    checkpoint_every: int = 500,
-    held_out=None,
-    chunk: int = 50,
-    stop_after: int | None = None,
-    stop_at: float | None = None,
-    mesh: Mesh | None = None,
-    on_chunk: Callable[[dict], None] | None = None,
-    progress: bool = True,
-) -> tuple[TrainingState, list[dict]]:
+    task: Task, state: TrainingState | None = None, *, checkpoint: Path | None = None, checkpoint_every: int = 500,
+    held_out=None, chunk: int = 50, stop_after: int | None = None, stop_at: float | None = None,
+    mesh: Mesh | None = None, on_chunk: Callable[[dict], None] | None = None, progress: bool = True,
+) -> tuple[TrainingState, list[dict]]:  # fmt: skip
     """Train to the number of steps that the task's config says.
 
     Args:
@@ -250,7 +241,7 @@ def optimise(
       stop_at: stop, with a checkpoint, at the end of the first chunk after this time
         (`time.monotonic`). Of processes that train together, the first one's clock counts.
       mesh: devices to spread each batch over (`parallel.all_devices`); by default one does it all.
-      on_chunk: called with each history row as it is made.
+      on_chunk: called with each history row as it is made, before the state of its step is written.
       progress: show a progress bar.
 
     Returns:
@@ -291,11 +282,12 @@ def optimise(
             if due and held_out is not None:
                 measured = held_out_terms(task, state, held_out, mesh)
                 row.update({f"held_out_{name}": value for name, value in measured.items()})
-            if due and checkpoint is not None:
-                save_state(checkpoint, task, state)
             history.append(row)
+            # Before the state: a run killed between the two finds a row too many, never one too few.
             if on_chunk is not None:
                 on_chunk(row)
+            if due and checkpoint is not None:
+                save_state(checkpoint, task, state)
             bar.update(length)
             bar.set_postfix(loss=f"{row['loss']:.4f}")
     return state, history

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,15 +27,15 @@ from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, starting_poses
-from f3amd_lib.ground.files import set_aside
+from f3amd_lib.ground.files import locked, set_aside
 from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
-from f3amd_lib.ground.records import read_table, run_record, write_table
+from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training import parallel
-from f3amd_lib.training.checkpoints import OutdatedFile, TrainedModel, describe, load_model, save_model
+from f3amd_lib.training.checkpoints import TrainedModel, describe, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task, weights_identity
-from f3amd_lib.training.optimise import TrainingState, differences, optimise, restore_state
+from f3amd_lib.training.optimise import Task, TrainingState, differences, optimise, restore_state
 from f3amd_lib.training.recipe import TrainingConfig, profile_recipe
 
 log = logging.getLogger("f3amd")
@@ -65,13 +65,9 @@ class PreparedData:
           styles: of the model that will see them, where it knows more than this data set has.
         """
         return build_windows(
-            self.packed,
-            split,
-            window=self.window,
-            num_history=self.num_history,
-            stride=1 if split == "train" else 4,
-            styles=styles,
-        )
+            self.packed, split, window=self.window, num_history=self.num_history,
+            stride=1 if split == "train" else 4, styles=styles,
+        )  # fmt: skip
 
     @functools.cached_property
     def normaliser(self) -> Normaliser:
@@ -88,13 +84,9 @@ class PreparedData:
     def model_config(self, preset: str, *, window: int | None = None, **settings):
         """Return a preset's config for this data set's channels and styles, and its window."""
         return presets.build_config(
-            preset,
-            channels=num_channels(self.packed.skeleton),
-            num_styles=len(self.packed.styles),
-            window=window or self.window,
-            num_history=self.num_history,
-            **settings,
-        )
+            preset, channels=num_channels(self.packed.skeleton), num_styles=len(self.packed.styles),
+            window=window or self.window, num_history=self.num_history, **settings,
+        )  # fmt: skip
 
     def task(self, preset: str, config: TrainingConfig, *, network: Mapping | None = None) -> DenoisingTask:
         """Return what trains a preset on this data set's training windows.
@@ -104,13 +96,9 @@ class PreparedData:
           network: fields of the preset's network to change.
         """
         return denoising_task(
-            self.model_config(preset, **(network or {})),
-            config,
-            self.packed.skeleton,
-            self.normaliser,
-            self.windows("train"),
-            dataset_fingerprint=self.packed.fingerprint,
-        )
+            self.model_config(preset, **(network or {})), config, self.packed.skeleton, self.normaliser,
+            self.windows("train"), dataset_fingerprint=self.packed.fingerprint,
+        )  # fmt: skip
 
 
 def prepare(profile: Profile, *, path=None) -> PreparedData:
@@ -165,17 +153,10 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 
 
 def train(
-    prepared: PreparedData,
-    profile: Profile,
-    *,
-    preset: str | None = None,
-    config: TrainingConfig | None = None,
-    network: Mapping | None = None,
-    folder=None,
-    mesh: Mesh | None = None,
-    stop_at: float | None = None,
+    prepared: PreparedData, profile: Profile, *, preset: str | None = None, config: TrainingConfig | None = None,
+    network: Mapping | None = None, folder=None, mesh: Mesh | None = None, stop_at: float | None = None,
     progress: bool = True,
-) -> tuple[TrainedModel | None, pd.DataFrame]:
+) -> tuple[TrainedModel | None, pd.DataFrame]:  # fmt: skip
     """Train a preset to the end, going on from its training state if there is one.
 
     Args:
@@ -194,8 +175,8 @@ def train(
       where they were measured. The model is None where `stop_at` came first; the state waits.
 
     Raises:
-      ValueError: if a training state lies there that was made with other settings, or the devices
-        cannot share a batch equally.
+      ValueError: if a training state lies there that was made with other settings, another process
+        trains the same there, or the devices cannot share a batch equally.
       TrainingDiverged: if the loss stops being a number.
     """
     preset = _preset_name(profile, preset)
@@ -203,17 +184,59 @@ def train(
     config = config or profile_recipe(profile, preset)
     parallel.check_batch(config.batch_size, mesh)
     task = prepared.task(preset, config, network=network)
+    if prepared.held_out_split == "train":
+        log.warning("no clip is held out: 'held-out' losses are of clips that the model was trained on")
     record = run_record(
-        profile=profile,
-        dataset=prepared.packed,
-        seed=config.seed,
-        model=preset,
-        training=config.to_dict(),
-        held_out_split=prepared.held_out_split,
-        num_train_windows=int(task.windows.num_windows),
+        profile=profile, dataset=prepared.packed, seed=config.seed, model=preset, training=config.to_dict(),
+        held_out_split=prepared.held_out_split, num_train_windows=int(task.windows.num_windows),
         **({} if mesh is None else {"training_devices": mesh.size}),
-    )
+    )  # fmt: skip
+    held_out = prepared.windows(prepared.held_out_split)
+    with alone_with(files):
+        state, history = train_in_legs(
+            task, files, record, held_out=held_out, mesh=mesh, stop_at=stop_at, progress=progress
+        )
+        if int(state.step) < config.num_steps:
+            return None, history
+        trained = as_trained(prepared, task, preset, state.averaged, record)
+        if parallel.is_first_process():
+            save_model(files.model, trained)
+            trained = load_model(files.model)  # in the precision of the file
+        parallel.wait_for_all("wrote the model")
+    return trained, history
+
+
+@contextlib.contextmanager
+def alone_with(files: ModelFiles) -> Iterator[None]:
+    """Hold the files of a run, so that no second run writes there; its other processes hold nothing.
+
+    Raises:
+      ValueError: if another process trains the same there.
+    """
+    with contextlib.ExitStack() as held:
+        if parallel.is_first_process():
+            held.enter_context(locked(files.model.with_suffix(".lock"), f"training {files.model.stem}"))
+        yield
+
+
+def train_in_legs(
+    task: Task, files: ModelFiles, record: dict, *, held_out, mesh: Mesh | None = None, **leg
+) -> tuple[TrainingState, pd.DataFrame]:
+    """Train a task from where its files are, keeping its state and its history there.
+
+    Args:
+      task: what to train.
+      files: of the run; what lies there without a state is kept under another name.
+      record: goes beside the history.
+      held_out: data to watch the losses on.
+      mesh: devices that share each batch.
+      **leg: stop_at and progress, as for `optimise`.
+
+    Returns:
+      (state, history); the state is short of the task's steps where `stop_at` came first.
+    """
     state, rows = _begun(files, task, mesh)
+    num_steps = task.config.num_steps
 
     def keep(row: dict) -> None:
         rows.append(row)
@@ -224,41 +247,26 @@ def train(
         task,
         state,
         checkpoint=files.state,
-        checkpoint_every=max(1, config.num_steps // 20),
-        held_out=prepared.windows(prepared.held_out_split),
-        chunk=max(1, min(50, config.num_steps // 20)),
-        stop_at=stop_at,
+        checkpoint_every=max(1, num_steps // 20),
+        held_out=held_out,
+        chunk=max(1, min(50, num_steps // 20)),
         mesh=mesh,
         on_chunk=keep,
-        progress=progress,
+        **leg,
     )
-    history = pd.DataFrame(rows)
-    if int(state.step) < config.num_steps:
-        return None, history
-    trained = as_trained(prepared, task, preset, state.averaged, record)
-    if parallel.is_first_process():
-        save_model(files.model, trained)
-        trained = load_model(files.model)  # in the precision of the file
-    parallel.wait_for_all("wrote the model")
-    return trained, history
+    return state, pd.DataFrame(rows)
 
 
 def as_trained(prepared: PreparedData, task: DenoisingTask, preset: str, params, record: dict) -> TrainedModel:
     """Return weights of a task, finished or on their way, with all that is needed to use them."""
     return TrainedModel(
-        name=preset,
-        config=task.model_config,
-        params=params,
-        normaliser=task.normaliser,
-        skeleton=task.skeleton,
-        styles=prepared.packed.styles,
-        diffusion=task.config.diffusion,
-        start_poses=starting_poses(prepared.packed, num_history=prepared.num_history),
-        record=record,
-    )
+        name=preset, config=task.model_config, params=params, normaliser=task.normaliser, skeleton=task.skeleton,
+        styles=prepared.packed.styles, diffusion=task.config.diffusion,
+        start_poses=starting_poses(prepared.packed, num_history=prepared.num_history), record=record,
+    )  # fmt: skip
 
 
-def _begun(files: ModelFiles, task: DenoisingTask, mesh: Mesh | None) -> tuple[TrainingState | None, list[dict]]:
+def _begun(files: ModelFiles, task: Task, mesh: Mesh | None) -> tuple[TrainingState | None, list[dict]]:
     """Return the state and the rows to go on from, of which all processes must see the same."""
     advice = "processes that train together need one folder that all of them see (--out)"
     begun = files.state.exists()
@@ -272,11 +280,13 @@ def _begun(files: ModelFiles, task: DenoisingTask, mesh: Mesh | None) -> tuple[T
     state = restore_state(files.state, task, mesh)
     if not parallel.same_everywhere(int(state.step)):
         raise ValueError(f"{files.state}: processes found different steps in it; {advice}")
-    if not files.history.exists():  # it is written after the state: a run may be killed between the two
-        log.warning("%s is missing: losses of the first %d steps are lost", files.history, state.step)
+    if not parallel.is_first_process():
         return state, []
-    earlier, _ = read_table(files.history)
-    return state, earlier[earlier["step"] <= int(state.step)].to_dict("records")
+    if (found := whole_table(files.history)) is None:
+        log.warning("%s is missing or broken: losses of the first %d steps are lost", files.history, state.step)
+        return state, []
+    # It is written before the state: a run that was killed between the two has a row too many.
+    return state, found[0][found[0]["step"] <= int(state.step)].to_dict("records")
 
 
 def obtain_model(
@@ -309,10 +319,9 @@ def obtain_model(
     files = model_files(profile, preset)
     recipe = profile_recipe(profile, preset)
     if files.model.exists() and files.history.exists():
-        with contextlib.suppress(OutdatedFile):  # set aside below
-            trained = load_model(files.model)
-            if not _unlike(trained, prepared, wanted, recipe):
-                return trained, read_table(files.history)[0], "earlier run"
+        trained = load_model(files.model)
+        if not _unlike(trained, prepared, wanted, recipe):
+            return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
     if files.model.exists() or not files.history.exists():
         _set_aside(files)
@@ -404,7 +413,7 @@ def set_aside_other_state(
 
 
 def available_models(profile: Profile) -> list[str]:
-    """List the presets that have weights, of the user's or shipped ones, in the order of `PRESETS`.
+    """List the presets that have weights, of the user's or shipped ones, in the order of `presets.of_paper`.
 
     Args:
       profile: as for `obtain_model`.
@@ -413,7 +422,7 @@ def available_models(profile: Profile) -> list[str]:
     if profile.name == "laptop":
         folders.append(PRETRAINED_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
-    names = [name + end for end in ("", *presets.FORMS) for name in presets.PRESETS]
+    names = [name + end for end in ("", *presets.FORMS) for name in presets.of_paper()]
     return [
         name
         for name in dict.fromkeys(names)
@@ -440,13 +449,8 @@ def find_model(dataset: str) -> Path:
             for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stat().st_mtime)
             if not re.search(r"\.state\.|\.old\d+\.", path.name)
         ]
-        for path in sorted(reversed(found), key=lambda path: path != first):
-            try:
-                load_model(path)
-            except OutdatedFile as error:
-                log.warning("left aside: %s", error)
-            else:
-                return path
+        if found:
+            return first if first in found else found[-1]
     raise ValueError(
         f"no trained model for data set {dataset!r}: run `f3amd train --data "
         f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"

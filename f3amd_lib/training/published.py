@@ -21,6 +21,7 @@ from safetensors.numpy import load_file
 from f3amd_lib.data.features import num_channels, split_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import starting_poses
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
@@ -35,16 +36,8 @@ WINDOW, NUM_HISTORY = 45, 10
 _UNUSED = re.compile(r"(.*\.)?(pe|style_feature_process\.(weight|bias))")
 """A table of sinusoids, which is computed here, and a layer that the released forward pass never calls."""
 
-_LINEAR = {
-    "noise_first": "embed_timestep.time_embed.0",
-    "noise_second": "embed_timestep.time_embed.2",
-    "path.0": "traj_trans_process.poseEmbedding",
-    "path.1": "traj_pose_process.poseEmbedding",
-    "history": "past_motion_process.poseEmbedding",
-    "future": "future_motion_process.poseEmbedding",
-    "output": "output_process.poseFinal",
-}
-_IN_BLOCK = {"hidden": "linear1", "output": "linear2", "attention.output": "self_attn.out_proj"}
+_NAMES = load_paper_file("camdm_release")
+_BLOCK = {"hidden": "linear1", "output": "linear2", "attention.output": "self_attn.out_proj"}
 _NORMS = {"attention_norm": "norm1", "output_norm": "norm2"}
 _BLOCK = "seqEncoder.layers.{}"
 
@@ -114,18 +107,18 @@ def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CA
     def linear(ours: str, weight, bias) -> None:
         flat[f"{ours}.kernel"], flat[f"{ours}.bias"] = weight.T, bias
 
-    for ours, theirs in _LINEAR.items():
+    for ours, theirs in _NAMES["linear"].items():
         linear(ours, take(f"{theirs}.weight"), take(f"{theirs}.bias"))
     depth = 0
     while any(name.startswith(f"{_BLOCK.format(depth)}.") for name in left):
         mine, theirs = f"blocks.{depth}", _BLOCK.format(depth)
-        for ours, name in _IN_BLOCK.items():
+        for ours, name in _NAMES["in_block"].items():
             linear(f"{mine}.{ours}", take(f"{theirs}.{name}.weight"), take(f"{theirs}.{name}.bias"))
         # Query, key and value lie in one array, one below the other.
         packed = (np.split(take(f"{theirs}.self_attn.in_proj_{part}"), 3) for part in ("weight", "bias"))
         for role, weight, bias in zip(("query", "key", "value"), *packed, strict=True):
             linear(f"{mine}.attention.{role}", weight, bias)
-        for ours, name in _NORMS.items():
+        for ours, name in _NAMES["norms"].items():
             flat[f"{mine}.{ours}.scale"], flat[f"{mine}.{ours}.bias"] = (
                 take(f"{theirs}.{name}.{part}") for part in ("weight", "bias")
             )
@@ -150,12 +143,12 @@ def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CA
             "num_history": NUM_HISTORY,
         }
     )
-    network = presets.build_from_config(config, jax.random.key(0))
+    network = nnx.eval_shape(lambda: presets.build_from_config(config, jax.random.key(0)))
     for keys, leaf in nnx.to_flat_state(nnx.state(network)):
         name = ".".join(map(str, keys))
         if flat[name].shape != leaf.shape:
             raise ValueError(f"{where}: {name} must have the shape {leaf.shape}, got {flat[name].shape}")
-        leaf[...] = jnp.asarray(flat[name])
+        leaf.set_value(jnp.asarray(flat[name]))
     return network
 
 
@@ -179,13 +172,8 @@ def published_model(path, packed: PackedMotion) -> TrainedModel:
     if list(packed.styles) != sorted(packed.styles):
         raise ValueError(f"{path}: numbers the styles in the order of their sorted names; the data set does not")
     return TrainedModel(
-        name=NAME,
-        config=config,
-        params=nnx.state(network),
-        normaliser=PublishedFeatures(),
-        skeleton=packed.skeleton,
-        styles=packed.styles,
-        diffusion=presets.find_preset("CAMDM-K4").diffusion,
+        name=NAME, config=config, params=nnx.state(network), normaliser=PublishedFeatures(),
+        skeleton=packed.skeleton, styles=packed.styles, diffusion=presets.find_preset("CAMDM-K4").diffusion,
         start_poses=starting_poses(packed, num_history=NUM_HISTORY),
         record={"dataset": packed.dataset, "dataset_licence": packed.licence, "dataset_credit": packed.credit},
-    )
+    )  # fmt: skip

@@ -1,0 +1,323 @@
+"""Tables of text to motion: `f3amd measure text_table1`, rows from `papers/acmdm/experiments.toml`.
+
+Each row's model is trained first, if it is not, by `training.text_models`; then it makes a motion for each held-out
+clip's caption, and the judge looks. A row is kept as soon as it is measured; a leg that is out of time goes on there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.data.text_encoders import TextEncoder, embed_captions
+from f3amd_lib.data.text_motions import TextMotions, pad_motions
+from f3amd_lib.experiments.runner import Records
+from f3amd_lib.generation.noise_optimisation import control_distance, optimise_noise
+from f3amd_lib.generation.text_to_motion import continue_prefix, sample_control, sample_text
+from f3amd_lib.generation.told_motion import motions_told
+from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.measures.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
+from f3amd_lib.measures.text_metrics import control_errors, foot_skating_ratio
+from f3amd_lib.networks.acmdm import TextCondition
+from f3amd_lib.networks.acmdm_control import Control
+from f3amd_lib.training.checkpoints import weights_digest
+from f3amd_lib.training.evaluator_task import EvaluatorTraining
+from f3amd_lib.training.text_models import (
+    CONTROL,
+    JUDGE,
+    TextModel,
+    controlled_joints,
+    text_model_files,
+    train_text_model,
+)
+
+TABLES = ("text_table1", "text_tableA1", "text_table3", "text_tableA5")
+"""Those that `measure_text_table` knows."""
+
+HELD = ("pelvis", "left_foot", "right_foot")
+"""Joints that stay where they are in upper-body editing (ACMDM section 4.4)."""
+
+_EULER_STEPS = 10
+"""Of the sampler whose noise is optimised (ACMDM Appendix F)."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all rows of a table share.
+
+    Attributes:
+      judge, encoder: what looks, and what embeds captions.
+      real: the clips whose captions are told, and with which motions are compared.
+      settings: of the profile, from the paper's file.
+      seed: of captions and noise.
+    """
+
+    judge: TextJudge
+    encoder: TextEncoder
+    real: TextMotions
+    settings: Mapping
+    seed: int
+
+    def captions(self, repeat: int) -> tuple[list[str], np.ndarray]:
+        """Return a caption of each clip and their embeddings [N, W], drawn anew in each repeat."""
+        generator = np.random.default_rng([self.seed, repeat, 2])
+        told = [said[generator.integers(len(said))] for said in self.real.captions]
+        return told, embed_captions(told, self.encoder).pooled
+
+    def quality(self, make: Callable) -> pd.DataFrame:
+        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3]."""
+        skating, lengths = [], self.real.lengths
+
+        def system(repeat: int):
+            told, pooled = self.captions(repeat)
+            made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
+            motions = [motion[:length] for motion, length in zip(made, lengths, strict=True)]
+            share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
+            skating.append({"metric": "foot_skating", "value": share})
+            return motions, told
+
+        table = judge_motions(
+            self.judge, self.encoder, self.real, {"made": system}, repeats=self.settings["repeats"], seed=self.seed,
+            group=self.settings["group"], bar=self.settings["sight"],
+        )  # fmt: skip
+        table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
+        return table[["metric", "value", "low", "high"]]
+
+    def num_steps(self, trained: TextModel) -> int | None:
+        """Return Euler's steps of a flow; other schedules walk the levels that they have."""
+        return self.settings["num_steps"] if trained.schedule.kind == "straight" else None
+
+
+# --------------------------------------------------------------------------------------------------------- whole motion
+
+
+def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
+    """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
+    how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
+    return bench.quality(lambda pooled, lengths, key: motions_told(trained, pooled, lengths, key, **how))
+
+
+def after_first_frames(trained: TextModel, starts, pooled, lengths, key, num_steps: int | None) -> np.ndarray:
+    """Return motions that go on from first frames in the clips' own places, window after window (prefix form).
+
+    Args:
+      trained: a model of the prefix form.
+      starts: first frames, [N, F, J, 3], metres; at least as many as its prefix has.
+      pooled, lengths: captions [N, W], frames of motion [N].
+      key: JAX random key.
+      num_steps: of Euler's method.
+
+    Returns:
+      [N, L, J, 3], metres, L the longest or more.
+    """
+    codec, config = trained.codec, trained.config
+    given = next(iter(trained.starts.values())).shape[0]
+    frames = given * codec.frames_per_state
+    windows = -(-(max(lengths) // codec.frames_per_state - given) // (config.window - given))
+    how = {} if num_steps is None else {"sampler": trained.schedule.sampler, "num_steps": num_steps}
+
+    @jax.jit
+    def draw(starts, pooled, key):
+        prefix = codec.encode(codec.axes.normalise(starts[:, :frames]), jnp.ones((len(starts), frames), bool))
+        captions = [pooled] * max(1, windows)
+        parts = continue_prefix(trained.network(), trained.schedule, prefix, captions, key, **how)
+        state = jnp.concatenate([prefix, *parts], axis=1)
+        return codec.decode(state, jnp.ones((len(state), state.shape[1] * codec.frames_per_state), bool))
+
+    return codec.axes.restore(np.asarray(draw(jnp.asarray(starts), jnp.asarray(pooled), key)))
+
+
+def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return the figures of an autoregressive form; the prefix form goes on from true or from generated frames."""
+    if not trained.starts:
+        return whole_rows(bench, trained, row, about, first)
+    count = next(iter(trained.starts.values())).shape[0] * trained.codec.frames_per_state
+    true = np.asarray(pad_motions([bench.real.clip(k)[:count] for k in range(bench.real.num_clips)], count).motion)
+
+    def make(pooled, lengths, key):
+        starts = true
+        if row["first_prefix"] == "generated":
+            starts = motions_told(first, pooled, count, jax.random.fold_in(key, 1), num_steps=bench.num_steps(first))
+        return after_first_frames(trained, starts, pooled, lengths, key, bench.num_steps(trained))
+
+    return bench.quality(make)
+
+
+# -------------------------------------------------------------------------------------------------------------- control
+
+
+def asked_frames(generator: np.random.Generator, lengths, how_many) -> np.ndarray:
+    """Return which frames of each motion are asked for, [N, L]: a number of frames, or a share of them (a float)."""
+    asked = np.zeros((len(lengths), max(lengths)), bool)
+    for row, length in zip(asked, lengths, strict=True):
+        count = round(how_many * length) if isinstance(how_many, float) else min(how_many, length)
+        row[generator.choice(length, max(1, count), replace=False)] = True
+    return asked
+
+
+def _controlled_states(bench: Bench, trained: TextModel, section: str, condition, mask) -> Callable:
+    """Return `states(noise, control)` of a section of Table 3: by the branch, or by optimised noise."""
+    schedule, steps = trained.schedule, bench.settings["num_steps"]
+    if section != "noise optimisation":
+        branch, how = trained.control_branch(), {"sampler": schedule.sampler, "num_steps": steps}
+        return lambda noise, control: sample_control(
+            trained.network(), branch, schedule, condition, control, noise, **how
+        )
+
+    def optimised(noise, control):
+        network, how = trained.network(), {"sampler": schedule.sampler, "num_steps": _EULER_STEPS}
+        sample = lambda noise: sample_text(network, schedule, condition, noise, **how)
+        distance = control_distance(trained.codec, mask, control)
+        return optimise_noise(sample, distance, noise, num_steps=bench.settings["optimise_steps"]).state
+
+    return optimised
+
+
+def control_drawer(bench: Bench, trained: TextModel, section: str, clips, pooled) -> tuple[Callable, np.ndarray]:
+    """Return what draws motions of some clips' captions under a control, and the true motions, [N, L, J, 3].
+
+    Args:
+      bench, trained, section: as in `control_rows`.
+      clips, pooled: numbers [N] of the clips, captions [N, W].
+
+    Returns:
+      (`draw(asked [N, L, J], key)` -> positions in metres, compiled once; true motions, zero in padding).
+    """
+    codec, config = trained.codec, trained.config
+    batch = pad_motions([bench.real.clip(clip) for clip in clips], int(bench.real.lengths[clips].max()))
+    condition = TextCondition(jnp.asarray(pooled), codec.state_mask(batch.mask))
+    wanted = jnp.asarray(codec.axes.normalise(batch.motion))
+    states = _controlled_states(bench, trained, section, condition, batch.mask)
+
+    @jax.jit
+    def draw(asked, key):
+        noise = jax.random.normal(key, (*condition.mask.shape, config.num_joints, config.channels))
+        return codec.decode(states(noise, Control.of(wanted, asked)), batch.mask)
+
+    return lambda asked, key: codec.axes.restore(np.asarray(draw(jnp.asarray(asked), key))), np.asarray(batch.motion)
+
+
+def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return errors by joint, mean over five densities, and their average with the seconds of one sentence.
+
+    With "upper-body edit" pelvis and feet are held in all frames of all clips, and the judge looks.
+    """
+    real, joints, section = bench.real, controlled_joints(bench.real.skeleton), row["section"]
+    num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
+
+    def asked_of(joints, frames):
+        asked = np.zeros((*frames.shape, num_joints), bool)
+        asked[..., joints] = frames[..., None]
+        return asked
+
+    if section == "upper-body edit":
+        held = asked_of([joints[name] for name in HELD], np.arange(max(real.lengths)) < real.lengths[:, None])
+
+        def make(pooled, lengths, key):
+            return control_drawer(bench, trained, section, np.arange(len(lengths)), pooled)[0](held, key)
+
+        return bench.quality(make).assign(joint="pelvis and feet")
+    few = bench.settings["optimised_clips" if section == "noise optimisation" else "control_clips"]
+    clips = np.arange(min(few, real.num_clips))
+    pooled, lengths, rows = bench.captions(0)[1][clips], real.lengths[clips], []
+    draw, wanted = control_drawer(bench, trained, section, clips, pooled)
+    for number, how_many in enumerate((*about["frames"], *about["shares"])):
+        for name, joint in joints.items():
+            generator = np.random.default_rng([bench.seed, number, joint])
+            asked = asked_of([joint], asked_frames(generator, lengths, how_many))
+            errors = control_errors(draw(asked, jax.random.fold_in(key, number)), wanted, asked)
+            rows += [{"joint": name.replace("_", " "), "metric": metric, "value": x} for metric, x in errors.items()]
+    table = pd.DataFrame(rows)
+    table = pd.concat([table, table.assign(joint="average")]).groupby(["joint", "metric"], sort=False)
+    draw, _ = control_drawer(bench, trained, section, clips[:1], pooled[:1])
+    asked = asked_of([0], np.ones((1, lengths[0]), bool))
+    draw(asked, key)  # compiles
+    started = time.perf_counter()
+    draw(asked, jax.random.fold_in(key, 1))
+    taken = {"joint": "average", "metric": "sampling_seconds", "value": time.perf_counter() - started}
+    return pd.concat([table["value"].mean().reset_index(), pd.DataFrame([taken])])
+
+
+# ----------------------------------------------------------------------------------------------------------- the runner
+
+KINDS = {"whole": whole_rows, "autoregressive": autoregressive_rows, "control": control_rows}
+
+
+def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> TextJudge | None:
+    """Return the judge of a data set, trained on its training split if it is not; None where `stop_at` comes first."""
+    files = text_model_files(profile, JUDGE, folder=folder)
+    if files.model.exists():
+        return load_judge(files.model)
+    # A check of the way needs no judge that sees.
+    training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
+    judge = train_judge(data, encoder, training, checkpoint=files.state, **leg)
+    if judge is not None:
+        save_judge(files.model, judge)
+    return judge
+
+
+def measure_text_table(
+    name: str, data: TextMotions, encoder: TextEncoder, profile: Profile, *,
+    models: Iterable[str] | None = None, folder=None, rows: Iterable[Mapping] | None = None, **leg,
+) -> Path | None:  # fmt: skip
+    """Train and measure the rows of a table that it still lacks.
+
+    Args:
+      name: of `TABLES`.
+      data, encoder: captioned motion, and what embeds captions.
+      profile: says how long each row is trained and how often it is measured.
+      models: rows of these models alone, which are measured again.
+      folder: where weights lie instead of `runs/`.
+      rows: instead of the file's.
+      **leg: stop_at and progress, as for `optimise`.
+
+    Returns:
+      The table, `records/<name>.csv`; None where the time was over first.
+    """
+    about, asked = load_paper_file("experiments", "acmdm")[name], list(models or ())
+    judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
+    if judge is None:
+        return None
+    settings = load_paper_file("experiments", "acmdm")["settings"][profile.name]
+    bench = Bench(judge, encoder, judged_clips(data), settings, profile.seed)
+    record = run_record(
+        profile=profile, dataset=data, seed=profile.seed, measurement=name, settings=dict(settings),
+        judge_weights=weights_digest(judge.params), text_encoder=encoder.identity,
+    )  # fmt: skip
+    rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
+    keys = [column for column in rows[0] if column not in ("trained", "first")]
+    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {name: keys}, again=asked)
+    trained = lambda preset: train_text_model(data, encoder, profile, preset, folder=folder, **leg)
+    for row in rows:
+        if asked and row["model"] not in asked:
+            continue
+        branch = about["kind"] == "control" and row["section"] != "noise optimisation"
+        model, first = trained(row["trained"] + (CONTROL if branch else "")), None
+        if model is not None and model.starts and row["first_prefix"] == "generated":
+            first = trained(row["first"])
+            model = None if first is None else model
+        if model is None:
+            return None
+        if leg.get("stop_at") is not None and time.monotonic() >= leg["stop_at"]:
+            return None
+        told = model.record["identity"]["training"]
+        named = row | {
+            "windows": told["num_steps"] * told["batch_size"],
+            "weights": weights_digest(model.params if model.branch is None else model.branch),
+        }
+
+        def measured(row: Mapping, model=model, first=first) -> dict:
+            return {name: KINDS[about["kind"]](bench, model, row, about, first)}
+
+        records.measure([named], measured)
+    return records.path(name)

@@ -1,0 +1,270 @@
+"""Motion that a caption tells: from a trained model and words to positions in metres, whole, controlled or as a stream.
+
+What a user asks for is checked here, once; `generation.text_to_motion` has the samplers.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from f3amd_lib.data.text_encoders import check_captions, check_words, embed_captions
+from f3amd_lib.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
+from f3amd_lib.generation.text_to_motion import (
+    continue_prefix,
+    sample_blocks,
+    sample_control,
+    sample_masked,
+    sample_text,
+)
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.redundant import smoothed_yaw
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.networks.acmdm import TextCondition
+from f3amd_lib.networks.acmdm_control import Control
+from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.training.text_models import TextModel, controlled_joints
+
+NEAR = 4
+"""Starts of a stream among which the seed chooses: those whose captions are nearest to the first one."""
+
+STREAM_PRESET = "ACMDM-n4-PS22-prefix"
+"""The model of the prefix form that two cores can train."""
+
+
+# ------------------------------------------------------------------------------------------------------- what is asked
+
+
+def told_captions(trained: TextModel, encoder, captions: Sequence[str], *, any_words: bool = False) -> np.ndarray:
+    """Return pooled embeddings of captions, [captions, W].
+
+    Args:
+      trained: the model that will be told.
+      encoder: of captions.
+      captions: what the person does.
+      any_words: let words through that the model has never seen.
+
+    Raises:
+      ValueError: for a caption that is empty, too long or has unknown words, or another encoder than the model's.
+    """
+    if encoder.identity != trained.text_encoder:
+        raise ValueError(f"{trained.name} reads captions of {trained.text_encoder}, not of {encoder.identity}")
+    check_captions(captions)
+    if not any_words:
+        for caption in captions:
+            check_words(caption, trained.words)
+    return embed_captions(list(captions), encoder).pooled
+
+
+def told_frames(trained: TextModel, seconds: float) -> int:
+    """Return the frames of a length, a multiple of 4; ValueError if the model makes none of that length."""
+    least, most = (frames / trained.fps for frames in (FEWEST_FRAMES, trained.most_frames // UNIT * UNIT))
+    if not least <= seconds <= most:  # also catches NaN
+        raise ValueError(f"--seconds must be between {least:g} and {most:g} for {trained.name}, got {seconds:g}")
+    return max(FEWEST_FRAMES, round(seconds * trained.fps / UNIT) * UNIT)
+
+
+def told_windows(trained: TextModel, seconds: float) -> int:
+    """Return the windows of a stream that a caption is told for; ValueError unless for up to 600 seconds."""
+    if not 0 < seconds <= 600:  # also catches NaN
+        raise ValueError(f"--seconds of a stream must be over 0 and at most 600 a caption, got {seconds:g}")
+    return max(1, round(seconds * trained.fps / window_frames(trained)))
+
+
+def window_frames(trained: TextModel) -> int:
+    """Return the frames of motion that one window of a stream adds; ValueError if the model is for no stream."""
+    if not trained.starts:
+        raise ValueError(
+            f"{trained.name} makes whole motions, a stream needs the prefix form: --model {STREAM_PRESET}, after "
+            f"f3amd train --preset {STREAM_PRESET} --data bandai"
+        )
+    given = len(next(iter(trained.starts.values())))
+    return (trained.config.window - given) * trained.codec.frames_per_state
+
+
+def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read where a joint should be, from a CSV file with the header frame,x,y,z: frames from 0, metres.
+
+    Args:
+      path: the file.
+      num_frames: of the clip.
+
+    Returns:
+      (frames [K], points [K, 3]).
+
+    Raises:
+      ValueError: naming file and line, for another header, a cell that is no number, a frame that is outside the clip
+        or comes twice, or no row at all.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; write a CSV with the header frame,x,y,z")
+    reader = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+    if (header := [cell.strip() for cell in next(reader, [])]) != ["frame", "x", "y", "z"]:
+        raise ValueError(f"{path}: line 1: the header must be frame,x,y,z, it is {','.join(header) or 'empty'}")
+    points: dict[int, list[float]] = {}
+    for cells in reader:
+        if not "".join(cells).strip():
+            continue
+        where = f"{path}: line {reader.line_num}:"
+        try:
+            frame, *point = map(float, cells)
+        except ValueError:
+            raise ValueError(f"{where} {','.join(cells)!r} is not four numbers") from None
+        if len(point) != 3 or not all(map(math.isfinite, (frame, *point))):
+            raise ValueError(f"{where} {','.join(cells)!r} is not four finite numbers: frame, x, y, z")
+        if frame != int(frame) or not 0 <= frame < num_frames:
+            raise ValueError(f"{where} frame {frame:g} is not one of the clip's, 0 to {num_frames - 1}; see --seconds")
+        if frame in points:
+            raise ValueError(f"{where} frame {frame:g} comes twice; keep one of its points")
+        points[int(frame)] = point
+    if not points:
+        raise ValueError(f"{path}: needs at least one row below its header")
+    return np.array(list(points)), np.array(list(points.values()))
+
+
+def find_joint(trained: TextModel, name: str) -> int:
+    """Return a joint that the control branch was trained for, by its role or its own name; ValueError lists them."""
+    known = controlled_joints(trained.skeleton)
+    own = {trained.skeleton.names[joint]: joint for joint in known.values()}
+    if name not in known | own:
+        raise ValueError(f"unknown joint {name!r}{nearest_hint(name, known)}")
+    return (known | own)[name]
+
+
+def check_solver(num_steps: int | None, guidance: float | None) -> None:
+    """Raise ValueError for a number of steps or a guidance that makes no sense."""
+    if num_steps is not None and not 1 <= num_steps <= 1000:
+        raise ValueError(f"--steps must be between 1 and 1000, got {num_steps}")
+    if guidance is not None and not 0 <= guidance <= 20:  # also catches NaN
+        raise ValueError(f"--guidance must be between 0 and 20, got {guidance}")
+
+
+# ------------------------------------------------------------------------------------------------------- what is made
+
+
+def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) -> dict:
+    """Return what the samplers are told: the guidance, and Euler's steps of a flow where a number is given."""
+    told = {} if guidance is None else {"guidance": guidance}
+    if num_steps is None:
+        return told
+    return told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
+
+
+def motions_told(
+    trained: TextModel, pooled, num_frames, key, *,
+    guidance: float | None = None, num_steps: int | None = None, control: Control | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Draw a motion for each caption, whole at once, or block by block or masked, as the model is made for.
+
+    Args:
+      trained: the model; one of the prefix form goes on from frames and is for `stream_told`.
+      pooled: captions, [B, W].
+      num_frames: of each motion, [B] or one for all; multiples of 4.
+      key: JAX random key.
+      guidance: w; by default the form's own.
+      num_steps: of Euler's method; by default the model's own sampler.
+      control: where joints should be, normalised, [B, L, J, 3].
+
+    Returns:
+      Positions, [B, L, J, 3], metres, starting near the origin facing +Z; L the longest; 0 in the padding.
+
+    Raises:
+      ValueError: for a model of the prefix form, or a control and no branch.
+    """
+    if trained.starts:
+        raise ValueError(
+            f"{trained.name} goes on from earlier frames: use it for a stream (--then), or another --model"
+        )
+    config, schedule, codec = trained.config, trained.schedule, trained.codec
+    branch = None if control is None else trained.control_branch()
+    lengths = np.broadcast_to(num_frames, len(pooled))
+    mask = frame_mask(lengths, int(lengths.max()))
+    condition = TextCondition(jnp.asarray(pooled), codec.state_mask(mask))
+    shape = (*condition.mask.shape, config.num_joints, config.channels)
+    key_noise, key_solver = jax.random.split(key)
+    asked = _asked(trained, guidance, num_steps)
+    if control is not None and guidance is not None:
+        asked["text_scale"] = asked.pop("guidance")
+
+    @jax.jit
+    def draw(noise, key):
+        network = trained.network()
+        if control is not None:
+            state = sample_control(network, branch, schedule, condition, control, noise, key=key, **asked)
+        elif isinstance(config, MaskedACMDMConfig):
+            state = sample_masked(network, schedule, condition, key, **asked)
+        else:
+            sample = sample_blocks if config.block_frames else sample_text
+            state = sample(network, schedule, condition, noise, key=key, **asked)
+        return codec.decode(state, mask)
+
+    made = np.asarray(draw(jax.random.normal(key_noise, shape), key_solver))
+    return codec.axes.restore(made) * np.asarray(mask)[..., None, None]
+
+
+def control_of(trained: TextModel, joint: int, frames, points, num_frames: int) -> Control:
+    """Return the control of one motion: a joint at points [K, 3], metres, in frames [K]."""
+    positions = np.zeros((1, num_frames, trained.config.num_joints, 3), np.float32)
+    positions[0, frames, joint] = trained.codec.axes.normalise(points)
+    asked = np.zeros(positions.shape[:-1], np.float32)
+    asked[0, frames, joint] = 1.0
+    return Control.of(jnp.asarray(positions), asked)
+
+
+def stream_told(
+    trained: TextModel, pooled, windows: Sequence[int], key, *,
+    guidance: float | None = None, num_steps: int | None = None, starts=None,
+) -> np.ndarray:  # fmt: skip
+    """Go on from frames of a clip, window after window, under captions that change on the way (ACMDM App. G, prefix).
+
+    Before each window the last frames are moved to the origin and turned to +Z, as clips begin, and what comes is
+    moved back: a stream may go anywhere and last for ever.
+
+    Args:
+      trained: a model of the prefix form.
+      pooled: captions in their order, [captions, W].
+      windows: how many windows each is told for.
+      key: JAX random key; it also chooses the start.
+      guidance, num_steps: as for `motions_told`.
+      starts: captions of `trained.starts` embedded, [starts, W], to begin near the first caption; by default anyhow.
+
+    Returns:
+      Positions, [frames, J, 3], metres: the start and all windows.
+
+    Raises:
+      ValueError: for a model that is not of the prefix form.
+    """
+    window_frames(trained)  # refuses a model that is for no stream
+    codec, asked = trained.codec, _asked(trained, guidance, num_steps)
+    states = np.stack(list(trained.starts.values()))
+    near = np.arange(len(states))
+    if starts is not None:
+        near = np.argsort(-(starts @ pooled[0]) / np.linalg.norm(starts, axis=-1))[:NEAR]
+    chosen = states[int(jax.random.choice(jax.random.fold_in(key, 0), near))][None]
+    given = chosen.shape[1] * codec.frames_per_state
+
+    @jax.jit
+    def go_on(before, caption, key):
+        prefix = codec.encode(before, jnp.ones((1, given), bool))
+        (made,) = continue_prefix(trained.network(), trained.schedule, prefix, [caption], key, **asked)
+        state = jnp.concatenate([prefix, made], axis=1)
+        return codec.decode(state, jnp.ones((1, state.shape[1] * codec.frames_per_state), bool))[:, given:]
+
+    metres = lambda normalised: codec.axes.restore(np.asarray(normalised, np.float64)[0])
+    parts = [metres(codec.decode(jnp.asarray(chosen), jnp.ones((1, given), bool)))]
+    told = [caption for caption, count in zip(pooled, windows, strict=True) for _ in range(count)]
+    for number, caption in enumerate(told, 1):
+        before = np.concatenate(parts)[-given:]
+        place = before[0, 0] * [1.0, 0.0, 1.0]
+        turned = matrix_from_yaw(smoothed_yaw(trained.skeleton, before[:1], 0.0)[0])
+        here = codec.axes.normalise((before - place) @ turned).astype(np.float32)
+        after = go_on(here[None], caption[None], jax.random.fold_in(key, number))
+        parts.append(metres(after) @ turned.T + place)
+    return np.concatenate(parts)

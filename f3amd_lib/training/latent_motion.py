@@ -1,0 +1,548 @@
+"""What MotionPCM trains: the autoencoder, the teacher on its latents, and a student that is distilled from the teacher.
+
+Each is a task of `training.optimise`. Settings of the paper and ours stand in `papers/motionpcm/recipes.toml`.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from f3amd_lib.data.text_motions import ClipTable, TextMotions, draw_clips, pad_motions
+from f3amd_lib.diffusion.phases import (
+    Phases,
+    beside,
+    cut_phases,
+    guided_noise,
+    hinge,
+    jump,
+    latent_consistency_end,
+    noise_travel,
+    pseudo_huber,
+    shares,
+    target_end,
+)
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
+from f3amd_lib.networks.motionpcm import (
+    DiscriminatorConfig,
+    LatentAutoencoderConfig,
+    LatentDenoiserConfig,
+    student_config,
+    student_of,
+)
+from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.text_motion import part_identity, part_recipe, task_tree
+
+CONSISTENCIES = ("phased", "latent")
+
+
+@dataclass(frozen=True)
+class LatentMotionTraining:
+    """How a part of MotionPCM is trained (MotionPCM section 5; MotionLCM V2's released code where it is silent).
+
+    Attributes:
+      num_steps: optimiser steps in all.
+      batch_size: motions a step.
+      learning_rate: of AdamW after the warm-up; it falls to 0 on a cosine.
+      warmup_steps: of a linear rise from 0.
+      gradient_clip: largest global gradient norm.
+      ema_decay: moving average of the weights, None for none; of a student it is mu, and the average is the target.
+      text_dropout: share of samples whose caption is replaced by the empty one (teacher).
+      kl_weight: of the autoencoder's divergence.
+      consistency: "phased", or "latent": MotionLCM's, all the way to the data.
+      skip: levels that a step of the teacher's solver passes, k.
+      num_phases: M.
+      least_guidance, most_guidance: between which w is drawn.
+      huber_width: h of the consistency loss; not in the paper.
+      adversarial_weight: lambda; 0 trains without a discriminator.
+      discriminator_rate: learning rate of its heads; not in the paper.
+      alternate: student and discriminator learn by turns, as in PCM's code; else both in every step (Algorithm 1).
+      num_frames: that clips are padded to (autoencoder).
+      seed: of initial weights and batches.
+
+    Raises:
+      ValueError: for a number out of its range or an unknown consistency.
+    """
+
+    num_steps: int
+    batch_size: int = 64
+    learning_rate: float = 2e-4
+    warmup_steps: int = 1000
+    gradient_clip: float = 1.0
+    ema_decay: float | None = None
+    text_dropout: float = 0.1
+    kl_weight: float = 1e-4
+    consistency: str = "phased"
+    skip: int = 100
+    num_phases: int = 1
+    least_guidance: float = 5.0
+    most_guidance: float = 15.0
+    huber_width: float = 0.5
+    adversarial_weight: float = 0.1
+    discriminator_rate: float = 2e-4
+    alternate: bool = False
+    num_frames: int = 196
+    seed: int = 1234
+
+    def __post_init__(self):
+        if self.consistency not in CONSISTENCIES:
+            raise ValueError(f"unknown consistency {self.consistency!r}{nearest_hint(self.consistency, CONSISTENCIES)}")
+        if self.consistency == "latent" and (self.num_phases > 1 or self.adversarial_weight):
+            raise ValueError(
+                "consistency 'latent' has no phases and no discriminator: num_phases 1, adversarial_weight 0"
+            )
+        whole = ("num_steps", "batch_size", "skip", "num_phases", "num_frames")
+        positive = ("learning_rate", "gradient_clip", "huber_width", "discriminator_rate")
+        for names, low in ((whole, 1), (positive, 1e-12), (("warmup_steps", "kl_weight", "adversarial_weight"), 0)):
+            for name in names:
+                if not low <= getattr(self, name) < float("inf"):
+                    raise ValueError(f"{name} must be at least {low:g} and finite, got {getattr(self, name)!r}")
+        if not 0 <= self.text_dropout <= 1 or not self.least_guidance <= self.most_guidance:
+            raise ValueError("text_dropout must be in [0, 1], and least_guidance no more than most_guidance")
+
+    def adamw(self, learning_rate: float, first_moment: float = 0.9) -> optax.GradientTransformation:
+        """Return AdamW without decay after clipping, with a warm-up and a cosine."""
+        warm = min(self.warmup_steps, self.num_steps - 1)
+        rate = optax.warmup_cosine_decay_schedule(learning_rate / (warm + 1), learning_rate, warm, self.num_steps)
+        adam = optax.adamw(rate, b1=first_moment, b2=0.999, weight_decay=0.0)
+        return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam)
+
+
+def latent_motion_recipe(part: str, num_steps: int, preset: str | None = None, **settings) -> LatentMotionTraining:
+    """Return how a part is trained.
+
+    Args:
+      part: a name of `papers/motionpcm/recipes.toml`, "student" or "short-student" for instance.
+      num_steps: optimiser steps.
+      preset: adds what its own training says (`presets.find_preset`).
+      **settings: fields of `LatentMotionTraining` to change.
+
+    Raises:
+      ValueError: for an unknown part, preset or field, with the nearest name.
+    """
+    return part_recipe("motionpcm", LatentMotionTraining, part, num_steps, preset, settings)
+
+
+def _identity(task, **models) -> dict:
+    return part_identity(task.name, models, task.config, task.dataset_fingerprint)
+
+
+# --------------------------------------------------------------------------------------------------------- autoencoder
+
+
+class FrameStatistics(NamedTuple):
+    """Mean and deviation of each number of a frame, [features]."""
+
+    mean: jax.Array
+    deviation: jax.Array
+
+    @classmethod
+    def of(cls, data: TextMotions) -> FrameStatistics:
+        """Return those of the training clips' redundant vectors, as HumanML3D has them."""
+        mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
+        return cls(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
+
+    def normalise(self, vectors):
+        """Map redundant vectors to network units, [..., features]."""
+        return (vectors - self.mean) / self.deviation
+
+    def restore(self, features):
+        """Map network units to redundant vectors, [..., features]."""
+        return features * self.deviation + self.mean
+
+
+def clip_error(numbers_hat, numbers, mask):
+    """Return smooth L1, mean over a frame's numbers, then over a clip's frames, then over clips (MotionLCM V2).
+
+    Args:
+      numbers_hat, numbers: [B, L, ...].
+      mask: frames that are motion, [B, L].
+    """
+    loss = optax.losses.huber_loss(numbers_hat, numbers).mean(axis=tuple(range(2, numbers.ndim)))
+    return jnp.mean(jnp.sum(loss * mask, axis=1) / jnp.sum(mask, axis=1))
+
+
+def reconstruction_terms(model, statistics: FrameStatistics, features, mask, keys=(None, None, None)) -> dict:
+    """Return {"features", "joints", "divergence"} of an autoencoder; without keys, of the mean and without dropout.
+
+    Args:
+      model: a `LatentAutoencoder`.
+      statistics: of the features.
+      features: normalised, zero in padding, [B, L, 12 J - 1].
+      mask: frames that are motion, [B, L].
+      keys: of the encoder's dropout, the latent's noise and the decoder's dropout.
+    """
+    mean, log_variance = model.encode(features, mask, keys[0])
+    latent = mean if keys[1] is None else draw_latent(keys[1], mean, log_variance)
+    features_hat = model.decode(latent, mask, keys[2])
+    joints_hat, joints = (positions_from_redundant(statistics.restore(x)) for x in (features_hat, features))
+    return {
+        "features": clip_error(features_hat, features, mask),
+        "joints": clip_error(joints_hat, joints, mask),
+        "divergence": 0.5 * jnp.mean(mean**2 + jnp.exp(log_variance) - 1.0 - log_variance),
+    }
+
+
+def draw_latent(key, mean, log_variance):
+    """Draw a latent of what the encoder made."""
+    return mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+
+
+@task_tree(("clips", "statistics"), ("model_config",))
+@dataclass(frozen=True, eq=False)
+class LatentAutoencoderTask:
+    """An autoencoder to train on whole clips (MotionPCM section 4.1; a `training.optimise.Task`).
+
+    Attributes:
+      model_config: the autoencoder.
+      config: how to train it.
+      clips: normalised redundant vectors.
+      statistics: of them.
+      dataset_fingerprint: of the data they come from.
+    """
+
+    name: ClassVar[str] = "latent autoencoder"
+
+    model_config: LatentAutoencoderConfig
+    config: LatentMotionTraining
+    clips: ClipTable
+    statistics: FrameStatistics
+    dataset_fingerprint: str = ""
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """AdamW, as the config says."""
+        return self.config.adamw(self.config.learning_rate)
+
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        return _identity(self, autoencoder=self.model_config)
+
+    def init(self, key):
+        """Return initial weights."""
+        return nnx.state(build_from_config(self.model_config, key)), None
+
+    def draw(self, state: TrainingState, key):
+        """Draw (features, mask) and the key of the loss."""
+        key_draw, key_loss = jax.random.split(key)
+        batch = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
+        return (batch.motion, batch.mask), key_loss
+
+    def loss(self, params, statistics, batch, key):
+        """Return (loss, (terms, statistics)): smooth L1 of features and of joints, and 1e-4 of the divergence."""
+        terms = self._terms(params, batch, jax.random.split(key, 3))
+        return terms["loss"], (terms, statistics)
+
+    def held_out_terms(self, params, statistics, held_out, key) -> dict:
+        """Return the terms on other clips, (features, mask), of the latent's mean."""
+        return self._terms(params, held_out, (None, None, None))
+
+    def _terms(self, params, batch, keys) -> dict:
+        terms = reconstruction_terms(network_with(self.model_config, params), self.statistics, *batch, keys)
+        loss = terms["features"] + terms["joints"] + self.config.kl_weight * terms["divergence"]
+        return {"loss": loss, **terms}
+
+
+# ------------------------------------------------------------------------------------------------------------- teacher
+
+
+class LatentTable(NamedTuple):
+    """Clips as an autoencoder sees them, on the device.
+
+    Attributes:
+      mean, log_variance: of each clip's latent, [K, window, channels]; a latent is drawn anew in every batch.
+      caption: first row of each clip's captions in `pooled`, [K].
+      count: captions of each clip, [K].
+      pooled: embeddings of all captions, [C, W].
+      empty: embedding of the empty caption, which stands for none, [W].
+    """
+
+    mean: jax.Array
+    log_variance: jax.Array
+    caption: jax.Array
+    count: jax.Array
+    pooled: jax.Array
+    empty: jax.Array
+
+    def draw(self, key, size: int):
+        """Draw clips: latents [B, window, channels] and a caption of each, [B, W]."""
+        key_clip, key_caption, key_latent = jax.random.split(key, 3)
+        clip = jax.random.randint(key_clip, (size,), 0, len(self.mean))
+        caption = self.caption[clip] + jax.random.randint(key_caption, (size,), 0, self.count[clip])
+        return draw_latent(key_latent, self.mean[clip], self.log_variance[clip]), self.pooled[caption]
+
+
+def latent_table(
+    model, statistics: FrameStatistics, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
+) -> LatentTable:
+    """Return the latents of a data set's clips.
+
+    Args:
+      model: a trained `LatentAutoencoder`.
+      statistics: of the features it was trained on.
+      data: the clips; all of them are in the table.
+      pooled: embeddings of their captions, clip after clip, [C, W].
+      empty: embedding of the empty caption, [W].
+      num_frames: that clips are cut or padded to.
+      batch: clips encoded at a time.
+    """
+    vectors = statistics.normalise(data.redundant_vectors())
+    rows = [vectors[first:last] for first, last in zip(data.start[:-1], data.start[1:], strict=True)]
+    graph, params = nnx.split(model)
+    encode = jax.jit(lambda params, *clips: nnx.merge(graph, params).encode(*clips))
+    made = []
+    for first in range(0, len(rows), batch):
+        padded = pad_motions(rows[first : first + batch], num_frames)
+        made.append(encode(params, padded.motion, padded.mask))
+    mean, log_variance = (jnp.concatenate(parts) for parts in zip(*made, strict=True))
+    count = jnp.asarray([len(captions) for captions in data.captions], jnp.int32)
+    first = jnp.cumsum(count) - count
+    return LatentTable(mean, log_variance, first, count, jnp.asarray(pooled), jnp.asarray(empty))
+
+
+@task_tree(("clips",), ("model_config", "schedule"))
+@dataclass(frozen=True, eq=False)
+class TeacherTask:
+    """A teacher to train: the noise of latents under a caption, or none (a `training.optimise.Task`).
+
+    Attributes:
+      model_config: the denoiser.
+      config: how to train it.
+      schedule: the noise schedule of its preset.
+      clips: latents and captions.
+      dataset_fingerprint: of the data, and of the autoencoder.
+    """
+
+    name: ClassVar[str] = "latent teacher"
+
+    model_config: LatentDenoiserConfig
+    config: LatentMotionTraining
+    schedule: NoiseSchedule
+    clips: LatentTable
+    dataset_fingerprint: str = ""
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """AdamW, as the config says."""
+        return self.config.adamw(self.config.learning_rate)
+
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        return _identity(self, teacher=self.model_config, diffusion=self.schedule)
+
+    def init(self, key):
+        """Return initial weights."""
+        return nnx.state(build_from_config(self.model_config, key)), None
+
+    def draw(self, state: TrainingState, key):
+        """Draw (latents, captions) and the key of the loss; a share of the captions is the empty one."""
+        key_draw, key_told, key_loss = jax.random.split(key, 3)
+        latent, text = self.clips.draw(key_draw, self.config.batch_size)
+        told = jax.random.bernoulli(key_told, 1.0 - self.config.text_dropout, (len(text), 1))
+        return (latent, jnp.where(told, text, self.clips.empty)), key_loss
+
+    def loss(self, params, statistics, batch, key):
+        """Return (loss, (terms, statistics)): the squared error of the noise."""
+        key_time, key_noise, key_dropout = jax.random.split(key, 3)
+        loss = self._error(params, batch, key_time, key_noise, key_dropout)
+        return loss, ({"loss": loss}, statistics)
+
+    def held_out_terms(self, params, statistics, held_out, key) -> dict:
+        """Return the loss on (latents, captions) of other clips, without dropout."""
+        return {"loss": self._error(params, held_out, *jax.random.split(key), None)}
+
+    def _error(self, params, batch, key_time, key_noise, key_dropout):
+        latent, text = batch
+        network = network_with(self.model_config, params)
+        time = jax.random.randint(key_time, (len(latent),), 0, len(self.schedule.levels))
+        noise = jax.random.normal(key_noise, latent.shape)
+        alpha, sigma = (beside(share, latent) for share in shares(self.schedule, time))
+        eps = network(alpha * latent + sigma * noise, time, network.encode(text), key=key_dropout)
+        return jnp.mean((eps - noise) ** 2)
+
+
+# -------------------------------------------------------------------------------------------------------- distillation
+
+
+class DistillationBatch(NamedTuple):
+    """What a student is asked, and what frozen networks say; samples first.
+
+    Attributes:
+      state: noisy latents z_t.
+      time, edge: where they are, and where their phase ends.
+      guidance: w.
+      text: captions.
+      target: what the target network says of the phase's end.
+      critic_time: s, at which the discriminator looks.
+      fresh: noise that carries the student's answer there.
+      real: data at s, with noise of its own.
+    """
+
+    state: jax.Array
+    time: jax.Array
+    edge: jax.Array
+    guidance: jax.Array
+    text: jax.Array
+    target: jax.Array
+    critic_time: jax.Array
+    fresh: jax.Array
+    real: jax.Array
+
+
+@task_tree(("teacher", "clips"), ("teacher_config", "schedule"))
+@dataclass(frozen=True, eq=False)
+class DistillationTask:
+    """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1; a `training.optimise.Task`).
+
+    Weights have the branches "student" and, with a discriminator, "discriminator". The loop's moving average of the
+    student is the target network. Both losses are taken at the weights before a step, as in Algorithm 1, whose line 15
+    looks at what the student of line 10 said; one step for both is therefore that algorithm's three updates.
+
+    Attributes:
+      teacher_config, teacher: config and frozen weights.
+      config: how to distil.
+      schedule: the teacher's noise schedule.
+      clips: latents and captions.
+      dataset_fingerprint: of the data, the autoencoder and the teacher.
+    """
+
+    name: ClassVar[str] = "student"
+
+    teacher_config: LatentDenoiserConfig
+    teacher: Any
+    config: LatentMotionTraining
+    schedule: NoiseSchedule
+    clips: LatentTable
+    dataset_fingerprint: str = ""
+
+    def __post_init__(self):
+        if self.config.ema_decay is None:
+            raise ValueError("a student's target is its moving average: set ema_decay, 0 for the student itself")
+
+    @property
+    def student_config(self) -> LatentDenoiserConfig:
+        """The student's network: the teacher's, told the guidance."""
+        return student_config(self.teacher_config)
+
+    @property
+    def critic_config(self) -> DiscriminatorConfig:
+        """The discriminator's heads."""
+        return DiscriminatorConfig(latent_width=self.teacher_config.latent_width, depth=self.teacher_config.depth)
+
+    @property
+    def phases(self) -> Phases:
+        """Solver points and phases."""
+        return cut_phases(len(self.schedule.levels), self.config.skip, self.config.num_phases)
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """AdamW for the student and another one for the heads, in every step or by turns: even steps are the heads'."""
+        config = self.config
+        parts = {"student": config.adamw(config.learning_rate)}
+        if config.adversarial_weight:
+            parts["discriminator"] = config.adamw(config.discriminator_rate, first_moment=0.0)
+        if config.alternate:
+            turn = {"student": 1, "discriminator": 0}
+            parts = {
+                name: optax.conditionally_mask(part, functools.partial(_is_turn, turn[name]))
+                for name, part in parts.items()
+            }
+        branch = lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params)
+        return optax.partition(parts, branch)
+
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        return _identity(self, teacher=self.teacher_config, diffusion=self.schedule)
+
+    def init(self, key):
+        """Return the teacher's weights as the student's, and fresh heads."""
+        key_student, key_critic = jax.random.split(key)
+        teacher = network_with(self.teacher_config, self.teacher)
+        params = {"student": nnx.state(student_of(teacher, key_student))}
+        if self.config.adversarial_weight:
+            params["discriminator"] = nnx.state(build_from_config(self.critic_config, key_critic))
+        return params, None
+
+    def draw(self, state: TrainingState, key):
+        """Draw latents, captions, points, guidance and noises, and ask teacher and target; no gradient comes here."""
+        key_clips, key_batch = jax.random.split(key)
+        clips = self.clips.draw(key_clips, self.config.batch_size)
+        return self.questions(state.ema["student"], *clips, key_batch), key_batch
+
+    def questions(self, target_params, latent, text, key) -> DistillationBatch:
+        """Return what a student is asked about clean latents, with the target's answers (Algorithm 1, lines 5-11)."""
+        config, phases, schedule = self.config, jax.tree.map(jnp.asarray, self.phases), self.schedule
+        key_point, key_noise, key_guidance, key_critic, key_real, key_fresh = jax.random.split(key, 6)
+        size = len(latent)
+        point = jax.random.randint(key_point, (size,), 0, len(phases.times))
+        time, before, phase = phases.times[point], phases.before[point], phases.phase[point]
+        edge = phases.edges[phase]
+        noise = jax.random.normal(key_noise, latent.shape)
+        noised = lambda t, noise: sum(
+            beside(share, latent) * part for share, part in zip(shares(schedule, t), (latent, noise), strict=True)
+        )
+        state = noised(time, noise)
+        limits = {"minval": config.least_guidance, "maxval": config.most_guidance}
+        guidance = jax.random.uniform(key_guidance, (size,), **limits)
+
+        teacher = network_with(self.teacher_config, self.teacher)
+        empty = jnp.broadcast_to(self.clips.empty, text.shape)
+        conditional, unconditional = (teacher(state, time, teacher.encode(told)) for told in (text, empty))
+        solved = jump(schedule, state, guided_noise(conditional, unconditional, guidance), time, before)
+        target = network_with(self.student_config, target_params)
+        eps = target(solved, before, target.encode(text), guidance)
+        if config.consistency == "latent":
+            end = latent_consistency_end(schedule, solved, eps, before)
+        else:
+            end = target_end(schedule, solved, eps, before, edge)
+        critic_time = jax.random.randint(key_critic, (size,), edge, phases.edges[phase + 1] + 1)
+        real = noised(critic_time, jax.random.normal(key_real, latent.shape))
+        fresh = jax.random.normal(key_fresh, latent.shape)
+        return DistillationBatch(state, time, edge, guidance, text, end, critic_time, fresh, real)
+
+    def loss(self, params, statistics, batch: DistillationBatch, key):
+        """Return (loss, (terms, statistics)): the student's (MotionPCM Eq. 14) and the heads', for a branch each."""
+        config, schedule = self.config, self.schedule
+        student = network_with(self.student_config, params["student"])
+        eps = student(batch.state, batch.time, student.encode(batch.text), batch.guidance)
+        if config.consistency == "latent":
+            end = latent_consistency_end(schedule, batch.state, eps, batch.time)
+        else:
+            end = jump(schedule, batch.state, eps, batch.time, batch.edge)
+        loss = jnp.mean(pseudo_huber(end - jax.lax.stop_gradient(batch.target), config.huber_width))
+        terms = {"consistency": loss}
+        if config.adversarial_weight:
+            fake = noise_travel(schedule, end, batch.edge, batch.critic_time, batch.fresh)
+            frozen = jax.lax.stop_gradient(params["discriminator"])
+            adversarial = jnp.mean(jax.nn.relu(1.0 - self.scores(frozen, fake, batch)))
+            real, made = (
+                self.scores(params["discriminator"], jax.lax.stop_gradient(seen), batch) for seen in (batch.real, fake)
+            )
+            terms |= {"adversarial": adversarial, "discriminator": hinge(real, made)}
+            # The heads' own loss has no weight: each branch is moved by its own optimiser.
+            loss = loss + config.adversarial_weight * adversarial + terms["discriminator"]
+        return loss, ({"loss": loss, **terms}, statistics)
+
+    def scores(self, heads, state, batch: DistillationBatch):
+        """Return the discriminator's scores of states at `critic_time` under the captions, high for data."""
+        teacher = network_with(self.teacher_config, self.teacher)
+        critic = network_with(self.critic_config, heads)
+        return critic(teacher.features(state, batch.critic_time, teacher.encode(batch.text)))
+
+    def held_out_terms(self, params, statistics, held_out, key) -> dict:
+        """Return the terms on (latents, captions) of other clips, of the moving average against itself."""
+        return self.loss(params, statistics, self.questions(params["student"], *held_out, key), key)[1][0]
+
+
+def _is_turn(parity: int, step):
+    return step % 2 == parity

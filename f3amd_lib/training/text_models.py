@@ -1,0 +1,505 @@
+"""Trained models of text to motion as files, and the road to them from a preset's name.
+
+    captioned clips -> normalised positions -> (autoencoder -> latent) -> denoiser -> (control branch)
+
+Each stage leaves one file that is whole in itself, with the weights of the stages before it. A preset's name with
+"+control" behind it stands for the branch beside the finished model of that name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from f3amd_lib.data.humanml3d import read_humanml3d
+from f3amd_lib.data.packed import packed_dataset
+from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.data.text_encoders import TextEncoder, embed_captions, words_of
+from f3amd_lib.data.text_motions import UNIT, AxisNormaliser, TextMotions, bandai_text_motions, clip_table, pad_motions
+from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.profiles import Profile, runs_dir
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
+from f3amd_lib.networks.acmdm_control import ControlBranch
+from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
+from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
+from f3amd_lib.networks.presets import config_from_dict
+from f3amd_lib.training.checkpoints import (
+    describe_skeleton,
+    described_skeleton,
+    errors_name,
+    load_tree,
+    network_with,
+    packed_shapes,
+    packed_weights,
+    save_tree,
+    unpacked_weights,
+    weights_digest,
+    weights_shapes,
+)
+from f3amd_lib.training.motion_codec import MotionCodec, with_latent
+from f3amd_lib.training.optimise import Task, differences
+from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles, alone_with, train_in_legs
+from f3amd_lib.training.text_motion import (
+    AutoencoderTask,
+    ControlTask,
+    TextMotionTask,
+    TextMotionTraining,
+    branch_with,
+    text_motion_recipe,
+)
+
+CONTROL = "+control"
+"""Behind a preset's name: the model with its control branch."""
+
+CONTROLLED = {"left_foot": "left_toe", "right_foot": "right_toe"} | {
+    name: name for name in ("head", "left_wrist", "right_wrist")
+}
+"""Joints that a branch learns to control besides the pelvis (ACMDM section 3.2): their names on the command line, and
+their roles in a skeleton."""
+
+_KIND = "text-to-motion model"
+_ENCODED_AT_ONCE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TextModel:
+    """A trained model of text to motion, or a motion autoencoder alone.
+
+    Attributes:
+      name: preset, with "+control" where there is a branch.
+      codec: between motion and the network's states: normaliser and autoencoder.
+      skeleton, fps: of the motion it was trained on.
+      record: how it was trained, on what, under what terms.
+      config, params: of the denoiser (the moving average); None for an autoencoder alone.
+      schedule: the noise schedule it was trained with.
+      text_encoder: identity of the encoder whose pooled vectors it reads.
+      words: of all captions that it was trained with.
+      starts: of the prefix form alone: by caption, first frames of a clip to go on from, states [P, J, C].
+      branch: weights of the control branch, None without one.
+    """
+
+    name: str
+    codec: MotionCodec
+    skeleton: Skeleton
+    fps: float
+    record: dict
+    config: ACMDMConfig | None = None
+    params: Any = None
+    schedule: NoiseSchedule | None = None
+    text_encoder: str = ""
+    words: tuple[str, ...] = ()
+    starts: dict = field(default_factory=dict)
+    branch: Any = None
+
+    def network(self) -> ACMDM | MaskedACMDM:
+        """Return the denoiser with its weights."""
+        return network_with(self.config, self.params)
+
+    def control_branch(self) -> ControlBranch:
+        """Return the control branch with its weights; ValueError says how to train one if there is none."""
+        if self.branch is None:
+            raise ValueError(f"{self.name} has no control branch; train one: f3amd train --preset {self.name}{CONTROL}")
+        return branch_with(self.config, self.codec, self.branch)
+
+    @property
+    def most_frames(self) -> int:
+        """Frames of motion in the longest state."""
+        return self.config.window * self.codec.frames_per_state
+
+
+def controlled_joints(skeleton: Skeleton) -> dict[str, int]:
+    """Return the joints that a branch learns to control, by their names on the command line; the pelvis is the root."""
+    return {"pelvis": 0} | {name: skeleton.role(role) for name, role in CONTROLLED.items() if skeleton.has_role(role)}
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
+    """Write a model; `load_text_model` gives it back, weights in the precision of the file.
+
+    Args:
+      path: file to write.
+      trained: the model.
+      dtype: of the weights, as for `checkpoints.save_model`.
+    """
+    codec, weights = trained.codec, {}
+    if trained.config is not None:
+        weights["params"] = trained.params
+    if codec.autoencoder is not None:
+        weights["autoencoder"] = codec.params
+    if trained.branch is not None:
+        weights["branch"] = trained.branch
+    tree = {name: packed_weights(params, dtype) for name, params in weights.items()}
+    tree["axes"] = codec.axes._asdict()
+    if codec.autoencoder is not None:
+        tree["latent"] = codec.latent._asdict()
+    tree["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
+    tree["offsets"] = jnp.asarray(trained.skeleton.offsets, jnp.float32)
+    metadata = {
+        "kind": _KIND,
+        "name": trained.name,
+        "model": None if trained.config is None else trained.config.to_dict(),
+        "autoencoder": None if codec.autoencoder is None else codec.autoencoder.to_dict(),
+        "diffusion": None if trained.schedule is None else trained.schedule.to_dict(),
+        "controlled": trained.branch is not None,
+        "weights": jnp.dtype(dtype).name,
+        "fps": trained.fps,
+        "text_encoder": trained.text_encoder,
+        "words": list(trained.words),
+        "start_shapes": {caption: list(np.shape(state)) for caption, state in trained.starts.items()},
+        **describe_skeleton(trained.skeleton),
+        "record": trained.record,
+    }
+    save_tree(path, tree, metadata)
+
+
+def load_text_model(path: Path) -> TextModel:
+    """Read a model written by `save_text_model`.
+
+    Raises:
+      ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
+    """
+    with errors_name(path):
+        tree, metadata = load_tree(path, _template)
+        config, autoencoder = (_config(metadata[what]) for what in ("model", "autoencoder"))
+        weights = {what: unpacked_weights(tree[what]) for what in ("params", "autoencoder", "branch") if what in tree}
+        axes, latent = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
+                        for what in ("axes", "latent"))  # fmt: skip
+        return TextModel(
+            name=metadata["name"],
+            codec=MotionCodec(axes, autoencoder, weights.get("autoencoder"), latent),
+            skeleton=described_skeleton(metadata, tree["offsets"]),
+            fps=metadata["fps"],
+            record=metadata["record"],
+            config=config,
+            params=weights.get("params"),
+            schedule=None if metadata["diffusion"] is None else schedule_from_dict(metadata["diffusion"]),
+            text_encoder=metadata["text_encoder"],
+            words=tuple(metadata["words"]),
+            starts={caption: np.asarray(state) for caption, state in tree["starts"].items()},
+            branch=weights.get("branch"),
+        )
+
+
+def _config(values: dict | None):
+    return None if values is None else config_from_dict(values)
+
+
+def _template(metadata: dict) -> dict:
+    """Return the shapes that a model's description speaks of."""
+    if metadata.get("kind") != _KIND:
+        raise ValueError(f"holds a {metadata.get('kind')}, not a {_KIND}")
+    single = jax.ShapeDtypeStruct
+    numbers = lambda width: {what: single((width,), jnp.float32) for what in AxisNormaliser._fields}
+    config, autoencoder = (_config(metadata[what]) for what in ("model", "autoencoder"))
+    shapes, tree = {}, {"axes": numbers(3)}
+    if config is not None:
+        shapes["params"] = weights_shapes(config)
+    if autoencoder is not None:
+        shapes["autoencoder"] = weights_shapes(autoencoder)
+        tree["latent"] = numbers(autoencoder.latent_channels)
+    if metadata["controlled"]:
+        frames = 1 if autoencoder is None else autoencoder.frames_per_latent
+        shapes["branch"] = nnx.state(nnx.eval_shape(lambda: ControlBranch(config, frames, rngs=nnx.Rngs(0))))
+    tree |= {what: packed_shapes(shape, metadata["weights"]) for what, shape in shapes.items()}
+    tree["starts"] = {name: single(tuple(shape), jnp.float32) for name, shape in metadata["start_shapes"].items()}
+    return tree | {"offsets": single((len(metadata["joints"]), 3), jnp.float32)}
+
+
+# ---------------------------------------------------------------------------------------------------------------- data
+
+
+def open_text_motions(name: str, source=None, *, held_out_wording: bool = False) -> TextMotions:
+    """Open captioned motions by name.
+
+    Args:
+      name: "bandai", whose captions are composed; or "folder", one in HumanML3D's layout.
+      source: the folder, or bandai's archive.
+      held_out_wording: of bandai: caption with the phrases that training never sees.
+
+    Raises:
+      ValueError: for a data set without captions, or a folder that is not given or broken.
+    """
+    if name == "bandai":
+        packed = packed_dataset(open_dataset("bandai", path=source, locomotion_only=False))
+        return bandai_text_motions(packed, held_out_wording=held_out_wording)
+    if name != "folder":
+        raise ValueError(f"data set {name!r} has no captions{nearest_hint(name, ('bandai', 'folder'))}")
+    if source is None:
+        raise ValueError("--data folder needs --source: a folder in HumanML3D's layout (f3amd dataset writes one)")
+    return read_humanml3d(source)
+
+
+def _whole_states(codec: MotionCodec, data: TextMotions) -> list[np.ndarray]:
+    """Return the normalised positions of each clip, as many as make whole frames of the state."""
+    frames = codec.frames_per_state
+    clips = (data.clip(number) for number in range(data.num_clips))
+    return [codec.axes.normalise(clip[: len(clip) // frames * frames]) for clip in clips]
+
+
+def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
+    """Return all clips as states, one after the other, [N / frames of a state, J, C]."""
+    frames, clips = codec.frames_per_state, _whole_states(codec, data)
+    if codec.autoencoder is None:
+        return np.concatenate(clips)
+    encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
+    for first in range(0, len(clips), _ENCODED_AT_ONCE):
+        part = clips[first : first + _ENCODED_AT_ONCE]
+        padded = pad_motions([*part, *[part[0]] * (_ENCODED_AT_ONCE - len(part))], longest)
+        states = np.asarray(encode(codec, padded.motion, padded.mask))
+        parts += [state[: len(clip) // frames] for state, clip in zip(states, part, strict=False)]
+    return np.concatenate(parts)
+
+
+def _captioned_states(codec: MotionCodec, data: TextMotions, encoder: TextEncoder):
+    """Return (clips as states, pooled embeddings of their captions)."""
+    table, captions = clip_table(data, encoded_clips(codec, data), codec.frames_per_state)
+    return table, pooled_captions(captions, encoder)
+
+
+def pooled_captions(captions: Sequence[str], encoder: TextEncoder) -> jax.Array:
+    """Return the pooled embedding of each caption, [N, W]; those that are said twice are embedded once."""
+    unlike, place = np.unique(captions, return_inverse=True)
+    return jnp.asarray(embed_captions(unlike.tolist(), encoder).pooled[place])
+
+
+# ---------------------------------------------------------------------------------------------------------------- tasks
+
+
+def autoencoder_task(data: TextMotions, split: str, preset: str, config: TextMotionTraining) -> AutoencoderTask:
+    """Return the training of a preset's autoencoder on the clips of a split."""
+    axes, part = data.normaliser(), data.select(data.members(split))
+    table, _ = clip_table(part, axes.normalise(part.positions))
+    return AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+
+
+def denoiser_task(
+    data: TextMotions, split: str, encoder: TextEncoder, preset: str, config: TextMotionTraining, codec: MotionCodec,
+    window: int | None = None,
+) -> TextMotionTask:  # fmt: skip
+    """Return the training of a preset's denoiser on the clips of a split.
+
+    Args:
+      data, split: captioned clips.
+      encoder: of the captions.
+      preset, config: the model and its training.
+      codec: of its states, which must have the preset's channels.
+      window: most frames of motion in a state, instead of the preset's.
+    """
+    table, pooled = _captioned_states(codec, data.select(data.members(split)), encoder)
+    sizes = {"num_joints": data.skeleton.num_joints, "text_width": pooled.shape[-1]}
+    if window:
+        sizes["window"] = window // codec.frames_per_state
+    model = presets.build_config(preset, **sizes)
+    if model.channels != table.frames.shape[-1]:
+        raise ValueError(f"{preset} models {model.channels} numbers a joint; positions have {table.frames.shape[-1]}")
+    fingerprint = data.fingerprint
+    if codec.autoencoder is not None:
+        fingerprint += f" in the latent of {weights_digest(codec.params)}"
+    return TextMotionTask(model, config, presets.find_preset(preset).diffusion, table, pooled, fingerprint)
+
+
+def control_task(
+    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: TextMotionTraining
+) -> ControlTask:
+    """Return the training of a control branch beside a finished model on the clips of a split."""
+    part, codec, frames = data.select(data.members(split)), base.codec, base.codec.frames_per_state
+    table, pooled = _captioned_states(codec, part, encoder)
+    positions = jnp.asarray(np.concatenate(_whole_states(codec, part)), jnp.float32)
+    positions = positions.reshape(len(table.frames), frames, *positions.shape[1:])
+    table = table._replace(frames=(table.frames, positions))
+    fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
+    joints = tuple(controlled_joints(data.skeleton).values())
+    return ControlTask(base.config, config, base.schedule, table, pooled, base.params, codec, joints, fingerprint)
+
+
+# ------------------------------------------------------------------------------------------------------------- training
+
+
+def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
+    """Return where a model of a data set and profile lies: `runs/<data set>/<profile>/text` or a folder of yours."""
+    folder = Path(folder or runs_dir(profile.dataset, profile.name) / "text")
+    return ModelFiles(*(folder / f"{name}.{what}" for what in ("safetensors", "state.safetensors", "history.csv")))
+
+
+def of_this_training(found, task: Task, files: ModelFiles):
+    """Return a finished model that was read from `files`; ValueError if it came from another training than `task`."""
+    if unlike := differences(task.identity(), found.record["identity"]):
+        lies = f"a model with other {'; '.join(unlike)} lies there"
+        raise ValueError(f"{files.model}: {lies}; move it away or name another folder (--out)")
+    return found
+
+
+def is_text_preset(name: str) -> bool:
+    """Say whether a preset, with or without "+control", is one that this file trains."""
+    families = (ACMDMConfig.family, MaskedACMDMConfig.family, AutoencoderConfig.family)
+    return presets.find_preset(name.removesuffix(CONTROL)).family in families
+
+
+def train_text_model(
+    data: TextMotions, encoder: TextEncoder, profile: Profile, name: str, *,
+    window: int | None = None, batch_size: int | None = None, folder=None, **leg,
+) -> TextModel | None:  # fmt: skip
+    """Train a preset, and first what it stands on, unless that is finished already, with whatever settings.
+
+    A killed training goes on where it was; a finished model is only read.
+
+    Args:
+      data: captioned clips.
+      encoder: of the captions.
+      profile: how long; "gpu" by the paper's recipe, else by the short ones.
+      name: of a preset of ACMDM, or with "+control" behind it.
+      window: most frames of motion in a state, instead of the preset's.
+      batch_size: instead of the recipe's.
+      folder: where files go instead of `runs/`.
+      **leg: stop_at and progress, as for `optimise`.
+
+    Returns:
+      The model as its file has it; None where `stop_at` came first.
+
+    Raises:
+      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data.
+      TrainingDiverged: if the loss stops being a number.
+    """
+    preset = presets.find_preset(name.removesuffix(CONTROL))
+    name = preset.name + (CONTROL if name.endswith(CONTROL) else "")
+    earlier = preset.name if name.endswith(CONTROL) else preset.latent
+    before = None
+    if earlier:
+        lies = text_model_files(profile, earlier, folder=folder).model
+        asked = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
+        before = load_text_model(lies) if lies.exists() else train_text_model(data, encoder, profile, earlier, **asked)
+        if before is None:
+            return None
+        if before.record["dataset_fingerprint"] != data.fingerprint:
+            raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
+    part = "autoencoder" if preset.family == AutoencoderConfig.family else "denoiser"
+    part = "control" if name.endswith(CONTROL) else part
+    codec = MotionCodec(data.normaliser()) if before is None else before.codec
+    settings = {"seed": profile.seed, "unit": max(1, UNIT // codec.frames_per_state)}
+    settings |= {} if batch_size is None else {"batch_size": batch_size}
+    recipe = part if profile.name == "gpu" else f"short-{part}"
+    config = text_motion_recipe(recipe, profile.train_steps, None if part == "control" else preset.name, **settings)
+    if part == "denoiser":
+        task_of = lambda split: denoiser_task(data, split, encoder, preset.name, config, codec, window)
+    elif part == "control":
+        task_of = lambda split: control_task(data, split, encoder, before, config)
+    else:
+        task_of = lambda split: autoencoder_task(data, split, preset.name, config)
+    files, task = text_model_files(profile, name, folder=folder), task_of("train")
+    if files.model.exists():
+        return of_this_training(load_text_model(files.model), task, files)
+    held_out = task_of("validation").draw(None, jax.random.key(0))[0]
+    if part == "autoencoder":
+        held_out = (held_out, jnp.ones(held_out.shape[:2], bool))
+    record = run_record(
+        profile=profile, dataset=data, seed=config.seed, model=name, identity=task.identity(),
+        num_train_clips=len(data.members("train")),
+    )  # fmt: skip
+    with alone_with(files):
+        state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
+    if int(state.step) < config.num_steps:
+        return None
+    about = {"skeleton": data.skeleton, "fps": data.fps, "record": record, "name": name}
+    if part == "autoencoder":
+        made = TextModel(codec=_codec_of(task, codec, state.averaged, data), **about)
+    elif part == "control":
+        made = dataclasses.replace(before, branch=state.averaged, name=name, record=record)
+    else:
+        trained_on = data.select(data.members("train"))
+        made = TextModel(
+            codec=codec, config=task.model_config, params=state.averaged, schedule=task.schedule,
+            text_encoder=encoder.identity, words=words_of([said for lines in trained_on.captions for said in lines]),
+            starts=first_frames(codec, trained_on, config.prefix_frames), **about,
+        )  # fmt: skip
+    save_text_model(files.model, made)
+    return load_text_model(files.model)
+
+
+def _codec_of(task: AutoencoderTask, codec: MotionCodec, params, data: TextMotions) -> MotionCodec:
+    """Return the codec of a trained autoencoder, its latent normalised over up to 512 training clips."""
+    part = data.members("train")
+    part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]
+    frames = task.model_config.frames_per_latent
+    clips = [codec.axes.normalise(data.clip(number)) for number in part]
+    padded = pad_motions(clips, max(map(len, clips)) // frames * frames)
+    return with_latent(codec, task.model_config, params, padded.motion, padded.mask)
+
+
+def first_frames(codec: MotionCodec, data: TextMotions, count: int) -> dict[str, np.ndarray]:
+    """Return the first frames of one clip of each pair of content and style, by its first caption, as states.
+
+    Args:
+      codec: of the states.
+      data: captioned clips.
+      count: frames of the state, P; 0 returns nothing.
+
+    Returns:
+      [P, J, C] each.
+    """
+    if not count:
+        return {}
+    frames = count * codec.frames_per_state
+    long_enough = [number for number in range(data.num_clips) if data.lengths[number] >= frames]
+    shown = {data.pairs[number]: number for number in reversed(long_enough)}.values()
+    clips = jnp.asarray(np.stack([codec.axes.normalise(data.clip(number)[:frames]) for number in shown]))
+    states = np.asarray(codec.encode(clips, jnp.ones(clips.shape[:2], bool)))
+    return {data.captions[number][0]: state for number, state in zip(shown, states, strict=True)}
+
+
+def find_text_model(dataset: str, preset: str | None = None, *, control: bool = False) -> Path:
+    """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
+
+    Args:
+      dataset: that it was trained on.
+      preset: by default the newest that turns text into motion.
+      control: it must have a control branch.
+
+    Raises:
+      ValueError: if there is none, saying how to train it.
+    """
+    folders = [
+        runs_dir(dataset, "gpu") / "text",
+        runs_dir(dataset, "laptop") / "text",
+        PRETRAINED_DIR / dataset / "text",
+    ]
+    wanted = None if preset is None else presets.find_preset(preset.removesuffix(CONTROL)).name
+    for folder in folders:
+        for path in sorted(folder.glob("*.safetensors"), key=lambda path: -path.stat().st_mtime):
+            name = path.name.removesuffix(".safetensors")
+            fits = name.endswith(CONTROL) == control and wanted in (None, name.removesuffix(CONTROL))
+            if fits and _makes_motion(name):
+                return path
+    name = (wanted or DEFAULT_PRESET) + (CONTROL if control else "")
+    raise ValueError(
+        f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
+    )
+
+
+def _makes_motion(name: str) -> bool:
+    """Say whether a file's name is that of a denoiser of ACMDM, not of a state, the judge or of another paper."""
+    try:
+        family = presets.find_preset(name.removesuffix(CONTROL)).family
+        return family in (ACMDMConfig.family, MaskedACMDMConfig.family)
+    except ValueError:
+        return False
+
+
+DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"
+"""The preset that two cores can train, and that is named where none is."""
+
+JUDGE = "judge"
+"""Name on the command line, and of the file, of the judge of text to motion."""

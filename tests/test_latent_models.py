@@ -1,0 +1,97 @@
+"""MotionPCM's models as files, and their training by name, one stage after the other."""
+
+import jax
+import numpy as np
+import pytest
+from test_text_judge import OneVectorAWord
+
+from f3amd_lib.data.text_motions import text_motions
+from f3amd_lib.diffusion.schedules import variance_preserving_betas
+from f3amd_lib.generation.latent_motion import decode_latent, sample_student
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.skeleton import resample
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.presets import Preset
+from f3amd_lib.training import text_models
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.latent_models import (
+    is_latent_preset,
+    load_latent_model,
+    stage_of,
+    stands_on,
+    train_latent_model,
+)
+from f3amd_lib.training.text_models import text_model_files
+
+SIZES = {"window": 2, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}
+SMALL = {**SIZES, "time_features": 8}
+VP = variance_preserving_betas()
+TINY = {
+    "tiny-VAE": Preset("tiny-VAE", "motionpcm", "latent autoencoder", VP, SIZES, {}, "ours"),
+    "tiny-teacher": Preset(
+        "tiny-teacher", "motionpcm", "latent denoiser", VP, SMALL, {}, "ours", latent="tiny-VAE"
+    ),
+    "tiny-M2": Preset(
+        "tiny-M2", "motionpcm", "latent denoiser", VP, {**SMALL, "guidance_features": 256},
+        {"num_phases": 2, "num_frames": 40}, "ours", latent="tiny-VAE",
+    ),
+}  # fmt: skip
+PROFILE = load_profile("smoke", "bandai", train_steps=2)
+QUIET = {"progress": False, "batch_size": 2}
+
+
+def test_a_preset_knows_what_it_stands_on():
+    chain = {}
+    for name in ("MotionPCM-VAE", "MotionPCM-teacher-small", "MotionPCM-M4", "MotionLCM-V2-small"):
+        preset = presets.find_preset(name)
+        chain[name] = stage_of(preset), stands_on(preset)
+    assert chain == {
+        "MotionPCM-VAE": ("autoencoder", ""),
+        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small"),
+        "MotionPCM-M4": ("student", "MotionPCM-teacher"),
+        "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
+    }
+
+
+def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
+    monkeypatch.setattr(text_models, "runs_dir", lambda *_: tmp_path)
+    (tmp_path / "text").mkdir()
+    for name in ("ACMDM-S-PS22-raw-n3", "MotionPCM-M1-small", "MotionPCM-VAE-small"):  # the newest comes last
+        (tmp_path / "text" / f"{name}.safetensors").touch()
+    assert text_models.find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
+    assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
+
+
+@pytest.mark.slow
+def test_a_student_is_trained_by_name_with_all_before_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("F3AMD_CACHE_DIR", str(tmp_path / "cache"))
+    clips = []
+    for seed in range(3):
+        motion = resample(synthetic.synthesize(synthetic.STYLES[0], seconds=2.0, seed=seed), 20.0).slice(0, 40)
+        clips.append((f"clip_{seed}", motion, (f"a person walks {seed}",), ("train", "train", "test")[seed], str(seed)))
+    data = text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+    for name, preset in TINY.items():
+        monkeypatch.setitem(presets.PRESETS, name, preset)
+    made = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    files = {name: text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
+    teacher, student = (load_latent_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
+    assert load_latent_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
+    for model in (teacher, student):
+        for found, wanted in zip(
+            *map(jax.tree.leaves, (model.autoencoder_params, made.autoencoder_params)), strict=True
+        ):
+            np.testing.assert_array_equal(found, wanted)
+    assert (teacher.config.guidance_features, student.config.guidance_features) == (0, 256)
+    assert student.record["identity"]["training"]["num_phases"] == 2
+    # Finished models are read, and other settings are refused by name.
+    again = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))
+    with pytest.raises(ValueError, match="other training settings \\(batch_size\\) lies there"):
+        train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-VAE", folder=tmp_path, progress=False, batch_size=1)
+    # From noise to vectors of a frame, all numbers.
+    network, coder = network_with(made.config, made.params), network_with(made.autoencoder, made.autoencoder_params)
+    noise, text = jax.random.normal(jax.random.key(0), (2, 2, 3)), np.zeros((2, 8), np.float32)
+    latent = sample_student(network, made.schedule, text, noise, num_steps=2)
+    vectors = decode_latent(coder, made.statistics, latent, np.ones((2, 12), bool))
+    assert vectors.shape == (2, 12, 12 * data.skeleton.num_joints - 1) and np.isfinite(vectors).all()

@@ -1,0 +1,344 @@
+"""Training of MotionPCM: what each task asks, who learns from what, and a toy on which a student does learn."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from f3amd_lib.data.text_motions import ClipTable
+from f3amd_lib.diffusion.oracles import GaussianMixture
+from f3amd_lib.diffusion.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
+from f3amd_lib.diffusion.schedules import variance_preserving_betas
+from f3amd_lib.generation.latent_motion import sample_latent_student, sample_student, sample_teacher, teacher_prediction
+from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig, student_of
+from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.latent_motion import (
+    DistillationTask,
+    FrameStatistics,
+    LatentAutoencoderTask,
+    LatentMotionTraining,
+    LatentTable,
+    TeacherTask,
+    clip_error,
+    latent_motion_recipe,
+)
+from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
+
+SCHEDULE = variance_preserving_betas()
+SMALL = {"latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32, "dropout": 0.0}
+TEACHER = LatentDenoiserConfig(**SMALL, window=2, channels=3, text_width=4, time_features=16)
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def latents(**changes):
+    """Five clips with one caption or two, and the empty one."""
+    count = jnp.asarray([1, 2, 1, 2, 1])
+    table = LatentTable(
+        normal(0, 5, 2, 3), jnp.full((5, 2, 3), -20.0), jnp.cumsum(count) - count, count, normal(1, 7, 4), normal(2, 4)
+    )
+    return table._replace(**changes)
+
+
+def recipe(**settings):
+    return LatentMotionTraining(**{"num_steps": 4, "batch_size": 8, "warmup_steps": 0, "seed": 0, **settings})
+
+
+TEACHER_WEIGHTS = nnx.state(build_from_config(TEACHER, jax.random.key(5)))
+
+
+def distillation(**settings):
+    config = recipe(**{"ema_decay": 0.95, "num_phases": 2, **settings})
+    return DistillationTask(TEACHER, TEACHER_WEIGHTS, config, SCHEDULE, latents())
+
+
+TASK = distillation()
+
+
+@pytest.fixture(scope="module")
+def start():
+    return initial_state(TASK)
+
+
+@pytest.fixture(scope="module")
+def batch(start):
+    return jax.jit(lambda state: TASK.draw(state, jax.random.key(3)))(start)[0]
+
+
+# ------------------------------------------------------------------------------------------------------------- recipes
+
+
+def test_recipes_are_the_papers_and_the_presets():
+    student = latent_motion_recipe("student", 384_000, "MotionPCM-M4")
+    assert (student.batch_size, student.learning_rate, student.ema_decay, student.num_phases) == (128, 2e-4, 0.95, 4)
+    assert (student.skip, student.adversarial_weight, student.huber_width) == (100, 0.1, 0.5)
+    assert (student.least_guidance, student.most_guidance) == (5.0, 15.0)
+    assert latent_motion_recipe("teacher", 10).learning_rate == 1e-4
+    assert latent_motion_recipe("student", 10, "MotionPCM-M1-mu0").ema_decay == 0.0
+    lcm = latent_motion_recipe("student", 10, "MotionLCM-V2")
+    assert (lcm.consistency, lcm.adversarial_weight) == ("latent", 0.0)
+    with pytest.raises(ValueError, match="did you mean 'student'"):
+        latent_motion_recipe("studnt", 10)
+    for settings, message in (
+        ({"consistency": "phase"}, "did you mean 'phased'"),
+        ({"consistency": "latent"}, "no phases and no discriminator"),
+        ({"batch_size": 0}, "batch_size"), ({"least_guidance": 16.0}, "least_guidance"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            recipe(**settings)
+    with pytest.raises(ValueError, match="set ema_decay"):
+        DistillationTask(TEACHER, TEACHER_WEIGHTS, recipe(), SCHEDULE, latents())
+
+
+# --------------------------------------------------------------------------------------------------------- autoencoder
+
+
+def test_an_error_is_a_mean_over_numbers_then_frames_then_clips():
+    made, mask = jnp.zeros((2, 4, 3)), jnp.arange(4) < jnp.asarray([[4], [1]])
+    true = made.at[0].set(2.0).at[1, 0].set(0.5).at[1, 1:].set(1e3)
+    # 1.5 and 0.125; padding does not count, and a short clip counts as much as a long one.
+    assert clip_error(made, true, mask) == pytest.approx((1.5 + 0.125) / 2)
+    assert clip_error(made, made, mask) == 0.0
+
+
+@pytest.mark.slow
+def test_an_autoencoder_rehearses_and_hears_of_joints():
+    joints, frames = 2, 12  # 23 numbers a frame
+    clips = ClipTable(
+        normal(3, 3 * frames, 23), jnp.arange(3) * frames, jnp.full(3, frames), jnp.arange(3), jnp.ones(3, jnp.int32)
+    )
+    config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=12 * joints - 1, num_positions=40)
+    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    task = LatentAutoencoderTask(config, recipe(num_frames=16, learning_rate=1e-2, num_steps=60), clips, statistics)
+    state, history = optimise(task, chunk=30, progress=False)
+    assert history[1]["features"] < history[0]["features"] and history[1]["joints"] > 0
+    row = history[1]
+    assert row["loss"] == pytest.approx(row["features"] + row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------------- teacher
+
+
+def test_a_clips_captions_are_its_own_and_some_are_the_empty_one():
+    marked = latents(
+        mean=jnp.arange(5.0)[:, None, None] * jnp.ones((1, 2, 3)), pooled=jnp.arange(7.0)[:, None].repeat(4, 1)
+    )
+    marked = marked._replace(empty=jnp.full(4, -1.0))
+    task = TeacherTask(TEACHER, recipe(batch_size=512, text_dropout=0.25), SCHEDULE, marked)
+    (latent, text), _ = task.draw(None, jax.random.key(0))
+    owner, caption = (np.rint(np.asarray(column)).astype(int) for column in (latent[:, 0, 0], text[:, 0]))
+    assert np.mean(caption == -1) == pytest.approx(0.25, abs=0.06)
+    clip_of = np.array([0, 1, 1, 2, 3, 3, 4])
+    told = caption >= 0
+    np.testing.assert_array_equal(clip_of[caption[told]], owner[told])
+    assert set(caption) == {-1, *range(7)}
+
+
+# -------------------------------------------------------------------------------------------------------- distillation
+
+
+def test_what_is_asked_lies_in_its_phase(batch, start):
+    drawn = jax.jit(lambda key: TASK.questions(start.ema["student"], *TASK.clips.draw(key, 256), key))(
+        jax.random.key(1)
+    )
+    phases, edge = TASK.phases, np.asarray(drawn.edge)
+    assert set(np.asarray(drawn.time)) == set(phases.times) and set(edge) == {0, 499}
+    end = np.where(edge == 0, 499, 999)
+    for time in (drawn.time, drawn.critic_time):
+        assert ((edge <= time) & (time <= end)).all()
+    assert (5 <= drawn.guidance).all() and (drawn.guidance <= 15).all() and drawn.guidance.std() > 2
+    # Data come to the discriminator with noise of their own: at s they fit the marginal, and not the student's noise.
+    alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, drawn.time))
+    clean = TASK.clips.draw(jax.random.key(1), 256)[0]
+    noise = (drawn.state - alpha * clean) / sigma
+    alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, drawn.critic_time))
+    critics = np.asarray((drawn.real - alpha * clean) / sigma)
+    late = np.asarray(drawn.critic_time) > 100
+    assert critics[late].std() == pytest.approx(1.0, abs=0.1) and noise.std() == pytest.approx(1.0, abs=0.1)
+    assert abs(np.corrcoef(critics[late].ravel(), np.asarray(noise)[late].ravel())[0, 1]) < 0.1
+
+
+def test_a_target_is_the_guided_teachers_step_and_then_the_targets_jump(start):
+    """Algorithm 1, lines 9 and 10, worked out again point by point, with another target than the student."""
+    target = jax.tree.map(lambda leaf: 1.1 * leaf, start.params["student"])
+    latent, text = TASK.clips.draw(jax.random.key(1), 6)
+    drawn = TASK.questions(target, latent, text, jax.random.key(4))
+    teacher, follower = network_with(TEACHER, TEACHER_WEIGHTS), network_with(TASK.student_config, target)
+    for row in range(6):
+        one = functools.partial(jax.lax.dynamic_slice_in_dim, start_index=row, slice_size=1)
+        state, time, w = one(drawn.state), int(drawn.time[row]), float(drawn.guidance[row])
+        told, free = (teacher(state, time, teacher.encode(t)) for t in (one(text), TASK.clips.empty[None]))
+        before = max(time - 100, 0)
+        solved = jump(SCHEDULE, state, (1 + w) * told - w * free, time, before)
+        answer = follower(solved, before, follower.encode(one(text)), jnp.asarray([w]))
+        edge = int(drawn.edge[row])
+        wanted = solved if before <= edge else jump(SCHEDULE, solved, answer, before, edge)
+        np.testing.assert_allclose(one(drawn.target), wanted, rtol=2e-3, atol=2e-3)
+
+
+def test_each_player_learns_from_its_own_loss_alone(batch, start):
+    """Algorithm 1's signs: the student raises the score of what it makes; the heads lower it, and raise the data's."""
+    params, terms_of = start.params, lambda params: TASK.loss(params, None, batch, None)[1][0]
+    gradient, terms = jax.jit(jax.grad(lambda p: TASK.loss(p, None, batch, None)[0])), jax.jit(terms_of)
+    moved = gradient(params)
+    norm = lambda tree: float(np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(tree))))
+    only = lambda name: jax.jit(jax.grad(lambda p: terms_of(p)[name]))(params)
+    consistency, adversarial, critic = (only(name) for name in ("consistency", "adversarial", "discriminator"))
+    assert norm(critic["student"]) == norm(adversarial["discriminator"]) == norm(consistency["discriminator"]) == 0
+    assert norm(adversarial["student"]) > 0 and norm(consistency["student"]) > 0
+    wanted = jax.tree.map(lambda a, b: a + 0.1 * b, consistency["student"], adversarial["student"])
+    for found, expected in zip(
+        jax.tree.leaves(moved), [*jax.tree.leaves(critic["discriminator"]), *jax.tree.leaves(wanted)], strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    step = lambda branch, direction: {
+        **params, branch: jax.tree.map(lambda p, g: p - 1e-2 * g, params[branch], direction[branch])
+    }  # fmt: skip
+    before = terms(params)
+    assert terms(step("student", adversarial))["adversarial"] < before["adversarial"]
+    better = terms(step("discriminator", critic))
+    assert better["discriminator"] < before["discriminator"] and better["adversarial"] > before["adversarial"]
+
+
+def test_the_loop_keeps_the_target_and_trains_both_and_resumes(start, tmp_path):
+    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (start.params, start.ema)), strict=True))
+    keep = jax.tree.map(jnp.copy, start)
+    state, terms = advance(TASK, jax.tree.map(jnp.copy, start), 1)
+    follow_up = jax.tree.map(lambda old, new: 0.95 * old + 0.05 * new, keep.ema, state.params)
+    for found, wanted in zip(jax.tree.leaves(state.ema), jax.tree.leaves(follow_up), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
+    for branch in ("student", "discriminator"):
+        changed = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), state.params[branch], keep.params[branch])
+        assert max(jax.tree.leaves(changed)) > 1e-5, branch
+    assert set(terms) == {"loss", "consistency", "adversarial", "discriminator"}
+    save_state(tmp_path / "student", TASK, state)
+    again = restore_state(tmp_path / "student", TASK)
+    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, state.params)), strict=True))
+    with pytest.raises(ValueError, match=r"training settings \(skip\)"):
+        restore_state(tmp_path / "student", distillation(skip=50))
+
+
+@pytest.mark.slow
+def test_players_may_learn_by_turns(start):
+    task = distillation(alternate=True, warmup_steps=1)
+    state = initial_state(task)
+    for learner in ("discriminator", "student", "discriminator"):
+        before = jax.tree.map(jnp.copy, state.params)
+        state, _ = advance(task, state, 1)
+        for branch in before:
+            same = all(
+                (a == b).all()
+                for a, b in zip(*map(jax.tree.leaves, (before[branch], state.params[branch])), strict=True)
+            )
+            assert same == (branch != learner)
+
+
+def test_latent_consistency_is_distilled_without_phases():
+    task = distillation(consistency="latent", num_phases=1, adversarial_weight=0.0)
+    state = initial_state(task)
+    assert set(state.params) == {"student"}
+    drawn = task.questions(state.ema["student"], *task.clips.draw(jax.random.key(1), 8), jax.random.key(4))
+    assert not drawn.edge.any()
+    loss, (terms, _) = task.loss(state.params, None, drawn, None)
+    student = network_with(task.student_config, state.params["student"])
+    eps = student(drawn.state, drawn.time, student.encode(drawn.text), drawn.guidance)
+    end = latent_consistency_end(SCHEDULE, drawn.state, eps, drawn.time)
+    wanted = np.sqrt((end - drawn.target) ** 2 + 0.25) - 0.5
+    assert loss == pytest.approx(float(wanted.mean()), rel=1e-4) and set(terms) == {"loss", "consistency"}
+
+
+# ----------------------------------------------------------------------------------------------------------------- toy
+
+
+MIXTURE = GaussianMixture([-1.0, 0.6], 0.15, [0.4, 0.6])
+TOY = LatentDenoiserConfig(
+    latent_width=32, depth=3, num_heads=2, hidden_width=64, dropout=0.0, window=1, channels=1, text_width=2,
+    time_features=32, num_positions=3,
+)  # fmt: skip
+
+
+def toy_table():
+    points = jnp.asarray(MIXTURE.sample(np.random.default_rng(0), 4096), jnp.float32)[:, None]
+    ones = jnp.ones(4096, jnp.int32)
+    return LatentTable(points, jnp.full_like(points, -30.0), 0 * ones, ones, jnp.zeros((1, 2)), jnp.zeros(2))
+
+
+def answers(config, params, guidance):
+    network = network_with(config, params)
+    context = lambda z: network.encode(jnp.zeros((len(z), 2)))
+    return lambda z, time: network(z, time, context(z), guidance)
+
+
+@pytest.fixture(scope="module")
+def toys():
+    """By seed: a teacher, and a student of it for each M."""
+    made = {}
+    for seed in range(3):
+        config = LatentMotionTraining(1500, 256, 3e-3, 100, seed=seed, ema_decay=0.99)
+        teacher = optimise(TeacherTask(TOY, config, SCHEDULE, toy_table()), chunk=1500, progress=False)[0].averaged
+        students = {}
+        for num_phases in (1, 2, 4):
+            settings = {"num_phases": num_phases, "adversarial_weight": 0.0, "ema_decay": 0.95, "huber_width": 0.05}
+            config = LatentMotionTraining(1500, 256, 1e-3, 50, seed=seed, **settings)
+            task = DistillationTask(TOY, teacher, config, SCHEDULE, toy_table())
+            students[num_phases] = optimise(task, chunk=1500, progress=False)[0].params["student"], task.student_config
+        made[seed] = teacher, students
+    return made
+
+
+@pytest.mark.slow
+def test_students_learn_where_the_flow_goes(toys):
+    """Over three seeds a student of M steps ends near the exact flow, its teacher in one step does not."""
+    noise = normal(11, 512, 1, 1)
+    alpha, sigma = shares(SCHEDULE, np.array([999, 0]), np)
+    exact = alpha[1] * MIXTURE.flow(np.asarray(noise)[:, 0] / alpha[0], *(sigma / alpha))[:, None]
+    error = lambda made: float(np.mean(np.abs(np.asarray(made) - exact)))
+    rows = []
+    for teacher, students in toys.values():
+        predict = answers(TOY, teacher, None)
+        row = {steps: error(follow(predict, SCHEDULE, noise, ddim_times(1000, steps))) for steps in (1, 10)}
+        for num_phases, (params, config) in students.items():
+            visited = cut_phases(1000, 100, num_phases).visited
+            row[f"M{num_phases}"] = error(follow(answers(config, params, 10.0), SCHEDULE, noise, visited))
+        rows.append(row)
+    table = {name: [row[name] for row in rows] for name in rows[0]}
+    print({name: np.round(values, 3).tolist() for name, values in table.items()})
+    for name in ("M1", "M2", "M4"):
+        assert np.mean(table[name]) < 0.5 * np.mean(table[1]), name
+        assert max(table[name]) < min(table[1]), name
+
+
+# ------------------------------------------------------------------------------------------------------------ sampling
+
+
+def test_samples_are_calls_of_the_network_at_the_papers_times():
+    student = student_of(network_with(TEACHER, TEACHER_WEIGHTS), jax.random.key(0))
+    student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
+    text, noise, empty = normal(1, 3, 4), normal(2, 3, 2, 3), normal(4, 4)
+    context, told = student.encode(text), jnp.full(3, 14.0)
+    state = noise
+    for time, edge in ((999, 499), (499, 0)):
+        state = jump(SCHEDULE, state, student(state, time, context, told), time, edge)
+    made = sample_student(student, SCHEDULE, text, noise, num_steps=2)
+    np.testing.assert_allclose(made, state, atol=1e-4)
+    assert np.abs(sample_student(student, SCHEDULE, text, noise, num_steps=2, guidance=5.0) - made).max() > 1e-3
+    teacher = network_with(TEACHER, TEACHER_WEIGHTS)
+    ask = lambda text: teacher(noise, 999, teacher.encode(text))
+    wanted = jump(SCHEDULE, noise, 7.5 * ask(text) - 6.5 * ask(jnp.stack([empty] * 3)), 999, 0)
+    np.testing.assert_allclose(
+        sample_teacher(teacher, SCHEDULE, text, empty, noise, num_steps=1), wanted, rtol=1e-3, atol=1e-3
+    )
+    plain = teacher_prediction(teacher, text, empty, 0.0)(noise, 999)
+    np.testing.assert_allclose(plain, ask(text), atol=1e-6)
+    # The teacher's leading rule asks what is left of noise at the lowest level.
+    leading = sample_teacher(teacher, SCHEDULE, text, empty, noise, num_steps=1, guidance=0.0, spacing="leading")
+    np.testing.assert_allclose(leading, jump(SCHEDULE, noise, teacher(noise, 1, teacher.encode(text)), 1, 0), atol=1e-4)
+    one = sample_latent_student(student, SCHEDULE, text, noise, jax.random.key(1), guidance=7.0)
+    asked = student(noise, 799, context, jnp.full(3, 7.0))
+    np.testing.assert_allclose(one, latent_consistency_end(SCHEDULE, noise, asked, 799), atol=1e-4)

@@ -1,0 +1,341 @@
+"""Models of text to motion as files, their training by name, and the command that makes motion of a caption."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_text_judge import OneVectorAWord
+
+from f3amd_lib.__main__ import main
+from f3amd_lib.data import text_encoders
+from f3amd_lib.data.text_motions import text_motions
+from f3amd_lib.diffusion.schedules import straight
+from f3amd_lib.generation import told_motion
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.bvh import read_bvh
+from f3amd_lib.motion.skeleton import resample
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.presets import Preset
+from f3amd_lib.training import text_models
+from f3amd_lib.training.checkpoints import describe
+from f3amd_lib.training.text_models import (
+    controlled_joints,
+    find_text_model,
+    load_text_model,
+    save_text_model,
+    train_text_model,
+)
+
+STYLES = synthetic.STYLES[:2]
+SIZES = {"latent_width": 16, "depth": 1, "num_heads": 2, "channels": 3, "window": 40}
+LATENT = {**SIZES, "channels": 4, "window": 8}
+TINY = {
+    "tiny": Preset("tiny", "acmdm", "ACMDM", straight(), SIZES, {}, "ours"),
+    "tiny-AE": Preset(
+        "tiny-AE", "acmdm", "motion autoencoder", straight(), {"width": 8, "dilations": (1,)}, {}, "ours"
+    ),
+    "tiny-prefix": Preset(
+        "tiny-prefix", "acmdm", "ACMDM", straight(), LATENT, {"prefix_frames": 3}, "ours", latent="tiny-AE"
+    ),
+}
+QUIET = {"progress": False, "batch_size": 2}
+PROFILE = load_profile("smoke", "bandai", train_steps=3)
+ENCODER = OneVectorAWord()
+
+
+@pytest.fixture(scope="module")
+def data():
+    clips = []
+    for style in STYLES:
+        for seed in range(6):
+            motion = resample(synthetic.synthesize(style, seconds=3.2, seed=seed), 20.0).slice(0, 64)
+            split = ("test", "validation", "train")[min(seed, 2)]
+            clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
+    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+
+
+@pytest.fixture(scope="module")
+def folder(data, tmp_path_factory):
+    """A folder in which all of the tiny models were trained."""
+    folder = tmp_path_factory.mktemp("text")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("F3AMD_CACHE_DIR", str(folder / "cache"))
+        for name, preset in TINY.items():
+            patch.setitem(presets.PRESETS, name, preset)
+        for name in ("tiny+control", "tiny-prefix"):
+            assert train_text_model(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
+        yield folder / "models"
+
+
+def load(folder, name):
+    return load_text_model(folder / f"{name}.safetensors")
+
+
+def same(one, other):
+    return all(jax.tree.leaves(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), one, other)))
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+def test_a_name_trains_what_it_stands_on_and_files_are_whole(folder, data):
+    base, controlled, prefix, codec = (
+        load(folder, name) for name in ("tiny", "tiny+control", "tiny-prefix", "tiny-AE")
+    )
+    assert (codec.config, base.branch, base.starts) == (None, None, {})
+    assert same(controlled.params, base.params) and controlled.branch is not None
+    assert prefix.codec.autoencoder == codec.codec.autoencoder and same(prefix.codec.params, codec.codec.params)
+    assert prefix.skeleton == data.skeleton and prefix.fps == data.fps
+    assert (prefix.config.window, prefix.config.text_width, prefix.config.num_joints) == (8, 8, 23)
+    np.testing.assert_allclose(base.codec.axes.mean, data.normaliser().mean)
+    assert set(base.words) == {"a", "person", "walks", *(style.lower() for style in STYLES)}
+    assert prefix.text_encoder == ENCODER.identity and prefix.record["dataset_credit"] == "nobody"
+    # The first 3 frames of the latent of the first training clip of each style.
+    assert list(prefix.starts) == [f"a person walks {style}" for style in STYLES]
+    clip = prefix.codec.axes.normalise(data.clip(2)[None, :12])
+    np.testing.assert_allclose(
+        prefix.starts[f"a person walks {STYLES[0]}"], prefix.codec.encode(clip, np.ones((1, 12), bool))[0], atol=0.05
+    )
+
+
+def test_models_come_back_from_their_files(folder, tmp_path):
+    for name in ("tiny+control", "tiny-prefix", "tiny-AE"):
+        trained = load(folder, name)
+        save_text_model(tmp_path / "exact", trained, jnp.float32)
+        again = load_text_model(tmp_path / "exact")
+        for what in ("params", "branch", "starts"):
+            assert same(getattr(again, what), getattr(trained, what))
+        assert same(again.codec, trained.codec)
+        for what in ("name", "config", "skeleton", "fps", "words", "text_encoder", "record", "schedule"):
+            assert getattr(again, what) == getattr(trained, what)
+        save_text_model(tmp_path / "small", trained, jnp.int8)
+        small = load_text_model(tmp_path / "small")
+        for one, other in zip(jax.tree.leaves(small.params), jax.tree.leaves(trained.params), strict=True):
+            np.testing.assert_allclose(one, other, atol=0.01 * float(jnp.abs(other).max()) + 1e-6)
+    assert describe(tmp_path / "small")["weights"] == "int8"
+
+
+def test_other_files_are_refused(folder, tmp_path):
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes((folder / "tiny.safetensors").read_bytes()[:-9])
+    for path, words in ((cut, "not a whole safetensors"), (folder / "tiny.state.safetensors", "not a text-to-motion")):
+        with pytest.raises(ValueError, match=words):
+            load_text_model(path)
+    with pytest.raises(ValueError, match=r"tiny has no control branch.*train --preset tiny\+control"):
+        load(folder, "tiny").control_branch()
+
+
+# ------------------------------------------------------------------------------------------------------------- training
+
+
+def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(folder, data, tmp_path):
+    train = lambda **leg: train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, **QUIET, **leg)
+    assert train(stop_at=0.0) is None
+    assert describe(tmp_path / "tiny.state.safetensors")["part"] == "text and motion"
+    assert same(train().params, load(folder, "tiny").params)
+
+
+def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(folder, data):
+    before = (folder / "tiny.safetensors").read_bytes()
+    train = lambda profile: train_text_model(data, ENCODER, profile, "tiny", folder=folder, **QUIET)
+    assert same(train(PROFILE).params, load(folder, "tiny").params)
+    with pytest.raises(ValueError, match=r"training settings \(seed\) lies there.*--out"):
+        train(dataclasses.replace(PROFILE, seed=5))
+    assert (folder / "tiny.safetensors").read_bytes() == before
+
+
+def test_a_branch_stands_beside_a_finished_model_of_any_settings_but_of_the_same_data(folder, data, tmp_path):
+    (tmp_path / "tiny.safetensors").write_bytes((folder / "tiny.safetensors").read_bytes())
+    train = lambda data: train_text_model(
+        data, ENCODER, dataclasses.replace(PROFILE, seed=5), "tiny+control", folder=tmp_path, stop_at=0.0, **QUIET
+    )
+    assert train(data) is None  # begun, and not refused
+    with pytest.raises(ValueError, match=r"tiny.safetensors: was trained on other data.*--out"):
+        train(data.select(range(1, data.num_clips)))
+
+
+def test_positions_do_not_train_a_preset_of_other_channels(folder, data, monkeypatch):
+    wrong = dataclasses.replace(TINY["tiny"], name="wrong", network=SIZES | {"channels": 13})
+    monkeypatch.setitem(presets.PRESETS, "wrong", wrong)
+    with pytest.raises(ValueError, match="wrong models 13 numbers a joint; positions have 3"):
+        train_text_model(data, ENCODER, PROFILE, "wrong", folder=folder, **QUIET)
+
+
+def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
+    monkeypatch.setattr(text_models, "runs_dir", lambda *_: folder.parent)
+    (folder.parent / "text").symlink_to(folder)
+    assert find_text_model("bandai", "tiny").name == "tiny.safetensors"
+    assert find_text_model("bandai").name in ("tiny.safetensors", "tiny-prefix.safetensors")
+    assert find_text_model("bandai", control=True).name == "tiny+control.safetensors"
+    with pytest.raises(ValueError, match=r"no trained ACMDM-S-PS22 .*f3amd train --preset ACMDM-S-PS22 --data bandai"):
+        find_text_model("bandai", "ACMDM-S-PS22")
+
+
+def test_only_data_with_captions_open():
+    with pytest.raises(ValueError, match="data set 'synthetic' has no captions"):
+        text_models.open_text_motions("synthetic")
+    with pytest.raises(ValueError, match="needs --source"):
+        text_models.open_text_motions("folder")
+
+
+# ---------------------------------------------------------------------------------------------------------- told motion
+
+
+def test_lengths_and_seeds(folder):
+    trained, pooled = load(folder, "tiny"), np.ones((2, 8), np.float32)
+    made = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
+    assert made.shape == (2, 32, 23, 3) and not made[0, 24:].any() and made[1, 31].any()
+    again = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
+    other = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(1), num_steps=2)
+    np.testing.assert_array_equal(made, again)
+    assert np.abs(made - other).max() > 0.01
+
+
+def test_the_model_is_told_the_caption_and_the_control_in_its_own_units(folder, monkeypatch):
+    trained, seen = load(folder, "tiny+control"), {}
+
+    def sample(base, branch, schedule, condition, control, noise, **told):
+        seen.update(condition=condition, control=control, told=told)
+        return control.positions
+
+    monkeypatch.setattr(told_motion, "sample_control", sample)
+    points = np.array([[0.1, 1.2, 0.3], [0.4, 0.9, 0.6]])
+    wrist = controlled_joints(trained.skeleton)["left_wrist"]
+    control = told_motion.control_of(trained, wrist, [3, 20], points, 24)
+    pooled = np.arange(8, dtype=np.float32)[None]
+    made = told_motion.motions_told(
+        trained, pooled, 24, jax.random.key(0), guidance=2.0, num_steps=5, control=control
+    )  # fmt: skip
+    np.testing.assert_allclose(made[0, [3, 20], wrist], points, atol=1e-5)  # metres in, metres out
+    assert float(control.asked.sum()) == 2.0 and (seen["condition"].pooled == pooled).all()
+    assert {"text_scale": 2.0, "num_steps": 5, "sampler": "ddim"}.items() <= seen["told"].items()
+
+
+@pytest.mark.parametrize("name", ["tiny-prefix", "raw"])
+def test_a_stream_goes_straight_on_wherever_it_walks(folder, name, monkeypatch):
+    """An oracle in the network's place walks on by the step that it sees: so must the stream, in a straight line."""
+    trained = load(folder, "tiny-prefix")
+    if name == "raw":
+        line = trained.skeleton.offsets + np.linspace(0, 1.1, 12)[:, None, None] * [1.0, 0.0, 0.5] + [0.0, 1.0, 0.0]
+        raw = load(folder, "tiny")
+        start = raw.codec.axes.normalise(line).astype(np.float32)
+        trained = dataclasses.replace(raw, starts={"a person walks": start})
+    captions = []
+
+    def go_on(network, schedule, prefix, told, key, **asked):
+        captions.append(told[0])
+        steps = 1.0 + jnp.arange(network.config.window - prefix.shape[1])[:, None, None]
+        yield prefix[:, -1:] + steps * (prefix[:, -1:] - prefix[:, -2:-1])
+
+    monkeypatch.setattr(told_motion, "continue_prefix", go_on)
+    pooled = np.eye(8, dtype=np.float32)[:2]
+    positions = told_motion.stream_told(trained, pooled, [1, 2], jax.random.key(0))
+    first = 12
+    assert len(positions) == first + 3 * told_motion.window_frames(trained)
+    if name == "raw":
+        step = np.diff(positions[:, 0], axis=0)
+        np.testing.assert_allclose(step, np.tile(step[0], (len(step), 1)), atol=1e-4)
+        np.testing.assert_allclose(positions[:first], line, atol=1e-5)
+
+
+def test_a_stream_begins_near_its_first_caption(folder):
+    trained = load(folder, "tiny-prefix")
+    starts = np.eye(8, dtype=np.float32)[:2]
+    many = {f"far {k}": trained.starts["a person walks ArmsCrossed"] + 9.0 for k in range(9)}
+    near = dataclasses.replace(trained, starts={**trained.starts, **many})
+    starts = np.concatenate([starts, -np.ones((9, 8), np.float32)])
+    for seed in range(3):
+        made = told_motion.stream_told(near, starts[:1], [0], jax.random.key(seed), starts=starts[:, :])
+        assert len(made) == 12
+    with pytest.raises(ValueError, match="a stream needs the prefix form: --model ACMDM-n4-PS22-prefix"):
+        told_motion.stream_told(load(folder, "tiny"), starts[:1], [1], jax.random.key(0))
+    with pytest.raises(ValueError, match="goes on from earlier frames"):
+        told_motion.motions_told(trained, starts[:1], 24, jax.random.key(0))
+
+
+# --------------------------------------------------------------------------------------------------------- command line
+
+
+@pytest.fixture
+def f3amd(folder, tmp_path, monkeypatch, capsys):
+    """Run `f3amd text` with the tiny models; return (status, last line of the errors)."""
+    monkeypatch.setattr(text_encoders, "load_text_encoder", lambda *_: ENCODER)
+    monkeypatch.setenv("F3AMD_CACHE_DIR", str(tmp_path / "cache"))
+
+    def run(*words, model="tiny"):
+        weights = str(folder / f"{model}.safetensors")
+        status = main(["text", *words, "--weights", weights, "--steps", "2", "--out", str(tmp_path / "out")])
+        return status, capsys.readouterr().err
+
+    return run
+
+
+def test_text_writes_four_files_that_say_the_same_and_overwrites_none(f3amd, tmp_path, data, caplog):
+    caplog.set_level("INFO")
+    assert f3amd("a person walks ArmsCrossed", "--seconds", "1.2", "--guidance", "1") == (0, "")
+    files = sorted((tmp_path / "out").iterdir())
+    assert [file.name for file in files] == [
+        f"a-person-walks-armscrossed_seed0.{end}" for end in ("bvh", "gif", "html", "png")
+    ]
+    motion = read_bvh(files[0])
+    assert (motion.num_frames, motion.fps) == (24, pytest.approx(20.0))
+    np.testing.assert_allclose(motion.skeleton.offsets[1:], data.skeleton.offsets[1:], atol=1e-4)
+    assert "cm on average" in caplog.text and "nobody" in files[2].read_text(encoding="utf-8")
+    before = [file.read_bytes() for file in files]
+    status, error = f3amd("a person walks ArmsCrossed", "--seconds", "1.2")
+    assert status == 2 and "exists already; pass --overwrite" in error
+    assert [file.read_bytes() for file in files] == before
+
+
+def test_text_with_a_control_tells_how_far_the_joint_is(f3amd, tmp_path, caplog):
+    caplog.set_level("INFO")
+    path = tmp_path / "path.csv"
+    path.write_text("frame,x,y,z\n0,0,1,0\n23,0,1,1\n")
+    words = ("a person walks", "--seconds", "1.2", "--control", str(path), "--joint", "left_wrist")
+    assert f3amd(*words, model="tiny+control") == (0, "")
+    assert "left_wrist is" in caplog.text
+
+
+def test_text_streams_captions(f3amd, tmp_path):
+    words = ("a person walks ArmsCrossed", "--then", "a person walks ArmsCrossed", "--seconds", "1")
+    assert f3amd(*words, model="tiny-prefix") == (0, "")
+    motion = read_bvh(next((tmp_path / "out").glob("*.bvh")))
+    assert motion.num_frames == 12 + 2 * 20  # a window adds 5 frames of the latent
+
+
+CONTROL = ("a person walks", "--seconds", "1.2", "--control", "CSV")
+
+
+@pytest.mark.parametrize(
+    "words, model, csv, wanted",
+    [
+        (("",), "tiny", None, "caption 1 of 1 is empty; say what the person does"),
+        (("a person walks", "--then", " "), "tiny-prefix", None, "caption 2 of 2 is empty"),
+        (("a person wallks",), "tiny", None, "the model never saw 'wallks'; did you mean 'walks'?"),
+        (("a person walks", "--seconds", "9"), "tiny", None, "--seconds must be between 1.2 and 2 for tiny, got 9"),
+        (("a person walks", "--seconds", "nan"), "tiny", None, "--seconds must be between 1.2 and 2"),
+        (("a person walks", "--seconds", "-1"), "tiny-prefix", None, "--seconds of a stream must be over 0"),
+        (("a person walks", "--guidance", "99"), "tiny", None, "--guidance must be between 0 and 20, got 99"),
+        (("a person walks", "--then", "a person walks"), "tiny", None, "a stream needs the prefix form"),
+        (("a person walks", "--then", "a person walks", "--control", "x.csv"), "tiny", None, "leave out --then"),
+        (CONTROL, "tiny", "frame,x,y,z\n0,0,1,0\n", "tiny has no control branch"),
+        (CONTROL, "tiny+control", "frame,x,z\n0,0,1\n", "CSV: line 1: the header must be frame,x,y,z, it is frame,x,z"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n", "needs at least one row"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n0,0,1,0\n24,0,1,0\n", "line 3: frame 24 is not one of the clip's"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,1,0\n3,0,1,0\n", "line 3: frame 3 comes twice"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,one,0\n", "line 2: '3,0,one,0' is not four numbers"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,inf,0\n", "line 2: '3,0,inf,0' is not four finite numbers"),
+        ((*CONTROL, "--joint", "left_wirst"), "tiny+control", "frame,x,y,z\n3,0,1,0\n", "did you mean 'left_wrist'?"),
+    ],
+)
+def test_text_refuses_in_one_line_what_it_cannot_do(f3amd, tmp_path, words, model, csv, wanted):
+    path = tmp_path / "path.csv"
+    if csv is not None:
+        path.write_text(csv)
+    status, error = f3amd(*(str(path) if word == "CSV" else word for word in words), model=model)
+    assert status == 2 and error.count("\n") == 1
+    assert wanted.replace("CSV", str(path)) in error
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,133 @@
+"""Tables of text to motion, rehearsed at the smallest size: trained, measured, kept, and read by the ledger."""
+
+import time
+
+import numpy as np
+import pytest
+from test_text_models import ENCODER, PROFILE, TINY
+
+from f3amd_lib.data.text_motions import text_motions
+from f3amd_lib.experiments import text_tables
+from f3amd_lib.experiments.text_tables import TABLES, asked_frames, measure_text_table
+from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures.text_metrics import control_errors
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.skeleton import resample
+from f3amd_lib.networks import presets
+from f3amd_lib.reports import claims
+from f3amd_lib.reports.evidence import SCHEMAS
+from f3amd_lib.training import text_models
+
+QUIET = {"progress": False}
+PLAIN, PREFIX = {"model": "ACMDM-S-PS22", "trained": "tiny"}, {"model": "ACMDM-S-PS2-prefix", "trained": "tiny-prefix"}
+SECTIONS = ("trained on all joints", "noise optimisation", "upper-body edit")
+ROWS = {
+    "text_table1": [{"model": "ACMDM-S-PS22-raw", "trained": "tiny"}],
+    "text_tableA1": [PLAIN | {"cfg": "yes"}, PLAIN | {"cfg": "no"}],
+    "text_table3": [PLAIN | {"section": section} for section in SECTIONS],
+    "text_tableA5": [
+        PREFIX | {"first_prefix": "generated", "first": "tiny"},
+        PREFIX | {"first_prefix": "ground truth"},
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data():
+    clips = []
+    for style in synthetic.STYLES[:2]:
+        for seed in range(6):
+            motion = resample(synthetic.synthesize(style, seconds=2.0, seed=seed), 20.0).slice(0, 40)
+            split = ("test", "test", "validation", "train")[min(seed, 3)]
+            clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
+    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+
+
+@pytest.fixture(scope="module")
+def tables(data, tmp_path_factory):
+    """All tables, of tiny models; (folder of results, table -> rows)."""
+    root = tmp_path_factory.mktemp("tables")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("F3AMD_CACHE_DIR", str(root / "cache"))
+        patch.setenv("F3AMD_RESULTS_DIR", str(root / "results"))
+        for name, preset in TINY.items():
+            patch.setitem(presets.PRESETS, name, preset)
+        made = {}
+        for name, rows in ROWS.items():
+            path = measure_text_table(name, data, ENCODER, PROFILE, folder=root / "models", rows=rows, **QUIET)
+            made[name] = read_table(path)[0]
+            if name == "text_table1":
+                # What is measured is not measured again, and a leg without time stops before the next row.
+                before = path.read_bytes()
+                patch.setattr(text_tables, "KINDS", {})
+                again = measure_text_table(name, data, ENCODER, PROFILE, folder=root / "models", rows=rows, **QUIET)
+                assert again == path and path.read_bytes() == before
+                patch.undo()
+                patch.setenv("F3AMD_CACHE_DIR", str(root / "cache"))
+                patch.setenv("F3AMD_RESULTS_DIR", str(root / "results"))
+                for tiny, preset in TINY.items():
+                    patch.setitem(presets.PRESETS, tiny, preset)
+        over = {"stop_at": time.monotonic() - 1.0, **QUIET}
+        assert measure_text_table("text_table1", data, ENCODER, PROFILE, folder=root / "other", **over) is None
+        yield made
+
+
+@pytest.mark.slow
+def test_every_table_has_the_columns_that_the_ledger_reads(tables):
+    for name, table in tables.items():
+        keys = list(SCHEMAS[name])
+        assert set(keys) <= set(table) and not table.duplicated(keys).any()
+        assert {"trained", "windows", "weights"} <= set(table)
+        # 3 steps of the recipe's batch.
+        assert set(table["windows"]) == {3 * 64}
+        assert np.isfinite(table["value"]).all()
+
+
+@pytest.mark.slow
+def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
+    table = tables["text_table3"].set_index(["section", "joint", "metric"])["value"]
+    for section in ("trained on all joints", "noise optimisation"):
+        errors = table[section].xs("control_average_error", level="metric")
+        assert len(errors) == 1 + 6 and errors["average"] == pytest.approx(errors.drop("average").mean())
+        assert table[section, "average", "sampling_seconds"] > 0
+    assert "text_FID" in table["upper-body edit", "pelvis and feet"].index
+
+
+@pytest.mark.slow
+def test_guidance_and_first_frames_arrive(tables):
+    one, other = (part["value"].to_numpy() for _, part in tables["text_tableA1"].groupby("cfg"))
+    assert not np.array_equal(one, other)  # three steps of training: the text hardly matters yet
+    one, other = (part["value"].to_numpy() for _, part in tables["text_tableA5"].groupby("first_prefix"))
+    assert not np.array_equal(one, other)
+
+
+def test_asked_frames_are_so_many_of_the_true_length():
+    generator = np.random.default_rng(0)
+    assert asked_frames(generator, [40, 24], 5).sum(axis=1).tolist() == [5, 5]
+    assert asked_frames(generator, [40, 24], 0.25).sum(axis=1).tolist() == [10, 6]
+    whole = asked_frames(generator, [40, 24], 1.0)
+    assert whole.sum(axis=1).tolist() == [40, 24] and not whole[1, 24:].any()
+    assert asked_frames(generator, [3], 5).sum() == 3
+
+
+def test_true_motion_has_no_control_error_and_a_moved_one_has_it(data):
+    """The measure that the rows rest on, both ways."""
+    true = data.clip(0)[None]
+    asked = asked_frames(np.random.default_rng(0), [40], 5)[..., None] & (np.arange(true.shape[2]) == 0)
+    assert control_errors(true, true, asked)["control_average_error"] == 0.0
+    assert control_errors(true + [0.6, 0, 0], true, asked)["control_location_error"] == 1.0
+
+
+def test_the_files_rows_name_presets_columns_and_commands():
+    about = load_paper_file("experiments", "acmdm")
+    assert set(TABLES) == {name for name in about if name != "settings"} == set(ROWS)
+    typed = " ".join(run for runs in claims.load_commands("acmdm").values() for run in runs)
+    for name in TABLES:
+        assert f"f3amd measure {name} " in typed
+        for row in about[name]["rows"]:
+            assert text_models.is_text_preset(row["trained"]) and presets.find_preset(row["model"])
+            assert {*row} - {"trained", "first"} == set(SCHEMAS[name]) - {"metric", "joint"}
+    # One autoencoder size and one number of blocks within a table, but where blocks are what is compared.
+    depths = {presets.find_preset(row["trained"]).network["depth"] for row in about["text_table1"]["rows"]}
+    assert depths == {3}

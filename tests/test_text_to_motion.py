@@ -1,0 +1,176 @@
+"""From noise and a caption to a state: guidance, control, and three ways to go on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from test_acmdm import BATCH, condition, config_of, fresh, normal, stirred
+
+from f3amd_lib.diffusion.flow import solve
+from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
+from f3amd_lib.generation.text_to_motion import (
+    continue_prefix,
+    control_prediction,
+    sample_blocks,
+    sample_control,
+    sample_masked,
+    sample_text,
+    text_prediction,
+    with_guidance,
+)
+from f3amd_lib.networks.acmdm_control import Control, control_branch, controlled
+from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
+
+SCHEDULE, NOISE = straight(), normal(1, BATCH, 8, 5, 4)
+EULER = {"sampler": "ddim", "num_steps": 2}
+TOLD = condition((8, 6))
+
+
+@pytest.fixture(scope="module")
+def network():
+    return stirred(fresh(config_of(depth=1)))
+
+
+def test_guidance_of_one_is_the_condition_and_of_zero_none(network):
+    text = lambda told: text_prediction(network, told)
+    time = jnp.asarray([0.2, 0.6])
+    told, free = text(TOLD)(NOISE, time), text(TOLD.without_text())(NOISE, time)
+    np.testing.assert_array_equal(with_guidance(text, TOLD, 1.0)(NOISE, time), told)
+    np.testing.assert_allclose(with_guidance(text, TOLD, 0.0)(NOISE, time), free, atol=1e-6)
+    np.testing.assert_allclose(with_guidance(text, TOLD, 3.0)(NOISE, time), free + 3.0 * (told - free), atol=1e-4)
+    assert float(jnp.abs(told - free).max()) > 1e-3
+
+
+def test_control_guidance_of_one_and_one_is_the_controlled_network(network):
+    branch = stirred(control_branch(network, 4, jax.random.key(2)), 4)
+    control = Control.of(normal(3, BATCH, 32, 5, 3), jnp.zeros((BATCH, 32, 5)).at[:, 3, 1].set(1.0))
+    time = jnp.asarray([0.2, 0.6])
+    full = controlled(network, branch, TOLD, control)(NOISE, time)
+    once = control_prediction(network, branch, TOLD, control, 1.0, 1.0)(NOISE, time)
+    np.testing.assert_allclose(once, full, atol=1e-6)
+    no_text = controlled(network, branch, TOLD.without_text(), control)(NOISE, time)
+    no_control = controlled(network, branch, TOLD, control.dropped())(NOISE, time)
+    wanted = full + 1.5 * (full - no_text) + 0.75 * (full - no_control)
+    pushed = control_prediction(network, branch, TOLD, control)(NOISE, time)
+    np.testing.assert_allclose(pushed, wanted, atol=1e-3)
+    state = sample_control(network, branch, SCHEDULE, TOLD, control, NOISE, sampler="ddim", num_steps=1)
+    # One Euler step from the noise along the velocity there.
+    start = control_prediction(network, branch, TOLD, control)(NOISE, jnp.zeros(BATCH))
+    wanted = (NOISE + start) * TOLD.mask[..., None, None]
+    np.testing.assert_allclose(state, wanted, atol=1e-3)
+
+
+def test_whole_motions_are_zero_in_padding_and_an_untrained_network_leaves_the_noise():
+    untrained = fresh(config_of(depth=1))
+    state = sample_text(untrained, SCHEDULE, TOLD, NOISE, **EULER)
+    np.testing.assert_allclose(state, NOISE * TOLD.mask[..., None, None], atol=1e-6)  # a velocity of 0
+    assert not np.any(state[1, 6:])
+
+
+def test_both_solvers_follow_one_flow(network):
+    """A weak network, so that two hundred steps of Euler are close."""
+    weak = nnx.merge(nnx.graphdef(network), jax.tree.map(lambda leaf: 0.5 * leaf, nnx.state(network)))
+    exact = sample_text(weak, SCHEDULE, TOLD, NOISE, guidance=1.0)
+    steps = sample_text(weak, SCHEDULE, TOLD, NOISE, guidance=1.0, sampler="ddim", num_steps=200)
+    np.testing.assert_allclose(steps, exact, atol=0.02)
+    assert float(jnp.abs(exact - NOISE * TOLD.mask[..., None, None]).max()) > 0.1
+
+
+def test_other_objectives_go_by_their_schedule_and_key():
+    x0, levels = normal(5, BATCH, 8, 5, 4), variance_preserving_betas(50, 0.002, 0.4, power=1)
+    state = solve(lambda state, time: x0, "x0", levels, NOISE, num_steps=5, key=jax.random.key(0))
+    np.testing.assert_allclose(state, x0, atol=1e-5)
+    # x0 has no velocity at the end of the straight path, and takes Euler's steps there.
+    np.testing.assert_allclose(solve(lambda state, time: x0, "x0", SCHEDULE, NOISE, num_steps=5), x0, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------------------- autoregression
+
+
+@pytest.mark.parametrize("guidance", [1.0, 2.5])
+def test_cached_and_uncached_blocks_agree(guidance):
+    network = stirred(fresh(config_of(depth=2, block_frames=3)))  # the last block is short
+    cached, uncached = (
+        sample_blocks(network, SCHEDULE, TOLD, NOISE, guidance=guidance, cached=cached, **EULER)
+        for cached in (True, False)
+    )
+    scale = float(jnp.abs(cached).max())
+    np.testing.assert_allclose(cached / scale, uncached / scale, atol=2e-5)
+    assert not np.any(cached[1, 6:])
+
+
+def test_blocks_do_not_depend_on_later_noise_and_need_a_network_with_blocks(network):
+    blocks = stirred(fresh(config_of(depth=1, block_frames=4)))
+    first = sample_blocks(blocks, SCHEDULE, TOLD, NOISE, guidance=1.0, **EULER)
+    later = sample_blocks(blocks, SCHEDULE, TOLD, NOISE.at[:, 6].add(1.0), guidance=1.0, **EULER)
+    np.testing.assert_array_equal(later[:, :4], first[:, :4])
+    earlier = sample_blocks(blocks, SCHEDULE, TOLD, NOISE.at[:, 1].add(1.0), guidance=1.0, **EULER)
+    assert float(jnp.abs(earlier[:, 4] - first[:, 4]).max()) > 1e-4
+    with pytest.raises(ValueError, match="build it with block_frames"):
+        sample_blocks(network, SCHEDULE, TOLD, NOISE)
+
+
+def test_a_stream_goes_on_from_its_last_frames_and_hears_new_captions(network):
+    prefix, captions = normal(6, BATCH, 3, 5, 4), [normal(7, BATCH, 6), normal(8, BATCH, 6)]
+    stream = lambda prefix, captions: list(
+        continue_prefix(network, SCHEDULE, prefix, captions, jax.random.key(1), guidance=1.0, **EULER)
+    )
+    first = stream(prefix, captions)
+    assert [made.shape for made in first] == [(BATCH, 5, 5, 4)] * 2
+    changed = stream(prefix, [captions[0], captions[0]])
+    np.testing.assert_array_equal(changed[0], first[0])
+    assert float(jnp.abs(changed[1] - first[1]).max()) > 1e-3
+    assert float(jnp.abs(stream(prefix.at[:, 1].add(1.0), captions)[0] - first[0]).max()) > 1e-3
+    # The second window follows the last three frames of the first, and nothing before them.
+    again = next(continue_prefix(
+        network, SCHEDULE, first[0][:, -3:], captions[1:], jax.random.key(1), guidance=1.0, **EULER
+    ))  # fmt: skip
+    assert again.shape == first[1].shape
+    with pytest.raises(ValueError, match="prefix must have 1 to 7"):
+        stream(normal(6, BATCH, 8, 5, 4), captions)
+
+
+def test_the_prefix_is_shown_clean_in_every_evaluation():
+    seen = []
+
+    class Watched:
+        config = config_of(depth=1)
+
+        def encode(self, condition):
+            return condition
+
+        def __call__(self, state, time, context):
+            seen.append(state)
+            return jnp.zeros_like(state)
+
+    prefix = normal(6, BATCH, 3, 5, 4)
+    made = next(
+        continue_prefix(
+            Watched(),
+            SCHEDULE,
+            prefix,
+            [normal(7, BATCH, 6)],
+            jax.random.key(1),
+            guidance=1.0,
+            sampler="ddim",
+            num_steps=1,
+        )
+    )
+    np.testing.assert_array_equal(seen[0][:, :3], prefix)
+    np.testing.assert_allclose(seen[0][:, 3:], made, atol=1e-6)  # a velocity of 0 leaves the noise
+
+
+def test_masked_sampling_reveals_every_frame_once():
+    """The head of an untrained masked network answers v = 0: every frame is the noise of the round that revealed it."""
+    network = fresh(config_of(MaskedACMDMConfig, depth=1))
+    state = np.asarray(sample_masked(network, SCHEDULE, TOLD, jax.random.key(0), guidance=1.0, num_rounds=4, **EULER))
+    assert not np.any(state[1, 6:]) and np.isfinite(state).all()
+    assert (np.abs(state[0]).max(axis=(1, 2)) > 0).all() and (np.abs(state[1, :6]).max(axis=(1, 2)) > 0).all()
+    assert 0.8 < state[0].std() < 1.2
+    trained = stirred(network)
+    first, other = (
+        sample_masked(trained, SCHEDULE, told, jax.random.key(0), guidance=2.0, num_rounds=3, **EULER)
+        for told in (TOLD, TOLD._replace(pooled=-TOLD.pooled))
+    )
+    assert float(jnp.abs(first - other).max()) > 1e-3
