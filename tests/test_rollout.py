@@ -1,9 +1,10 @@
 """Rollouts with networks whose answers are known: seams, paths, histories, errors (section 3.1)."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, refused, tiny_camdm, tiny_trained
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, make_condition, refused, tiny_camdm, tiny_trained
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
@@ -178,6 +179,30 @@ def test_noise_levels_are_those_of_training_unless_told(trained):
     chosen = MotionGenerator(trained, 4, schedule=variance_exploding(8.0, 1.0), spacing="uniform")
     np.testing.assert_array_equal(chosen.sigmas, variance_exploding(8.0, 1.0).grid(4, "uniform"))
     refused("num_steps=0", MotionGenerator, trained, 0)
+
+
+class Repeats:
+    """A network that answers with the state that it is asked about, or with the level that it is told."""
+
+    def __init__(self, network, what):
+        self.config, self.encode, self.what = network.config, network.encode, what
+
+    def __call__(self, x_noisy, sigma, context):
+        level = jnp.broadcast_to(sigma, x_noisy.shape[:1])[:, None, None]
+        return x_noisy if self.what == "state" else level + 0.0 * x_noisy
+
+
+def test_leading_steps_start_from_noise_alone_whatever_level_they_are_told():
+    levels = variance_preserving_cosine(4)
+    generator = MotionGenerator(tiny_trained(config=tiny_camdm(), diffusion=levels), 1, spacing="leading")
+    network, condition = generator._network, make_condition(4)
+    generator._network = Repeats(network, "level")
+    told = generator.sample_window(jax.random.key(0), condition)
+    np.testing.assert_allclose(told, levels.levels[0], rtol=1e-6)
+    generator._network = Repeats(network, "state")
+    state = np.asarray(generator.sample_window(jax.random.key(0), condition), float)
+    # Unit noise in the preserving state; the level alone would leave almost none.
+    assert abs((state / np.hypot(1.0, levels.levels[0])).std() - 1.0) < 0.1
 
 
 def test_the_sampler_belongs_to_the_noise_that_the_model_was_trained_with():

@@ -90,6 +90,7 @@ ON_TWO_DEVICES = """
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_numbers_of_one():
     program = textwrap.dedent(ON_TWO_DEVICES).format(tests=os.path.dirname(__file__))
     done = subprocess.run(

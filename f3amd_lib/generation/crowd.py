@@ -38,8 +38,8 @@ from f3amd_lib.data.features import center_window, motion_from_frames, turn_fram
 from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
 from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.files import locked, whole_file
+from f3amd_lib.ground.names import checked_seed, nearest_hint
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
@@ -135,15 +135,9 @@ def _sunflower(characters: range) -> np.ndarray:
 
 
 def plan_crowd(
-    num_characters: int,
-    num_frames: int,
-    *,
-    pace=_TEMPLATE_SPEED,
-    seed: int = 0,
-    min_distance: float = MIN_DISTANCE,
-    radius: float | None = None,
-    names: Sequence[str] = PATHS,
-) -> tuple[RootPath, ...]:
+    num_characters: int, num_frames: int, *, pace=_TEMPLATE_SPEED, seed: int = 0,
+    min_distance: float = MIN_DISTANCE, radius: float | None = None, names: Sequence[str] = PATHS,
+) -> tuple[RootPath, ...]:  # fmt: skip
     """Plan paths for a crowd that keeps apart, ready for `MotionGenerator.rollout`.
 
     Args:
@@ -163,7 +157,7 @@ def plan_crowd(
       ValueError: for counts or paces out of range, an unknown path, or what `keep_apart` refuses.
     """
     num_characters = _whole("num_characters", num_characters, 1)
-    num_frames, seed = _whole("num_frames", num_frames, 2), _whole("seed", seed, 0)
+    num_frames, seed = _whole("num_frames", num_frames, 2), checked_seed(seed)
     pace = np.asarray(pace, np.float64)
     if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
         raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
@@ -232,19 +226,11 @@ class Crowd:
 
 
 def generate_crowd(
-    generator: MotionGenerator,
-    num_characters: int,
-    num_frames: int,
-    out,
-    *,
-    styles: str | Sequence[str] | None = None,
-    paths: str | Sequence[str] | PathMaker = PATHS,
-    min_distance: float | None = None,
-    seed: int = 0,
-    chunk: int | None = None,
-    overwrite: bool = False,
+    generator: MotionGenerator, num_characters: int, num_frames: int, out, *,
+    styles: str | Sequence[str] | None = None, paths: str | Sequence[str] | PathMaker = PATHS,
+    min_distance: float | None = None, seed: int = 0, chunk: int | None = None, overwrite: bool = False,
     progress: bool = False,
-) -> Crowd:
+) -> Crowd:  # fmt: skip
     """Animate any number of characters, and write them to a folder chunk by chunk.
 
     Memory depends on the chunk, not on the number of characters. A call that was stopped goes on
@@ -277,7 +263,7 @@ def generate_crowd(
     """
     trained, skeleton = generator.trained, generator.trained.skeleton
     num_characters = _whole("num_characters", num_characters, 1)
-    num_frames, seed = _whole("num_frames", num_frames, 2), _whole("seed", seed, 0)
+    num_frames, seed = _whole("num_frames", num_frames, 2), checked_seed(seed)
     if chunk is None:
         chunk = default_chunk(num_frames, trained.config.channels)
     chunk = min(_whole("chunk", chunk, 1), num_characters)
@@ -315,6 +301,14 @@ def generate_crowd(
     }
     settings = json.loads(json.dumps(settings))
     out = Path(out)
+    with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):
+        return _generate(generator, settings, make_paths, in_turn, min_distance, out, overwrite, progress)
+
+
+def _generate(generator, settings, make_paths, in_turn, min_distance, out: Path, overwrite, progress) -> Crowd:
+    """Make what is still missing of a crowd; the folder is ours alone."""
+    trained = generator.trained
+    num_characters, num_frames, seed, chunk = (settings[of] for of in ("num_characters", "num_frames", "seed", "chunk"))
     finished, first_path = _look_into(out, settings, overwrite)
     _check_room(out, settings)
 

@@ -21,11 +21,14 @@ from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import checked_seed, nearest_hint
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import cast_network
 from f3amd_lib.training.checkpoints import TrainedModel
+
+MOST_STEPS = 1000
+"""Most steps a round: as many levels as diffusion models are trained on; thousands would compile for minutes."""
 
 
 class MotionGenerator:
@@ -42,22 +45,23 @@ class MotionGenerator:
     """
 
     def __init__(
-        self,
-        trained: TrainedModel,
-        num_steps: int = 8,
-        *,
-        schedule: NoiseSchedule | None = None,
-        spacing: str = "endpoints",
-        sampler: str | None = None,
-        dtype=jnp.float32,
-    ):
+        self, trained: TrainedModel, num_steps: int = 8, *, schedule: NoiseSchedule | None = None,
+        spacing: str = "endpoints", sampler: str | None = None, dtype=jnp.float32,
+    ):  # fmt: skip
         self.trained = trained
+        if num_steps > MOST_STEPS:
+            raise ValueError(
+                f"num_steps must be at most {MOST_STEPS}, got {num_steps}: more changes nothing but the time"
+            )
         self.num_steps = num_steps
         schedule = schedule or trained.diffusion
         self.sampler = sampler or schedule.sampler
         if self.sampler not in SAMPLERS:
             raise ValueError(f"unknown sampler {self.sampler!r}{nearest_hint(self.sampler, SAMPLERS)}")
         self.sigmas = schedule.grid(num_steps, spacing)
+        # A walk that is told a low level from the first starts from noise alone all the same: of variance 1 in the
+        # preserving state, and of 1 + sigma^2 in ours.
+        self._start = float(np.hypot(1.0, self.sigmas[0])) if spacing == "leading" else None
         self.dtype = jnp.dtype(dtype)
         network = trained.network()
         self._network = network if dtype == jnp.float32 else cast_network(network, dtype)
@@ -73,7 +77,9 @@ class MotionGenerator:
         """
         condition = jax.tree.map(lambda leaf: leaf.astype(self.dtype), condition)
         noise = None if noise is None else noise.astype(self.dtype)
-        x0_hat = sample_round(self._network, condition, self.sigmas, key, noise=noise, sampler=self.sampler)
+        x0_hat = sample_round(
+            self._network, condition, self.sigmas, key, noise=noise, start=self._start, sampler=self.sampler
+        )
         return x0_hat.astype(jnp.float32)
 
     def sample_window_each(self, keys, condition: Condition):
@@ -162,15 +168,9 @@ class MotionGenerator:
         return np.asarray(frames)[:, :num_frames]
 
     def rollout(
-        self,
-        paths: RootPath | Sequence[RootPath],
-        styles: str | Sequence[str],
-        *,
-        seed: int = 0,
-        history: np.ndarray | None = None,
-        blend_frames: int = 0,
-        lock_feet: bool = False,
-    ) -> Rollout:
+        self, paths: RootPath | Sequence[RootPath], styles: str | Sequence[str], *, seed: int = 0,
+        history: np.ndarray | None = None, blend_frames: int = 0, lock_feet: bool = False,
+    ) -> Rollout:  # fmt: skip
         """Animate one or many characters along their paths.
 
         Args:
@@ -192,7 +192,7 @@ class MotionGenerator:
           ValueError: for an unknown style, unlike lengths or counts, a wrong history, or more
             blend_frames than a window has.
         """
-        trained, config = self.trained, self.trained.config
+        trained, config, seed = self.trained, self.trained.config, checked_seed(seed)
         paths = [paths] if isinstance(paths, RootPath) else list(paths)
         styles = [styles] if isinstance(styles, str) else list(styles)
         batch = max(len(paths), len(styles))

@@ -14,7 +14,7 @@ from f3amd_lib.diffusion.samplers import sample
 
 
 def sample_round(
-    network, condition, sigmas, key=None, *, noise=None, sampler: str = "ddim", unroll: bool = False
+    network, condition, sigmas, key=None, *, noise=None, start=None, sampler: str = "ddim", unroll: bool = False
 ) -> jax.Array:
     """Sample one window for every character.
 
@@ -25,6 +25,7 @@ def sample_round(
       sigmas: [N + 1], falling, from a noise schedule's `grid`.
       key: JAX random key of the noise; not needed if `noise` is given and the sampler draws none.
       noise: standard normal numbers to start from, [B, T, C], instead of drawn ones.
+      start: standard deviation of the state to start from; None is the first level's.
       sampler: a name of `samplers.SAMPLERS`.
       unroll: write the steps out one by one instead of a `lax.scan` (for exports).
 
@@ -51,8 +52,8 @@ def sample_round(
         raise ValueError(f"noise must have shape {shape}, got {noise.shape}")
     context = network.encode(condition)
     denoise = lambda x_noisy, sigma: network(x_noisy, sigma, context)
-    start = jnp.asarray(sigmas[0], noise.dtype) * noise
-    return sample(sampler, denoise, start, sigmas, key=key_steps, unroll=unroll)
+    state = jnp.asarray(sigmas[0] if start is None else start, noise.dtype) * noise
+    return sample(sampler, denoise, state, sigmas, key=key_steps, unroll=unroll)
 
 
 def sample_round_on_devices(

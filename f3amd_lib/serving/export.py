@@ -181,14 +181,10 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
     )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
     return ExportedRound(
-        config=config,
-        sigmas=tuple(sigmas.tolist()),
-        sampler=sampler,
-        batch=batch,
-        inputs=inputs,
+        config=config, sigmas=tuple(sigmas.tolist()), sampler=sampler, batch=batch, inputs=inputs,
         weights_digest=weights_digest(state),
         exported=dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized)),
-    )
+    )  # fmt: skip
 
 
 def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
@@ -279,14 +275,9 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, tuple
 
 
 def save_artefact(
-    folder,
-    exported: ExportedRound,
-    *,
-    name: str,
-    targets: Iterable[str] = ("llvm-cpu",),
-    trained: TrainedModel | None = None,
-    overwrite: bool = False,
-) -> Path:
+    folder, exported: ExportedRound, *, name: str, targets: Iterable[str] = ("llvm-cpu",),
+    trained: TrainedModel | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
     """Write a round as a folder that `artefact.load_artefact` runs, whole or not at all.
 
     The folder holds the program as StableHLO and for JAX, a compiled module per target, the scales
@@ -399,16 +390,9 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def export_model(
-    trained: TrainedModel,
-    folder,
-    *,
-    num_steps: int = 8,
-    batch: int = 1,
-    sampler: str | None = None,
-    schedule: NoiseSchedule | None = None,
-    targets: Iterable[str] = ("llvm-cpu",),
-    overwrite: bool = False,
-) -> Path:
+    trained: TrainedModel, folder, *, num_steps: int = 8, batch: int = 1, sampler: str | None = None,
+    schedule: NoiseSchedule | None = None, targets: Iterable[str] = ("llvm-cpu",), overwrite: bool = False,
+) -> Path:  # fmt: skip
     """Export a trained model: what `f3amd export` does.
 
     Args:

@@ -1,32 +1,25 @@
 """Motion that a reader can turn around: a player as one HTML page, for browsers and notebooks.
 
-`player_page` makes the page, `write_player` writes it, `show_player` shows it in a notebook. The
-page is whole: its script and style (`player.js`, `player.css`) and all motion stand in it, a
-content security policy forbids it any request, and it works offline and inside an iframe.
+`player_page` makes the page, `write_player` writes it, `show_player` shows it in a notebook. The page is whole:
+scripts, style and all motion stand in it, a content security policy forbids it any request, and it works offline and
+inside an iframe. It is drawn with three.js (MIT, `web/three.min.js`), of which each page carries 220 kB; the scripts
+beside it are ours.
 
-Limbs are drawn as lines on a 2D canvas by code of our own. The alternative was three.js, which is
-well kept and would bring depth, lights and meshes, none of which a stick figure needs. Its parts
-for lines wider than a pixel and a camera to orbit (renderer, `LineSegments2`, `OrbitControls`)
-bundle to 583 kB minified (0.187.0), in every page, where a notebook is held under 250 kB; ours
-takes 29 kB. And each player would take a WebGL context, of which browsers allow about
-16 at a time: fewer than the players of a long notebook, and none where there is no GPU.
-
-How motion is stored (`"version": 1`). The page holds a JSON object with titles, skeletons, frame
-rate and, under `tracks`, the numbers: base64 of one zlib stream. All are whole millimetres, so that
-a point is off by at most half a millimetre a coordinate. Inflated, the stream holds for each
-character of each scene, in the page's order:
+How motion is stored (`"version": 2`). The page holds a JSON object with titles, skeletons, frame rate and, under
+`tracks`, the numbers: base64 of one zlib stream. Inflated, the stream holds for each character of each scene, in the
+page's order:
 
 | track | type | shape | what |
 |---|---|---|---|
-| root | int32 | [T, 3] | global position of the root joint |
-| points | int16 | [T, P, 3] | joints and tips that are drawn, relative to the root |
+| root | int32 | [T, 3] | global position of the root joint, millimetres |
+| turns | int16 | [T, J, 3] | rotation vector of each joint (the root's is global), `turns` steps a radian |
 | contacts | uint8 | [T, 1] | bit 0: left toe in contact, bit 1: right toe; if `contacts` is true |
-| path | int32 | [T, 2] | target x and z; if `path` is true |
+| path | int32 | [T, 2] | target x and z, millimetres; if `path` is true |
 
-int16 reaches 32.767 m from the root, far beyond any limb, wherever the root walks. A track is
-stored as its first frame followed by the differences from frame to frame, modulo the type's range;
-then channel by channel, T numbers each; then all lowest bytes first, followed by all next ones, as
-little endian has them. Differences of smooth motion are small, which lets zlib shorten them.
+A track is stored as its first frame followed by the differences from frame to frame, modulo the type's range; then
+channel by channel, T numbers each; then all lowest bytes first, followed by all next ones, as little endian has them.
+Differences of smooth motion are small, which lets zlib shorten them. Joints come back to about a millimetre,
+those of a crowd to a few.
 """
 
 from __future__ import annotations
@@ -43,6 +36,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.stick_figures import (
@@ -51,15 +45,19 @@ from f3amd_lib.drawing.stick_figures import (
     TARGET_COLOR,
     TRAIL_COLOR,
     bones_of,
-    drawn_points,
     is_head,
+    limb_side,
     path_on_ground,
 )
 from f3amd_lib.drawing.style import save_figure, show_figure
+from f3amd_lib.ground.files import whole_file
+from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.serving.web_page import POLICY, module_scripts, read_web
 
-_FOLDER = Path(__file__).parent
 _MILLIMETRES = 1000.0
+_FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
+_FEW = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +70,8 @@ class Character:
       contacts: which toe is in contact, boolean [T, 2], left then right; by default
         `Motion.contacts`, where the skeleton's toes are known.
       name: for messages; by default the motion's.
-      color: "#rrggbb" of trunk, head and trail, to tell characters apart; limbs keep the colours of
-        left and right.
+      color: "#rrggbb" of body and trail, to tell characters apart; of sticks, limbs keep the colours of left and right.
+      ghost: another motion that is drawn with this one and can be seen through, such as the real clip.
     """
 
     motion: Motion
@@ -81,6 +79,7 @@ class Character:
     contacts: np.ndarray | None = None
     name: str = ""
     color: str | None = None
+    ghost: Motion | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,56 +135,58 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
       title: of the page.
       credit: a line at its foot: whose motion this is, and under which terms.
       autoplay: start at once, unless the reader's system asks for reduced motion.
-      follow: let the camera go along with the characters; by default it does where every scene
-        has one.
+      follow: let the camera go along with one character of each scene; by default it does where every scene has one.
 
     Returns:
       The page, HTML; it needs no file and no network.
 
     Raises:
-      ValueError: for no scene or no character, unlike frame rates or lengths (of motions, paths or
-        contacts), numbers not finite, points out of range (see the module's table), boundaries
-        that are no frames of the motion, or a colour that is none.
+      ValueError: for no scene or no character, unlike frame rates or lengths (of motions, paths or contacts), motion
+        without rotations, numbers not finite or too far out, boundaries that are no frames of the motion, or a colour
+        that is none.
     """
     scenes = _as_scenes(scenes)
     first = scenes[0].characters[0].motion
-    drawn: list[_Drawn] = []
+    skeletons: list[Skeleton] = []
     tracks: list[bytes] = []
     described = []
+    steps = _FINE if sum(len(scene.characters) for scene in scenes) <= _FEW else _COARSE
     for scene in scenes:
         boundaries = _checked_boundaries(scene, first.num_frames)
         described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
-        for character in scene.characters:
+        for character in _with_ghosts(scene.characters):
             _check_in_step(character, first)
-            how = _what_is_drawn(character.motion.skeleton)
-            if how not in drawn:
-                drawn.append(how)
-            about, pieces = _encode_character(character, how)
-            described[-1]["characters"].append({"skeleton": drawn.index(how), **about})
+            skeleton = character.motion.skeleton
+            if skeleton not in skeletons:
+                skeletons.append(skeleton)
+            about, pieces = _encode_character(character, steps)
+            described[-1]["characters"].append({"skeleton": skeletons.index(skeleton), **about})
             tracks.extend(pieces)
     data = {
-        "version": 1,
+        "version": 2,
         "fps": float(first.fps),
         "frames": first.num_frames,
+        "turns": steps,
         "autoplay": bool(autoplay),
         "follow": all(len(scene.characters) == 1 for scene in scenes) if follow is None else follow,
         "around": _first_azimuth(first),
-        "skeletons": [dataclasses.asdict(one) | {"points": len(one.points)} for one in drawn],
+        "skeletons": [describe_for_web(skeleton) for skeleton in skeletons],
         "scenes": described,
         "tracks": base64.b64encode(zlib.compress(b"".join(tracks), 9)).decode("ascii"),
     }
     named = title or ", ".join(scene.title for scene in scenes if scene.title) or "Motion"
-    return string.Template(_read("player.html")).substitute(
+    return string.Template(read_web("player.html")).substitute(
+        policy=POLICY,
         title=html.escape(named),
         heading=_element("h1", title),
         colors=_color_rules(),
-        style=_read("player.css"),
+        style=read_web("player.css"),
         panels="\n".join(_panel(scene, first) for scene in scenes),
         legend=_legend(described),
         credit=_element('p class="credit"', credit),
         # "</script>" in a title would end the block that holds it.
         data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        script=_read("player.js"),
+        modules=module_scripts("player"),
     )
 
 
@@ -213,8 +214,8 @@ def write_player(path, scenes, *, strip: bool = True, overwrite: bool = True, **
         raise ValueError(f"{taken}: exists already; pass overwrite=True or another path")
     page = player_page(scenes, **options)
     figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    with whole_file(path, overwrite=True) as temporary:
+        temporary.write_text(page, encoding="utf-8")
     if strip:
         save_figure(figure, targets[1])
     return path
@@ -259,7 +260,7 @@ class Player:
         """The player as an HTML element to put into another page."""
         titled = re.search(r"<title>(.*?)</title>", self.page, re.S)[1]
         return (
-            f'<iframe title="Motion player: {titled}" sandbox="allow-scripts" loading="lazy" '
+            f'<iframe title="Motion player: {titled}" sandbox="allow-scripts allow-downloads" loading="lazy" '
             f'style="width:100%;height:{self.height}px;border:1px solid #8a8a8a;border-radius:6px" '
             f'srcdoc="{html.escape(self.page, quote=True)}"></iframe>'
         )
@@ -357,46 +358,50 @@ def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
 # ------------------------------------------------------------------------------ what is drawn of it
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Points of a skeleton that the player draws, and how; indices below are places in `points`."""
-
-    points: tuple[int, ...]  # of joints, then end sites
-    limbs: list[dict]  # side and bones, (parent, child) pairs
-    head: tuple[int, int] | None  # head and neck
-    toes: tuple[int, int] | None
+@dataclass(frozen=True, eq=False)
+class _Ghost(Character):
+    """A character that can be seen through."""
 
 
-def _what_is_drawn(skeleton: Skeleton) -> _Drawn:
-    """Sort bones into limbs, which are drawn whole, far ones first.
+def _with_ghosts(characters) -> list[Character]:
+    """Put each ghost behind its character."""
+    ghosts = [
+        [_Ghost(one.ghost, name=f"{one.name}, ghost")] if isinstance(one.ghost, Motion) else [] for one in characters
+    ]
+    return [each for one, ghost in zip(characters, ghosts, strict=True) for each in (one, *ghost)]
 
-    A limb is a chain of bones of one side: it begins where a bone's side differs from that of the
-    bone above it. Sorting a handful of limbs does for the eye what sorting all bones would, in a
-    fraction of the strokes.
-    """
-    limb_of: dict[int, int] = {}  # the limb whose bone ends in this point
-    limbs: list[dict] = []
-    middle = None  # the trunk is one limb, though hips and shoulders part it
-    for parent, child, side in sorted(bones_of(skeleton), key=lambda bone: bone[1]):
-        number = middle if side == "middle" else limb_of.get(parent)
-        if number is None or limbs[number]["side"] != side:
-            number = len(limbs)
-            limbs.append({"side": side, "bones": []})
-        if side == "middle":
-            middle = number
-        limbs[number]["bones"].append((parent, child))
-        limb_of[child] = number
+
+def describe_for_web(skeleton: Skeleton) -> dict:
+    """Describe a skeleton with its body and sticks as `web/body.js` wants it, metres, ready for JSON."""
+
+    def numbers(values):
+        return [round(float(value), 5) for value in values]
+
+    tips = [offset for _, offset in skeleton.end_sites]
+    offsets = [*skeleton.offsets, *tips]
     heads = [k for k, name in enumerate(skeleton.names) if is_head(name)]
-    head = (heads[0], skeleton.parents[heads[0]]) if heads and heads[0] > 0 else None
+    capsules = [
+        [one.joint, numbers(one.start), numbers(one.end), numbers(one.radii), numbers(one.wide)]
+        for one in body_capsules(skeleton)
+    ]
+    return {
+        "names": list(skeleton.names),
+        "parents": list(skeleton.parents),
+        "offsets": [numbers(offset) for offset in skeleton.offsets],
+        "sides": [limb_side(name) for name in skeleton.names],
+        "capsules": capsules,
+        "bones": [[parent, numbers(offsets[child]), side] for parent, child, side in bones_of(skeleton)],
+        "head": [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None,
+        "toes": list(_toes(skeleton) or ()) or None,
+    }
+
+
+def _toes(skeleton: Skeleton) -> tuple[int, int] | None:
+    """Return the toes; None for a rig that we do not know, which has no contacts to show."""
     try:
-        toes = skeleton.toes
-    except ValueError:  # a rig that we do not know has no contacts to show
-        toes = None
-    needed = {point for limb in limbs for bone in limb["bones"] for point in bone}
-    points = tuple(sorted(needed | {0, *(head or ()), *(toes or ())}))
-    places = lambda pair: None if pair is None else (points.index(pair[0]), points.index(pair[1]))
-    limbs = [{"side": limb["side"], "bones": [places(bone) for bone in limb["bones"]]} for limb in limbs]
-    return _Drawn(points, limbs, places(head), places(toes))
+        return skeleton.toes
+    except ValueError:
+        return None
 
 
 def _first_azimuth(motion: Motion) -> float:
@@ -411,28 +416,22 @@ def _first_azimuth(motion: Motion) -> float:
 # ----------------------------------------------------------------------------------- as numbers
 
 
-def _encode_character(character: Character, drawn: _Drawn) -> tuple[dict, list[bytes]]:
+def _encode_character(character: Character, steps: int) -> tuple[dict, list[bytes]]:
     """Describe a character and turn its tracks into bytes."""
     motion, label = character.motion, character.name
-    num_frames = motion.num_frames
-    points = drawn_points(motion, np.arange(num_frames))[:, drawn.points]
-    root = _whole_millimetres(points[:, 0], label, "root")
-    joints = _whole_millimetres(points, label, "points") - root[:, None]
-    reach = np.abs(joints).max(axis=(1, 2))
-    if reach.max() > np.iinfo(np.int16).max:
-        frame = int(reach.argmax())
-        raise ValueError(
-            f"{label}: a joint lies {reach[frame] / _MILLIMETRES:.1f} m from its root at frame "
-            f"{frame}, the player reaches 32.767 m; are its units metres?"
-        )
-    pieces = [_track(root, "<i4"), _track(joints, "<i2")]
+    num_frames, toes = motion.num_frames, _toes(motion.skeleton)
+    rotations = motion.needed_rotations("the player")
+    turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
+    turns = np.rint(steps * turns).reshape(num_frames, -1)
+    pieces = [_track(_whole_millimetres(motion.root_position, label, "root"), "<i4"), _track(turns, "<i2")]
+    ghost = isinstance(character, _Ghost)
 
     contacts = character.contacts
-    if contacts is None and drawn.toes is not None:
+    if contacts is None and toes is not None and not ghost:
         contacts = motion.contacts
     if contacts is not None:
         contacts = np.asarray(contacts)
-        if drawn.toes is None:
+        if toes is None:
             raise ValueError(f"{label}: contacts are given, but this skeleton's toes are not known")
         if contacts.shape != (num_frames, 2):
             raise ValueError(f"{label}: contacts must be [{num_frames}, 2] (left, right), got {contacts.shape}")
@@ -452,8 +451,8 @@ def _encode_character(character: Character, drawn: _Drawn) -> tuple[dict, list[b
                 f"{num_frames} at {motion.fps:g}"
             )
         pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
-    about = {"color": character.color, "contacts": contacts is not None, "path": character.path is not None}
-    return about, pieces
+    about = {"name": label, "color": character.color, "ghost": ghost}
+    return about | {"contacts": contacts is not None, "path": character.path is not None}, pieces
 
 
 def _whole_millimetres(metres: np.ndarray, label: str, what: str) -> np.ndarray:
@@ -469,18 +468,11 @@ def _track(values: np.ndarray, dtype: str) -> bytes:
     """Differences along time, channel by channel, lowest bytes first (see the module's text)."""
     values = values.reshape(len(values), -1)
     steps = np.concatenate([values[:1], np.diff(values, axis=0)])
-    narrow = np.ascontiguousarray(steps.T).astype(dtype)  # wraps round, and back when added up
+    narrow = np.ascontiguousarray(steps.T).astype(np.int64).astype(dtype)  # wraps round, and back when added up
     return np.ascontiguousarray(narrow.reshape(-1, 1).view(np.uint8).T).tobytes()
 
 
 # -------------------------------------------------------------------------------------- as HTML
-
-
-def _read(name: str) -> str:
-    """Read a part of the page without its indents and lines of comment, a sixth of its bytes."""
-    lines = (_FOLDER / name).read_text(encoding="utf-8").splitlines()
-    stripped = (line.strip() for line in lines)
-    return "\n".join(line for line in stripped if line and not line.startswith("//"))
 
 
 def _color_rules() -> str:
@@ -498,7 +490,7 @@ def _panel(scene: Scene, first: Motion) -> str:
     title = _element("strong", scene.title)
     return (
         f'<figure class="panel"><figcaption>{title}{_element("span", scene.note)}</figcaption>'
-        f'<canvas role="img" aria-label="{html.escape(shown, quote=True)}"></canvas></figure>'
+        f'<div class="labels" role="img" aria-label="{html.escape(shown, quote=True)}"></div></figure>'
     )
 
 
@@ -515,6 +507,8 @@ def _legend(scenes: list[dict]) -> str:
         keys.append(("dot", "contact", "toe in contact"))
     if not all(character["color"] for character in characters):
         keys.append(("line", "trail", "walked"))
+    if any(character["ghost"] for character in characters):
+        keys.append(("line", "flesh", "ghost: the real clip"))
     if any(character["path"] for character in characters):
         keys.append(("dash", "target", "target path"))
     if any(scene["boundaries"] for scene in scenes):

@@ -1,14 +1,15 @@
 """The motion player in a real browser: what a reader sees, presses and touches."""
 
 import base64
-import io
+import json
+import struct
 
 import numpy as np
 import pytest
 from builders import wandering_motion
 from conftest import DESKTOP, PHONE
-from PIL import Image
 
+from f3amd_lib.motion.bvh import format_bvh, read_bvh
 from f3amd_lib.motion.root_paths import path_from_motion
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.serving.player import Character, Scene, player_page, show_player, write_player
@@ -66,16 +67,24 @@ def settled(browser) -> dict:
 
 
 def pixels(browser, panel: int = 0) -> np.ndarray:
-    """What a panel's canvas shows, [H, W, 3]."""
-    picture = browser.script("return document.querySelectorAll('canvas')[arguments[0]].toDataURL()", panel)
-    image = Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1])))
-    return np.asarray(image.convert("RGB"))
+    """What a panel shows, [H, W, 3], without its title."""
+    settled(browser)
+    box = browser.script(
+        "const b = document.querySelectorAll('.panel')[arguments[0]].getBoundingClientRect();"
+        "const s = devicePixelRatio; return [b.left, b.top + 60, b.right, b.bottom].map((v) => Math.round(v * s))",
+        panel,
+    )
+    return browser.screenshot()[box[1] : box[3], box[0] : box[2]]
 
 
-def share_of(picture: np.ndarray, color: str, within: int = 30) -> int:
-    """Number of pixels near a colour."""
-    wanted = np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)])
-    return int((np.abs(picture.astype(int) - wanted).max(axis=-1) < within).sum())
+def share_of(picture: np.ndarray, color: str) -> int:
+    """Number of pixels of a colour's hue, lit or in shade; none of grey."""
+    import matplotlib.colors as mcolors
+
+    seen = mcolors.rgb_to_hsv(picture / 255.0)
+    hue = mcolors.rgb_to_hsv(mcolors.to_rgb(color))[0]
+    apart = np.abs(seen[..., 0] - hue)
+    return int(((np.minimum(apart, 1 - apart) < 0.04) & (seen[..., 1] > 0.25) & (seen[..., 2] > 0.15)).sum())
 
 
 # ------------------------------------------------------------------------------ the fixture itself
@@ -120,7 +129,7 @@ def test_titles_stand_over_their_panels_and_text_is_text(browser, side_by_side):
     captions = browser.script(
         "return [...document.querySelectorAll('.panel')].map((one) =>"
         " [one.querySelector('strong').textContent, one.getBoundingClientRect().left,"
-        "  one.querySelector('canvas').getAttribute('aria-label')])"
+        "  one.querySelector('.labels').getAttribute('aria-label')])"
     )
     assert [title for title, _, _ in captions] == TITLES
     lefts = [left for _, left, _ in captions]
@@ -135,9 +144,8 @@ def test_the_browser_reads_the_positions_that_python_wrote(browser, side_by_side
     opened(browser, side_by_side)
     for scene, frame in ((0, 0), (3, FRAMES - 1), (2, 47)):
         read = [browser.script("return player.position(...arguments)", scene, 0, frame, place) for place in (0, 5)]
-        # The first points are joints in their order; heads' tips come last.
         expected = walks[scene].positions[frame, [0, 5]] * 1000
-        np.testing.assert_allclose(read, expected, atol=0.5001)
+        np.testing.assert_allclose(read, expected, atol=1.5)
 
 
 def test_every_panel_shows_a_figure_in_the_colours_of_the_pictures(browser, side_by_side):
@@ -145,9 +153,11 @@ def test_every_panel_shows_a_figure_in_the_colours_of_the_pictures(browser, side
 
     opened(browser, side_by_side)
     for panel in range(4):
-        picture = pixels(browser, panel)
-        for side in ("left", "right", "middle"):
-            assert share_of(picture, LIMB_COLORS[side]) > 300, (panel, side)
+        for body in (True, False):
+            browser.script("player.setBody(arguments[0])", body)
+            picture = pixels(browser, panel)
+            for side in ("left", "right"):
+                assert share_of(picture, LIMB_COLORS[side]) > 300, (panel, side, body)
 
 
 # -------------------------------------------------------------------------------------------- time
@@ -231,10 +241,9 @@ def test_motions_play_in_step(browser, side_by_side, walks):
             browser.script("player.seek(arguments[0])", frame)
             settled(browser)
             green.append(share_of(pixels(browser, panel), "#0B9E64"))
+        assert green[0] > 20, (panel, green)
         if not touching.all():
-            assert green[0] > 20 and green[1] == 0, (panel, green)
-        else:
-            assert green[0] > 20
+            assert green[1] == 0, (panel, green)
 
 
 # -------------------------------------------------------------------------------- keys and fingers
@@ -285,9 +294,11 @@ def test_a_focused_button_or_slider_obeys_once(browser, alone):
 def test_every_control_has_a_name(browser, alone):
     opened(browser, alone)
     browser.find("#turn").click()
-    controls = browser.driver.find_elements("css selector", "button, input, select, canvas, summary")
+    browser.find("#more").click()
+    controls = browser.driver.find_elements("css selector", "button, input, select, #timeline, summary")
+    controls = [control for control in controls if control.is_displayed()]
     names = [control.accessible_name for control in controls]
-    assert len(names) >= 20 and all(names)
+    assert len(names) >= 30 and all(names)
     assert len(set(names)) == len(names)
 
 
@@ -299,14 +310,15 @@ def test_dragging_orbits_and_the_wheel_zooms(browser, alone):
         browser.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
     settled(browser)
     after = browser.script("return {...player.view}")
-    assert after["around"] == pytest.approx(before["around"] - 0.8)
+    high = browser.find("#stage").rect["height"]
+    assert after["around"] == pytest.approx(before["around"] - 2 * np.pi * 100 / high)
     assert after["elevation"] < before["elevation"]
     assert (pixels(browser) != picture).any()
     browser.command("Input.dispatchMouseEvent", type="mouseWheel", x=600, y=300, deltaX=0, deltaY=-200)
-    browser.wait("return player.view.zoom > 1.2")
+    browser.wait("return player.view.zoom > 1.05")
     browser.find("#reset").click()
     again = browser.script("return {...player.view}")
-    assert again == before
+    assert again == pytest.approx(before)
 
 
 def press(browser, letter: str, shift: bool = False) -> dict:
@@ -391,8 +403,8 @@ def test_touch_orbits_and_pinches(browser, alone):
     browser.touch("touchMove", (250, 300))
     browser.touch("touchEnd")
     after = browser.script("return {...player.view}")
-    assert after["around"] == pytest.approx(before["around"] - 0.4, abs=0.2)
-    assert after["zoom"] == before["zoom"]
+    assert -1.5 < after["around"] - before["around"] < -0.3
+    assert after["zoom"] == pytest.approx(before["zoom"])
     browser.touch("touchStart", (150, 300), (250, 300))
     browser.touch("touchMove", (100, 300), (300, 300))
     browser.touch("touchEnd")
@@ -417,7 +429,7 @@ def test_follow_and_from_above(browser, alone):
     settled(browser)
     assert above.get_attribute("aria-pressed") == "true"
     assert (pixels(browser) != standing).any()
-    assert browser.script("return player.view.around") == pytest.approx(np.pi)  # +Z up the page
+    assert abs(browser.script("return player.view.around")) == pytest.approx(np.pi, abs=1e-3)  # +Z up the page
     above.click()
     settled(browser)
     difference = pixels(browser).astype(int) - standing
@@ -481,7 +493,7 @@ def test_dark_readers_get_a_dark_page(browser, side_by_side, screenshots):
     settled(browser)  # the page changes while it is open
     dark = browser.screenshot(screenshots / "player_dark.png").mean()
     assert light > 200 and dark < 60
-    assert share_of(pixels(browser), "#6fa6e6") > 300  # the right limbs, light on dark
+    assert share_of(pixels(browser), "#6fa6e6") > 200  # the right limbs, light on dark
 
 
 def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
@@ -494,14 +506,13 @@ def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
     browser.driver.switch_to.frame(frame)
     browser.wait("return document.documentElement.dataset.ready === 'yes'")
     browser.wait("return player.state().frame > 2")
-    picture = pixels(browser)
-    assert share_of(picture, "#EF9A26") > 300
     # On its own: neither the notebook around it nor its storage is within reach.
     assert browser.script("try { return String(window.parent.document); } catch (error) { return error.name; }") in (
         "SecurityError",
         "null",
     )
     browser.driver.switch_to.default_content()
+    assert share_of(browser.screenshot(), "#EF9A26") > 300
     assert browser.errors() == [] and browser.requests() == []
 
 
@@ -527,36 +538,128 @@ def test_damaged_data_are_told_of(browser, tmp_path):
     assert "cannot be shown" in browser.find("#message").text
 
 
-def test_a_crowd_is_all_there(browser, tmp_path, screenshots, capsys):
-    """Frame rates are printed for whoever wants them; a machine's speed is no test."""
+def test_slow_machines_get_sticks_and_are_told(browser, tmp_path, screenshots, capsys):
+    """Bodies of a crowd stay where a picture takes 17 ms at most; times are printed, for whoever wants them."""
     base = [synthesize("Neutral", 2.0, seed=seed) for seed in range(4)]
     lines = []
-    for count in (1, 16, 100):
-        side = int(np.ceil(np.sqrt(count)))
+    for count in (1, 100):
         crowd = [
             base[k % 4].replace(
-                root_position=base[k % 4].root_position + np.array([1.5 * (k % side), 0.0, 1.5 * (k // side)])
+                root_position=base[k % 4].root_position + np.array([1.5 * (k % 10), 0.0, 1.5 * (k // 10)])
             )
             for k in range(count)
         ]
-        path = write_player(tmp_path / f"{count}.html", Scene(crowd, title="Crowd"), strip=False)
+        path = write_player(tmp_path / f"{count}.html", Scene(crowd, title="Crowd"), strip=False, autoplay=False)
         opened(browser, path)
-        one, other, seconds = browser.driver.execute_async_script(
-            "const [done] = arguments; const one = player.state(); const began = performance.now();"
-            "const since = () => (performance.now() - began) / 1000;"
-            "setTimeout(() => done([one, player.state(), since()]), 1500);"
-        )
-        draws = other["draws"] - one["draws"]
-        assert draws > 0
-        lines.append(
-            f"{count:3d} characters: {draws / seconds:.0f} pictures a second, "
-            f"{(other['drawMs'] - one['drawMs']) / draws:.2f} ms of script each, "
-            f"page {path.stat().st_size / 1000:.0f} kB"
-        )
-    browser.script("player.setPlaying(false)")
+        now, said = state(browser), browser.script("return document.getElementById('notice').textContent")
+        software = browser.script("return player.stage.software")
+        assert now["body"] == ("Drawn as sticks" not in said)
+        if count > 12:
+            assert now["body"] == (not software and now["bodyMs"] <= 1000 / 60)
+        else:
+            assert now["body"] == (now["bodyMs"] <= 250)
+        browser.script("player.setBody(false); player.seek(3)")
+        settled(browser)
+        sticks = browser.script("return player.stage.cost()")
+        lines.append(f"{count:3d} characters: a picture with sticks takes {sticks:.0f} ms, software: {software}")
     browser.screenshot(screenshots / "player_crowd.png")
-    left = share_of(pixels(browser), "#EF9A26")
-    assert left > 3000  # one figure alone, so far away, covers some 50 pixels
+    assert share_of(pixels(browser), "#EF9A26") > 1000
     assert browser.errors() == []
     with capsys.disabled():
         print("", *lines, sep="\n")
+
+
+# ----------------------------------------------------------------------------- files in, files out
+
+
+def test_what_the_page_saves_as_bvh_is_what_python_reads(browser, side_by_side, walks, tmp_path):
+    opened(browser, side_by_side)
+    text = browser.script("return player.bvhText(player.characters[1])")
+    again = read_bvh(text=text)
+    assert again.skeleton.names == walks[1].skeleton.names
+    np.testing.assert_allclose(again.positions, walks[1].positions, atol=2e-3)
+    assert np.abs(again.positions - walks[2].positions).max() > 0.02
+
+
+def test_what_the_page_saves_as_glb_has_skin_joints_and_every_frame(browser, side_by_side, walks):
+    opened(browser, side_by_side)
+    packed = browser.driver.execute_async_script(
+        "const done = arguments[0]; player.glbOf(player.characters[0]).then((made) =>"
+        " done(btoa(Array.from(new Uint8Array(made), (k) => String.fromCharCode(k)).join(''))))"
+    )
+    data = base64.b64decode(packed)
+    size = struct.unpack_from("<I", data, 12)[0]
+    file = json.loads(data[20 : 20 + size])
+    assert data[:4] == b"glTF" and file["asset"]["version"] == "2.0"
+    joints = [file["nodes"][k]["name"] for k in file["skins"][0]["joints"]]
+    assert joints == list(walks[0].skeleton.names)
+    assert len(file["animations"][0]["channels"]) == 1 + len(joints)
+    times = file["accessors"][file["animations"][0]["samplers"][0]["input"]]
+    assert (times["count"], times["max"][0]) == (FRAMES, pytest.approx((FRAMES - 1) / 30))
+
+
+def test_a_dropped_bvh_walks_beside_the_first(browser, alone, walks, screenshots):
+    opened(browser, alone)
+    text = format_bvh(walks[2])
+    drop = (
+        "const items = new DataTransfer(); items.items.add(new File([arguments[0]], arguments[1]));"
+        "document.dispatchEvent(new DragEvent('drop', {dataTransfer: items, bubbles: true, cancelable: true}))"
+    )
+    browser.script(drop, text, "mine.bvh")
+    browser.wait("return player.characters.length === 2")
+    settled(browser)
+    browser.screenshot(screenshots / "player_dropped.png")
+    assert "another skeleton" in browser.script("return document.getElementById('notice').textContent")
+    joints = [0, 9, 18]
+    read = np.array([browser.script("return player.position(0, 1, 40, arguments[0])", joint) for joint in joints])
+    expected = 1000 * walks[2].positions[40, joints]
+    np.testing.assert_allclose(read - read[0], expected - expected[0], atol=1.5)  # it stands somewhere else
+    browser.script(drop, "nonsense", "bad.bvh")
+    browser.wait("return document.getElementById('notice').textContent.includes('bad.bvh cannot be shown')")
+    assert browser.script("return player.characters.length") == 2
+    assert browser.errors() == []
+
+
+# --------------------------------------------------------------------------------- loop, names, ghost
+
+
+def test_a_loop_plays_its_frames_only(browser, alone):
+    opened(browser, alone)
+    browser.script("player.seek(20)")
+    browser.keys("i")
+    browser.script("player.seek(30)")
+    browser.keys("o")
+    assert state(browser)["loop"] == [20, 30]
+    browser.script("player.seek(20); player.setPlaying(true)")
+    seen = browser.driver.execute_async_script(
+        "const done = arguments[0]; const seen = []; const began = performance.now();"
+        "(function look() { seen.push(player.state().time);"
+        " if (performance.now() - began < 1500) requestAnimationFrame(look); else done(seen); })();"
+    )
+    assert min(seen) >= 20 and max(seen) <= 30 and np.diff(seen).min() < -5
+    browser.keys("l")
+    assert state(browser)["loop"] == [0, FRAMES - 1]
+
+
+def test_names_ghost_and_persons(browser, walks, tmp_path, screenshots):
+    two = [Character(walks[0], name="one", ghost=walks[2]), Character(walks[1], name="two")]
+    opened(browser, write_player(tmp_path / "two.html", Scene(two, title="Two"), strip=False, autoplay=False))
+    shown = "return document.querySelectorAll('.labels span').length"
+    assert browser.script(shown) == 0
+    browser.keys("n")
+    settled(browser)
+    assert browser.script(shown) == 23
+    assert browser.script("return document.querySelector('.labels span').textContent") == "Hips"
+    with_ghost = pixels(browser)
+    browser.keys("g")
+    assert (pixels(browser) != with_ghost).any()
+    browser.find("#more").click()
+    browser.script(
+        "const list = document.getElementById('person'); list.value = '2'; list.dispatchEvent(new Event('change'))"
+    )
+    browser.screenshot(screenshots / "player_person.png")
+    assert browser.script("return player.view.follow") is True
+    assert browser.script("return player.stage.views[0].target.toArray()") == pytest.approx(
+        [*walks[1].root_position[0, [0]], 0.88, *walks[1].root_position[0, [2]]], abs=0.15
+    )
+    browser.script("player.followPerson(player.characters[0])")

@@ -1,0 +1,145 @@
+"""Motion as glTF 2.0 (`.glb`): skeleton, skin and animation in one file, which engines and Blender open.
+
+Each character has its own joints, skin and mesh (`motion.body`); all play in one animation. Units are metres, +Y is up,
+a character with yaw 0 faces +Z: glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of sign.
+
+Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pygltflib as gltf
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.ground.files import whole_file
+from f3amd_lib.motion.body import make_body
+from f3amd_lib.motion.skeleton import Motion, forward_kinematics
+
+_COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
+_KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
+_GREY = [0.42, 0.47, 0.55, 1.0]
+
+
+class _File:
+    """A glTF document and the bytes that its accessors point into."""
+
+    def __init__(self, credit: str):
+        self.document = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="f3amd_lib", copyright=credit or None))
+        self.bytes = b""
+
+    def put(self, values: np.ndarray, dtype: str, target: int | None = None) -> int:
+        """Store an array, [N, ...], and return its accessor."""
+        values = np.ascontiguousarray(values, f"<{dtype}")
+        document = self.document
+        document.bufferViews.append(
+            gltf.BufferView(buffer=0, byteOffset=len(self.bytes), byteLength=values.nbytes, target=target)
+        )
+        flat = values.reshape(len(values), -1)
+        bounds = {name: getattr(flat, name)(axis=0).tolist() for name in ("min", "max")}
+        if values.ndim == 3:  # of matrices nobody asks for bounds
+            bounds, values = {}, np.swapaxes(values, 1, 2)  # column by column
+        self.bytes += values.tobytes() + bytes(-values.nbytes % 4)
+        kind = _KINDS[values.shape[1:]]
+        view = len(document.bufferViews) - 1
+        accessor = gltf.Accessor(
+            bufferView=view, componentType=_COMPONENTS[dtype], count=len(values), type=kind, **bounds
+        )
+        document.accessors.append(accessor)
+        return len(document.accessors) - 1
+
+
+def _quaternions(rotations) -> np.ndarray:
+    """Turn [T, J, 3, 3] into (x, y, z, w), [T, J, 4], each near the one before it."""
+    turns = Rotation.from_matrix(np.reshape(rotations, (-1, 3, 3))).as_quat().reshape(*rotations.shape[:2], 4)
+    flips = np.where((turns[1:] * turns[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
+    turns[1:] *= np.cumprod(flips, axis=0)[..., None]
+    return turns
+
+
+def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Animation, times: int) -> list[int]:
+    """Add joints, mesh, skin and channels; return the character's two top nodes."""
+    document, skeleton = file.document, motion.skeleton
+    body = make_body(skeleton)
+    turns = _quaternions(np.asarray(motion.needed_rotations("a glTF animation"), np.float64))
+    root = np.asarray(motion.root_position, np.float64)
+    first = len(document.nodes)
+    for joint, name in enumerate(skeleton.names):
+        children = [first + child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        place = root[0] if joint == 0 else skeleton.offsets[joint]
+        document.nodes.append(
+            gltf.Node(name=name, translation=place.tolist(), rotation=turns[0, joint].tolist(), children=children)
+        )
+    rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
+    inverse = np.tile(np.eye(4), (skeleton.num_joints, 1, 1))
+    inverse[:, :3, 3] = -rest
+    document.skins.append(
+        gltf.Skin(
+            joints=list(range(first, first + skeleton.num_joints)),
+            skeleton=first,
+            inverseBindMatrices=file.put(inverse, "f4"),
+        )
+    )
+    padding = ((0, 0), (0, 4 - body.joints.shape[1]))
+    corners = body.vertices[body.faces]
+    normals = np.zeros_like(body.vertices)  # of a vertex: the sum of its faces' ones, which weighs them by area
+    np.add.at(normals, body.faces, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
+    attributes = gltf.Attributes(
+        POSITION=file.put(body.vertices, "f4", gltf.ARRAY_BUFFER),
+        NORMAL=file.put(normals / np.linalg.norm(normals, axis=1, keepdims=True), "f4", gltf.ARRAY_BUFFER),
+        JOINTS_0=file.put(np.pad(body.joints, padding), "u1", gltf.ARRAY_BUFFER),
+        WEIGHTS_0=file.put(np.pad(body.weights, padding), "f4", gltf.ARRAY_BUFFER),
+    )
+    indices = file.put(body.faces.ravel(), "u4", gltf.ELEMENT_ARRAY_BUFFER)
+    document.meshes.append(gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)]))
+    label = motion.name or f"character {number}"
+    document.nodes.append(gltf.Node(name=label, mesh=len(document.meshes) - 1, skin=len(document.skins) - 1))
+    for node, path, values in [(first, "translation", root)] + [
+        (first + joint, "rotation", turns[:, joint]) for joint in range(skeleton.num_joints)
+    ]:
+        animation.samplers.append(gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
+        target = gltf.AnimationChannelTarget(node=node, path=path)
+        animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+    return [first, len(document.nodes) - 1]
+
+
+def write_glb(path, motions: Motion | Sequence[Motion], *, credit: str = "", overwrite: bool = False) -> Path:
+    """Write motions as one binary glTF file.
+
+    Args:
+      path: ends in .glb; folders are made.
+      motions: one or several, of one frame rate and length.
+      credit: whose motion this is and under which terms; stands in the file as its copyright.
+      overwrite: replace what is there.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: for a wrong suffix, a file that is there, no motion, unlike rates or lengths, or motion without
+        rotations.
+    """
+    path = Path(path)
+    if path.suffix != ".glb":
+        raise ValueError(f"{path}: binary glTF is written as .glb")
+    motions = [motions] if isinstance(motions, Motion) else list(motions)
+    if len({(motion.num_frames, motion.fps) for motion in motions}) != 1:
+        raise ValueError(f"{path}: needs motions of one length and frame rate, got {len(motions)} motions")
+    file = _File(credit)
+    document = file.document
+    material = gltf.PbrMetallicRoughness(baseColorFactor=_GREY, metallicFactor=0.0, roughnessFactor=0.8)
+    document.materials.append(gltf.Material(name="body", pbrMetallicRoughness=material))
+    animation = gltf.Animation(name="motion")
+    times = file.put(np.arange(motions[0].num_frames) / motions[0].fps, "f4")
+    top = [node for k, motion in enumerate(motions) for node in _add_character(file, motion, k, animation, times)]
+    document.animations.append(animation)
+    document.scenes.append(gltf.Scene(nodes=top))
+    document.scene = 0
+    document.buffers.append(gltf.Buffer(byteLength=len(file.bytes)))
+    document.set_binary_blob(file.bytes)
+    with whole_file(path, overwrite=overwrite) as unfinished:
+        unfinished.write_bytes(b"".join(document.save_to_bytes()))
+    return path

@@ -1,0 +1,177 @@
+"""A page on which one steers a trained model: the network runs in the browser.
+
+`steer_page` makes one HTML file with everything in it: the weights as ONNX, ONNX Runtime for WebAssembly, three.js, and
+our own modules (`serving/web`). All of it is gzipped and in base64, so that the page works from a disk and asks nothing
+of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import re
+import string
+from pathlib import Path
+
+import numpy as np
+
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, is_head
+from f3amd_lib.generation.steering import first_pose, usual_pace
+from f3amd_lib.ground.files import whole_file
+from f3amd_lib.serving.npm_packages import package_credit, package_file
+from f3amd_lib.serving.onnx_export import denoiser_program, model_card
+from f3amd_lib.training.checkpoints import TrainedModel
+
+WEB = Path(__file__).parent / "web"
+MODULES = (
+    ("three.core.js", "./three.core.js", "build/three.core.js"),
+    ("three.module.js", "three", "build/three.module.js"),
+    ("motion.js", "./motion.js", None),
+    ("steer.js", "./steer.js", None),
+)
+"""Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
+
+_MARKS = {"past": "#b5651d", "taken": "#1b7f4d", "dropped": "#4f7fbf", "target": TARGET_COLOR, "seam": "#d33f3f"}
+
+
+def steer_page(
+    trained: TrainedModel, *, num_steps: int = 8, weights: str = "int8", program: bytes | None = None
+) -> str:
+    """Return a page on which one steers characters of a model, HTML; it needs no other file and no network.
+
+    Args:
+      trained: a model of history, path and style that is sampled by DDIM.
+      num_steps: of the sampler; the page also offers 1.
+      weights: how they are stored, see `onnx_export.WEIGHTS`.
+      program: from `onnx_export.denoiser_program`, for any number of characters, instead of exporting here.
+
+    Raises:
+      ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, or a model that lacks
+        a starting pose for one of its styles.
+    """
+    if trained.diffusion.sampler != "ddim":
+        raise ValueError(
+            f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
+        )
+    card = model_card(trained, num_steps)
+    missing = [style for style in trained.styles if style not in trained.start_poses]
+    if missing:
+        raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
+    if program is None:
+        program = denoiser_program(trained.network(), weights=weights)
+    paces = [usual_pace(trained, style) for style in trained.styles]
+    poses = [
+        first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in zip(trained.styles, paces, strict=True)
+    ]
+    files = {name: package_file("three", path) if path else (WEB / name).read_bytes() for name, _, path in MODULES}
+    files |= {
+        "worker": _worker().encode(),
+        "wasm": package_file("onnxruntime-web", "dist/ort-wasm-simd-threaded.wasm"),
+        "program": program,
+        "poses": np.asarray(poses, np.float32).tobytes(),
+    }
+    data = {
+        "card": _used(card) | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")},
+        "modules": [(name, specifier) for name, specifier, _ in MODULES],
+        "bones": bones_of(trained.skeleton),
+        "head": _head(trained.skeleton),
+        "paces": paces,
+        "colors": LIMB_COLORS,
+        "marks": _MARKS,
+        "first_styles": _first_styles(trained.styles),
+    }
+    choice = '<label><input type="radio" name="steps" value="{0}"{1}>{0}</label>'
+    offered = sorted(map(int, card["sigmas"]), reverse=True)
+    steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
+    credit = ". ".join(
+        filter(None, (card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))))
+    )
+    return string.Template((WEB / "steer.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(f"Steer {trained.name}"),
+        name=html.escape(trained.name),
+        about=html.escape(
+            f"{trained.name}, trained on {card['data']}, a diffusion model of {_count(trained)} weights."
+        ),
+        window=trained.config.window,
+        history=trained.config.num_history,
+        runtime=html.escape(package_credit("onnxruntime-web").split(":")[0]),
+        credit=html.escape(credit),
+        licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
+        steps=steps,
+        style=string.Template((WEB / "steer.css").read_text(encoding="utf-8")).substitute(
+            marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
+        ),
+        data=_json(data),
+        files=_json({name: _packed(content) for name, content in files.items()}),
+        loader=(WEB / "loader.js").read_text(encoding="utf-8"),
+    )
+
+
+def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **options) -> Path:
+    """Write `steer_page` as a file.
+
+    Raises:
+      ImportError, ValueError: as `steer_page`; for a suffix other than .html, or a file that is there already.
+    """
+    path = Path(path)
+    if path.suffix != ".html":
+        raise ValueError(f"{path}: the page is written as .html")
+    page = steer_page(trained, **options)
+    with whole_file(path, overwrite=overwrite) as temporary:
+        Path(temporary).write_text(page, encoding="utf-8")
+    return path
+
+
+def _worker() -> str:
+    """Return the worker as one classic script: a browser lets a page on a disk start no other.
+
+    Raises:
+      ValueError: if ONNX Runtime's bundle is not written as expected.
+    """
+    bundle = package_file("onnxruntime-web", "dist/ort.wasm.bundle.min.mjs").decode("utf-8")
+    body, _, names = bundle.partition("export{")
+    names, closed, rest = names.partition("};")
+    pairs = [name.split(" as ") for name in names.split(",")]
+    if not closed or "export" in rest or any(len(pair) != 2 for pair in pairs):
+        raise ValueError("onnxruntime-web: the bundle's exports are not where they are expected; pin another version")
+    # It asks for its address only to find files that the page hands it.
+    body = body.replace("import.meta.url", '"https://page.invalid/"')
+    exported = ",".join(f"{name}:{own}" for own, name in pairs)
+    motion = (WEB / "motion.js").read_text(encoding="utf-8")
+    worker = (WEB / "steer_worker.js").read_text(encoding="utf-8")
+    ours = re.sub(r"^export ", "", motion, flags=re.M) + re.sub(r"^import .*\n", "", worker, flags=re.M)
+    return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
+
+
+def _json(value) -> str:
+    # "</script>" in a name would end the block that holds it.
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _used(card: dict) -> dict:
+    """Return a card without what the page does not read."""
+    return {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
+
+
+def _head(skeleton) -> tuple[int, int] | None:
+    """Return the head joint and its parent, or None."""
+    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
+    return (heads[0], skeleton.parents[heads[0]]) if heads and skeleton.parents[heads[0]] >= 0 else None
+
+
+def _first_styles(styles) -> tuple[str, str]:
+    """Return the two styles that the slider blends at first."""
+    first = "Neutral" if "Neutral" in styles else styles[0]
+    return first, next((style for style in ("Proud", *styles) if style in styles and style != first), first)
+
+
+def _count(trained: TrainedModel) -> str:
+    import jax
+
+    return f"{sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params)):,}"

@@ -1,0 +1,53 @@
+// The network, in a worker: ONNX Runtime in WebAssembly, one thread, all characters in one call. The page sends what the
+// player wishes, and gets frames back.
+import * as ort from "onnxruntime-web";
+import { advance, normalNumbers, startCharacter } from "./motion.js";
+
+let card, session, poses, characters = [], draw = normalNumbers(1);
+
+async function denoise(x, sigma, { history, path, style }) {
+  const batch = x.length / (card.window * card.channels);
+  const tensor = (data, ...dims) => new ort.Tensor("float32", data, dims);
+  const { x0_hat: clean } = await session.run({
+    x_noisy: tensor(x, batch, card.window, card.channels),
+    sigma: tensor(new Float32Array(batch).fill(sigma), batch),
+    history: tensor(history, batch, card.num_history, card.channels),
+    path: tensor(path, batch, card.window, 8),
+    style: tensor(style, batch, card.styles.length),
+  });
+  return clean.data;
+}
+
+const frameList = (flat, channels) =>
+  Array.from({ length: flat.length / channels }, (_, k) => flat.subarray(k * channels, (k + 1) * channels));
+
+const answers = {
+  async open(message) {
+    ({ card } = message);
+    poses = frameList(message.poses, card.num_history * card.channels).map((pose) => frameList(pose, card.channels));
+    Object.assign(ort.env.wasm, { wasmBinary: message.wasm, numThreads: 1, proxy: false });
+    session = await ort.InferenceSession.create(message.program, { executionProviders: ["wasm"] });
+    return {};
+  },
+  // Characters that are there stay; new ones start at {x, z, yaw, style}. noise of a seed, for tests.
+  characters({ places, seed, keep }) {
+    if (seed !== undefined) draw = normalNumbers(seed);
+    characters = places.map((place, k) =>
+      (keep && characters[k]) || startCharacter(poses[place.style], place.x, place.z, place.yaw));
+    return { histories: characters.map(({ history }) => history) };
+  },
+  async round({ wishes, styles, sigmas, hop, blend, noise }) {
+    const began = performance.now();
+    const drawn = noise ?? draw(characters.length * card.window * card.channels);
+    const made = await advance(card, characters, wishes, styles, denoise, drawn, sigmas, hop, blend);
+    return { made, targets: characters.map(({ target }) => target), ms: performance.now() - began };
+  },
+};
+
+self.onmessage = async ({ data: { id, kind, ...message } }) => {
+  try {
+    self.postMessage({ id, ...(await answers[kind](message)) });
+  } catch (error) {
+    self.postMessage({ id, error: String(error?.message ?? error) });
+  }
+};

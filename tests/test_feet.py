@@ -1,0 +1,98 @@
+"""`measure feet`: what blending and locking do is measured on one and the same rollout, never mixed up."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders import packed_from, tiny_trained
+
+from f3amd_lib.data.features import world_frames
+from f3amd_lib.experiments import measure
+from f3amd_lib.generation.generated import Rollout
+from f3amd_lib.ground.profiles import load_profile, repository_root
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.training.pipeline import PreparedData
+
+WINDOW, HISTORY = 32, 10
+PROFILE = load_profile("smoke", "synthetic", window=WINDOW)
+
+
+def feet_rows(table) -> list[str]:
+    """The rows of the table in docs/results.md, from a record."""
+    rows = []
+    for (model, steps, treatment), part in table.groupby(["model", "steps", "treatment"], sort=False):
+        if treatment not in ("as made", "blended, feet locked"):
+            continue
+        seeds = part.groupby("seed")[["slide_speed", "joint_acceleration", "seam_kick", "floor_penetration"]].mean()
+        mean, spread = seeds.mean(), seeds.std()
+        cells = [
+            f"{mean[name]:.{digits}f}" + (f" ± {spread[name]:.{digits}f}" if len(seeds) > 1 else "")
+            for name, digits in zip(seeds, (1, 2, 1, 1), strict=True)
+        ]
+        named = "real" if not steps else f"`{model}`, {steps} step{'s' * (steps > 1)}, {treatment}"
+        rows.append(f"| {named} | {' | '.join(cells)} |")
+    return rows
+
+
+class Slider:
+    """Generates walkers whose root goes 40 % too far, so that feet slide, and who jump at each seam."""
+
+    def __init__(self, trained, num_steps):
+        self.num_steps = num_steps
+
+    def rollout(self, paths, styles, *, seed):
+        frames = []
+        for number in range(len(styles)):
+            walk = synthesize("Neutral", (HISTORY + len(paths[0].yaw)) / 30, seed=10 * seed + number)
+            root = walk.root_position * [1.4, 1.0, 1.4]
+            root[:, 0] += 0.03 * (((np.arange(len(root)) - HISTORY) // WINDOW) % 2)
+            frames.append(world_frames(walk.replace(root_position=root)))
+        frames = np.array(frames)
+        return Rollout(walk.skeleton, frames[:, HISTORY:], frames[:, :HISTORY], tuple(paths), tuple(styles), WINDOW)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    clips = [(synthesize("Neutral", 5.0, seed=seed), seed % 2, seed % 3) for seed in range(6)]
+    prepared = PreparedData(packed_from(clips), WINDOW, HISTORY)
+    profile = dataclasses.replace(PROFILE, evaluation_styles=("calm", "proud"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("F3AMD_RESULTS_DIR", str(tmp_path_factory.mktemp("results")))
+        patch.setattr(measure, "obtain_model", lambda prepared, profile, *, preset: (tiny_trained(), None, ""))
+        patch.setattr(measure, "available_models", lambda profile: ["F3AMD-FNO-32"])
+        patch.setattr(measure, "MotionGenerator", Slider)
+        patch.setattr(measure, "WALKING_SEEDS", 1)
+        return read_table(measure.measure_feet(prepared, profile))
+
+
+def test_every_model_step_style_and_treatment_has_its_row(table):
+    rows, record = table
+    made = rows[rows.model == "F3AMD-FNO-32"]
+    assert set(made.steps) == {8, 1} and set(made.treatment) == set(measure.TREATMENTS)
+    assert len(made) == 2 * 4 * 2 and set(rows[rows.model == "real"].treatment) == {"as made"}
+    assert record["measurement"] == "feet" and set(record["weights_digests"]) == {"real", "F3AMD-FNO-32"}
+
+
+def test_locked_feet_slide_less_and_blended_seams_kick_less(table):
+    rows, _ = table
+    mean = rows[(rows.model == "F3AMD-FNO-32") & (rows.steps == 8)].groupby("treatment").mean(numeric_only=True)
+    assert mean.slide_speed["as made"] > 20  # the nonsense is seen
+    assert mean.slide_speed["feet locked"] < 0.3 * mean.slide_speed["as made"]
+    assert mean.slide_speed["blended"] > 0.7 * mean.slide_speed["as made"]  # blending holds no foot
+    assert mean.seam_kick["blended"] < 0.7 * mean.seam_kick["as made"]
+    assert mean.slide_speed["blended, feet locked"] < 0.3 * mean.slide_speed["as made"]
+
+
+def test_the_page_of_results_says_what_the_record_says():
+    page = (repository_root() / "docs" / "results.md").read_text(encoding="utf-8")
+    table, record = read_table(repository_root() / "paper_figures/bandai/laptop/records/feet.csv")
+    rows = feet_rows(table)
+    assert len(rows) == 9 and all(row in page for row in rows)
+    assert (record["num_seeds"], record["num_frames"], len(record["styles"])) == (3, 640, 7)
+    other = table.assign(slide_speed=table.slide_speed + 1)
+    assert not any(row in page for row in feet_rows(other))
+    # "about one frame in twenty", "one in forty"
+    locked = table[table.treatment == "blended, feet locked"].groupby(["model", "steps"]).sliding_share.mean()
+    assert locked.between(0.04, 0.07).all()
+    assert 1 / 45 < table[table.model == "real"].sliding_share.mean() < 1 / 35

@@ -1,0 +1,147 @@
+"""An ONNX program gives JAX's numbers, for any number of characters, and its card says all that is needed."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import builders
+import jax
+import numpy as np
+import pytest
+from builders import refused
+
+from f3amd_lib.diffusion.samplers import walk
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
+from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.serving.onnx_export import (
+    CARD,
+    PROGRAM,
+    OnnxDenoiser,
+    denoiser_program,
+    export_onnx,
+    largest_difference,
+    seeded_inputs,
+)
+from f3amd_lib.training.checkpoints import load_model
+
+PRETRAINED = Path(__file__).resolve().parents[1] / "f3amd_lib" / "pretrained"
+SHIPPED = sorted(path.relative_to(PRETRAINED).as_posix() for path in PRETRAINED.rglob("*.safetensors"))
+needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
+
+
+@pytest.fixture(scope="module")
+def trained():
+    record = {"dataset": "tiny", "dataset_licence": "CC BY 4.0", "dataset_credit": "nobody"}
+    return builders.tiny_trained(record=record, latent_width=64)
+
+
+@pytest.fixture(scope="module")
+def folder(trained, tmp_path_factory):
+    return export_onnx(trained, tmp_path_factory.mktemp("onnx") / "tiny", num_steps=2)
+
+
+def whole_walks(program, trained, num_steps, batch):
+    """The same round by ONNX Runtime and by JAX, [B, T, C] each, of the same noise."""
+    network, schedule = trained.network(), trained.diffusion
+    noise, condition = seeded_inputs(trained.config, batch)
+    sigmas, key = schedule.grid(num_steps), jax.random.key(7)
+    if schedule.sampler == "ddpm":  # draws at each step: the same keys, and then the same start
+        key_steps = jax.random.split(key)[1]
+    else:
+        key_steps = None
+    denoise = OnnxDenoiser(program).given(condition)
+    states = list(walk(schedule.sampler, denoise, np.float32(sigmas[0]) * noise, sigmas, key=key_steps))
+    run = jax.jit(lambda noise: sample_round(network, condition, sigmas, key, noise=noise, sampler=schedule.sampler))
+    return np.asarray(states[-1].x_noisy), np.asarray(run(noise))
+
+
+@needs_onnx
+@pytest.mark.parametrize("batch", (1, 3))
+@pytest.mark.parametrize("num_steps", (1, 8))
+def test_a_round_agrees_with_jax_for_any_number_of_characters(folder, trained, num_steps, batch):
+    found, wanted = whole_walks((folder / PROGRAM).read_bytes(), trained, num_steps, batch)
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
+@needs_onnx
+def test_other_weights_or_another_condition_would_be_seen(folder, trained):
+    run, network = OnnxDenoiser((folder / PROGRAM).read_bytes()), trained.network()
+    noise, condition = seeded_inputs(trained.config, 2)
+    level = np.array([1.0, 3.0], np.float32)  # one a character
+    found = run(noise, level, *condition)
+    np.testing.assert_allclose(found, builders.evaluate(network, noise, level, condition), atol=1e-5)
+    assert np.abs(found - run(noise, level[::-1], *condition)).max() > 1e-3
+    for field in Condition._fields:
+        other = condition._replace(**{field: getattr(condition, field)[::-1]})
+        assert np.abs(found - run(noise, level, *other)).max() > 1e-4, field
+
+
+@needs_onnx
+def test_the_card_says_what_the_model_is_and_how_near_it_is(folder, trained):
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    assert card["styles"] == list(trained.styles) and card["terms"] == "CC BY 4.0" and card["batch"] == "any"
+    assert card["skeleton"]["parents"] == list(trained.skeleton.parents)
+    np.testing.assert_allclose(card["normaliser"]["mean"], trained.normaliser.mean)
+    np.testing.assert_allclose(card["sigmas"]["2"], trained.diffusion.grid(2))
+    assert card["inputs"]["sigma"]["shape"] == ["B"] and 0 < card["largest_error"] < 1e-4
+    assert {path.suffix for path in folder.iterdir()} == {".onnx", ".json", ".py", ".cs"}
+
+
+@needs_onnx
+def test_the_worked_example_runs_beside_the_files_alone(folder):
+    bare = {"PATH": os.environ["PATH"]}
+    done = subprocess.run(
+        [sys.executable, "-I", "example.py"], cwd=folder, env=bare, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 characters, 8 frames" in done.stdout
+
+
+@needs_onnx
+def test_fewer_bits_are_smaller_and_cost_what_is_measured(folder, trained):
+    network, sigmas = trained.network(), trained.diffusion.grid(4)[:-1]
+    sizes, errors = [(folder / PROGRAM).stat().st_size], [0.0]
+    for weights in ("float16", "int8"):
+        program = denoiser_program(network, weights=weights)
+        sizes.append(len(program))
+        errors.append(largest_difference(program, network, sigmas))
+    assert sizes[0] > sizes[1] > sizes[2]
+    assert 1e-6 < errors[1] < errors[2] < 0.1
+
+
+@needs_onnx
+def test_a_fixed_number_of_characters_is_fixed(trained):
+    program = denoiser_program(trained.network(), batch=2)
+    assert OnnxDenoiser(program).input_shapes["history"] == (2, builders.HISTORY, builders.CHANNELS)
+
+
+@needs_onnx
+def test_what_cannot_be_exported_is_told(trained, folder, monkeypatch):
+    network = trained.network()
+    refused("unknown weights 'int4'", denoiser_program, network, weights="int4")
+    refused("at least 1 character", denoiser_program, network, batch=0)
+    refused("pass --overwrite", export_onnx, trained, folder)
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)
+    with pytest.raises(ImportError, match="make onnx-tools"):
+        denoiser_program(network)
+
+
+@needs_onnx
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_model_agrees_with_jax(name):
+    trained = load_model(PRETRAINED / name)
+    program = denoiser_program(trained.network())
+    for num_steps in (8, 1):
+        found, wanted = whole_walks(program, trained, num_steps, 2)
+        np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=f"{name}, {num_steps} steps")
+
+
+@needs_onnx
+def test_camdm_walks_with_fresh_noise():
+    trained = builders.tiny_trained(config=builders.tiny_camdm(), diffusion=variance_preserving_cosine(4))
+    found, wanted = whole_walks(denoiser_program(trained.network()), trained, 4, 2)
+    np.testing.assert_allclose(found, wanted, atol=1e-4)

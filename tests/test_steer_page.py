@@ -1,0 +1,222 @@
+"""The page's sampling, kinematics and conditions are Python's, to 1e-4 for the same noise; and the page is whole.
+
+Its modules run in node. tests/web/test_steer.py has the page in a browser, with the network itself.
+"""
+
+import base64
+import gzip
+import json
+import re
+import subprocess
+from types import SimpleNamespace
+
+import builders
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import refused
+
+from f3amd_lib.data.features import frame_positions, orthonormalise
+from f3amd_lib.diffusion.samplers import sample
+from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
+from f3amd_lib.generation.blending import blend_seams
+from f3amd_lib.generation.steering import Steering, Target, first_pose, move_target
+from f3amd_lib.serving import npm_packages, steer
+from f3amd_lib.serving.npm_packages import package_file
+from f3amd_lib.serving.onnx_export import model_card
+from f3amd_lib.serving.steer import WEB, steer_page, write_steer
+
+SIGMAS = variance_exploding().grid(3)
+BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};\n//# sourceMappingURL=x"
+
+
+def in_node(tmp_path, body: str, **given):
+    """Run a script with motion.js as `m` and `given`; what it hands to `say` comes back."""
+    (tmp_path / "motion.mjs").write_bytes((WEB / "motion.js").read_bytes())
+    (tmp_path / "given.json").write_text(json.dumps(given))
+    (tmp_path / "test.mjs").write_text(
+        'import * as m from "./motion.mjs"; import { readFileSync } from "node:fs";'
+        'const given = JSON.parse(readFileSync("given.json"));'
+        "const frames = (rows) => rows.map((row) => Float64Array.from(row));"
+        "const lists = (x) => ArrayBuffer.isView(x) ? Array.from(x) : Array.isArray(x) ? x.map(lists) : x;"
+        "const say = (x) => process.stdout.write(JSON.stringify(lists(x)));" + body
+    )
+    done = subprocess.run(["node", "test.mjs"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def toy(x_noisy, sigma, condition):
+    """A denoiser that reads all it is given; `TOY` is the same for the page."""
+    past = condition.history[:, -1:].mean(axis=2, keepdims=True)
+    way = condition.path @ jnp.arange(1.0, 9.0)[:, None]
+    style = (condition.style @ jnp.arange(1.0, 3.0))[:, None, None]
+    return 0.3 * x_noisy / (1.0 + sigma) + 0.1 * past + 0.002 * way + 0.05 * style
+
+
+TOY = """
+const toy = (x, sigma, { history, path, style }) => x.map((value, i) => {
+  const C = given.card.normaliser.mean.length, T = given.card.window, H = given.kept;
+  const k = Math.floor(i / C), b = Math.floor(k / T);
+  let past = 0, way = 0;
+  for (let c = 0; c < C; c++) past += history[(b * H + H - 1) * C + c] / C;
+  for (let c = 0; c < 8; c++) way += path[8 * k + c] * (c + 1);
+  return 0.3 * value / (1 + sigma) + 0.1 * past + 0.002 * way + 0.05 * (style[2 * b] + 2 * style[2 * b + 1]);
+});
+"""
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return builders.tiny_trained(record={"dataset": "tiny", "dataset_licence": "CC0", "dataset_credit": "<nobody>"})
+
+
+@pytest.mark.needs("node")
+def test_targets_move_alike(tmp_path):
+    wishes = [(1.2, 1.0), (0.0, 0.0), (1.6, -2.9), (0.4, 3.1)]
+    found = in_node(
+        tmp_path,
+        "let target = { x: 1, z: -2, heading: 0.5, turning: 0, speed: 0.3 }; const paths = [];"
+        "for (const [speed, direction] of given.wishes) {"
+        " const made = m.moveTarget(target, { speed, direction }, 20); target = made.target; paths.push(made.path); }"
+        "say(paths)",
+        wishes=wishes,
+    )
+    target = Target(np.array([[1.0, -2.0]]), np.array([0.5]), np.zeros(1), np.array([0.3]))
+    for path, (speed, direction) in zip(found, wishes, strict=True):
+        target, positions, headings = move_target(target, [speed], [direction], 20)
+        wanted = np.concatenate([positions[0], headings[0][:, None]], axis=-1)
+        np.testing.assert_allclose(np.reshape(path, (20, 3)), wanted, atol=1e-9)
+
+
+@pytest.mark.needs("node")
+def test_kinematics_blending_and_rotations_are_alike(tmp_path, trained):
+    skeleton = trained.skeleton
+    history, window = builders.random_frames((5,), 1), builders.random_frames((8,), 2)
+    near = orthonormalise(history[-1:] + 0.1 * np.random.default_rng(0).normal(size=(8, builders.CHANNELS)))
+    rough = 1.3 * window + 0.1
+    found = in_node(
+        tmp_path,
+        "const history = frames(given.history);"
+        "say([frames(given.window).map((f) => m.jointPositions(given.skeleton, f)),"
+        " frames(given.rough).map(m.orthonormalise),"
+        " m.blendSeam(history, frames(given.window), 4), m.blendSeam(history, frames(given.near), 6),"
+        " m.blendSeam(history, frames(given.window), 0)])",
+        history=history.tolist(),
+        window=window.tolist(),
+        near=near.tolist(),
+        rough=rough.tolist(),
+        skeleton=model_card(trained, 1)["skeleton"],
+    )
+    joints = 3 * skeleton.num_joints
+    positions = np.reshape(np.array(found[0])[:, :joints], (8, -1, 3))
+    np.testing.assert_allclose(positions, frame_positions(skeleton, window), atol=1e-6)
+    np.testing.assert_allclose(found[1], orthonormalise(rough), atol=1e-6)
+    for blended, frames, count in ((found[2], window, 4), (found[3], near, 6), (found[4], window, 0)):
+        np.testing.assert_allclose(blended, blend_seams(frames, 8, count, history=history), atol=1e-6)
+    assert np.abs(np.array(found[2]) - window).max() > 0.1
+
+
+@pytest.mark.needs("node")
+def test_rounds_under_way_are_alike_for_the_same_noise(tmp_path, trained):
+    """Three rounds of two characters: condition, sampler, scales, blending, history and target, all together."""
+
+    def sample_window(key, condition, noise):
+        start = jnp.float32(SIGMAS[0]) * noise
+        return sample("ddim", lambda x, sigma: toy(x, sigma, condition), start, SIGMAS)
+
+    generator = SimpleNamespace(trained=trained, sample_window=sample_window)
+    headings, places = [0.4, -2.0], [(1.0, 0.5), (-1.0, 3.0)]
+    poses = [first_pose(trained, "calm", (0.0, 0.0), 0.0, 1.0) for _ in places]
+    starts = [first_pose(trained, "calm", place, yaw, 1.0) for place, yaw in zip(places, headings, strict=True)]
+    steering = Steering(generator, np.stack(starts), headings, hop=3, blend_frames=2)
+    noise = np.random.default_rng(1).standard_normal((3, 2, builders.WINDOW, builders.CHANNELS)).astype(np.float32)
+    speed, direction, style = [1.2, 0.0], [2.0, 0.0], np.array([[0.25, 0.75], [1.0, 0.0]])
+    wanted = [steering.advance(speed, direction, style, one) for one in noise]
+    found = in_node(
+        tmp_path,
+        TOY + "const characters = given.poses.map((pose, k) =>"
+        "  m.startCharacter(frames(pose), ...given.places[k], given.headings[k]));"
+        "const made = []; for (const noise of given.noise)"
+        "  made.push((await m.advance(given.card, characters, given.wishes, given.style, async (...a) => toy(...a),"
+        "    noise, given.sigmas, 3, 2)).map(({ frames }) => frames));"
+        "say([made, characters.map(({ target }) => [target.x, target.z, target.heading, target.speed])])",
+        card=model_card(trained, 1) | {"window": builders.WINDOW},
+        kept=builders.HISTORY,
+        poses=[pose.tolist() for pose in poses],
+        places=places,
+        headings=headings,
+        wishes=[{"speed": s, "direction": d} for s, d in zip(speed, direction, strict=True)],
+        style=style.tolist(),
+        noise=[one.ravel().tolist() for one in noise],
+        sigmas=SIGMAS.tolist(),
+    )
+    np.testing.assert_allclose(found[0], wanted, atol=1e-4)
+    target = steering.target
+    ends = np.column_stack([target.position, target.heading, target.speed])
+    np.testing.assert_allclose(found[1], ends, atol=1e-6)
+    assert np.abs(wanted[0][0] - wanted[0][1]).max() > 0.1
+
+
+@pytest.mark.needs("node")
+def test_the_page_draws_standard_normal_numbers(tmp_path):
+    drawn = in_node(tmp_path, "const draw = m.normalNumbers(5); say([draw(20000), m.normalNumbers(6)(5)])")
+    numbers = np.array(drawn[0])
+    assert abs(numbers.mean()) < 0.03 and abs(numbers.std() - 1) < 0.02 and abs((numbers**4).mean() - 3) < 0.3
+    assert abs(np.corrcoef(numbers[1:], numbers[:-1])[0, 1]) < 0.03
+    assert drawn[1] != drawn[0][:5]
+
+
+# --------------------------------------------------------------------------------------------------- the page as text
+
+
+@pytest.fixture
+def packages(monkeypatch):
+    monkeypatch.setattr(steer, "package_file", lambda package, path: BUNDLE if "onnx" in package else b"// three")
+
+
+def carried(page: str, name: str):
+    return json.loads(re.search(rf'id="{name}">(.*?)</script>', page, re.S)[1])
+
+
+def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp_path):
+    path = write_steer(tmp_path / "steer.html", trained, program=b"weights")
+    page = path.read_text(encoding="utf-8")
+    files = {name: gzip.decompress(base64.b64decode(text)) for name, text in carried(page, "steer-files").items()}
+    assert files["program"] == b"weights" and files["motion.js"] == (WEB / "motion.js").read_bytes()
+    poses = np.frombuffer(files["poses"], np.float32).reshape(2, builders.HISTORY, builders.CHANNELS)
+    np.testing.assert_allclose(poses[:, -1, [0, 2]], 0.0, atol=1e-6)
+    data = carried(page, "steer-data")
+    assert data["card"]["styles"] == ["calm", "proud"] and data["card"]["window"] == builders.WINDOW
+    assert {name for name, _ in data["modules"]} | {"worker", "wasm", "program", "poses"} == set(files)
+    head = page.split('<script type="application/json" id="steer-data">')[0]
+    assert "http" not in head.replace("http-equiv", "") and "default-src 'none'" in head
+    assert "&lt;nobody&gt;" in head and "CC0" in head and "inertialised" in head
+    refused("exists already", write_steer, path, trained, program=b"", overwrite=False)
+    refused("written as .html", write_steer, tmp_path / "steer.txt", trained)
+
+
+def test_the_worker_is_one_script_without_modules(trained, packages):
+    worker = gzip.decompress(
+        base64.b64decode(carried(steer_page(trained, program=b""), "steer-files")["worker"])
+    ).decode()
+    assert "const ort=(()=>{var a=1" in worker and "return{InferenceSession:a,default:b}" in worker
+    assert not re.search(r"^(import|export) |import\.meta", worker, re.M)
+
+
+def test_another_bundle_or_sampler_is_refused(trained, monkeypatch):
+    camdm = builders.tiny_trained(config=builders.tiny_camdm(), diffusion=variance_preserving_cosine(4))
+    refused("walks by 'ddim' alone", steer_page, camdm, program=b"")
+    monkeypatch.setattr(steer, "package_file", lambda *_: b"var a=1; export default a;")
+    refused("pin another version", steer_page, trained, program=b"")
+
+
+def test_a_package_that_is_not_as_pinned_is_refused_with_its_place(monkeypatch, tmp_path):
+    monkeypatch.setattr(npm_packages.pooch, "os_cache", lambda name: tmp_path)
+    (tmp_path / "three-0.187.0.tgz").write_bytes(b"something else")
+
+    def offline(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setattr(npm_packages.pooch.core, "stream_download", offline)
+    refused("put that file at .*three-0.187.0.tgz", package_file, "three", "build/three.module.js")

@@ -1,0 +1,178 @@
+"""The steer page in a real browser: the network runs in it, and somebody drives."""
+
+import json
+
+import builders  # noqa: F401  (tests/ is on the path)
+import numpy as np
+import pytest
+
+from f3amd_lib.diffusion.schedules import variance_exploding
+from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.generation.steering import FPS, Steering, first_pose
+from f3amd_lib.measures.walking import seam_kick
+from f3amd_lib.serving.onnx_export import denoiser_program
+from f3amd_lib.serving.steer import write_steer
+from f3amd_lib.training.checkpoints import load_model
+from f3amd_lib.training.pipeline import find_model
+
+pytestmark = pytest.mark.needs("jax2onnx", "onnxruntime")
+PHONE = (390, 844)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return load_model(find_model("synthetic"))
+
+
+@pytest.fixture(scope="module")
+def page(trained, tmp_path_factory):
+    program = denoiser_program(trained.network(), weights="int8")
+    return write_steer(tmp_path_factory.mktemp("steer") / "steer.html", trained, program=program)
+
+
+def opened(browser, page):
+    browser.open(page)
+    browser.wait(
+        "return document.documentElement.dataset.ready === 'yes' && !!window.steer"
+        " || !document.getElementById('message').hidden",
+        120,
+    )
+    assert browser.find("#message").text == ""
+    return browser
+
+
+def key(browser, kind: str, code: str) -> None:
+    browser.script("dispatchEvent(new KeyboardEvent(arguments[0], {code: arguments[1]}))", kind, code)
+
+
+def choose(browser, name: str, value) -> None:
+    browser.script(f"document.querySelector('input[name={name}][value=\"{value}\"]').click()")
+
+
+def test_rounds_are_pythons_for_the_same_noise(browser, page, trained):
+    """The whole way: history, condition, the network in WebAssembly with the page's weights, sampler, blending."""
+    opened(browser, page)
+    config, rng = trained.config, np.random.default_rng(0)
+    noise = rng.standard_normal((2, 2, config.window, config.channels)).astype(np.float32)
+    names, paces, yaws = ("Neutral", "Old"), (1.22, 0.58), (0.3, -1.0)
+    style = np.eye(len(trained.styles))[[trained.style_index(name) for name in names]]
+    style[1] = 0.5 * style[0] + 0.5 * style[1]
+    page_paces = browser.script("return JSON.parse(document.getElementById('steer-data').textContent).paces")
+    for num_steps in (8, 1):
+        generator = MotionGenerator(trained, num_steps)
+        poses = [
+            first_pose(trained, name, (k, 2.0 * k), yaws[k], page_paces[trained.style_index(name)])
+            for k, name in enumerate(names)
+        ]
+        steering = Steering(generator, np.stack(poses), yaws)
+        wanted = [steering.advance(paces, (1.0, -1.0), style, one) for one in noise]
+        browser.driver.set_script_timeout(120)
+        found = browser.driver.execute_async_script(
+            "const done = arguments[1]; steer.rehearse(JSON.parse(arguments[0])).then(done, (e) => done(String(e)))",
+            json.dumps(
+                {
+                    "places": [
+                        {"x": k, "z": 2.0 * k, "yaw": yaws[k], "style": trained.style_index(name)}
+                        for k, name in enumerate(names)
+                    ],
+                    "wishes": [{"speed": paces[k], "direction": (1.0, -1.0)[k]} for k in range(2)],
+                    "styles": style.tolist(),
+                    "noise": noise.reshape(2, -1).tolist(),
+                    "sigmas": variance_exploding(**dict(trained.diffusion.settings)).grid(num_steps).tolist(),
+                    "hop": steering.hop,
+                    "blend": steering.blend_frames,
+                }
+            ),
+        )
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
+    assert browser.errors() == [] and browser.requests() == []
+
+
+def test_a_square_driven_by_keys(browser, page, trained, screenshots, capsys):
+    """20 s, a side each 5 s: the character follows the line, does not jump, and nothing complains."""
+    opened(browser, page)
+    choose(browser, "steps", 1)  # what a slow machine still makes in time
+    browser.wait("return steer.state().timed >= 3", 60)
+    sides = ("ArrowUp", "ArrowRight", "ArrowDown", "ArrowLeft")
+    key(browser, "keydown", sides[0])
+    browser.wait("return steer.state().rounds > 3")
+    browser.script("steer.forget()")
+    began = browser.script("return steer.state().newest")
+    for side, following in zip(sides, (*sides[1:], None), strict=True):
+        began += 150
+        browser.wait(f"return steer.state().newest >= {began}", 90)
+        if following:
+            key(browser, "keydown", following)
+        key(browser, "keyup", side)
+    state, record = browser.script("return steer.state()"), browser.script("return steer.record()")
+    browser.screenshot(screenshots / "steer.png")
+    record = record[:600]
+    points = np.reshape([row["points"] for row in record], (600, -1, 3))[:, : trained.skeleton.num_joints]
+    ends = [(row["target"], points[k, 0, [0, 2]]) for k, row in enumerate(record) if row["target"]]
+    error = float(np.mean([np.linalg.norm(np.subtract(target, root)) for target, root in ends]))
+    kick = float(seam_kick(points, 8))
+    corners = points[[0, 149, 299, 449, 599], 0][:, [0, 2]]
+    legs = np.diff(corners, axis=0)
+    with capsys.disabled():
+        print(
+            f"\nsquare: path error {100 * error:.1f} cm, seam kick {kick:.2f}, {state['rate']:.0f} pictures a second, "
+            f"{state['ms']:.0f} ms a round in 1 step, waited {state['waits']} times"
+        )
+    assert state["hop"] in (8, 16, 24, 32) and len(ends) > 15
+    assert error < 0.15
+    if state["hop"] == 8:
+        assert kick < 2.0
+    assert np.abs(np.diff(points, axis=0)).max() < 0.3  # metres a frame: nobody is beamed
+    # Up the picture is +Z, right of it -X: each side goes where its key said.
+    for leg, wanted in zip(legs, ((0, 1), (-1, 0), (0, -1), (1, 0)), strict=True):
+        assert leg @ wanted > 0.75 * np.linalg.norm(leg) and 3.0 < np.linalg.norm(leg) < 8.0
+    assert np.linalg.norm(corners[-1] - corners[0]) < 4.0
+    assert browser.errors() == [] and browser.requests() == []
+    browser.script("steer.forget()")  # without a key it stops
+    browser.wait("return steer.record().length > 90", 60)
+    last = np.reshape([row["points"][:3] for row in browser.script("return steer.record()")[-10:]], (10, 3))
+    assert FPS * np.linalg.norm(np.diff(last[:, [0, 2]], axis=0), axis=-1).mean() < 0.3
+
+
+def test_what_a_round_costs_at_1_8_and_32_characters(browser, page, screenshots, capsys):
+    """Times are printed for whoever wants them; a machine's speed is no test."""
+    opened(browser, page)
+    lines = []
+    for steps in (8, 1):
+        choose(browser, "steps", steps)
+        for count in (1, 8, 32):
+            choose(browser, "count", count)
+            browser.wait(f"return steer.state().count === {count} && steer.state().timed >= 3", 180)
+            state = browser.script("return steer.state()")
+            lines.append(f"{steps} steps, {count:2d} characters: {state['ms']:.0f} ms a round, hop {state['hop']}")
+            assert not state["frozen"] and len(state["targets"]) == count
+    browser.script("document.getElementById('made').click()")
+    browser.wait("return steer.state().rounds > 0")
+    browser.screenshot(screenshots / "steer_32.png")
+    with capsys.disabled():
+        print("", *lines, sep="\n")
+    assert browser.errors() == [] and browser.requests() == []
+
+
+def test_the_style_slider_and_the_finger_are_heard(browser, page, screenshots):
+    browser.resize(*PHONE, phone=True)
+    opened(browser, page)
+    choose(browser, "steps", 1)
+    browser.script("const b = document.getElementById('blend'); b.value = 100; b.dispatchEvent(new Event('input'))")
+    browser.script("document.getElementById('made').click()")
+    browser.touch("touchStart", (200, 200))
+    browser.touch("touchMove", (200, 120))
+    browser.wait("return steer.state().rounds > 6", 60)
+    browser.script("steer.forget()")
+    browser.wait("return steer.record().length > 8", 60)
+    browser.screenshot(screenshots / "steer_phone.png")
+    wish = browser.script("return steer.record().at(-1).wish")
+    paces = browser.script("return JSON.parse(document.getElementById('steer-data').textContent).paces")
+    second = browser.script("return document.getElementById('second').selectedIndex")
+    assert abs(wish["speed"] - paces[second]) < 1e-3 and abs(wish["direction"]) < 1e-6
+    browser.touch("touchEnd")
+    wide = browser.script("return document.documentElement.scrollWidth - innerWidth")
+    panel = browser.find("#panel").rect
+    assert wide <= 0 and panel["x"] >= 0 and panel["x"] + panel["width"] <= PHONE[0]
+    assert panel["y"] > 0.45 * PHONE[1]  # the picture has the upper half
+    assert browser.errors() == []
