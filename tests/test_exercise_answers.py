@@ -6,6 +6,8 @@ says what is wrong.
 
 import re
 
+import course_answers_first
+import course_answers_second
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -455,6 +457,11 @@ WRONG["12.e"] = [
     (lambda lead, n: -lead % 2**n, "give 2 numbers"),
     (lambda lead, n: _bits(0, n), "0 frames late"),
 ]
+
+# The course, notebooks/course/ ------------------------------------------------------------------
+
+RIGHT |= course_answers_first.RIGHT | course_answers_second.RIGHT
+WRONG |= course_answers_first.WRONG | course_answers_second.WRONG
 
 # ------------------------------------------------------------------------------------------------
 

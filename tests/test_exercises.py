@@ -17,18 +17,24 @@ from helpers.exercises import CHECKS, check, hint
 from helpers.exercises.judging import NotAnswered, agree
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-NUMBER = re.compile(r"\d{1,2}\.[a-z]")
 
 
 def tagged_cells(tag: str) -> list[tuple[str, str, str, str]]:
     """(number, notebook, Markdown before it, source) of each code cell with a tag."""
     found = []
-    for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb")):
+    for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb")) + sorted(NOTEBOOKS.glob("course/[0-9][0-9]_*.ipynb")):
         cells = nbformat.read(path, as_version=4).cells
         for before, cell in zip(cells, cells[1:], strict=False):
             if tag in cell.metadata.get("tags", []):
                 text = before.source if before.cell_type == "markdown" else ""
-                found.append((asked_number(cell.source), path.stem, text, cell.source))
+                found.append(
+                    (
+                        asked_number(cell.source),
+                        path.relative_to(NOTEBOOKS).with_suffix("").as_posix(),
+                        text,
+                        cell.source,
+                    )
+                )
     return found
 
 
@@ -76,21 +82,23 @@ def test_every_exercise_has_one_stub_one_solution_and_one_check():
     assert len(set(stubs)) == len(stubs) >= 20
 
 
-def test_exercises_stand_in_the_notebook_of_their_number_five_or_more_each():
+def test_exercises_stand_in_the_notebook_of_their_number_five_or_more_each_two_in_the_course():
     by_notebook = {}
     for number, notebook, text, _ in EXERCISES:
-        assert int(number.split(".")[0]) == int(notebook[:2])
+        assert number.split(".")[0] == re.sub(r"^(course/)?0?(\d+)_.*", lambda m: "C" * bool(m[1]) + m[2], notebook)
         assert f"**{number}" in text, f"{number} has no question before it"
         by_notebook.setdefault(notebook, []).append(number)
-    assert [name[:2] for name in by_notebook] == ["02", "10", "11", "12"]
-    for numbers in by_notebook.values():
+    assert [name[:2] for name in by_notebook if "/" not in name] == ["02", "10", "11", "12"]
+    for notebook, numbers in by_notebook.items():
         chapter = numbers[0].split(".")[0]
         assert numbers == [f"{chapter}.{letter}" for letter in "abcdefgh"[: len(numbers)]]
-        assert len(numbers) >= 5
+        assert len(numbers) >= (2 if notebook.startswith("course/") else 5)
 
 
-def test_solutions_lie_in_one_notebook_each_with_its_reason():
-    assert len({notebook for _, notebook, _, _ in SOLUTIONS}) == 1
+def test_solutions_lie_in_notebooks_of_their_own_each_with_its_reason():
+    solved = {notebook for _, notebook, _, _ in SOLUTIONS}
+    assert all(notebook.endswith("_solutions") for notebook in solved)
+    assert solved.isdisjoint(notebook for _, notebook, _, _ in EXERCISES)
     for number, _, text, _ in SOLUTIONS:
         assert f"**{number}" in text and len(text) > 80, number
 
@@ -120,7 +128,7 @@ def test_a_check_prints_a_sentence_and_returns_nothing(capsys):
 
 @pytest.mark.parametrize("number", ["2.z", "2a", "", 2])
 def test_an_unknown_number_is_refused_with_the_nearest(number):
-    with pytest.raises(ValueError, match=r"no exercise .*2\.a"):
+    with pytest.raises(ValueError, match=r"no exercise .*2\.[a-g]"):
         hint(number, 1.0)
 
 

@@ -10,6 +10,8 @@ from helpers.exercises import CHECKS, hint
 
 from f3amd_lib.reports.equation_map import notebook_sections
 
+IN_SESSIONS = [number for number in CHECKS if not number.startswith("C")]
+"""Exercises of the three sessions; those of the course have numbers that begin with C."""
 PLAN = Path(__file__).resolve().parents[1] / "docs/lesson_plan.md"
 TEXT = PLAN.read_text(encoding="utf-8")
 NUMBER = re.compile(r"\b\d{1,2}\.[a-z]\b")
@@ -53,12 +55,12 @@ def test_every_exercise_is_planned_once_beside_a_section_of_its_notebook():
         for number in NUMBER.findall(cells[3]):
             assert cells[2].startswith(f"[{number.split('.')[0]}.")
             planned.append(number)
-    assert sorted(planned) == sorted(CHECKS)
-    assert set(NUMBER.findall(TEXT)) == set(CHECKS)
+    assert sorted(planned) == sorted(IN_SESSIONS)
+    assert set(NUMBER.findall(TEXT)) == set(IN_SESSIONS)
 
 
 def test_every_exercise_has_an_expected_answer():
-    assert list(ANSWERS) == list(CHECKS)
+    assert list(ANSWERS) == IN_SESSIONS
     assert all(ANSWERS.values())
 
 
@@ -99,7 +101,16 @@ THEORY = [*(f"{name}.ipynb" for name in (
 ))]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", THEORY)
+COURSE = [f"course/{path.name}" for path in sorted((PLAN.parents[1] / "notebooks/course").glob("*.ipynb"))]
+
+
+@pytest.mark.parametrize("name", COURSE)
+def test_a_notebook_of_the_course_takes_less_than_half_an_hour(name):
+    reading, exercises = stated_minutes(nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4))
+    assert name.endswith("_solutions.ipynb") or (8 <= reading <= 25 and reading + exercises <= 35)
+
+
+@pytest.mark.parametrize("name", THEORY + COURSE)
 def test_a_notebook_says_honestly_how_long_it_takes(name):
     notebook = nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4)
     reading, exercises = stated_minutes(notebook)
@@ -126,3 +137,26 @@ def test_answers_are_folded_away_and_the_plan_is_linked():
     root = PLAN.parents[1]
     assert "docs/lesson_plan.md" in (root / "README.md").read_text(encoding="utf-8")
     assert "lesson_plan" in (root / "docs/index.md").read_text(encoding="utf-8")
+
+
+SEMESTER = PLAN.with_name("semester.md").read_text(encoding="utf-8")
+
+
+def test_the_semester_has_twelve_weeks_and_the_afternoon_three_hours():
+    weeks, afternoon = (rows(part) for part in re.split(r"^## ", SEMESTER, flags=re.M)[1:])
+    assert [cells[0] for cells in weeks] == [str(week) for week in range(1, 13)]
+    assert sum(int(cells[0]) for cells in afternoon) == 180
+    for cells in weeks:
+        title, path = re.match(r"\[(.*?)\]\((.*?)\)", cells[2]).groups()
+        first = nbformat.read(PLAN.parent / path, as_version=4).cells[0].source
+        assert first.startswith(f"# {title.split(' · ')[0]} · ")
+        chapter = title.split(" · ")[0].lstrip("0")
+        exercises = re.findall(r"C?\d+\.[a-z]", cells[3])
+        assert all(number in CHECKS and number.split(".")[0] == chapter for number in exercises)
+
+
+def test_every_exercise_of_the_course_is_in_the_semester_once():
+    named = re.findall(r"\bC\d+\.[a-z]\b", SEMESTER)
+    assert sorted(named) == sorted(number for number in CHECKS if number.startswith("C"))
+    links = re.findall(r"\]\(([^)#]+)\)", SEMESTER)
+    assert [link for link in links if not (PLAN.parent / link).is_file()] == []

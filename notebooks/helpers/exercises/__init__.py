@@ -1,9 +1,9 @@
 """Exercises of the theory notebooks: a stub in the notebook, and a check that knows what is right.
 
-An exercise has a number, "2.a" for the first one of notebook 02. Its stub ends in
-`check("2.a", answer)`, which prints whether the answer is right and, where it is not, a hint that
-does not give it away. What is right is worked out or measured by the check itself, with the
-functions of the library.
+An exercise has a number, "2.a" for the first one of notebook 02, "C1.a" for that of the course's first
+notebook. Its stub ends in `check("2.a", answer)`, which prints whether the answer is right and, where it
+is not, a hint that does not give it away. What is right is worked out or measured by the check itself,
+with the functions of the library.
 
 Each module here holds the exercises of one notebook as `CHECKS`: by number, a function of the
 answer that returns None if it is right, else the hint.
@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from f3amd_lib.ground.names import nearest_hint
 
-from helpers.exercises import networks, one_step, printed_update, sampler_theory
+from helpers.exercises import course, networks, one_step, printed_update, sampler_theory
 from helpers.exercises.judging import NotAnswered, is_missing
 
-CHECKS = sampler_theory.CHECKS | printed_update.CHECKS | one_step.CHECKS | networks.CHECKS
+CHECKS = sampler_theory.CHECKS | printed_update.CHECKS | one_step.CHECKS | networks.CHECKS | course.CHECKS
 """The checks of all exercises by number, in the order of the notebooks."""
 
 
