@@ -244,20 +244,26 @@ def train_networks(
     )  # fmt: skip
     keys = [jax.random.split(jax.random.key(seed), 3) for seed in seeds]
     graph = nnx.graphdef(nnx.eval_shape(lambda: build_from_config(config, keys[0][0])))
-    begin = jax.jit(jax.vmap(lambda key: nnx.state(build_from_config(config, key))))
-    params = begin(jnp.stack([key_init for key_init, _, _ in keys]))
+    params = _initial_weights(config, jnp.stack([key_init for key_init, _, _ in keys]))
     shape = (num_steps, batch_size)
     sigmas = [diffusion.draw(jax.random.split(key_sigma, 3)[0], (num_steps * batch_size,)) for _, key_sigma, _ in keys]
     sigmas = jnp.stack(sigmas).reshape(-1, *shape)
     batches = _draw_batches(data, sigmas, jnp.stack([key_batches for _, _, key_batches in keys]))
+    # The noise is in the batches alone: trainings that differ in it are one program, compiled once.
     recipe = TrainingConfig(
         num_steps, batch_size, learning_rate, schedule="warmup_cosine", warmup_steps=max(1, num_steps // 10),
-        ema_decay=0.99, gradient_clip=1.0, diffusion=diffusion,
+        ema_decay=0.99, gradient_clip=1.0,
     )  # fmt: skip
     task = PathTask(PathNetwork(params, data, graph), batches, recipe)
     state, terms = advance(task, initial_state(task), num_steps)
     of_seed = lambda number: jax.tree.map(lambda leaf: leaf[number], state.averaged)
     return [PathNetwork(of_seed(number), data, graph) for number in range(len(keys))], np.asarray(terms["by_seed"]).T
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _initial_weights(config, keys):
+    """Return the weights of a network a key, each leaf [S, ...]."""
+    return jax.vmap(lambda key: nnx.state(build_from_config(config, key)))(keys)
 
 
 @functools.partial(jax.jit, static_argnames="data")
