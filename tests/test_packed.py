@@ -192,21 +192,6 @@ def test_another_format_is_refused(packed, tmp_path, monkeypatch):
     refused(r"a\.npz: is of format 99, this version reads \d+", load_packed, path)
 
 
-@pytest.mark.parametrize(
-    "changes, message",
-    [
-        ({"clip_start": np.array([0, 42, 42, 152], np.int32)}, "clip_start does not cut"),
-        ({"clip_start": np.array([0, 42, 102, 151], np.int32)}, "clip_start does not cut"),
-        ({"clip_style": np.array([0, 1, 2], np.int32)}, "clip_style points outside"),
-        ({"clip_split": np.array([0, 1, 3], np.uint8)}, "clip_split points outside"),
-        ({"floor_shift": np.zeros(2, np.float32)}, r"floor_shift has shape \(2,\)"),
-        ({"clip_contents": ("walk",)}, "1 contents for 3 clips"),
-    ],
-)
-def test_parts_must_fit_together(packed, changes, message):
-    refused(f"'handmade': {message}", dataclasses.replace, packed, **changes)
-
-
 def test_one_skeleton_for_all(motions):
     longer = dataclasses.replace(LEGS, offsets=LEGS.offsets * 1.1)
     motions["sad_long"] = legs_motion(50, 4, longer)

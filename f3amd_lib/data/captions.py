@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import re
-import tomllib
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.skeleton import Motion
 
-_WORDS = tomllib.loads((resources.files("f3amd_lib.data") / "captions.toml").read_text(encoding="utf-8"))
+_WORDS = read_toml(Path(__file__).with_name("captions.toml"))
 
 CAPTIONED = tuple(_WORDS["content"])
 """Contents that have words."""

@@ -18,9 +18,7 @@ import csv
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +26,12 @@ from tqdm import tqdm
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
 from f3amd_lib.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, UNIT, TextMotions, text_motions
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
-LAYOUTS = tomllib.loads((resources.files("f3amd_lib.data") / "layouts.toml").read_text(encoding="utf-8"))
+LAYOUTS = read_toml(Path(__file__).with_name("layouts.toml"))
 """Published layouts: "humanml3d" and "kit"."""
 
 _SPLIT_FILES = dict(zip(SPLITS, ("train.txt", "val.txt", "test.txt"), strict=True))
@@ -79,12 +77,21 @@ def write_caption_line(caption: str) -> str:
     return f"{caption}#{' '.join(f'{word}/OTHER' for word in words)}#0.0#0.0"
 
 
-def _array(path: Path, shape: tuple, fix: str) -> np.ndarray:
-    """Return a file's array as float32; -1 in the shape stands for any length."""
+def _load(path: Path, fix: str) -> np.ndarray:
+    """Return a file's array of numbers; ValueError names one that holds none."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    # What numpy and Python's own tokenizer raise over damaged bytes is no closed list.
+    except Exception as error:
         raise ValueError(f"{path}: cannot be read as an array without pickles ({error}); {fix}") from error
+    if getattr(array, "dtype", np.dtype(object)).kind not in "fiu":
+        raise ValueError(f"{path}: holds no array of real numbers; {fix}")
+    return array
+
+
+def _array(path: Path, shape: tuple, fix: str) -> np.ndarray:
+    """Return a file's array as float32; -1 in the shape stands for any length."""
+    array = _load(path, fix)
     if array.shape == shape[1:]:
         array = array[None]  # a clip of one frame is stored without a frame axis
     if array.ndim != len(shape) or array.shape[1:] != shape[1:] or not array.size:
@@ -137,7 +144,7 @@ def read_humanml3d(
             if name in seen:
                 raise ValueError(f"{where}: {name!r} is listed before, in {seen[name]}; keep one")
             seen[name] = file
-            if Path(name).name != name:
+            if Path(name).name != name or "\0" in name or len(name) > 200:
                 raise ValueError(f"{where}: {name!r} is no plain id; mend the line")
             positions = _array(folder / "new_joints" / f"{name}.npy", (-1, joints, 3), fix)
             wide = positions[:, :0, 0]
@@ -200,17 +207,19 @@ def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, 
         try:
             about = json.loads(own.read_text(encoding="utf-8"))
             skeleton = Skeleton(about["joints"], about["parents"], np.array(about["offsets"], np.float64))
-            about = {"fewest_frames": 1, "fps": float(about["fps"])} | about
-        except (KeyError, TypeError, ValueError) as error:
+            about = {"fewest_frames": 1} | about | {"fps": float(about["fps"])}
+            if not (0.0 < about["fps"] <= 1000.0 and isinstance(about.get("pairs", {}), dict)):
+                raise ValueError("its rate or its pairs are none")
+            texts = [about.get(key, "") for key in ("name", "licence", "credit")]
+            if not all(isinstance(text, str) for text in [*skeleton.names, *texts, *about.get("pairs", {}).values()]):
+                raise ValueError("its names and terms must be text")
+        except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); {fix}") from error
         return skeleton, about
     if layout is None:
         ids = [line.strip() for line in _lines(folder / "train.txt", fix) if line.strip()]
         first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
-        try:
-            joints = np.load(first, allow_pickle=False).shape[-2]
-        except (OSError, ValueError, IndexError, EOFError) as error:
-            raise ValueError(f"{first}: cannot be read as positions without pickles ({error}); {fix}") from error
+        joints = (0, *_load(first, fix).shape)[-2]
         known = {len(about["joints"]): name for name, about in LAYOUTS.items()}
         if joints not in known:
             raise ValueError(
@@ -291,7 +300,10 @@ def read_caption_table(path) -> dict[str, tuple[str, ...]]:
       ValueError: naming the file and the line, for a missing column, an empty cell or a # in a caption.
     """
     path = Path(path)
-    rows = list(csv.DictReader(_lines(path, "choose a CSV file in UTF-8")))
+    try:
+        rows = list(csv.DictReader(_lines(path, "choose a CSV file in UTF-8")))
+    except csv.Error as error:
+        raise ValueError(f"{path}: is not a CSV file ({error}); write it anew") from error
     captions: dict[str, list[str]] = {}
     for line, row in enumerate(rows, 2):
         file, caption = ((row.get(column) or "").strip() for column in ("file", "caption"))

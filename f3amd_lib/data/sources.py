@@ -21,24 +21,23 @@ import hashlib
 import io
 import json
 import os
-import tomllib
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pooch
 
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.skeleton import Motion, resample
 
-_SETS = tomllib.loads((resources.files("f3amd_lib.data") / "data_sets.toml").read_text(encoding="utf-8"))
+_SETS = read_toml(Path(__file__).with_name("data_sets.toml"))
 NAMES = tuple(_SETS)
 SPLITS = ("train", "validation", "test")
 FPS = 30.0
@@ -101,13 +100,9 @@ class Dataset:
 
 
 def open_dataset(
-    name: str,
-    *,
-    path=None,
-    locomotion_only: bool = True,
-    seconds_per_style: float = 60.0,
+    name: str, *, path=None, locomotion_only: bool = True, seconds_per_style: float = 60.0,
     num_styles: int | None = None,
-) -> Dataset:
+) -> Dataset:  # fmt: skip
     """Open a data set by name: find or download it, verify it and list its clips.
 
     Args:
@@ -169,13 +164,36 @@ def assign_splits(strata: Iterable[tuple[str, object]], percent: tuple[int, int]
 def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     """Open a zip once per process; a changed file is opened anew."""
     try:
-        return zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        opened = zipfile.ZipFile(path)
+    # Also what a forged directory raises: ValueError, NotImplementedError, struct.error, ...
+    except Exception as error:
         raise ValueError(f"{path}: broken or truncated zip archive ({error}); fetch it again") from error
+    if bomb := _too_large([info for info in opened.infolist() if info.filename.lower().endswith(_READ)]):
+        raise ValueError(f"{path}: refused before anything was unpacked: {bomb}; unpack it yourself if you trust it")
+    return opened
+
+
+_READ = (".bvh", ".csv")  # endings of the files that are read
+_MOST_FILES, _MOST_BYTES, _MOST_IN_ALL, _MOST_RATIO = 100_000, 1 << 29, 1 << 35, 200
+"""Limits on archives: files, bytes of one and of all, and how much one may grow. (100STYLE: 810 files, some 4 GB
+in all, of 17 MB at most; text of numbers shrinks 3 to 5 times, of still frames up to 100 times.)"""
+
+
+def _too_large(members: list[zipfile.ZipInfo]) -> str:
+    """Say by what an archive's directory asks for more than motion files do, "" if it does not."""
+    if len(members) > _MOST_FILES:
+        return f"{len(members)} files, at most {_MOST_FILES} are read"
+    for info in members:
+        if info.file_size > _MOST_BYTES:
+            return f"{info.filename!r} unpacks to {info.file_size / 1e9:.1f} GB"
+        if info.file_size > _MOST_RATIO * max(info.compress_size, 5000):
+            return f"{info.filename!r} unpacks to over {_MOST_RATIO} times its size"
+    total = sum(info.file_size for info in members)
+    return f"its files unpack to {total / 1e9:.0f} GB" if total > _MOST_IN_ALL else ""
 
 
 # All that a damaged member of a zip, or a file that went away, raises on reading.
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError, RuntimeError)
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError, RuntimeError, ValueError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -209,7 +227,12 @@ class _Archive:
     def read(self, name: str) -> bytes:
         """Return a file's bytes; ValueError names archive and file if they cannot be had."""
         try:
-            return self._zip().read(name) if self.is_zip else (Path(self.path) / name).read_bytes()
+            if self.is_zip:
+                return self._zip().read(name)
+            file = Path(self.path) / name
+            if file.stat().st_size > _MOST_BYTES:
+                raise OSError(f"{file.stat().st_size / 1e9:.1f} GB are too many for a motion file")
+            return file.read_bytes()
         except _UNREADABLE as error:
             raise ValueError(f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again") from error
 
@@ -233,6 +256,8 @@ def _archive_at(path) -> _Archive:
     path = Path(path).expanduser()
     if not path.exists():
         raise ValueError(f"{path}: there is no such file or folder; check the path")
+    if path.is_file() and path.suffix.lower() in _READ:
+        raise ValueError(f"{path}: is a single file; name the folder that it lies in")
     return _Archive(str(path))
 
 
@@ -306,16 +331,11 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
     clips = tuple(clips)
     styles = tuple(sorted({clip.style for clip in clips}))
     return Dataset(
-        name=name,
-        licence=_SETS[name]["licence"],
-        credit=_SETS[name]["credit"],
-        fingerprint=_fingerprint(name, clips, content),
-        styles=styles,
-        clips=clips,
+        name=name, licence=_SETS[name]["licence"], credit=_SETS[name]["credit"],
+        fingerprint=_fingerprint(name, clips, content), styles=styles, clips=clips,
         primary_styles=styles if primary is None else tuple(filter(primary, styles)),
-        mirror_styles=frozenset(filter(mirror, styles)),
-        notes=tuple(notes),
-    )
+        mirror_styles=frozenset(filter(mirror, styles)), notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
@@ -441,7 +461,7 @@ class _ListedFile:
 @functools.lru_cache(maxsize=1)
 def _bandai_list() -> tuple[_ListedFile, ...]:
     """Return the committed list of files: sizes and checksums at the pinned commit."""
-    source = resources.files("f3amd_lib.data").joinpath("bandai_files.csv")
+    source = Path(__file__).with_name("bandai_files.csv")
     with source.open("r", encoding="utf-8", newline="") as file:
         return tuple(
             _ListedFile(row["name"], int(row["frames"]), int(row["size"]), int(row["crc32"], 16), row["sha256_prefix"])
@@ -552,8 +572,8 @@ def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[t
             texts = [(row.get(f"{code}_{end}") or "N/A").strip() for end in ("START", "STOP")]
             if texts == ["N/A", "N/A"]:
                 continue
-            if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
-                what = f"{code} of {style} has the range {texts[0]!r} to {texts[1]!r}"
+            if not all(text.isdecimal() and len(text) < 10 for text in texts) or int(texts[0]) >= int(texts[1]):
+                what = f"{code} of {style} has the range {texts[0][:20]!r} to {texts[1][:20]!r}"
                 raise ValueError(f"{label}, line {line}: {what}; it needs two rising whole numbers, or N/A twice")
             if (style, code) in cuts:
                 raise ValueError(f"{label}, line {line}: style {style} is listed twice")

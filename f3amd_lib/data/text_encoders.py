@@ -89,10 +89,15 @@ def check_words(caption: str, known: Sequence[str]) -> None:
     Raises:
       ValueError: naming the words, and the nearest known one of the first.
     """
-    vocabulary = sorted(set(_words(" ".join(known))))
+    vocabulary = words_of(known)
     if unknown := [word for word in _words(caption) if word not in vocabulary]:
         hint = nearest_hint(unknown[0], vocabulary, most=0)
         raise ValueError(f"caption {caption!r}: the model never saw {', '.join(map(repr, unknown))}{hint}")
+
+
+def words_of(captions: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of captions, in small letters, each once, sorted."""
+    return tuple(sorted(set(_words(" ".join(captions)))))
 
 
 def _words(text: str) -> list[str]:

@@ -253,7 +253,7 @@ class MotionBatch(NamedTuple):
     """Padded clips.
 
     Attributes:
-      motion: [B, F, ...], float32; 0 in the padding.
+      motion: [B, F, ...], float32, or a tree of such; 0 in the padding.
       length: frames of each, [B], int32.
       mask: true for frames, false for padding, [B, F].
       caption: row of each clip's caption in the table of embeddings, [B], int32; -1 where none was drawn.
@@ -291,7 +291,7 @@ class ClipTable(NamedTuple):
     """Clips on the device, to draw batches from.
 
     Attributes:
-      frames: of all clips, [N, ...], in network units.
+      frames: of all clips, [N, ...], in network units; or a tree of such.
       start, length: of each clip, [K].
       caption: first row of each clip's captions in the table of embeddings, [K].
       count: captions of each clip, [K].
@@ -304,18 +304,20 @@ class ClipTable(NamedTuple):
     count: jax.Array
 
 
-def clip_table(data: TextMotions, frames) -> tuple[ClipTable, list[str]]:
+def clip_table(data: TextMotions, frames, frames_per_row: int = 1) -> tuple[ClipTable, list[str]]:
     """Return the clips of a data set as a table, and the captions that its numbers stand for.
 
     Args:
       data: the clips; all of them are in the table.
-      frames: what is drawn of each frame, [N, ...], in network units.
+      frames: what is drawn of each frame, [N, ...], in network units; or a tree of such.
+      frames_per_row: frames of motion that a row of `frames` stands for: 4 of ACMDM's latent. A clip has whole rows.
     """
+    length = data.lengths // frames_per_row
     count = np.array([len(captions) for captions in data.captions], np.int32)
     captions = [caption for several in data.captions for caption in several]
-    columns = (data.start[:-1], data.lengths, np.cumsum(count) - count, count)
+    columns = (np.cumsum(length) - length, length, np.cumsum(count) - count, count)
     columns = (jnp.asarray(column, jnp.int32) for column in columns)
-    return ClipTable(jnp.asarray(frames, jnp.float32), *columns), captions
+    return ClipTable(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), frames), *columns), captions
 
 
 def draw_clips(key, table: ClipTable, size: int, num_frames: int, unit: int = UNIT) -> MotionBatch:
@@ -340,7 +342,7 @@ def draw_clips(key, table: ClipTable, size: int, num_frames: int, unit: int = UN
     length = unit * (units - shorter)
     first = table.start[clip] + jax.random.randint(keys[3], (size,), 0, table.length[clip] - length + 1)
     mask = frame_mask(length, num_frames)
-    frames = table.frames[jnp.where(mask, first[:, None] + jnp.arange(num_frames), 0)]
-    return MotionBatch(
-        jnp.where(mask.reshape(*mask.shape, *[1] * (frames.ndim - 2)), frames, 0.0), length, mask, caption
-    )
+    rows = jnp.where(mask, first[:, None] + jnp.arange(num_frames), 0)
+    spread = lambda frames: mask.reshape(*mask.shape, *[1] * (frames.ndim - 1))
+    motion = jax.tree.map(lambda frames: jnp.where(spread(frames), frames[rows], 0.0), table.frames)
+    return MotionBatch(motion, length, mask, caption)

@@ -8,7 +8,7 @@ Python loop over samples.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -89,38 +89,33 @@ class Batch(NamedTuple):
     style: jax.Array
 
 
-def _smooth(signal: np.ndarray, width: float) -> np.ndarray:
-    """Smooth along axis 0; odd reflection at the ends lets a straight path stay straight."""
+def _smooth(signal: np.ndarray, width: float, of: Callable = np.asarray) -> np.ndarray:
+    """Smooth a function of a signal along axis 0; odd reflection at the ends lets a straight path stay straight."""
     if width == 0.0 or len(signal) < 2:
-        return signal
+        return of(signal)
     pad = int(4 * width) + 1
     # numpy reflects as often as it takes where a clip is shorter than the kernel.
     padded = np.pad(signal, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
-    return gaussian_filter1d(padded, width, axis=0)[pad : pad + len(signal)]
+    return gaussian_filter1d(of(padded), width, axis=0)[pad : pad + len(signal)]
 
 
 def _path_variants(skeleton: Skeleton, frames: np.ndarray) -> np.ndarray:
     """Return x, z, sin yaw, cos yaw under each smoothing, [3, T, 4]."""
-    yaw = np.unwrap(frame_yaw(skeleton, frames))
-    line = np.concatenate([frames[:, [0, 2]], yaw[:, None]], axis=1)
+    yaw = np.unwrap(frame_yaw(skeleton, frames))[:, None]
+    # The facing is smoothed as a direction, as in CAMDM: the mean of two angles may lie the long way round.
+    facing = lambda angle: np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
     variants = []
     for width in _SMOOTHING:
-        smooth = _smooth(line, width)
-        angle = smooth[:, 2:]
-        variants.append(np.concatenate([smooth[:, :2], np.sin(angle), np.cos(angle)], axis=1))
+        direction = _smooth(yaw, width, facing)
+        direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+        variants.append(np.concatenate([_smooth(frames[:, [0, 2]], width), direction], axis=1))
     return np.stack(variants)
 
 
 def build_windows(
-    packed: PackedMotion,
-    split: str,
-    *,
-    window: int = 32,
-    num_history: int = 10,
-    stride: int = 1,
-    mirrored: bool | None = None,
-    styles: Sequence[str] = (),
-) -> WindowSet:
+    packed: PackedMotion, split: str, *, window: int = 32, num_history: int = 10, stride: int = 1,
+    mirrored: bool | None = None, styles: Sequence[str] = (),
+) -> WindowSet:  # fmt: skip
     """Lay all windows of a split out on the device.
 
     Args:

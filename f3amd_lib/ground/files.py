@@ -4,16 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
+import tomllib
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: no locks of this kind
+    fcntl = None
+
+_LEFTOVER_S = 3600.0
+"""Age from which an unfinished file belongs to a process that was killed."""
+
+_cleared: set[Path] = set()
+"""Folders that this process has looked through for unfinished files."""
+
+
+def read_toml(path) -> dict:
+    """Return what a TOML file holds."""
+    return tomllib.loads(Path(path).read_text(encoding="utf-8"))
 
 
 @contextlib.contextmanager
 def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`; what is written there becomes `path` at the end.
 
-    If the block fails, `path` stays as it was and the temporary file is removed.
+    If the block fails, `path` stays as it was and the temporary file is removed. The file gets the
+    permissions that the user's umask says, whoever wrote it.
 
     Args:
       path: the file wanted; missing folders are made.
@@ -29,13 +48,67 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     if path.exists() and not overwrite:
         raise ValueError(f"{path}: exists already; choose another name or pass overwrite=True")
     path.parent.mkdir(parents=True, exist_ok=True)
+    _clear_leftovers(path.parent)
     # Unique among threads, and among machines that share the folder.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
+        temporary.touch()
+        permissions = temporary.stat().st_mode
         yield temporary
+        temporary.chmod(permissions)  # safetensors makes a new file that the owner alone may read
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _clear_leftovers(folder: Path) -> None:
+    """Remove, once per process, what killed processes left unfinished in a folder."""
+    folder = folder.resolve()
+    if folder in _cleared:
+        return
+    _cleared.add(folder)
+    for item in folder.glob(".*.part"):
+        with contextlib.suppress(OSError):  # another process may be faster
+            if time.time() - item.stat().st_mtime > _LEFTOVER_S:
+                item.unlink()
+
+
+@contextlib.contextmanager
+def locked(path, doing: str) -> Iterator[None]:
+    """Hold a lock file while the block runs, so that no second process does the same work there.
+
+    The operating system frees the lock of a process that was killed. Where a file system (or Windows)
+    has no such locks, the block runs without one.
+
+    Args:
+      path: of the lock file; missing folders are made.
+      doing: what the block does, for the message, such as "training F3AMD-FNO-96".
+
+    Raises:
+      ValueError: if another process holds the lock.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        file = path.open("a")
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break
+        except BlockingIOError:
+            file.close()
+            raise ValueError(
+                f"{path.parent}: another process is {doing} there; wait for it, or name another folder (--out)"
+            ) from None
+        except OSError:  # a file system without locks
+            break
+        file.close()  # whoever held the lock has removed its file: ours is another one
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
 
 
 def set_aside(paths: Iterable[Path], name: str) -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import numbers
 from collections.abc import Iterable, Mapping
 
 
@@ -43,6 +44,13 @@ def refuse_unknown(values: Mapping, config_class: type, what: str) -> None:
     for key in values:
         if key not in known:
             raise ValueError(f"unknown {what} {key!r}{nearest_hint(key, known)}")
+
+
+def checked_seed(seed) -> int:
+    """Return a seed; ValueError unless it is a whole number from 0 to 2^32 - 1, each of which gives other noise."""
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
+        raise ValueError(f"seed must be a whole number from 0 to {2**32 - 1}, got {str(seed)[:40]}")
+    return int(seed)
 
 
 def row_label(model: str, steps: int) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
 
 _FOLDER = Path(__file__).parents[1] / "papers"
@@ -17,6 +18,11 @@ _FOLDER = Path(__file__).parents[1] / "papers"
 def paper_folders() -> list[str]:
     """Return the names of all papers, as their folders are called."""
     return sorted(path.parent.name for path in _FOLDER.glob("*/paper.toml"))
+
+
+def has_paper_file(name: str, paper: str) -> bool:
+    """Tell whether a paper's folder has a file, by its name without the ending."""
+    return (_FOLDER / paper / f"{name}.toml").exists()
 
 
 @functools.cache
@@ -34,7 +40,7 @@ def load_paper_file(name: str, paper: str = "f3amd") -> dict:
         raise ValueError(f"unknown paper {paper!r}{nearest_hint(paper, paper_folders())}")
     path = _FOLDER / paper / f"{name}.toml"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return read_toml(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: is missing; write it as {_FOLDER / 'f3amd' / path.name} is written") from None
     except tomllib.TOMLDecodeError as error:
@@ -71,17 +77,18 @@ PAPER_TABLES = {entry["number"]: (entry["file"], entry["title"]) for entry in lo
 """Table number of the F3AMD paper -> (file, title in our words)."""
 
 
-def load_paper_table(number: int, paper: str = "f3amd") -> pd.DataFrame:
+def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     """Return one table of a paper in tidy form.
 
     Args:
-      number: the table's number in the paper.
+      number: the table's number in the paper, as its `paper.toml` has it.
       paper: its folder.
 
     Returns:
-      A new DataFrame with the columns model, window_frames, steps and either device, characters
-      (times) or none, then metric, unit, better, printed (text as printed, "" for a dash) and
-      value (float, NaN for a dash). `frame.attrs` has the table's number, title and setting.
+      A new DataFrame with the column model, the settings of a row (F3AMD: window_frames, steps and either
+      device, characters, for times, or none), then metric, unit, better, printed (text as printed, "" for a
+      dash), value (float, NaN for a dash) and what else the file has. `frame.attrs` has the table's number,
+      title and setting.
 
     Raises:
       ValueError: if there is no such table.
@@ -89,7 +96,7 @@ def load_paper_table(number: int, paper: str = "f3amd") -> pd.DataFrame:
     about = load_paper_file("paper", paper)
     entries = {entry["number"]: entry for entry in about.get("table", ())}
     if number not in entries:
-        known = f"Tables {min(entries)} to {max(entries)}" if entries else "no tables"
+        known = f"Tables {next(iter(entries))} to {next(reversed(entries))}" if entries else "no tables"
         raise ValueError(f"the {about['name']} paper has {known}, not {number!r}")
     frame = _read_table(number, paper).copy()
     frame.attrs = {"table": number, "title": entries[number]["title"], "setting": about["setting"]}
@@ -97,7 +104,7 @@ def load_paper_table(number: int, paper: str = "f3amd") -> pd.DataFrame:
 
 
 @functools.cache
-def _read_table(number: int, paper: str) -> pd.DataFrame:
+def _read_table(number: int | str, paper: str) -> pd.DataFrame:
     entry = next(entry for entry in load_paper_file("paper", paper)["table"] if entry["number"] == number)
     frame = pd.read_csv(_FOLDER / paper / "numbers" / entry["file"], dtype=str, keep_default_na=False)
     frame = frame.rename(columns={"value": "printed"})

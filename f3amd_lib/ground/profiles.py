@@ -11,16 +11,15 @@ import dataclasses
 import math
 import numbers
 import os
-import tomllib
-from importlib import resources
 from pathlib import Path
 
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import checked_seed, nearest_hint
 
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
 RESULT_FOLDERS = ("records", "tables", "figures", "media")
-_NUMBERS = tomllib.loads((resources.files("f3amd_lib.ground") / "profiles.toml").read_text(encoding="utf-8"))
+_NUMBERS = read_toml(Path(__file__).with_name("profiles.toml"))
 SHOWN_STYLES = tuple(_NUMBERS["on"]["synthetic"]["laptop"]["evaluation_styles"])
 """Styles of `synthetic` that differ in posture, arms, rhythm and symmetry: what figures show and
 walking checks judge."""
@@ -125,8 +124,10 @@ def _checked(key: str, value, annotation: str):
     if not fits or value == "":
         called += " or None" if rest else ""
         raise ValueError(f"{key} must be {called}, got {value!r} ({type(value).__name__})")
-    if kind in ("int", "float") and (value < 0 or (value == 0 and key != "seed")):
-        raise ValueError(f"{key} must be {'0 or more' if key == 'seed' else 'above 0'}, got {value!r}")
+    if key == "seed":
+        return checked_seed(value)
+    if kind in ("int", "float") and value <= 0:
+        raise ValueError(f"{key} must be above 0, got {value!r}")
     return {"int": int, "float": float, "str": str}.get(kind, tuple)(value)
 
 

@@ -88,7 +88,7 @@ def run_record(*, profile, dataset, seed: int, **extra) -> dict:
         "device_platform": devices[0].platform,
         "device_kind": devices[0].device_kind,
         "num_devices": len(devices),
-        "cores": _num_cores(),
+        "cores": usable_cores(),
         "date_utc": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }
     taken = sorted(set(extra) & (set(record) | {"table"}))
@@ -167,8 +167,9 @@ def read_table(path) -> tuple[pd.DataFrame, dict]:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such table")
     record = _read_record(path, record_path)
-    text = path.read_text(encoding="utf-8")
-    if _text_hash(text) != record.get("table", {}).get("sha256"):
+    # Bytes that are no text cannot have the checksum of a text.
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if _text_hash(text) != (record.get("table") or {}).get("sha256"):
         raise ValueError(
             f"{path}: not the table that {record_path.name} describes (it was changed, or a run "
             "died while writing); measure it again"
@@ -183,10 +184,11 @@ def _read_record(path: Path, record_path: Path) -> dict:
         )
     try:
         record = json.loads(record_path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{record_path}: not a readable run record ({error})") from None
-    if not isinstance(record, dict):
-        raise ValueError(f"{record_path}: not a run record (a JSON object is needed)")
+    except (ValueError, RecursionError) as error:  # broken JSON, bytes that are no text, or thousands of brackets
+        raise ValueError(f"{record_path}: not a readable run record ({error}); measure it again") from None
+    parts = [record] if not isinstance(record, dict) else [record.get("table"), record.get("weights_digests")]
+    if not all(part is None or isinstance(part, dict) for part in parts):
+        raise ValueError(f"{record_path}: not a run record (JSON objects are needed); measure it again")
     return record
 
 
@@ -205,7 +207,7 @@ def _refuse_foreign(path: Path, record_path: Path, record: dict) -> None:
 
 def _text_hash(text: str) -> str:
     # Line ends are not content: a checkout on another system may have changed them.
-    return hashlib.sha256(text.replace("\r\n", "\n").encode("utf-8")).hexdigest()
+    return hashlib.sha256(text.replace("\r\n", "\n").encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _name(thing, what: str) -> str:
@@ -274,8 +276,8 @@ def _git_state() -> tuple[str | None, bool | None]:
     return commit, None if commit is None or status is None else bool(status)
 
 
-def _num_cores() -> int:
-    """Cores this process may use."""
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -328,10 +330,30 @@ def set_aside_table(path) -> Path:
     return path.with_name(f"{kept}.csv") if kept else path
 
 
+def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
+    """Read a table that a run wants to go on from; a broken one is renamed with a warning, so that the run can.
+
+    Args:
+      path: of the CSV.
+
+    Returns:
+      (table, record); None if there is no table, or a broken one.
+    """
+    path = Path(path)
+    if not (path.exists() or path.with_suffix(".json").exists()):
+        return None
+    try:
+        return read_table(path)
+    except (ValueError, FileNotFoundError) as error:
+        log.warning("%s; kept as %s", error, set_aside_table(path).name)
+        return None
+
+
 def kept_rows(path, record: dict) -> pd.DataFrame | None:
     """Return the rows of an earlier run that asked for the same, so that a stopped run goes on.
 
-    A table that asked for something else is kept under another name.
+    A table that asked for something else is kept under another name, and so is a broken one: a run may
+    have been killed between the table and its record.
 
     Args:
       path: of the CSV.
@@ -339,14 +361,11 @@ def kept_rows(path, record: dict) -> pd.DataFrame | None:
 
     Returns:
       The rows; None if there are none.
-
-    Raises:
-      ValueError: if the table there is broken.
     """
     path = Path(path)
-    if not path.exists():
+    if (found := whole_table(path)) is None:
         return None
-    rows, earlier = read_table(path)
+    rows, earlier = found
     if record_hash(earlier) != record_hash(record):
         kept = set_aside_table(path)
         log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)

@@ -1,0 +1,252 @@
+"""Files that are forged, oversized or absurd: one sentence that names the file, and no harm."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+import warnings
+import zipfile
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import SKELETON, packed_from, refused, tiny_packed, tiny_trained, wandering_motion
+
+from f3amd_lib.data import sources
+from f3amd_lib.data.packed import load_packed, pack, packed_dataset, save_packed
+from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.generation.rollout import MOST_STEPS, MotionGenerator
+from f3amd_lib.ground.names import checked_seed
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.measures.metrics import camdm_metrics, camdm_orientation_error
+from f3amd_lib.motion.bvh import format_bvh, parse_bvh
+from f3amd_lib.motion.root_paths import named_path, read_path_csv
+from f3amd_lib.motion.skeleton import Motion, Skeleton, facing_yaw
+from f3amd_lib.training.checkpoints import describe, load_model, load_tree, save_tree
+from f3amd_lib.training.recipe import TrainingConfig
+
+TEXT = format_bvh(wandering_motion(3))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("Frames: 3", "Frames: " + "9" * 5000, r"line \d+: Frames"),
+        ("CHANNELS 6", "CHANNELS " + "9" * 5000, r"line \d+: holds a word of 5000"),
+        ("CHANNELS 6", "CHANNELS " + "9" * 50, r"line \d+: CHANNELS"),
+        ("Frame Time: 0.0333333333", "Frame Time: 1e-320", r"line \d+: Frame Time"),
+        ("Frame Time: 0.0333333333", "Frame Time: 1e300", r"line \d+: Frame Time"),
+        ("ROOT Hips", "ROOT " + "H" * 5000, r"line 2: holds a word of 5000"),
+        ("ROOT Hips", "ROOT \ud800", r"line 2: holds bytes that are not UTF-8"),
+        ("OFFSET 0.000000", "OFFSET 1e200", r"line \d+: OFFSET"),
+    ],
+)
+def test_absurd_bvh_is_refused_with_its_line(old, new, line):
+    assert old in TEXT
+    refused(f"walk.bvh, {line}", parse_bvh, TEXT.replace(old, new, 1), "walk.bvh")
+
+
+def test_absurd_numbers_in_a_row_are_refused_with_their_place():
+    head, _, rows = TEXT.partition("Frame Time: 0.0333333333\n")
+    first, *others = rows.split("\n")
+    for word in ("1e200", "9" * 300, "1e9"):
+        row = " ".join([word, *first.split()[1:]])
+        text = "\n".join([f"{head}Frame Time: 0.0333333333", row, *others])
+        refused(r"walk.bvh, line \d+: .*number 1 of frame 0", parse_bvh, text, "walk.bvh")
+
+
+def test_a_row_of_two_million_numbers_is_refused_in_a_moment():
+    head, _, _ = TEXT.partition("Frame Time: 0.0333333333\n")
+    started = time.perf_counter()
+    refused("frame 0 has 2000000 numbers", parse_bvh, f"{head}Frame Time: 0.0333333333\n{'0 ' * 2_000_000}\n", "a.bvh")
+    assert time.perf_counter() - started < 10.0
+
+
+def test_a_chain_of_5000_joints_is_written_and_read_again():
+    count = 5000
+    names, parents = tuple(f"j{k}" for k in range(count)), tuple(range(-1, count - 1))
+    offsets = np.zeros((count, 3))
+    offsets[1:, 1] = 0.01
+    rotations = np.broadcast_to(np.eye(3), (1, count, 3, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        text = format_bvh(Motion(Skeleton(names, parents, offsets), np.zeros((1, 3)), rotations))
+    assert text.count("{") == text.count("}") == count + 1
+    assert parse_bvh(text, "chain").skeleton.parents == parents
+
+
+@pytest.mark.parametrize(
+    ("rows", "match"),
+    [
+        ("0,0\n1e9,0\n", "line 3: x is '1e9'"),
+        ("0,0\n0,1e9\n", "line 3: z is '1e9'"),
+        ("0,0\n" + "1" * 200_000 + ",0\n", "line 3: is longer"),
+        ('0,0\n"' + "1" * 900 + "\n" + "1" * 900 + '",0\n', "line 3"),
+        ("0,0\n" * 108_001, "line 108002: more than 108000 rows"),
+    ],
+)
+def test_absurd_paths_are_refused_before_anything_is_made(tmp_path, rows, match):
+    file = tmp_path / "path.csv"
+    file.write_text(f"x,z\n{rows}")
+    refused(f"path.csv: {match}", read_path_csv, file)
+
+
+def test_a_quoted_path_is_still_read(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text('"x","z"\n"0","0"\n"0","0.1"\n')
+    assert read_path_csv(file).num_frames == 2
+
+
+def test_seeds_that_would_give_others_noise_are_refused():
+    assert checked_seed(np.int64(7)) == 7 and checked_seed(2**32 - 1) == 2**32 - 1
+    for seed in (-1, 2**32, 2**63, 1.5, True, "1"):
+        refused("seed must be", checked_seed, seed)
+    refused("seed must be", named_path, "complex", 10, seed=2**32)
+    refused("seed must be", load_profile, "smoke", "synthetic", seed=-1)
+    refused("seed must be", TrainingConfig, num_steps=1, batch_size=1, seed=2**32)
+    generator = MotionGenerator(tiny_trained(), num_steps=1)
+    refused("seed must be", generator.rollout, named_path("straight", 8), "calm", seed=-1)
+
+
+def test_more_steps_than_anybody_needs_are_refused_at_once():
+    refused("num_steps must be at most", MotionGenerator, tiny_trained(), MOST_STEPS + 1)
+
+
+# ------------------------------------------------------------------------------------------ archives
+
+
+def _zip(path, content: bytes, name="walk/a.bvh"):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, content)
+    return path
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = _zip(tmp_path / "bomb.zip", b"0" * 30_000_000)
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *args: pytest.fail("unpacked"))
+    refused("bomb.zip: refused before anything was unpacked.*times its size", open_dataset, "folder", path=path)
+
+
+@pytest.mark.parametrize(
+    ("limit", "match"), [("_MOST_FILES", "files"), ("_MOST_BYTES", "unpacks to"), ("_MOST_IN_ALL", "files unpack")]
+)
+def test_too_many_too_large_and_too_much_are_refused(tmp_path, monkeypatch, limit, match):
+    path = _zip(tmp_path / f"{limit}.zip", TEXT.encode())
+    monkeypatch.setattr(sources, limit, 0)
+    refused(match, open_dataset, "folder", path=path)
+
+
+def test_an_ordinary_zip_is_read(tmp_path):
+    assert len(open_dataset("folder", path=_zip(tmp_path / "a.zip", TEXT.encode())).clips) == 1
+
+
+def test_a_single_file_is_no_data_set(tmp_path, monkeypatch):
+    file = tmp_path / "walk.bvh"
+    file.write_text(TEXT)
+    monkeypatch.setenv(sources.DATA_DIR_VARIABLE, str(file))
+    for name in ("folder", "bandai"):
+        refused("walk.bvh: is a single file; name the folder", open_dataset, name)
+
+
+# -------------------------------------------------------------------------------- caches and weights
+
+
+def test_a_cache_with_flipped_bytes_is_refused_by_name_whatever_numpy_says(tmp_path):
+    path = save_packed(tmp_path / "cache.npz", tiny_packed())
+    sound = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        data = bytearray(sound)
+        for place in rng.integers(0, len(data), rng.integers(1, 9)):
+            data[place] ^= rng.integers(1, 256)
+        path.write_bytes(data)
+        try:
+            assert load_packed(path).num_clips == tiny_packed().num_clips
+        except ValueError as error:
+            assert str(path) in str(error)
+
+
+@pytest.mark.parametrize("foreign", [MemoryError, RuntimeError, SyntaxError, RecursionError])
+def test_any_failure_of_a_cache_packs_anew(tmp_path, monkeypatch, cache_dir, foreign):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "calm_a.bvh").write_text(format_bvh(wandering_motion(60)))
+    dataset = open_dataset("folder", path=tmp_path / "data")
+    first = packed_dataset(dataset, progress=False)
+
+    def broken(*args, **settings):
+        raise foreign("damaged")
+
+    monkeypatch.setattr("f3amd_lib.data.packed.np.load", broken)
+    with pytest.warns(UserWarning, match="packing anew"):
+        again = packed_dataset(dataset, progress=False)
+    np.testing.assert_array_equal(again.root_position, first.root_position)
+
+
+def test_half_precision_moves_joints_by_less_than_a_millimetre():
+    """The packed cache keeps rotations in float16; what that costs is what its docstring says."""
+    worst = 0.0
+    for seed in range(4):
+        motion = wandering_motion(30, seed)
+        kept = packed_from([(motion, 0, 0)]).motion(0)
+        worst = max(worst, np.linalg.norm(kept.positions - motion.positions, axis=-1).max())
+    assert 1e-5 < worst < 1e-3
+
+
+def test_half_precision_moves_no_joint_of_real_clips_by_half_a_millimetre(bandai_dataset):
+    """On every fiftieth clip; what the docstring of data/packed.py says."""
+    clips = bandai_dataset.clips[::50]
+    kept = pack(dataclasses.replace(bandai_dataset, clips=clips), progress=False)
+    motions = {clip.name: clip.load() for clip in clips if clip.name in kept.clip_names}
+    gaps = [
+        np.linalg.norm(kept.motion(number).positions - motions[name].positions, axis=-1).max()
+        for number, name in enumerate(kept.clip_names)
+    ]
+    assert 1e-4 < max(gaps) < 5e-4
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [[], 3, "text", {"kind": "trained model", "model": []}, {"kind": "trained model", "model": {"family": 4}}]
+    + [{"kind": "trained model", "model": {"family": "f3amd"}, "diffusion": [1]}, {"kind": None}],
+)
+def test_forged_descriptions_are_refused_by_name(tmp_path, forged):
+    path = tmp_path / "forged.safetensors"
+    save_tree(path, {"a": jnp.ones(2)}, forged)
+    refused("forged.safetensors", load_model, path)
+
+
+def test_descriptions_nested_deeper_than_python_reads_are_refused_by_name(tmp_path, monkeypatch):
+    path = tmp_path / "deep.safetensors"
+    monkeypatch.setattr(json, "dumps", lambda value: "[" * 100_000)
+    save_tree(path, {"a": jnp.ones(2)}, {})
+    refused("deep.safetensors", describe, path)
+    refused("deep.safetensors", load_tree, path, {"a": jnp.ones(2)})
+
+
+# ------------------------------------------------------------------------- CAMDM's own orientation
+
+
+def _with_collars(turned: float):
+    """A figure that stands with its hips along +X and its collar bones turned by some radians."""
+    names = ("Hips", "LeftUpLeg", "RightUpLeg", "Shoulder_L", "Shoulder_R", "LeftToeBase", "RightToeBase")
+    skeleton = Skeleton(names, (-1, 0, 0, 0, 0, 1, 2), np.zeros((7, 3)))
+    across = np.array([np.cos(turned), 0.0, -np.sin(turned)])
+    body = [[0, 1, 0], [0.1, 1, 0], [-0.1, 1, 0], 0.2 * across + [0, 1.5, 0], -0.2 * across + [0, 1.5, 0]]
+    positions = np.tile(np.array([*body, [0.1, 0, 0], [-0.1, 0, 0]], float), (20, 1, 1))
+    return skeleton, positions + np.arange(20)[:, None, None] * [0.0, 0.0, 0.04]
+
+
+def test_camdms_orientation_error_sees_the_shoulders_as_its_code_does():
+    skeleton, positions = _with_collars(0.8)
+    path = named_path("straight", 20)
+    assert facing_yaw(skeleton, positions) == pytest.approx(0.0)
+    assert facing_yaw(skeleton, positions, shoulders=True) == pytest.approx(0.4)
+    measured = camdm_metrics(positions, path, skeleton)["camdm_orientation_error_deg"]
+    assert measured == pytest.approx(np.rad2deg(0.4))
+    assert camdm_orientation_error(np.zeros(20), path) == pytest.approx(0.0)
+
+
+def test_a_skeleton_without_collar_bones_faces_where_its_hips_do():
+    positions = wandering_motion(20).positions
+    np.testing.assert_array_equal(facing_yaw(SKELETON, positions), facing_yaw(SKELETON, positions, shoulders=True))

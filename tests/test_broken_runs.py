@@ -1,0 +1,215 @@
+"""Runs that are killed, doubled, full or broken: nothing whole is lost, and the next call works."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import time
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
+
+from f3amd_lib import __main__ as command_line
+from f3amd_lib.drawing import style
+from f3amd_lib.ground import files
+from f3amd_lib.ground.files import locked, whole_file
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import kept_rows, read_table, write_table
+from f3amd_lib.training import checkpoints, pipeline
+from f3amd_lib.training.optimise import TrainingState, optimise
+from f3amd_lib.training.pipeline import PreparedData
+
+RECORD = {"dataset": "synthetic", "profile": "smoke", "seed": 0}
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """A training state of step 20 and a history of two rows, (files, begin again)."""
+    its = pipeline.model_files(load_profile("smoke", "synthetic"), folder=tmp_path)
+    its.state.write_bytes(b"a state")
+    write_table(its.history, pd.DataFrame({"step": [10, 20], "loss": [2.0, 1.0]}), RECORD)
+    state = TrainingState({}, None, None, jnp.asarray(20))
+    monkeypatch.setattr(pipeline, "restore_state", lambda *args: state)
+    return its, lambda: pipeline._begun(its, None, None)
+
+
+def test_a_history_goes_on(begun):
+    state, rows = begun[1]()
+    assert int(state.step) == 20 and [row["step"] for row in rows] == [10, 20]
+
+
+def test_a_run_killed_between_history_and_state_makes_the_row_again(begun):
+    its, begin = begun
+    write_table(its.history, pd.DataFrame({"step": [10, 20, 30], "loss": [2.0, 1.0, 0.5]}), RECORD)
+    assert [row["step"] for row in begin()[1]] == [10, 20]
+
+
+def test_the_history_is_written_before_the_state(tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr("f3amd_lib.training.optimise.save_state", lambda path, task, state: order.append("state"))
+    monkeypatch.setattr(
+        "f3amd_lib.training.optimise.advance",
+        lambda task, state, length, mesh: (state._replace(step=state.step + length), {"loss": np.ones(length)}),
+    )
+    start = TrainingState({"a": jnp.ones(1)}, None, None, jnp.zeros((), jnp.int32))
+    task = tiny_task(num_steps=4)
+    optimise(task, start, checkpoint=tmp_path / "state", on_chunk=lambda row: order.append("history"), progress=False)
+    assert order == ["history", "state"]
+
+
+@pytest.mark.parametrize("broken", ["no record", "cut", "record cut", "record a list", "no text", "only the record"])
+def test_a_broken_history_is_set_aside_with_a_warning(begun, broken, caplog):
+    its, begin = begun
+    record = its.history.with_suffix(".json")
+    if broken == "no record":
+        record.unlink()
+    elif broken == "cut":
+        its.history.write_bytes(its.history.read_bytes()[:12])
+    elif broken == "record cut":
+        record.write_bytes(record.read_bytes()[:100])
+    elif broken == "record a list":
+        record.write_text("[1, 2]")
+    elif broken == "no text":
+        its.history.write_bytes(b"\xff\xfe\x00step")
+    else:
+        its.history.unlink()
+    with caplog.at_level(logging.WARNING, "f3amd"):
+        state, rows = begin()
+    assert int(state.step) == 20 and rows == []
+    assert "first 20 steps" in caplog.text and "old1" in caplog.text
+    write_table(its.history, pd.DataFrame({"step": [30], "loss": [0.5]}), RECORD)  # the run goes on
+    assert len(read_table(its.history)[0]) == 1
+    assert list(its.history.parent.glob("*.old1.*"))
+
+
+def test_a_broken_record_of_a_measurement_is_set_aside_too(tmp_path, caplog):
+    path = tmp_path / "quality.csv"
+    write_table(path, pd.DataFrame({"model": ["a"], "value": [1.0]}), RECORD)
+    assert len(kept_rows(path, RECORD)) == 1
+    path.with_suffix(".json").unlink()
+    with caplog.at_level(logging.WARNING, "f3amd"):
+        assert kept_rows(path, RECORD) is None
+    assert (tmp_path / "quality.old1.csv").exists() and "quality.old1.csv" in caplog.text
+    write_table(path, pd.DataFrame({"model": ["b"], "value": [2.0]}), RECORD)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 20_000, "[]", "3", '{"table": [1]}', '{"table": null}', '{"weights_digests": 4}', "\udc80"]
+)
+def test_forged_records_are_refused_by_name(tmp_path, text):
+    path = tmp_path / "quality.csv"
+    write_table(path, pd.DataFrame({"value": [1.0]}), RECORD)
+    path.with_suffix(".json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    refused("quality", read_table, path)
+
+
+def test_a_second_training_in_one_folder_is_refused_while_the_first_runs(tmp_path, monkeypatch):
+    profile = load_profile("smoke", "synthetic")
+    prepared, task = PreparedData(tiny_packed(), WINDOW, HISTORY), tiny_task()
+    monkeypatch.setattr(PreparedData, "task", lambda self, *args, **settings: task)
+    lock = pipeline.model_files(profile, folder=tmp_path).model.with_suffix(".lock")
+    with locked(lock, "training"):
+        refused("another process", pipeline.train, prepared, profile, config=task.config, folder=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_is_free_once_its_process_is_killed(tmp_path):
+    lock = tmp_path / "folder" / "run.lock"
+    words = f"from f3amd_lib.ground.files import locked\nimport time\nwith locked({str(lock)!r}, 'work'):\n"
+    script = words + "    print('held', flush=True)\n    time.sleep(60)"
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(ValueError, match="another process is work there"):
+            with locked(lock, "work"):
+                pass
+    finally:
+        process.kill()
+        process.wait()
+    with locked(lock, "work"):
+        assert lock.exists()
+    assert not lock.exists()
+
+
+def test_what_a_killed_process_left_unfinished_goes_after_an_hour(tmp_path):
+    old, young, foreign = (tmp_path / name for name in (".a.csv.1.part", ".b.csv.2.part", "kept.part"))
+    for path in (old, young, foreign):
+        path.write_text("half")
+    os.utime(old, (time.time() - 7200,) * 2)
+    os.utime(foreign, (time.time() - 7200,) * 2)
+    files._cleared.clear()
+    with whole_file(tmp_path / "a.csv") as temporary:
+        temporary.write_text("whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".b.csv.2.part", "a.csv", "kept.part"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
+def test_weights_can_be_read_by_whom_the_umask_says(tmp_path):
+    before = os.umask(0o027)
+    try:
+        checkpoints.save_tree(tmp_path / "weights.safetensors", {"a": jnp.ones(3)}, {})
+    finally:
+        os.umask(before)
+    assert (tmp_path / "weights.safetensors").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
+    def full(arrays, path, header):
+        raise checkpoints.SafetensorError("No space left on device (os error 28)")
+
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(b"the old ones")
+    monkeypatch.setattr(checkpoints, "save_file", full)
+    with pytest.raises(OSError, match=r"weights.safetensors: cannot be written .*No space left"):
+        checkpoints.save_tree(path, {"a": jnp.ones(3)}, {})
+    assert path.read_bytes() == b"the old ones" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_picture_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+    def cut(figure, dpi):
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "figure.png"
+    path.write_bytes(b"the old one")
+    monkeypatch.setattr(style, "_png", cut)
+    with pytest.raises(OSError, match="No space"):
+        style.save_figure(None, path)
+    assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(("command", "goes_on"), [("presets", False), ("train", True)])
+def test_ctrl_c_ends_in_one_line(monkeypatch, capsys, command, goes_on):
+    def stopped(*args, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command_line.tyro.extras, "subcommand_cli_from_dict", stopped)
+    assert command_line.main([command]) == 130
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith(f"f3amd {command}: stopped")
+    assert ("goes on" in lines[0]) == goes_on
+
+
+def test_held_out_losses_of_training_clips_are_not_silent(tmp_path, monkeypatch, caplog):
+    packed = tiny_packed()
+    object.__setattr__(packed, "clip_split", np.zeros(packed.num_clips, np.uint8))
+    prepared, task = PreparedData(packed, WINDOW, HISTORY), tiny_task()
+    monkeypatch.setattr(PreparedData, "task", lambda self, *args, **settings: task)
+    state = types.SimpleNamespace(step=0)
+    monkeypatch.setattr(pipeline, "optimise", lambda *args, **settings: (state, []))
+    with caplog.at_level(logging.WARNING, "f3amd"):
+        profile = load_profile("smoke", "synthetic")
+        assert pipeline.train(prepared, profile, config=task.config, folder=tmp_path)[0] is None
+    assert "no clip is held out" in caplog.text
+
+
+def test_the_package_starts_without_jax_in_half_a_second():
+    script = "import sys, time; t = time.perf_counter(); import f3amd_lib; s = time.perf_counter() - t\n"
+    script += "assert not {'jax', 'numpy', 'pandas'} & set(sys.modules); print(s)"
+    times = [float(subprocess.check_output([sys.executable, "-c", script], text=True)) for _ in range(3)]
+    assert min(times) < 0.5
