@@ -13,14 +13,14 @@ SHELL := /bin/bash
 VENV := $(or $(F3AMD_VENV),.venv)
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/installed
-NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/standalone/*.ipynb))
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/course/*.ipynb notebooks/standalone/*.ipynb))
 
 export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools lint \
-  lab clean site site-tools
+.PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools \
+  lint lab clean site site-tools onnx-tools
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
@@ -38,6 +38,9 @@ figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DA
 
 smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
 	$(PYTHON) -m f3amd_lib figures --data $(DATA) --profile smoke
+
+course: $(INSTALLED) ## Run the notebooks of the course on samplers (no data, nothing stored)
+	$(PYTHON) -m f3amd_lib course
 
 # Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
@@ -58,6 +61,10 @@ bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
 	  -q -r requirements-bench.txt
 
+onnx-tools: $(INSTALLED) ## Add jax2onnx and ONNX Runtime to .venv (about 150 MB more)
+	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
+	  -q -r requirements-onnx.txt
+
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
@@ -74,7 +81,7 @@ test-all: test test-slow test-long test-extras site test-web ## All tests there 
 
 # What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
 # the marker `needs`.
-test-extras: bench-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime or Sphinx
+test-extras: bench-tools onnx-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime or Sphinx
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
 
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
@@ -83,7 +90,7 @@ web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if 
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
 	  -q --require-hashes --no-deps -r requirements-web.txt
 
-test-web: web-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
+test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
 	$(PYTEST) tests/web $(PYTEST_OPTIONS)
 
 site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
@@ -91,10 +98,11 @@ site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80
 	  -q --require-hashes --no-deps -r requirements-site.txt
 
 # From nothing each time, so that no page outlives its source. A warning is an error.
-site: site-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html
+site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html
 	rm -rf docs/_build
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
+	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_lib steer --overwrite --out docs/_build/html/steer.html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared

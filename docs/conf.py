@@ -32,7 +32,7 @@ extensions = [
 
 # What becomes a page. New notebooks and pages are found by themselves.
 root_doc = "docs/index"
-include_patterns = ["docs/**.md", "notebooks/**.ipynb", "paper_figures/claims.md"]
+include_patterns = ["docs/**.md", "notebooks/**.ipynb", "paper_figures/claims*.md"]
 exclude_patterns = [
     ".*",  # .venv and other hidden folders, caches
     "**/.ipynb_checkpoints",
@@ -102,7 +102,10 @@ html_theme_options = {
     "use_fullscreen_button": False,
     "back_to_top_button": True,
     # The ledger's tables need the width.
-    "secondary_sidebar_items": {"**": ["page-toc.html"], "paper_figures/claims": []},
+    "secondary_sidebar_items": {
+        "**": ["page-toc.html"],
+        **{f"paper_figures/{path.stem}": [] for path in Path(__file__).parents[1].glob("paper_figures/claims*.md")},
+    },
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ class Data:
       data: synthetic, bandai, 100style or folder.
       profile: smoke, laptop or gpu.
       source: folder or archive, for data sets that need one.
-      window: future frames, 32 or 64.
+      window: future frames, 32 or 64; of text to motion the most frames of a clip.
     """
 
     data: str = "synthetic"
@@ -144,37 +145,38 @@ def dataset(
     log.info("wrote        %s: %d clips", folder, written.num_clips)
 
 
-def presets(channels: int = 141, styles: int = 100) -> None:
-    """List the models with their sizes.
+def presets(
+    paper: str = "f3amd", channels: int = 141, styles: int = 100, joints: int = 22, text_width: int | None = None
+) -> None:
+    """List the models of a paper with their sizes.
 
     Args:
-      channels: features a frame, 6 J + 3.
-      styles: how many.
+      paper: its folder in `f3amd_lib/papers`.
+      channels: of F3AMD and CAMDM: features a frame, 6 J + 3.
+      styles: of F3AMD and CAMDM: how many.
+      joints: of ACMDM: J.
+      text_width: of ACMDM and MotionPCM: numbers in a caption's embedding; by default those of the paper's encoder.
     """
     from f3amd_lib.ground.tables import markdown_table
     from f3amd_lib.networks import presets
 
-    log.info("%s", markdown_table(presets.table(channels=channels, num_styles=styles)))
+    text = {} if text_width is None else {"text_width": text_width}
+    sizes = {"f3amd": {"channels": channels, "num_styles": styles}, "acmdm": {"num_joints": joints, **text}}
+    sizes = sizes.get(paper, text)
+    log.info("%s", markdown_table(presets.table(paper, **sizes)))
 
 
 def train(
-    motion: Data,
-    preset: Repeatable = (),
-    minutes: float | None = None,
-    steps: int | None = None,
-    batch_size: int | None = None,
-    seed: int | None = None,
-    out: Path | None = None,
-    all_devices: bool = False,
-    processes: int | None = None,
-    process: int | None = None,
-    coordinator: str | None = None,
-    cluster: bool = False,
-) -> int:
+    motion: Data, preset: Repeatable = (), minutes: float | None = None, steps: int | None = None,
+    batch_size: int | None = None, seed: int | None = None, out: Path | None = None, all_devices: bool = False,
+    processes: int | None = None, process: int | None = None, coordinator: str | None = None, cluster: bool = False,
+) -> int:  # fmt: skip
     """Train a model; a killed run goes on where it stopped.
 
     Args:
-      preset: such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order.
+      preset: such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order. Of text to motion
+        (--data bandai) such as ACMDM-S-PS22-raw-n3; NAME+control its control branch; judge the judge;
+        MotionPCM-M1-small and so on a student, with the autoencoder and the teacher before it.
       minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
       steps: optimiser steps; by default the profile's.
       batch_size: windows a step.
@@ -190,6 +192,8 @@ def train(
     from f3amd_lib.training import parallel
     from f3amd_lib.training.pipeline import model_files
 
+    if any(name == "judge" or "ACMDM" in name or name.startswith(("MotionPCM", "MotionLCM")) for name in preset):
+        return _train_text(motion, preset, minutes, steps, batch_size, seed, out)
     together = (coordinator, processes, process)
     named = any(value is not None for value in together)
     if cluster and named:
@@ -213,19 +217,49 @@ def train(
     return status
 
 
+def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out) -> int:
+    """Train models of text to motion, or their judge; what is finished is left as it is."""
+    from f3amd_lib.data.text_encoders import load_text_encoder
+    from f3amd_lib.ground.profiles import load_profile
+    from f3amd_lib.measures.text_judge import load_judge, save_judge, train_judge
+    from f3amd_lib.training import latent_models, text_models
+    from f3amd_lib.training.evaluator_task import EvaluatorTraining
+
+    is_latent = lambda name: name != text_models.JUDGE and latent_models.is_latent_preset(name.removesuffix("+control"))
+    for name in names:
+        if name != text_models.JUDGE and not (is_latent(name) or text_models.is_text_preset(name)):
+            raise ValueError(f"{name} needs no captions: train it by a call of its own")
+    given = lambda **asked: {key: value for key, value in asked.items() if value is not None}
+    profile = load_profile(motion.profile, motion.data, **given(train_steps=steps, batch_size=batch_size, seed=seed))
+    data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
+    stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
+    for name in names:
+        files = text_models.text_model_files(profile, name, folder=out)
+        if is_latent(name):
+            settings = {"batch_size": batch_size, "folder": out}
+            done = latent_models.train_latent_model(data, encoder, profile, name, stop_at=stop_at, **settings)
+        elif name != text_models.JUDGE:
+            settings = {"window": motion.window, "batch_size": batch_size, "folder": out}
+            done = text_models.train_text_model(data, encoder, profile, name, stop_at=stop_at, **settings)
+        elif files.model.exists():
+            done = load_judge(files.model)
+        else:
+            training = EvaluatorTraining(**given(num_steps=steps, batch_size=batch_size, seed=seed))
+            done = train_judge(data, encoder, training, checkpoint=files.state, stop_at=stop_at)
+            if done is not None:
+                save_judge(files.model, done)
+        log.info("%-12s %s", name, files.state if done is None else files.model)
+        if done is None:
+            return UNFINISHED
+    return 0
+
+
 def rollout(
-    style: Required,
-    model: Model,
-    path: str = "figure-eight",
-    seed: int = 0,
-    seconds: float = 20.0,
-    speed: float = 1.2,
-    blend: int = 4,
-    slide: bool = False,
-    raw: bool = False,
-    out: Path = Path("out"),
-) -> None:
-    """Animate one character: BVH, film strip, GIF (its first 12 s), player.
+    style: Required, model: Model, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0,
+    speed: float = 1.2, blend: int = 4, slide: bool = False, raw: bool = False, format: str = "bvh",
+    start: Path | None = None, out: Path = Path("out"),
+) -> None:  # fmt: skip
+    """Animate one character: motion, film strip, GIF (its first 12 s), player.
 
     Args:
       style: one that the model knows.
@@ -236,16 +270,16 @@ def rollout(
       blend: so many frames after each window boundary.
       slide: do not hold feet where they stand.
       raw: as the network made it: no blending, no held feet.
+      format: of the motion: bvh, glb (glTF with a body) or csv; several with commas between.
+      start: a BVH file to go on from: its last frames are the history; another humanoid's are retargeted.
       out: folder to write to.
     """
-    from f3amd_lib.drawing.pictures import film_strip, write_gif
-    from f3amd_lib.drawing.style import save_figure
-    from f3amd_lib.motion.bvh import write_bvh
     from f3amd_lib.motion.root_paths import named_path, read_path_csv
-    from f3amd_lib.serving.player import rollout_scene, write_player
+    from f3amd_lib.serving.player import rollout_scene
 
     name = f"{style}_{Path(path).stem}_seed{seed}"
-    targets = [out / f"{name}{ending}" for ending in (".bvh", ".png", ".gif", ".html")]
+    formats = _motion_formats(format)
+    targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *formats)]
     model.check_free(*targets)
     if path.lower().endswith(".csv"):
         line = read_path_csv(path)
@@ -253,23 +287,157 @@ def rollout(
         line = named_path(path, _num_frames(seconds), speed=speed, seed=seed)
     generator = model.generator()
     trained = generator.trained
+    history = None
+    if start is not None:
+        from f3amd_lib.generation.start_poses import start_history
+        from f3amd_lib.motion.bvh import read_bvh
+
+        history, note = start_history(trained, read_bvh(start), line)
+        log.info("start        %s", note)
     made = generator.rollout(
         line,
         style,
         seed=seed,
+        history=history,
         blend_frames=0 if raw else blend,
         lock_feet=not (raw or slide) and _has_legs(trained.skeleton),
     )
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
-    motion, title = made.motion(), f"{trained.name}, {style}"
-    out.mkdir(parents=True, exist_ok=True)
-    write_bvh(targets[0], motion, overwrite=model.overwrite)
-    save_figure(film_strip(motion, paths=line, titles=[title]), targets[1])
-    write_gif(targets[2], motion, target_paths=line, titles=[title], max_seconds=12.0)
-    credit = trained.record.get("dataset_credit") or ""
-    write_player(targets[3], rollout_scene(made, title), credit=credit, strip=False)
+    motion = made.motion()
+    title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
+    _write_shown(targets, motion, rollout_scene(made, title), trained, paths=line, overwrite=model.overwrite)
+
+
+def _write_shown(targets, motion, scene, trained, *, paths=None, overwrite: bool) -> None:
+    """Write a motion as film strip, GIF (its first 12 s) and player page, then in each format that was asked for."""
+    from f3amd_lib.drawing.pictures import film_strip, write_gif
+    from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.generation.generated import generated_credit
+    from f3amd_lib.serving.player import write_player
+
+    strip, gif, page, *files = targets
+    strip.parent.mkdir(parents=True, exist_ok=True)
+    credit = generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
+    save_figure(film_strip(motion, paths=paths, titles=[scene.title]), strip)
+    every = max(1, round(motion.fps / 10))
+    write_gif(gif, motion, target_paths=paths, titles=[scene.title], every=every, max_seconds=12.0)
+    write_player(page, scene, credit=credit, strip=False)
+    for path in files:
+        _write_motion(path, motion, credit, overwrite)
     for target in targets:
         log.info("wrote        %s", target)
+
+
+def text(
+    caption: Positional[str],
+    then: Repeatable = (),
+    model: str | None = None,
+    data: str = "bandai",
+    weights: Path | None = None,
+    seconds: float = 4.0,
+    guidance: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    control: Path | None = None,
+    joint: str = "pelvis",
+    any_words: bool = False,
+    text_weights: Path | None = None,
+    format: str = "bvh",
+    overwrite: bool = False,
+    out: Path = Path("out"),
+) -> None:
+    """Animate what a caption tells: motion, film strip, GIF (its first 12 s), player.
+
+    Args:
+      caption: such as "an elderly person raises the left hand".
+      then: what the person does after that, without a stop; repeatable. Needs a model of the prefix form.
+      model: a preset, such as ACMDM-S-PS22-raw-n3; by default the newest that is trained.
+      data: the data set that it was trained on.
+      weights: a weights file instead.
+      seconds: of each caption.
+      guidance: how hard the caption pushes; by default the paper's 3 (control 2.5, a stream 4).
+      steps: of Euler's method; by default the model's own sampler, which may choose its steps itself.
+      seed: of the noise.
+      control: CSV with the header frame,x,y,z: where a joint should be, frames from 0, metres. Needs a control branch.
+      joint: that is controlled: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
+      any_words: take words, too, that no caption of the training had.
+      text_weights: folder of CLIP or Sentence-T5, for a model that was trained with one of them.
+      format: of the motion: bvh, glb (glTF with a body) or csv; several with commas between.
+      overwrite: replace what lies there.
+      out: folder to write to.
+    """
+    import jax
+    import numpy as np
+
+    from f3amd_lib.data.text_encoders import check_captions, embed_captions, load_text_encoder
+    from f3amd_lib.generation import told_motion
+    from f3amd_lib.motion.inverse_kinematics import fitted
+    from f3amd_lib.motion.skeleton import Motion
+    from f3amd_lib.serving.player import Character, Scene
+    from f3amd_lib.training.text_models import find_text_model, load_text_model
+
+    captions = [caption, *then]
+    check_captions(captions)
+    told_motion.check_solver(steps, guidance)
+    if then and control:
+        raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
+    name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
+    targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
+    Model(overwrite=overwrite).check_free(*targets)
+    preset = model or (told_motion.STREAM_PRESET if then else None)
+    trained = load_text_model(weights or find_text_model(data, preset, control=control is not None))
+    log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
+    log.info("terms        %s", trained.record.get("dataset_licence"))
+    encoder = load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
+    pooled = told_motion.told_captions(trained, encoder, captions, any_words=any_words)
+    key, how, points, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, None, ()
+    if then or trained.starts:
+        windows = told_motion.told_windows(trained, seconds)
+        starts = embed_captions(list(trained.starts), encoder).pooled
+        positions = told_motion.stream_told(trained, pooled, [windows] * len(captions), key, starts=starts, **how)
+        each = windows * told_motion.window_frames(trained)
+        boundaries = range(len(positions) - each * len(captions), len(positions), each)
+    else:
+        num_frames = told_motion.told_frames(trained, seconds)
+        if control is not None:
+            which = told_motion.find_joint(trained, joint)
+            frames, points = told_motion.read_control_csv(control, num_frames)
+            how["control"] = told_motion.control_of(trained, which, frames, points, num_frames)
+        positions = told_motion.motions_told(trained, pooled, num_frames, key, **how)[0]
+    title = ", then ".join(captions)
+    motion, residual = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, title))
+    log.info("bones        joints moved by %.1f cm on average, %.1f cm at most, so that bones keep their lengths",
+             100 * residual.mean(), 100 * residual.max())  # fmt: skip
+    if points is not None:
+        missed = 100 * np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
+        log.info("control      %s is %.1f cm away on average, %.1f cm at most", joint, missed.mean(), missed.max())
+    scene = Scene(Character(motion, name=name), title=title, boundaries=boundaries)
+    _write_shown(targets, motion, scene, trained, overwrite=overwrite)
+
+
+def _motion_formats(given: str) -> list[str]:
+    """Return the file endings of `--format bvh,glb`; ValueError names one that is not known."""
+    wanted = list(dict.fromkeys(f".{name.strip().lower()}" for name in given.split(",")))
+    unknown = [name for name in wanted if name not in (".bvh", ".glb", ".csv")]
+    if unknown:
+        raise ValueError(f"--format {given}: give bvh, glb or csv, or several with commas between")
+    return wanted
+
+
+def _write_motion(path: Path, motion, credit: str, overwrite: bool) -> None:
+    """Write a motion as .bvh, .glb or .csv."""
+    if path.suffix == ".glb":
+        from f3amd_lib.serving.gltf import write_glb
+
+        write_glb(path, motion, credit=credit, overwrite=overwrite)
+    elif path.suffix == ".csv":
+        from f3amd_lib.motion.motion_csv import write_motion_csv
+
+        write_motion_csv(path, motion, overwrite=overwrite)
+    else:
+        from f3amd_lib.motion.bvh import write_bvh
+
+        write_bvh(path, motion, overwrite=overwrite)
 
 
 def _has_legs(skeleton) -> bool:
@@ -292,16 +460,10 @@ def _num_frames(seconds: float) -> int:
 
 
 def crowd(
-    model: Model,
-    characters: int = 1024,
-    seconds: float = 32 / 30,
-    style: Repeatable = (),
-    seed: int = 0,
-    chunk: int | None = None,
-    plan: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="[METRES]")] = None,
-    pictures: bool = False,
-    out: Path = Path("out/crowd"),
-) -> None:
+    model: Model, characters: int = 1024, seconds: float = 32 / 30, style: Repeatable = (), seed: int = 0,
+    chunk: int | None = None, plan: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="[METRES]")] = None,
+    pictures: bool = False, raw: bool = False, out: Path = Path("out/crowd"),
+) -> None:  # fmt: skip
     """Animate any number of characters, streamed to a folder; goes on where it was stopped.
 
     Args:
@@ -311,7 +473,8 @@ def crowd(
       seed: of paths and noise.
       chunk: characters at once.
       plan: paths that keep this far apart at every frame, 0.8 without a number.
-      pictures: draw OUT.png and the player page OUT.html as well.
+      pictures: draw OUT.png and the player page OUT.html as well, with seams blended and feet held.
+      raw: draw them as the network made them; the folder holds that in any case.
       out: folder to write to.
     """
     from f3amd_lib.generation.crowd import generate_crowd
@@ -325,75 +488,107 @@ def crowd(
     generator = model.generator()
     started = time.perf_counter()
     made = generate_crowd(
-        generator,
-        characters,
-        num_frames,
-        out,
-        styles=list(style) or None,
-        min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0],
-        seed=seed,
-        chunk=chunk,
-        overwrite=model.overwrite,
-        progress=True,
-    )
+        generator, characters, num_frames, out, styles=list(style) or None,
+        min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
+        overwrite=model.overwrite, progress=True,
+    )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     log.info("took         %.0f s", time.perf_counter() - started)
     if pictures:
-        _crowd_pictures(made, *drawn)
+        _crowd_pictures(made, *drawn, window=None if raw else generator.trained.config.window)
     for file in drawn:
         log.info("wrote        %s", file)
 
 
-def _crowd_pictures(crowd, still: Path, page: Path) -> None:
-    """Draw a crowd half way through, and write a page that plays up to 100 of it."""
+def _finished(motion, window: int, lock: bool):
+    """Blend a motion's seams and hold its feet, as where people look."""
+    from f3amd_lib.data.features import motion_from_frames, world_frames
+    from f3amd_lib.generation.blending import blend_seams
+    from f3amd_lib.generation.foot_locking import lock_feet
+
+    frames = blend_seams(world_frames(motion), window, min(4, window))
+    motion = motion_from_frames(motion.skeleton, frames, motion.fps, motion.name)
+    return lock_feet(motion) if lock else motion
+
+
+def _crowd_pictures(crowd, still: Path, page: Path, *, window: int | None) -> None:
+    """Draw a crowd half way through, and write a page that plays up to 100 of it.
+
+    Seams of windows are blended over 4 frames and feet held where they stand, unless `window` is None.
+    """
     from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
     from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.generation.generated import generated_credit
     from f3amd_lib.serving.player import Character, Scene, write_player
 
     made_by = crowd.settings["model"]
     motions = [crowd.motion(k) for k in range(min(100, len(crowd)))]
+    if window is not None:
+        lock = _has_legs(crowd.skeleton)
+        motions = [_finished(motion, window, lock) for motion in motions]
     colors = crowd_colors([motion.name for motion in motions])
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
-    credit = ", ".join(filter(None, (made_by["dataset_credit"], made_by["dataset_licence"])))
+    credit = generated_credit(made_by["name"], made_by["dataset_credit"], made_by["dataset_licence"])
     write_player(page, Scene(characters, title=made_by["name"]), strip=False, credit=credit)
     save_figure(crowd_figure({made_by["name"]: (motions, colors)}, crowd.num_frames // 2), still)
 
 
-def export(model: Model, characters: int = 1, target: Repeatable = (), out: Path = Path("out/round")) -> None:
-    """Make a round that runs without the model code: StableHLO, jax.export, IREE.
+def export(
+    model: Model,
+    characters: int | None = None,
+    target: Repeatable = (),
+    stored: str = "float32",
+    out: Path = Path("out/round"),
+) -> None:
+    """Make a round that runs without the model code: StableHLO, jax.export, IREE; or a denoiser for ONNX.
 
     Args:
-      characters: of one call.
-      target: llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable; by default this processor.
+      characters: of one call; by default 1, and with onnx any number.
+      target: llvm-cpu, vmvx, vulkan-spirv, cuda-sm_80; repeatable; by default this processor. Or onnx, alone.
+      stored: with onnx, how weights are kept: float32, float16, int8.
       out: folder to write to.
     """
-    from f3amd_lib.serving.export import export_model
+    if "onnx" in target:
+        from f3amd_lib.serving.onnx_export import export_onnx
 
-    if not target and importlib.util.find_spec("iree"):
-        target = ("llvm-cpu",)
-    elif not target:
-        log.info("not compiled for this processor, since IREE is missing: make bench-tools")
-    folder = export_model(
-        model.load(),
-        out,
-        num_steps=model.steps,
-        batch=characters,
-        sampler=model.sampler,
-        targets=target,
-        overwrite=model.overwrite,
-    )
+        if len(target) > 1 or model.sampler:
+            raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
+        folder = export_onnx(
+            model.load(), out, num_steps=model.steps, batch=characters, weights=stored, overwrite=model.overwrite
+        )
+    else:
+        from f3amd_lib.serving.export import export_model
+
+        if not target and importlib.util.find_spec("iree"):
+            target = ("llvm-cpu",)
+        elif not target:
+            log.info("not compiled for this processor, since IREE is missing: make bench-tools")
+        folder = export_model(
+            model.load(), out, num_steps=model.steps, batch=characters or 1, sampler=model.sampler, targets=target,
+            overwrite=model.overwrite,
+        )  # fmt: skip
     for file in sorted(folder.iterdir()):
         log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)
 
 
+def steer(model: Model, stored: str = "int8", out: Path = Path("out/steer.html")) -> None:
+    """Write a page on which one steers the model by keys, mouse, touch or gamepad; it needs no server.
+
+    Args:
+      stored: how weights are kept: int8, float16, float32.
+      out: page to write.
+    """
+    from f3amd_lib.serving.steer import write_steer
+
+    model.check_free(out)
+    page = write_steer(out, model.load(), num_steps=model.steps, weights=stored)
+    log.info("wrote        %s (%.1f MB): open it in a browser", page, page.stat().st_size / 1e6)
+
+
 def bench(
-    motion: Data,
-    suite: Repeatable = (),
-    characters: UseAppendAction[tuple[int, ...]] = (),
-    again: bool = False,
-    training: bool = False,
-    parts: bool = False,
-) -> None:
+    motion: Data, suite: Repeatable = (), characters: UseAppendAction[tuple[int, ...]] = (), again: bool = False,
+    training: bool = False, parts: bool = False,
+) -> None:  # fmt: skip
     """Time synthesis and training, write records, compare with what is asked.
 
     Args:
@@ -429,41 +624,75 @@ def bench(
 
 
 def measure(
-    names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = (), published: Path | None = None
-) -> None:
+    names: Positional[tuple[str, ...]] = (),
+    *,
+    motion: Data,
+    model: Repeatable = (),
+    published: Path | None = None,
+    minutes: float | None = None,
+) -> int:
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
-      names: learning, quality, walking and so on; all if none.
+      names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_table1,
+        text_tableA1, text_table3, text_tableA5, by name alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
+      minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
     """
+    from f3amd_lib.experiments import text_tables
     from f3amd_lib.experiments.measure import MEASUREMENTS
+    from f3amd_lib.ground.files import locked
     from f3amd_lib.ground.names import nearest_hint
-    from f3amd_lib.ground.profiles import load_profile
+    from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.networks import presets
 
     for name in names:
-        if name not in MEASUREMENTS:
-            raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, MEASUREMENTS)}")
+        if name not in (known := [*MEASUREMENTS, *text_tables.TABLES]):
+            raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, known)}")
+    if of_text := [name for name in names if name in text_tables.TABLES]:
+        if len(of_text) < len(names):
+            raise ValueError(f"{', '.join(of_text)}: measure tables of text to motion by a call of their own")
+        return _measure_text(of_text, motion, model, minutes)
     models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
     other_window = profile.window != load_profile(profile.name, profile.dataset).window
     if (other_window or published) and set(names) != {"quality"}:
         raise ValueError("--window and --published are for quality alone: measure it by name")
     extra = {"published": published} if published else {}
+    records = results_dir(profile.dataset, profile.name) / "records"
     for name in names or MEASUREMENTS:
-        log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **extra))
+        with locked(records / f".{name}.lock", f"measuring {name}"):
+            log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **extra))
+    return 0
+
+
+def _measure_text(names, motion: Data, models, minutes) -> int:
+    """Train and measure the rows of tables of text to motion."""
+    from f3amd_lib.data.text_encoders import load_text_encoder
+    from f3amd_lib.experiments.text_tables import measure_text_table
+    from f3amd_lib.ground.files import locked
+    from f3amd_lib.ground.profiles import load_profile, results_dir
+    from f3amd_lib.training.text_models import open_text_motions
+
+    profile, encoder = load_profile(motion.profile, motion.data), load_text_encoder()
+    data = open_text_motions(motion.data, motion.source)
+    records = results_dir(profile.dataset, profile.name) / "records"
+    stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
+    for name in names:
+        with locked(records / f".{name}.lock", f"measuring {name}"):
+            table = measure_text_table(name, data, encoder, profile, models=models, stop_at=stop_at)
+        if table is None:
+            log.info("%-12s unfinished: call again to go on", name)
+            return UNFINISHED
+        log.info("%-12s %s", name, table)
+    return 0
 
 
 def campaign(
-    motion: Data,
-    minutes: float | None = None,
-    batch_size: int = 128,
-    only: Repeatable = (),
-    packed: Path | None = None,
-    out: Path | None = None,
-) -> int:
+    motion: Data, minutes: float | None = None, batch_size: int = 128, only: Repeatable = (),
+    packed: Path | None = None, out: Path | None = None,
+) -> int:  # fmt: skip
     """Train and measure the long queue of real motion in legs; a killed leg goes on where it stopped.
 
     Args:
@@ -476,6 +705,7 @@ def campaign(
     from f3amd_lib.data.packed import load_packed
     from f3amd_lib.experiments.campaign import run_campaign
     from f3amd_lib.experiments.measure import protocol_of
+    from f3amd_lib.ground.files import locked
     from f3amd_lib.ground.profiles import load_profile, runs_dir
     from f3amd_lib.training.pipeline import PreparedData
 
@@ -485,18 +715,20 @@ def campaign(
         profile = load_profile(motion.profile, motion.data)
         prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
     classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
-    state = "measured"
-    for name, windows, state in run_campaign(
+    state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
+    legs = run_campaign(
         prepared,
         profile,
         classifier,
         protocol,
-        folder=out or runs_dir(profile.dataset, profile.name) / "campaign",
+        folder=folder,
         batch_size=batch_size,
         only=only,
         budget_s=None if minutes is None else 60.0 * minutes,
-    ):
-        log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
+    )
+    with locked(folder / ".campaign.lock", "running the campaign"):
+        for name, windows, state in legs:
+            log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0
 
 
@@ -530,15 +762,33 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
     return 0
 
 
-def claims(accept: bool = False) -> int:
-    """Judge the paper's claims from records; writes paper_figures/claims.md.
+def course(only: Repeatable = ()) -> int:
+    """Run the course on samplers, notebooks/course/; it needs no data, and copies go to runs/course/.
+
+    Args:
+      only: number of a notebook; repeatable.
+    """
+    from f3amd_lib import reproduce
+
+    logging.getLogger("papermill").setLevel(logging.WARNING)
+    try:
+        reproduce.run_course(only, say=log.info)
+    except reproduce.NotebookFailed as error:
+        print(f"Stopped: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def claims(accept: bool = False, paper: str | None = None) -> int:
+    """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
 
     Args:
       accept: take changed verdicts for right and write them down.
+      paper: whose claims, such as acmdm; each paper's if none.
     """
     from f3amd_lib.reports import claims as ledger
 
-    return ledger.main(["--accept"] if accept else [])
+    return ledger.main(accept, paper)
 
 
 def cards() -> int:
@@ -548,7 +798,27 @@ def cards() -> int:
     return model_cards.main()
 
 
-COMMANDS = (data, dataset, presets, train, rollout, crowd, export, bench, measure, campaign, figures, claims, cards)
+RESUMED = ("train", "crowd", "bench", "measure", "campaign", "figures")
+"""Commands that leave whole what they have done, and go on from it."""
+
+COMMANDS = (
+    data,
+    dataset,
+    presets,
+    train,
+    rollout,
+    text,
+    crowd,
+    export,
+    steer,
+    bench,
+    measure,
+    campaign,
+    figures,
+    course,
+    claims,
+    cards,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -569,6 +839,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ArithmeticError, ImportError) as error:
         print(f"f3amd {words[0]}: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        again = "; the same command goes on from what is written" if words[0] in RESUMED else ""
+        print(f"\nf3amd {words[0]}: stopped by Ctrl-C{again}", file=sys.stderr)
+        return 130
     return status or 0
 
 

@@ -153,14 +153,9 @@ def what_to_open(results: Path) -> list[str]:
 
 
 def reproduce(
-    dataset: str,
-    profile: str,
-    *,
-    only: Iterable[str] = (),
-    parameters: Mapping | None = None,
-    notebooks_dir=None,
+    dataset: str, profile: str, *, only: Iterable[str] = (), parameters: Mapping | None = None, notebooks_dir=None,
     say: Callable[[str], None] = lambda line: None,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """Run the numbered notebooks with a data set and a profile; stop at the first that fails.
 
     A run of all notebooks leaves `tables/run_summary.csv` among the results; a run of some, or one
@@ -222,6 +217,31 @@ def reproduce(
     if failure:
         raise failure
     return summary
+
+
+def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda line: None) -> list[Path]:
+    """Run the notebooks of `notebooks/course/`, which take no parameters and write nothing; stop at one that fails.
+
+    Args:
+      only: see `select_notebooks`.
+      say: called with each line of news.
+
+    Returns:
+      The executed copies, in `runs/course/`.
+
+    Raises:
+      ValueError: for a notebook that is not there.
+      NotebookFailed: if a notebook stops.
+    """
+    root = profiles.repository_root()
+    selected = select_notebooks(find_notebooks(root / "notebooks/course"), only)
+    copies = [root / "runs/course" / path.name for path in selected]
+    copies[0].parent.mkdir(parents=True, exist_ok=True)
+    for path, copy in zip(selected, copies, strict=True):
+        start = time.monotonic()
+        _execute(path, copy, {})
+        say(f"{path.stem:24s} {_duration(time.monotonic() - start):>11s}")
+    return copies
 
 
 def _execute(path: Path, copy: Path, parameters: Mapping) -> None:

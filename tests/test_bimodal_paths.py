@@ -10,6 +10,7 @@ from helpers.bimodal_paths import BimodalPaths
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
+from f3amd_lib.training.optimise import _advance as advance_program
 
 DATA = BimodalPaths()
 SMALL = BimodalPaths(num_frames=8, num_modes=4)
@@ -182,6 +183,13 @@ def trained():
     return networks[0], losses[0], losses[1]
 
 
+@pytest.mark.slow
+def test_trainings_that_differ_in_noise_alone_are_compiled_once(trained):
+    compiled = advance_program._cache_size()
+    toy.train_networks(SMALL, EXPLODING, (2, 3), **SHORT)
+    assert advance_program._cache_size() == compiled
+
+
 def test_a_short_training_learns_the_mean_and_the_sides(trained):
     network, losses, _ = trained
     assert losses.shape == (400,) and losses[-50:].mean() < 0.2 * losses[:5].mean()
@@ -197,6 +205,7 @@ def test_a_trained_network_comes_near_the_exact_error_and_not_below(trained):
     assert (found > 0.995 * exact).all() and (found < 1.3 * exact + 0.1).all()
 
 
+@pytest.mark.slow
 def test_seeds_that_train_side_by_side_differ_and_know_nothing_of_each_other(trained):
     _, losses, other = trained
     assert not np.allclose(losses, other, rtol=0.01)

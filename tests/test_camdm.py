@@ -35,11 +35,15 @@ def test_section_6_the_papers_baseline_reads_76_tokens():
     assert len(config.noise_levels) == 8
 
 
+def tokens_of(network, x_noisy, sigma, condition):
+    return dict(network.stages(x_noisy, sigma, network.encode(condition)))["tokens"]
+
+
 def test_sequence_is_as_long_as_the_config_says():
     for split_path in (False, True):
         network = network_of(tiny_camdm(split_path=split_path))
-        context = network.encode(make_condition())
-        tokens = dict(network.stages(draw(2, WINDOW, CHANNELS), 1.0, context))["tokens"]
+        given = draw(2, WINDOW, CHANNELS)
+        tokens = jax.eval_shape(lambda x, net=network: tokens_of(net, x, 1.0, make_condition()), given)
         expected = 2 + (2 if split_path else 1) * WINDOW + HISTORY + WINDOW
         assert tokens.shape == (2, expected, 8)
         assert network.config.num_tokens == expected
@@ -48,8 +52,7 @@ def test_sequence_is_as_long_as_the_config_says():
 def test_tokens_by_hand():
     network = network_of(tiny_camdm(split_path=True))
     condition, x_noisy, sigma = make_condition(), draw(2, WINDOW, CHANNELS), LEVELS[2]
-    context = network.encode(condition)
-    tokens = dict(network.stages(x_noisy, sigma, context))["tokens"]
+    tokens = jax.jit(lambda x_noisy: tokens_of(network, x_noisy, sigma, condition))(x_noisy)
     code = position_code(0, network.config.num_tokens, 8, base=10_000.0)
     bare = np.asarray(tokens) - code
     weights = lambda layer: (np.asarray(layer.kernel[...]), np.asarray(layer.bias[...]))

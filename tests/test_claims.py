@@ -1203,12 +1203,12 @@ def test_the_command_tells_by_its_status(tmp_path, monkeypatch, caplog):
     only = [claims.find_claim("Q13")]
     monkeypatch.setattr(claims, "load_claims", lambda paper: only)
     results = keep(tmp_path / "paper_figures", CASES["Q13"][0])
-    assert claims.main([]) == 1 and "Nothing was written" in caplog.text
-    assert claims.main(["--accept"]) == 0 and claims.main([]) == 0
+    assert claims.main() == 1 and "Nothing was written" in caplog.text
+    assert claims.main(accept=True) == 0 and claims.main() == 0
     assert "Q13 by our records" in caplog.text
     assert (results / "claims.md").read_text().count("| Q13 |") == 1
     (results / "bandai" / "laptop" / "records" / "quality.json").unlink()
-    assert claims.main([]) == 2
+    assert claims.main() == 2
 
 
 def test_markdown_shows_verdict_figure_and_record(tmp_path):

@@ -23,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11.2", "3.12.3", "3.13.5", "3.14.0")
 MACHINES = ("x86_64", "aarch64")
 
+APART = ("bench", "onnx")
+"""Extras with a requirements file of their own, without hashes."""
+
 HASHED = ("web",)
 """Extras with a requirements file of their own, hashed and in step with the lock."""
 
@@ -41,9 +44,10 @@ IMPORT_NAMES = {
 
 
 def read_apart() -> dict[str, set[str]]:
-    """Packages of requirements-bench.txt -> their pinned versions, which may differ by system."""
+    """Packages of requirements-bench.txt and -onnx.txt -> their pinned versions, which may differ by system."""
     pinned: dict[str, set[str]] = {}
-    for line in (ROOT / "requirements-bench.txt").read_text(encoding="utf-8").splitlines():
+    texts = [(ROOT / f"requirements-{extra}.txt").read_text(encoding="utf-8") for extra in APART]
+    for line in "".join(texts).splitlines():
         if line and not line.startswith(("#", "-")):
             item = Requirement(line)
             (pin,) = item.specifier
@@ -256,12 +260,8 @@ def test_the_version_is_the_same_everywhere():
 
 def test_what_is_installed_apart_is_pinned_within_its_range():
     ranges = all_requirements(read_pyproject())
-    bench = {
-        canonicalize_name(Requirement(line).name)
-        for line in read_pyproject()["project"]["optional-dependencies"]["bench"]
-    }
     apart = read_apart()
-    assert set(apart) == bench - {"psutil"}
+    assert set(apart) == set().union(*(extra_names(PYPROJECT, extra) for extra in APART)) - {"psutil"}
     for name, versions in apart.items():
         for version in versions:
             assert ranges[name].contains(version.split("+")[0]), f"{name} {version}"

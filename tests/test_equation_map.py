@@ -225,9 +225,20 @@ def test_a_broken_open_point_is_refused(changes, message):
     )
 
 
-def test_open_points_are_told_once_with_a_reason():
-    table = readings_table()
+@pytest.mark.parametrize("paper", ["f3amd", "acmdm", "motionpcm"])
+def test_open_points_are_told_once_with_a_reason(paper):
+    table = readings_table(paper=paper)
     assert table["open point"].is_unique and (table[["the paper", "why"]] != "").all(axis=None)
+
+
+def test_acmdms_open_points_and_equations_are_its_own():
+    table = readings_table(paper="acmdm").set_index("open point")["here"]
+    assert table["levels of DDPM for x0 and eps"].startswith("50 levels")
+    assert table["masked form"].startswith("blocks that see known frames, and a head of 3 layers")
+    rows = equation_map(paper="acmdm").set_index("equation")
+    assert "diffusion/schedules: straight" in rows.loc["Eq. 2", "functions"]
+    assert "test_flow: test_acmdm_eq02_ddim_takes_eulers_steps_of_the_flow" in rows.loc["Eq. 2", "tests"]
+    assert "diffusion/flow" in rows.loc["Eq. 1", "functions"]
 
 
 # ------------------------------------------------------------------------------- a second paper
@@ -243,8 +254,10 @@ def second_paper(tmp_path, monkeypatch):
         '[[equation]]\nlabel = "Eq. 2"\nsection = "1"\nwhat = "sum"\n'
         '[[equation]]\nlabel = "Box 1"\nsection = "2"\nwhat = "update"\n'
     )
+    (tmp_path / "other/commands.toml").write_text('[[command]]\nrun = "f3amd measure"\nclaims = ["Q1"]\n')
     (tmp_path / "other/claims.toml").write_text(
-        '[groups]\nQ = "Quality"\n[thresholds]\n[[claim]]\nid = "Q1"\ntext = "better"\nwhere = "1"\n'
+        '[groups]\nQ = "Quality"\n[thresholds]\n[page]\npreface = "-"\nintervals = "-"\nunjudged = "-"\n'
+        '[[claim]]\nid = "Q1"\ntext = "better"\nwhere = "1"\n'
         'decided_by = "FID"\n[[claim.statement]]\nsays = "CAMDM is worse"\nkind = "worse"\nmodel = "CAMDM"\n'
         'against = "F3AMD-FNO-96"\nmetric = "FID"\n'
     )

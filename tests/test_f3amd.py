@@ -15,6 +15,7 @@ from builders import (
     make_condition,
     network_of,
     refused,
+    same_tree,
     tiny_config,
     tiny_normaliser,
 )
@@ -23,7 +24,8 @@ from flax import nnx
 from f3amd_lib.data.features import path_condition, turn_frames
 from f3amd_lib.networks.attention import position_code
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.networks.f3amd import F3AMDConfig
+from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
+from f3amd_lib.networks.presets import build_from_config
 
 SIGMA = jnp.array([0.3, 20.0])
 
@@ -400,3 +402,11 @@ def test_normalising_commutes_with_turning():
     turned_last = turn_frames(normaliser.normalise(frames), yaw)
     turned_first = normaliser.normalise(turn_frames(frames, yaw))
     np.testing.assert_allclose(turned_last, turned_first, atol=2e-5)
+
+
+def test_layers_get_the_keys_that_flax_would_deal():
+    """Weights depend on the key alone, whoever counts the layers."""
+    ours = build_from_config(tiny_config(), jax.random.key(3))
+    theirs = F3AMD(tiny_config(), rngs=nnx.Rngs(params=jax.random.key(3)))
+    assert same_tree(nnx.state(ours), nnx.state(theirs))
+    assert not same_tree(nnx.state(ours), nnx.state(build_from_config(tiny_config(), jax.random.key(4))))

@@ -79,13 +79,13 @@ def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeyp
     two = {name: presets.find_preset(name) for name in (first, second)}
     monkeypatch.setattr(presets, "PRESETS", two)
     asked = []
-    curves = learning_curves.learning_curve
+    curves = measure.learning_curve
 
     def spy(data, preset, **settings):
         asked.append(preset)
         return curves(data, preset, **settings)
 
-    monkeypatch.setattr(learning_curves, "learning_curve", spy)
+    monkeypatch.setattr(measure, "learning_curve", spy)
     measure.measure_learning(prepared, profile)
     assert asked == [second]
     both, _ = read_table(path)
@@ -97,6 +97,8 @@ def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeyp
 
 
 def test_other_settings_keep_no_rows(prepared, small, tmp_path, monkeypatch):
+    curve = pd.DataFrame({"step": [0, 4], "loss": [math.nan, 1.0], "held_out_loss": [2.0, 1.0]})
+    monkeypatch.setattr(measure, "learning_curve", lambda data, preset, seed: curve.assign(model=preset))
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     profile = load_profile("smoke", "synthetic")
     path = measure.measure_learning(prepared, profile, ["F3AMD-FNO-32"])

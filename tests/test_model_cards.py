@@ -23,7 +23,9 @@ def test_every_shipped_model_has_its_card(path):
     record = describe(path)["record"]
     assert record["dataset_licence"] in card and record["dataset_credit"] in card
     assert ("non-commercial" in card) == ("NC" in record["dataset_licence"])
-    assert f"{record['training']['num_steps']:,} steps" in card
+    recipe = record["training"]  # of the last leg, where there were several
+    assert f"({record.get('windows_seen', recipe['num_steps'] * recipe['batch_size']):,} windows" in card
+    assert record.get("schedule_note", "") in card
 
 
 def test_page_of_results_shows_what_is_on_record(tmp_path):

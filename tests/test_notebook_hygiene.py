@@ -19,6 +19,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+COURSE = sorted((ROOT / "notebooks/course").glob("*.ipynb"))
 STANDALONE = sorted((ROOT / "notebooks/standalone").glob("*.ipynb"))
 LARGEST_NOTEBOOK = 250_000  # bytes
 LARGEST_FILE = 5_000_000  # bytes
@@ -35,8 +36,8 @@ BINARY = {".png", ".gif", ".npz", ".safetensors", ".jpg", ".pdf"}
 def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
     """Everything about a notebook file that should not be committed, one sentence each.
 
-    One that is not numbered stands alone: `reproduce` does not run it, so that it needs neither a
-    number nor parameters.
+    One that is not numbered stands alone, or in the course: no data set and no profile is chosen for it,
+    so that it needs no parameters.
     """
     faults = []
     text = path.read_text(encoding="utf-8")
@@ -122,8 +123,8 @@ def repository_faults(paths, root: Path) -> list[str]:
             faults.append(f"{name}: {path.stat().st_size} bytes, limit {LARGEST_FILE}")
         if path.suffix in (".bvh", ".zip") and not re.fullmatch(r"paper_figures/[^/]+/[^/]+/media/[^/]+\.bvh", name):
             faults.append(f"{name}: motion data does not belong in the repository")
-        if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/(standalone/)?[^/]+", name):
-            faults.append(f"{name}: notebooks lie in notebooks/ or notebooks/standalone/")
+        if path.suffix == ".ipynb" and not re.fullmatch(r"notebooks/((course|standalone)/)?[^/]+", name):
+            faults.append(f"{name}: notebooks lie in notebooks/, its course/ or its standalone/")
         if path.suffix not in BINARY:
             found = MACHINE_PATH.search(path.read_text(encoding="utf-8", errors="replace"))
             if found:
@@ -139,6 +140,19 @@ def test_notebook_is_fit_to_be_read(path):
 @pytest.mark.parametrize("path", STANDALONE, ids=lambda path: path.stem)
 def test_standalone_notebook_is_fit_to_be_read(path):
     assert notebook_faults(path, numbered=False) == []
+
+
+@pytest.mark.parametrize("path", COURSE, ids=lambda path: path.stem)
+def test_notebook_of_the_course_is_fit_to_be_read(path):
+    assert notebook_faults(path, numbered=False) == []
+    assert re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name)
+    assert not re.search(r"keep_figure|write_table", path.read_text(encoding="utf-8")), "the course stores nothing"
+
+
+def test_the_course_is_numbered_without_gaps():
+    topics = [path.name[:2] for path in COURSE if not path.stem.endswith("_solutions")]
+    assert topics == [f"{i:02d}" for i in range(1, len(topics) + 1)]
+    assert all(path.name[:2] > topics[-1] for path in COURSE[len(topics) :]), "solutions come last"
 
 
 def test_notebooks_are_numbered_without_gaps():
@@ -187,7 +201,7 @@ def test_no_committed_figure_is_cut_off():
 def test_no_picture_of_a_notebook_is_cut_off():
     pictures = [
         (f"{path.name}, cell {cell.id}", base64.b64decode("".join(output.data["image/png"])))
-        for path in NOTEBOOKS + STANDALONE
+        for path in NOTEBOOKS + COURSE + STANDALONE
         for cell in nbformat.read(path, as_version=4).cells
         for output in cell.get("outputs", [])
         if "image/png" in output.get("data", {})

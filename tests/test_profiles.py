@@ -84,7 +84,7 @@ def test_sensible_values_become_the_fields_type(key, given, kept):
         ("seconds_per_style", float("nan"), "seconds_per_style must be a finite number"),
         ("seconds_per_style", False, "seconds_per_style must be a finite number"),
         ("seconds_per_style", -1, "seconds_per_style must be above 0"),
-        ("seed", -1, "seed must be 0 or more"),
+        ("seed", -1, "seed must be a whole number from 0"),
         ("preset", 96, "preset must be a name"),
         ("evaluation_styles", "proud", "evaluation_styles must be a list of names"),
         ("evaluation_styles", [1], "evaluation_styles must be a list of names"),

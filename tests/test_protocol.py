@@ -93,7 +93,7 @@ def measured(generator, packed, prepared, classifier):
     return measure_model(generator, packed, classifier, SMALL, prepared.windows("validation"))
 
 
-TEXT_METRICS = {metric.name for table in ("text", "control") for metric in SHOWN[table]}
+TEXT_METRICS = {metric.name for table in ("text", "control") for metric in SHOWN[table]} | {"sampling_seconds"}
 PROTOCOL_METRICS = (
     set(METRICS) - TEXT_METRICS - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
 )

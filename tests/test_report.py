@@ -21,6 +21,7 @@ from f3amd_lib.ground import papers, records, tables
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_euler, matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.networks.presets import find_preset
 
 
 def make_motion(num_frames=120, fps=30.0, name="test walk"):
@@ -207,6 +208,30 @@ def test_paper_tables_are_whole_and_tidy(number):
     dashes = frame["printed"] == ""
     assert (frame["value"].isna() == dashes).all() and not dashes.all()
     assert frame.attrs["table"] == number and "100STYLE" in frame.attrs["setting"]
+
+
+ACMDM_ROWS = {"1": 75, "2": 70, "3": 108, "4": 28, "A1": 144, "A2": 252, "A3": 42, "A4": 49, "A5": 24}
+
+
+@pytest.mark.parametrize("number", ACMDM_ROWS)
+def test_acmdms_tables_are_whole_and_its_own_rows_have_presets(number):
+    frame = papers.load_paper_table(number, "acmdm")
+    assert len(frame) == ACMDM_ROWS[number] and "HumanML3D" in frame.attrs["setting"]
+    assert set(frame["better"]) <= {"up", "down", "real"}
+    assert (frame["value"].isna() == (frame["printed"] == "")).all()
+    if number != "4":  # meshes: no network of theirs is here yet
+        own = {name for name in frame["model"] if name.startswith("ACMDM")}
+        assert own and all(find_preset(name).paper == "acmdm" for name in own)
+
+
+def test_acmdms_headline_row_is_the_same_in_every_table():
+    rows = [("1", "ACMDM-S-PS22 (absolute, AdaLN, causal AE, v)"), ("2", "ACMDM-S-PS22"), ("A1", "ACMDM-S-PS22")]
+    for number, model in rows:
+        frame = papers.load_paper_table(number, "acmdm")
+        row = frame[(frame["model"] == model) & (frame["metric"] == "FID") & (frame.get("cfg", "yes") == "yes")]
+        assert row["printed"].tolist() == ["0.109"], number
+    with pytest.raises(ValueError, match="Tables 1 to A5, not '7'"):
+        papers.load_paper_table("7", "acmdm")
 
 
 def test_the_headline_row_is_the_same_in_every_table():

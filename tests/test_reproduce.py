@@ -229,3 +229,16 @@ def test_parameters_that_the_documents_name_exist(number, parameters):
     notebooks = reproduce.find_notebooks(profiles.repository_root() / "notebooks")
     chosen = reproduce.select_notebooks(notebooks, [number])
     reproduce.check_parameters(chosen, ["profile", "data", *parameters])
+
+
+def test_the_course_runs_without_parameters_into_copies_of_its_own(checkout):
+    folder = checkout / "notebooks/course"
+    folder.mkdir(parents=True)
+    write_notebook(folder, "01_first", "import pathlib; assert pathlib.Path.cwd().name == 'course'")
+    write_notebook(folder, "02_broken", "raise ValueError('stop here')")
+    news = []
+    (copy,) = reproduce.run_course(["1"], say=news.append)
+    assert copy == checkout / "runs/course/01_first.ipynb" and copy.is_file()
+    assert news[0].startswith("01_first")
+    with pytest.raises(reproduce.NotebookFailed, match="02_broken"):
+        reproduce.run_course()

@@ -161,10 +161,12 @@ def test_parts_are_left_out():
     for part in ("", *PARTS[:-1]):
         left = without(network, part) if part else network
         program = jax.make_jaxpr(lambda x, left=left: left(x, 1.0, left.encode(Condition(*given))))
-        counts[part] = str(program(x_noisy)).count("dot_general")
-        assert left(x_noisy, 1.0, left.encode(Condition(*given))).shape == x_noisy.shape
+        traced = program(x_noisy)
+        counts[part] = str(traced).count("dot_general")
+        assert traced.out_avals[0].shape == x_noisy.shape
     assert all(counts[part] < counts[""] for part in PARTS[:-1])
-    assert network(x_noisy, 1.0, network.encode(Condition(*given))).shape == x_noisy.shape
+    whole = jax.make_jaxpr(lambda x: network(x, 1.0, network.encode(Condition(*given))))(x_noisy)
+    assert str(whole).count("dot_general") == counts[""]
     refused("unknown part", without, network, "noise")
     refused("Fourier blocks with FiLM", without, network_of(tiny_config(base_block="transformer")), "FiLM")
 

@@ -6,7 +6,7 @@ Markdown while the site is built:
 - `room f3amd_lib.motion`: the docstrings of all modules of one room of the library;
 - `gallery bandai`: figures, animations and players under `paper_figures/bandai/`;
 - `moving`: animations and players of all data sets;
-- `notebooks` or `notebooks standalone`: the notebooks, each with its question;
+- `notebooks`, `notebooks course` or `notebooks standalone`: the notebooks, each with its question;
 - `readme`: the README from its quick start on.
 """
 

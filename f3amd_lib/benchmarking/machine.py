@@ -14,6 +14,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from f3amd_lib.ground.records import usable_cores
+
 PRECISIONS = {
     "float32": ("float32", jnp.float32),
     "tf32": ("tensorfloat32", jnp.float32),
@@ -37,12 +39,6 @@ def matmul_precision(precision: str):
 def device_name() -> str:
     """Return "CPU", "GPU" or "TPU" for the device that JAX computes on."""
     return {"cuda": "GPU", "rocm": "GPU"}.get(jax.devices()[0].platform, jax.devices()[0].platform.upper())
-
-
-def usable_cores() -> int:
-    """Return how many cores this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _processor() -> str:

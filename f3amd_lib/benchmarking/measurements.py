@@ -65,13 +65,9 @@ def _circumstances() -> dict:
 
 
 def measure_synthesis_time(
-    prepared: PreparedData,
-    profile: Profile,
-    suites: Iterable[str] | None = None,
-    *,
-    characters: Iterable[int] | None = None,
-    again: bool = False,
-) -> Path:
+    prepared: PreparedData, profile: Profile, suites: Iterable[str] | None = None, *,
+    characters: Iterable[int] | None = None, again: bool = False,
+) -> Path:  # fmt: skip
     """Time rounds of the family in every implementation there is (see `benchmarking.synthesis`).
 
     Args:
@@ -144,7 +140,8 @@ def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterab
     model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
     workloads = [Workload(model, prepared.model_config(model), 1, characters) for characters in counts]
     table = pd.concat(time_breakdown(workload, progress=True, **turns) for workload in workloads)
-    return _write(prepared, profile, "round_parts", table)
+    path = results_dir(profile.dataset, profile.name) / "records" / "round_parts.csv"
+    return write_table(path, table, _record(prepared, profile, "round_parts", **_circumstances()))
 
 
 def measure_training_time(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -192,13 +189,6 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
     table = pd.concat([kept_rows(path, record), pd.DataFrame(rows)])
     table = table.drop_duplicates(["model", "window_frames", "device", "batch_size"], keep="last")
     return write_table(path, table, record)
-
-
-def _write(prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, **extra) -> Path:
-    """Write a table of times with its record, and return its path."""
-    path = results_dir(profile.dataset, profile.name) / "records" / f"{name}.csv"
-    write_table(path, table, _record(prepared, profile, name, **extra, **_circumstances()))
-    return path
 
 
 def _training_call(task: DenoisingTask, chunk: int):

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import operator
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.papers import load_paper_table
 
-_OURS = ("jit", "jit, all devices", "IREE")
-_TORCH = ("PyTorch", "PyTorch, oneDNN", "PyTorch, compiled")
-_ONE, _EIGHT = ("F3AMD-FNO-96", 1, _OURS), ("F3AMD-FNO-96", 8, _OURS)
-_CAMDM, _CAMDM_TORCH = ("CAMDM", 8, _OURS), ("CAMDM", 8, _TORCH)
-_SHARE = "share of the matrix product's speed"
-
-_BARS = (
-    (f"FNO-96, 1 step: {_SHARE}", 32, ">=", 0.65, _ONE),
-    (f"FNO-96, 8 steps: {_SHARE}", 32, ">=", 0.65, _EIGHT),
-    (f"CAMDM, 8 steps: {_SHARE}", 32, ">=", 0.65, _CAMDM),
-    (f"CAMDM, 8 steps, PyTorch: {_SHARE}", 32, ">=", 0.6, _CAMDM_TORCH),
-    ("time of CAMDM, 8 steps, over FNO-96, 1 step", 32, ">=", 55, _CAMDM, _ONE),
-    ("time of CAMDM, 8 steps, over FNO-96, 8 steps", 32, ">=", 7, _CAMDM, _EIGHT),
-    ("time of CAMDM in PyTorch, 8 steps, over FNO-96, 1 step", 32, "reported", None, _CAMDM_TORCH, _ONE),
-    ("time of FNO-96, 1 step, over its plain form under jit", 1, "<=", 0.35, _ONE, ("F3AMD-FNO-96", 1, ("jit, FFT",))),
-)
-"""What, characters, what is asked, and (model, steps, implementations) of one system or of two."""
+_ASKED = read_toml(Path(__file__).with_name("speed_bars.toml"))
 
 
-def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, implementations) -> pd.Series | None:
+def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, implementations: str) -> pd.Series | None:
     """Return the fastest row of a system at 32 frames in float32; None if there is none."""
     rows = table[
         (table["model"] == model)
@@ -36,7 +22,7 @@ def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, imple
         & (table["characters"] == characters)
         & (table["window_frames"] == 32)
         & (table["precision"] == "float32")
-        & table["way"].isin(implementations)
+        & table["way"].isin(_ASKED["implementations"][implementations])
     ]
     return None if rows.empty else rows.loc[rows["value"].idxmin()]
 
@@ -56,8 +42,9 @@ def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
     """
     times = times[times["suite"] == suite]
     rows = []
-    for what, characters, sign, bound, *systems in _BARS:
-        fastest = [_fastest(times, characters, *system) for system in systems]
+    for bar in _ASKED["bar"]:
+        sign, bound = bar["sign"], bar.get("bound")
+        fastest = [_fastest(times, bar["characters"], *system) for system in bar["systems"]]
         measured, way, met = None, "", "not measured"
         if all(row is not None for row in fastest):
             way = " / ".join(row["way"] for row in fastest)
@@ -67,9 +54,8 @@ def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
             holds = {">=": operator.ge, "<=": operator.le, "reported": lambda one, other: True}[sign]
             met = "yes" if holds(measured, bound) else "no"
         asked = sign if bound is None else f"{sign} {bound}"
-        rows.append(
-            {"what": what, "characters": characters, "asked": asked, "measured": measured, "way": way, "met": met}
-        )
+        row = {"what": bar["what"], "characters": bar["characters"], "asked": asked}
+        rows.append(row | {"measured": measured, "way": way, "met": met})
     return pd.DataFrame(rows)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from f3amd_lib.benchmarking.implementations import (
 )
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.ground.files import read_toml
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ CANDIDATE_COLUMNS = ["model", "steps", "characters", "way", "window_frames", "pr
 @functools.cache
 def suites() -> dict[str, list[dict]]:
     """Return what each suite times, as `suites.toml` has it."""
-    return tomllib.loads(Path(__file__).with_name("suites.toml").read_text(encoding="utf-8"))
+    return read_toml(Path(__file__).with_name("suites.toml"))
 
 
 def check_suites(names: Iterable[str]) -> list[str]:

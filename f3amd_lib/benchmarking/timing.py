@@ -53,15 +53,9 @@ def median_interval(rounds, draws: int = 2000) -> tuple[float, float]:
 
 
 def take_turns(
-    candidates: Mapping[str, Callable[[], object]],
-    *,
-    min_rounds: int = 100,
-    min_seconds: float = 10.0,
-    fewest_rounds: int = 5,
-    warmup: int = 3,
-    clock: Callable[[], float] = time.perf_counter,
-    progress: bool = False,
-) -> dict[str, Timing]:
+    candidates: Mapping[str, Callable[[], object]], *, min_rounds: int = 100, min_seconds: float = 10.0,
+    fewest_rounds: int = 5, warmup: int = 3, clock: Callable[[], float] = time.perf_counter, progress: bool = False,
+) -> dict[str, Timing]:  # fmt: skip
     """Time functions by turns until each has had enough rounds or seconds.
 
     Args:

@@ -31,6 +31,7 @@ from f3amd_lib.drawing.stick_figures import (
     path_on_ground,
 )
 from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style, save_figure
+from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.skeleton import Motion
 
 # ------------------------------------------------------------------------------------ one body
@@ -428,8 +429,9 @@ def write_gif(
     sample = np.concatenate([np.asarray(pictures[0]), np.asarray(pictures[len(pictures) // 2])])
     palette = Image.fromarray(sample).quantize(32, Image.Quantize.MAXCOVERAGE, kmeans=1)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False)
+    first, *others = pictures
+    with whole_file(path, overwrite=True) as temporary:
+        first.save(temporary, "gif", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
     return path
 
 

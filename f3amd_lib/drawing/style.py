@@ -18,16 +18,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-PALETTE = {
-    "black": "#1A1A1A",
-    "purple": "#542788",
-    "blue": "#2166AC",
-    "green": "#35978F",
-    "vermilion": "#D6604D",
-    "orange": "#F1A340",
-    "sky": "#92C5DE",
-    "grey": "#8A8A8A",
-}
+from f3amd_lib.ground.files import read_toml, whole_file
+
+_COLORS = read_toml(Path(__file__).with_name("colors.toml"))
+PALETTE: dict[str, str] = _COLORS["palette"]
 """Colours from dark to light; neighbours in this order differ in lightness as well as in hue."""
 
 STYLE_SHEET = Path(__file__).with_name("project.mplstyle")
@@ -47,14 +41,8 @@ class ModelStyle:
         return {"color": self.color, "marker": self.marker, "linestyle": self.linestyle}
 
 
-# Purple for FNO and green for CAMDM, as in the paper; within a family, width sets the shade.
-_FNO_SHADES = {32: "#B9A3D6", 48: "#9E7FC7", 64: "#8159B0", 96: "#542788", 128: "#2D0B55"}
-_TRANSFORMER_SHADES = {32: "#FBD29A", 48: "#F8BE6D", 64: "#F1A340", 96: "#D3831C", 128: "#A35F0C"}
 # Our own recipes stand beside the paper's models and are never to be taken for one of them.
 _OUR_COLORS = {"-plus": PALETTE["vermilion"], "-steady": PALETTE["blue"]}
-_WIDTH_MARKERS = {32: "v", 48: "^", 64: "s", 96: "o", 128: "D"}
-# Motion broken on purpose (`measures.corruptions`); no network is drawn in these colours.
-_BROKEN_COLORS = {"frozen pose": "#4FA3CC", "shuffled frames": "#8C6D46", "noisy motion": "#C2649A"}
 
 
 def model_style(name: str) -> ModelStyle:
@@ -70,24 +58,24 @@ def model_style(name: str) -> ModelStyle:
     """
     lowered = name.lower()
     number = re.search(r"-(32|48|64|96|128)(?!\d)", lowered)
-    width = int(number.group(1)) if number else 96
+    width = number.group(1) if number else "96"
     if lowered.startswith("real"):
         return ModelStyle(PALETTE["black"], "", "--")
     if lowered.startswith("paper"):
         return ModelStyle(PALETTE["grey"], "x", ":")
-    if lowered in _BROKEN_COLORS:
-        return ModelStyle(_BROKEN_COLORS[lowered], ".", "-")
+    if lowered in _COLORS["broken"]:
+        return ModelStyle(_COLORS["broken"][lowered], ".", "-")
     if lowered.startswith("camdm"):
         line = ":" if "pytorch" in lowered else "--" if "code" in lowered or number else "-"
         return ModelStyle(PALETTE["green"], "P", line)
     if "transformer" in lowered:
-        return ModelStyle(_TRANSFORMER_SHADES[width], _WIDTH_MARKERS[width], "-")
+        return ModelStyle(_COLORS["transformer"][width], _COLORS["markers"][width], "-")
     if lowered.startswith("f3amd"):
         for suffix, color in _OUR_COLORS.items():
             if lowered.split(",")[0].endswith(suffix):
-                return ModelStyle(color, _WIDTH_MARKERS[width], "-")
+                return ModelStyle(color, _COLORS["markers"][width], "-")
         line = ":" if "raw" in lowered else "--" if "dct" in lowered else "-"
-        return ModelStyle(_FNO_SHADES[width], _WIDTH_MARKERS[width], line)
+        return ModelStyle(_COLORS["fno"][width], _COLORS["markers"][width], line)
     return ModelStyle(PALETTE["grey"], ".", "-")
 
 
@@ -159,8 +147,8 @@ def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
     path = Path(path)
     if path.suffix != ".png":
         raise ValueError(f"{path}: figures are written as .png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(_png(figure, dpi))
+    with whole_file(path, overwrite=True) as temporary:
+        temporary.write_bytes(_png(figure, dpi))
     return path
 
 

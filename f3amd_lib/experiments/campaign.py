@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from f3amd_lib.experiments.protocol import Protocol, measure_model
 from f3amd_lib.experiments.recipes import find_recipe
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record
@@ -83,7 +83,7 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
       ValueError: for an unknown preset or recipe.
     """
     snapshots = []
-    for row in tomllib.loads(Path(path).read_text(encoding="utf-8"))["run"]:
+    for row in read_toml(path)["run"]:
         runs = [("paper", presets.find_preset(name).name) for name in row.get("presets", ())]
         runs += [(name, find_recipe(name).preset) for name in row.get("recipes", ())]
         for recipe, preset in runs:
@@ -94,18 +94,10 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
 
 
 def run_campaign(
-    prepared: PreparedData,
-    profile: Profile,
-    classifier: StyleClassifier,
-    protocol: Protocol,
-    *,
-    folder,
-    batch_size: int = 128,
-    only: Iterable[str] = (),
-    budget_s: float | None = None,
-    snapshots: list[tuple[Run, int]] | None = None,
-    progress: bool = True,
-) -> Iterator[tuple[str, int, str]]:
+    prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
+    batch_size: int = 128, only: Iterable[str] = (), budget_s: float | None = None,
+    snapshots: list[tuple[Run, int]] | None = None, progress: bool = True,
+) -> Iterator[tuple[str, int, str]]:  # fmt: skip
     """Train and measure what the queue still lacks, until it is done or the time is over.
 
     Args:

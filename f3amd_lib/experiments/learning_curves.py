@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pandas as pd
 from jax.sharding import Mesh
-from tqdm import tqdm
 
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training import parallel
@@ -25,15 +24,9 @@ SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
 
 
 def train_family(
-    prepared: PreparedData,
-    profile: Profile,
-    presets: Iterable[str],
-    *,
-    folder=None,
-    budget_s: float | None = None,
-    mesh: Mesh | None = None,
-    progress: bool = True,
-) -> Iterator[tuple[str, str]]:
+    prepared: PreparedData, profile: Profile, presets: Iterable[str], *, folder=None, budget_s: float | None = None,
+    mesh: Mesh | None = None, progress: bool = True,
+) -> Iterator[tuple[str, str]]:  # fmt: skip
     """Train presets one after the other, all with the profile's steps and batch.
 
     Each leaves its model, state and history in one folder, and a later call goes on from them: a
@@ -76,17 +69,9 @@ def train_family(
 
 
 def snapshot(
-    prepared: PreparedData,
-    preset: str,
-    recipe: TrainingConfig,
-    steps: int,
-    record: dict,
-    *,
-    folder,
-    network: Mapping | None = None,
-    stop_at: float | None = None,
-    progress: bool = True,
-) -> tuple[TrainedModel | None, float]:
+    prepared: PreparedData, preset: str, recipe: TrainingConfig, steps: int, record: dict, *, folder,
+    network: Mapping | None = None, stop_at: float | None = None, progress: bool = True,
+) -> tuple[TrainedModel | None, float]:  # fmt: skip
     """Train up to a step, going on from an earlier snapshot of the folder.
 
     Args:
@@ -149,17 +134,6 @@ def learning_curve(
     _, history = optimise(task, state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=progress)
     rows += [{"model": preset, **{name: row[name] for name in ("step", "loss", "held_out_loss")}} for row in history]
     return pd.DataFrame(rows)
-
-
-def learning_curves(
-    prepared: PreparedData, presets: Iterable[str], *, seed: int = 0, progress: bool = True
-) -> Iterator[pd.DataFrame]:
-    """Yield the learning curve of one preset after the other, so that each can be kept at once."""
-    presets = list(presets)
-    with tqdm(presets, unit="model", disable=not progress) as bar:
-        for preset in bar:
-            bar.set_postfix_str(preset)
-            yield learning_curve(prepared, preset, seed=seed)
 
 
 def learning_table(curves: pd.DataFrame) -> pd.DataFrame:

@@ -56,15 +56,9 @@ class WindowWalks:
 
 
 def walk_windows(
-    trained: TrainedModel,
-    windows: WindowSet,
-    steps: Sequence[int] = (8, 4, 2, 1),
-    *,
-    spacing: str = "endpoints",
-    num_windows: int = 64,
-    num_seeds: int = 8,
-    seed: int = 0,
-) -> WindowWalks:
+    trained: TrainedModel, windows: WindowSet, steps: Sequence[int] = (8, 4, 2, 1), *, spacing: str = "endpoints",
+    num_windows: int = 64, num_seeds: int = 8, seed: int = 0,
+) -> WindowWalks:  # fmt: skip
     """Sample held-out windows with both updates and several numbers of steps.
 
     Args:
@@ -90,14 +84,9 @@ def walk_windows(
 
 
 def walk_conditions(
-    trained: TrainedModel,
-    condition: Condition,
-    steps: Sequence[int] = (8, 4, 2, 1),
-    *,
-    spacing: str = "endpoints",
-    num_seeds: int = 8,
-    seed: int = 0,
-) -> dict[tuple[str, int], np.ndarray]:
+    trained: TrainedModel, condition: Condition, steps: Sequence[int] = (8, 4, 2, 1), *, spacing: str = "endpoints",
+    num_seeds: int = 8, seed: int = 0,
+) -> dict[tuple[str, int], np.ndarray]:  # fmt: skip
     """Sample windows under given conditions with both updates, as `walk_windows` does.
 
     Args:

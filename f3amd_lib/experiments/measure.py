@@ -32,7 +32,7 @@ from f3amd_lib.experiments.denoising import (
     window_row,
     x0_error_by_sigma,
 )
-from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curves, snapshot
+from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.protocol import (
     REFERENCE_MODELS,
@@ -46,6 +46,8 @@ from f3amd_lib.experiments.protocol import (
 from f3amd_lib.experiments.real_clips import reference_clips, style_floor
 from f3amd_lib.experiments.recipes import RECIPE_STEPS, RECIPES, train_recipe
 from f3amd_lib.experiments.runner import Records
+from f3amd_lib.generation.blending import blend_rollout
+from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
@@ -63,6 +65,8 @@ from f3amd_lib.training.recipe import profile_recipe
 log = logging.getLogger("f3amd")
 
 STEPS = (8, 4, 2, 1)
+LEADING = ", leading"
+"""Added to the name of a network of K levels in rows whose fewer steps count from the least noisy one."""
 """Numbers of denoising steps that the paper compares (Table 5)."""
 
 SPACINGS = ("endpoints", "uniform")
@@ -116,6 +120,10 @@ def _trained(prepared: PreparedData, profile: Profile, names: Iterable[str]) -> 
     return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
+def _record(prepared: PreparedData, profile: Profile, measurement: str, **settings) -> dict:
+    return run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement, **settings)
+
+
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
     return {name: weights_digest(model.params) for name, model in trained.items()}
 
@@ -144,18 +152,14 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     Returns:
       The table, `records/learning.csv`.
     """
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="learning",
-        **SHORT_RUN,
-    )  # fmt: skip
+    record = _record(prepared, profile, "learning", **SHORT_RUN)
     asked = _names(models)
     records = Records(_records_dir(profile), record, {"learning": ["model"]}, again=asked)
 
     def curve(row: Mapping) -> dict:
-        return {"learning": pd.concat(learning_curves(prepared, [row["model"]], seed=profile.seed, progress=False))}
+        return {"learning": learning_curve(prepared, row["model"], seed=profile.seed)}
 
-    records.measure([{"model": name} for name in asked or presets.PRESETS], curve)
-    return records.path("learning")
+    return records.measure([{"model": name} for name in asked or presets.of_paper()], curve)
 
 
 def measure_quality(
@@ -185,8 +189,12 @@ def measure_quality(
     digests = _digests(trained) | dict.fromkeys(REFERENCE_MODELS, record["classifier_weights"])
     todo = [(model, 0) for model in REFERENCE_MODELS]
     for name, model in trained.items():
-        levels = len(getattr(model.config, "noise_levels", ())) or max(STEPS)
-        todo += [(name, steps) for steps in STEPS if steps <= levels]
+        levels = len(getattr(model.config, "noise_levels", ()))
+        counts = [steps for steps in STEPS if steps <= (levels or max(STEPS))]
+        todo += [(name, steps) for steps in counts]
+        if levels:  # respaced in the other way that is in use, see `NoiseSchedule.times`
+            digests[name + LEADING] = digests[name]
+            todo += [(name + LEADING, steps) for steps in counts if steps < levels]
     keys = ["model", "window_frames", "steps"]
     records = Records(
         _records_dir(profile),
@@ -199,20 +207,21 @@ def measure_quality(
     def score(row: Mapping) -> dict:
         started, tables = time.perf_counter(), {}
         if row["steps"]:
-            generator = MotionGenerator(trained[row["model"]], row["steps"])
+            name = row["model"].removesuffix(LEADING)
+            spacing = "endpoints" if name == row["model"] else "leading"
+            generator = MotionGenerator(trained[name], row["steps"], spacing=spacing)
             rows, tables["quality_by_round"] = measure_model(generator, packed, classifier, protocol, held_out)
         else:
             rows = measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
         return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
 
-    records.measure(
+    return records.measure(
         [
             {"model": model, "window_frames": profile.window, "steps": steps, "weights": digests[model]}
             for model, steps in todo
         ],
         score,
     )
-    return records.path("quality")
 
 
 def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -229,10 +238,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
     styles = _styles(prepared, profile)
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
-    record = run_record(
-        profile=profile, dataset=packed, seed=profile.seed, measurement="walking",
-        num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles,
-    )  # fmt: skip
+    record = _record(prepared, profile, "walking", num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
     made = packed.dataset == "synthetic"  # its floor is at 0, and its source walks any path
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
     paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in seeds}
@@ -264,8 +270,56 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     todo = [{"model": "real", "steps": 0, "weights": ""}]
     todo += [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (8, 1)]
     records = Records(_records_dir(profile), record, {"walking": ["model", "steps"]}, again=asked)
-    records.measure(todo, walk)
-    return records.path("walking")
+    return records.measure(todo, walk)
+
+
+TREATMENTS = {"as made": (0, False), "blended": (4, False), "feet locked": (0, True), "blended, feet locked": (4, True)}
+"""What is done to a rollout where people look at it -> frames blended after a seam, whether feet are locked."""
+
+
+def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure what blending and foot locking do to feet, floor and seams, on the rollouts of `measure_walking`.
+
+    Never a row of the paper's: what is treated is not what the network made.
+
+    Returns:
+      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" as there.
+    """
+    packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
+    styles = _styles(prepared, profile)
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
+    record = run_record(
+        profile=profile, dataset=packed, seed=profile.seed, measurement="feet",
+        num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles,
+    )  # fmt: skip
+    floors = {style: 0.0 if packed.dataset == "synthetic" else style_floor(packed, style) for style in styles}
+    trained = _trained(prepared, profile, asked or available_models(profile))
+
+    def treat(row: Mapping) -> dict:
+        if not row["steps"]:
+            clips = reference_clips(packed, styles, window=profile.window)
+            shown = [("as made", 0, packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
+        else:
+            generator, shown = MotionGenerator(trained[row["model"]], row["steps"]), []
+            for seed in seeds:
+                made = generator.rollout(evaluation_paths(packed, styles, num_frames, seed=seed), styles, seed=seed)
+                for treatment, (blend_frames, lock) in TREATMENTS.items():
+                    treated = blend_rollout(made, blend_frames)
+                    treated = lock_rollout(treated) if lock else treated
+                    shown += [(treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles)]
+        figures = [
+            {"treatment": treatment, "seed": seed, "style": style}
+            | walking_figures(motion, profile.window, floors[style])
+            for treatment, seed, style, motion in shown
+        ]
+        return {"feet": pd.DataFrame(figures)}
+
+    digests = _digests(trained)
+    todo = [{"model": "real", "steps": 0, "weights": ""}]
+    todo += [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (8, 1)]
+    records = Records(_records_dir(profile), record, {"feet": ["model", "steps"]}, again=asked)
+    records.measure(todo, treat)
+    return records.path("feet")
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -278,7 +332,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
       the held-out loss fell over the last quarter of training (NaN where none was watched).
     """
     asked = _names(models)
-    record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="trained")
+    record = _record(prepared, profile, "trained")
     found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
 
     def sum_up(row: Mapping) -> dict:
@@ -292,10 +346,9 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
 
     records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
     digests = _digests({name: model for name, (model, *_) in found.items()})
-    records.measure(
+    return records.measure(
         [{"model": name, "window_frames": profile.window, "weights": digests[name]} for name in found], sum_up
     )
-    return records.path("trained")
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -336,11 +389,9 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
         rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
         motions = [rollout.motion(character) for character in range(len(styles))]
         feet[name, profile.window, profile.num_steps] = list(zip(styles, motions, strict=True))
-    record = run_record(
-        profile=profile, dataset=packed, seed=seed, measurement="foot_spectrum",
-        num_frames=profile.rollout_frames, styles=styles,
-        weights_digests={name: [digest] for name, digest in _digests(trained).items()},
-    )  # fmt: skip
+    digests = {name: [digest] for name, digest in _digests(trained).items()}
+    about = {"num_frames": profile.rollout_frames, "styles": styles, "weights_digests": digests}
+    record = _record(prepared, profile, "foot_spectrum", **about)
     return write_table(_records_dir(profile) / "foot_spectrum.csv", sensitivity.foot_spectrum(feet), record)
 
 
@@ -411,8 +462,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
         if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
     ]
     records.measure(windows, walk_windows, into="literal_update_windows")
-    records.measure(rollouts, walk_rollouts)
-    return records.path("literal_update")
+    return records.measure(rollouts, walk_rollouts)
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -424,7 +474,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
       the levels that a model was told where it was told some, and `input_use.csv`, how far the
       estimates move with noisy input and noise level (see `denoising.input_use`).
     """
-    record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="noise_use")
+    record = _record(prepared, profile, "noise_use")
     held_out = prepared.windows(prepared.held_out_split)
     asked = _names(models)
     trained = _trained(prepared, profile, asked or _models_with_weights(profile))
@@ -468,10 +518,8 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     task = prepared.task(trained.name, profile_recipe(profile, trained.name))
     held_out = prepared.windows(prepared.held_out_split)
     table = gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="gradient_norm",
-        weights_digests={trained.name: [weights_digest(trained.params)]},
-    )  # fmt: skip
+    digests = {trained.name: [weights_digest(trained.params)]}
+    record = _record(prepared, profile, "gradient_norm", weights_digests=digests)
     return write_table(_records_dir(profile) / "gradient_norm.csv", table.assign(model=trained.name), record)
 
 
@@ -503,8 +551,8 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
         rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
         return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
 
-    records.measure([{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)], score)
-    return records.path("quality_by_epoch")
+    todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
+    return records.measure(todo, score)
 
 
 def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -520,10 +568,7 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
       ValueError: if models are named.
     """
     _refuse_models(models, "recipes are rows of their own")
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="recipes",
-        num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size,
-    )  # fmt: skip
+    record = _record(prepared, profile, "recipes", num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size)
     held_out = prepared.windows(prepared.held_out_split)
     folder = runs_dir(profile.dataset, profile.name) / "recipes"
 
@@ -533,8 +578,7 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
         return {"recipes": rows.assign(**row, weights=weights_digest(trained.params))}
 
     records = Records(_records_dir(profile), record, {"recipes": ["recipe"]})
-    records.measure([{"recipe": name, "change": RECIPES[name].change} for name in RECIPES], train_and_ask)
-    return records.path("recipes")
+    return records.measure([{"recipe": name, "change": RECIPES[name].change} for name in RECIPES], train_and_ask)
 
 
 def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -546,10 +590,7 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     packed, asked, styles = prepared.packed, _names(models), _styles(prepared, profile)
     seeds = range(profile.seed, profile.seed + PRECISION_SEEDS)
     trained = _trained(prepared, profile, asked or _models_with_weights(profile))
-    record = run_record(
-        profile=profile, dataset=packed, seed=profile.seed, measurement="precision",
-        styles=styles, num_seeds=PRECISION_SEEDS,
-    )  # fmt: skip
+    record = _record(prepared, profile, "precision", styles=styles, num_seeds=PRECISION_SEEDS)
 
     def compare(row: Mapping) -> dict:
         frames = profile.rollout_frames
@@ -559,10 +600,9 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
 
     digests = _digests(trained)
     records = Records(_records_dir(profile), record, {"precision": ["model", "steps"]}, again=asked)
-    records.measure(
+    return records.measure(
         [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (1, 8)], compare
     )
-    return records.path("precision")
 
 
 MEASUREMENTS: dict[str, Callable] = {
@@ -576,6 +616,7 @@ MEASUREMENTS: dict[str, Callable] = {
     "quality": measure_quality,
     "quality_by_epoch": measure_quality_by_epoch,
     "walking": measure_walking,
+    "feet": measure_feet,
     "trained": measure_trained,
     "foot_spectrum": measure_foot_spectrum,
     "sensitivity": measure_sensitivity,

@@ -100,15 +100,9 @@ def _apart(order: np.ndarray, starts: np.ndarray, gap: int, most: int) -> list[i
 
 
 def continuation_spread(
-    skeleton: Skeleton,
-    windows: WindowSet,
-    pool: WindowSet,
-    *,
-    given: Sequence[str] = tuple(GIVEN),
-    num_windows: int = 128,
-    num_neighbours: int = 8,
-    seed: int = 0,
-) -> pd.DataFrame:
+    skeleton: Skeleton, windows: WindowSet, pool: WindowSet, *, given: Sequence[str] = tuple(GIVEN),
+    num_windows: int = 128, num_neighbours: int = 8, seed: int = 0,
+) -> pd.DataFrame:  # fmt: skip
     """Measure how far real motion goes apart that had style, path and history in common.
 
     For each of some windows, the windows of `pool` that are nearest to it are looked up: of its
@@ -291,16 +285,9 @@ def _levels_of(trained: TrainedModel, sigmas) -> list[float]:
 
 
 def posterior_table(
-    prepared: PreparedData,
-    models: Mapping[str, TrainedModel],
-    *,
-    num_windows: int,
-    num_draws: int,
-    num_levels: int,
-    num_neighbours: int,
-    seed: int = 0,
-    progress: bool = False,
-) -> pd.DataFrame:
+    prepared: PreparedData, models: Mapping[str, TrainedModel], *, num_windows: int, num_draws: int,
+    num_levels: int, num_neighbours: int, seed: int = 0, progress: bool = False,
+) -> pd.DataFrame:  # fmt: skip
     """Put real continuations and models on one set of held-out windows into one table.
 
     Args:

@@ -37,15 +37,14 @@ from f3amd_lib.experiments.real_clips import (
     style_pace,
     training_clips,
 )
-from f3amd_lib.experiments.rollout_measures import by_round
+from f3amd_lib.experiments.rollout_measures import by_round, motion_figures
 from f3amd_lib.generation.rollout import MotionGenerator, Rollout
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.measures import distributions
 from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
-from f3amd_lib.measures.metrics import camdm_metrics, first_metrics
+from f3amd_lib.measures.metrics import camdm_metrics
 from f3amd_lib.measures.registry import BY_KEY, METRICS
-from f3amd_lib.measures.walking import walking_measures
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion
 
@@ -128,10 +127,8 @@ def _sideways_in_training(packed: PackedMotion, styles: tuple[str, ...]) -> floa
 
 def _figures_without_classifier(motion: Motion, path: RootPath, window: int, floor: float) -> dict[str, float]:
     """Measure one motion against a path; the names are those of records."""
-    positions, skeleton = np.asarray(motion.positions), motion.skeleton
-    figures = first_metrics(positions, path, window, skeleton, floor_shift=floor)
-    figures |= camdm_metrics(positions, path, skeleton)
-    figures |= walking_measures(positions, skeleton, floor_shift=floor)
+    figures = motion_figures(motion, path, window, floor)
+    figures |= camdm_metrics(np.asarray(motion.positions), path, motion.skeleton)
     return {BY_KEY[key].name: float(value) for key, value in figures.items()}
 
 
@@ -288,14 +285,9 @@ def _rows(figures: Mapping[str, float], **columns) -> list[dict]:
 
 
 def measure_model(
-    generator: MotionGenerator,
-    packed: PackedMotion,
-    classifier: StyleClassifier,
-    protocol: Protocol,
-    held_out: WindowSet,
-    *,
-    name: str | None = None,
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+    generator: MotionGenerator, packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol,
+    held_out: WindowSet, *, name: str | None = None,
+) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
     """Run the whole protocol for one model and number of steps.
 
     All styles and seeds are walked in one batch. Seeds differ in path, noise and, as far as there
@@ -379,14 +371,9 @@ def _rounds(rollout: Rollout, columns: dict) -> pd.DataFrame:
 
 
 def measure_real(
-    packed: PackedMotion,
-    classifier: StyleClassifier,
-    protocol: Protocol,
-    *,
-    window: int,
-    model: str = "real",
+    packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol, *, window: int, model: str = "real",
     repeats: int = 20,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """Score held-out clips, as they are or broken by a recipe, as if they were rollouts.
 
     A clip follows the smoothed path of the motion that it came from. Every repeat takes another

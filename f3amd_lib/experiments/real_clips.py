@@ -158,14 +158,9 @@ def follow_clip(
 
 
 def reference_clips(
-    packed: PackedMotion,
-    styles: Sequence[str],
-    *,
-    window: int,
-    split: str = "test",
-    slowest: float = 0.4,
+    packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test", slowest: float = 0.4,
     fastest: float = 1.6,
-) -> list[int]:
+) -> list[int]:  # fmt: skip
     """List the real clips that stand beside a rollout: held out, same styles, same speeds.
 
     Args:

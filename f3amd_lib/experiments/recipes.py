@@ -7,12 +7,12 @@ rows stand in `papers/f3amd/recipes.toml`; all take the same number of steps fro
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_other_state, train
@@ -54,11 +54,7 @@ class Recipe:
         return paper_recipe(self.preset, num_steps, **settings)
 
 
-_TABLE = Path(__file__).parents[1] / "papers/f3amd/recipes.toml"
-
-RECIPES: dict[str, Recipe] = {
-    name: Recipe(name, **row) for name, row in tomllib.loads(_TABLE.read_text(encoding="utf-8")).items()
-}
+RECIPES: dict[str, Recipe] = {name: Recipe(name, **row) for name, row in load_paper_file("recipes").items()}
 """Rows by name, the paper's first."""
 
 

@@ -29,14 +29,9 @@ class Records:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        record: dict,
-        keys: Mapping[str, Sequence[str]],
-        *,
-        again: Collection[str] = (),
+        self, folder: Path, record: dict, keys: Mapping[str, Sequence[str]], *, again: Collection[str] = (),
         summaries: Mapping[str, tuple[str, Callable[[pd.DataFrame], pd.DataFrame]]] = {},
-    ):
+    ):  # fmt: skip
         self.folder, self.record, self.keys = Path(folder), record, keys
         self.again, self.summaries = again, summaries
         self.tables = {name: kept_rows(self.path(name), record) for name in keys}
@@ -76,8 +71,8 @@ class Records:
 
     def measure(
         self, todo: Iterable[Mapping], measure: Callable[[Mapping], Mapping[str, pd.DataFrame]], *, into: str = ""
-    ) -> None:
-        """Measure what has no rows yet, and keep each as soon as it is measured.
+    ) -> Path:
+        """Measure what has no rows yet, keep each as soon as it is measured; return the table, or its summary.
 
         Args:
           todo: what names each measurement, column -> value, with the digest of its weights where
@@ -96,3 +91,4 @@ class Records:
             for name, (table, summarise) in self.summaries.items():
                 if table in measured:
                     self._write(name, summarise(self.tables[table]), table)
+        return self.path(next(iter(self.summaries), into))

@@ -37,15 +37,10 @@ _SEGMENT = 64
 
 
 def graded_corruptions(
-    packed: PackedMotion,
-    classifier: StyleClassifier,
-    protocol: Protocol,
-    strengths: Sequence[float] = STRENGTHS,
-    *,
-    corruptions: Sequence[str] = tuple(CORRUPTIONS),
-    splits: Sequence[str] = ("validation", "test"),
+    packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol, strengths: Sequence[float] = STRENGTHS,
+    *, corruptions: Sequence[str] = tuple(CORRUPTIONS), splits: Sequence[str] = ("validation", "test"),
     progress: bool = False,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """Break held-out clips more and more and measure the distance to real training windows.
 
     Each strength and seed draws windows of its own, so that the order is that of independent

@@ -36,6 +36,8 @@ from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.networks.attention import dropout
+from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.spectral import TemporalConvolution
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, load_tree, save_tree
 from f3amd_lib.training.optimise import TrainingState, optimise
@@ -147,9 +149,7 @@ class StyleNetwork(nnx.Module):
         z = windows
         for block in self.blocks:
             z = block(z, training)
-        if training and self.dropout > 0:
-            kept = jax.random.bernoulli(key, 1.0 - self.dropout, z.shape)
-            z = jnp.where(kept, z / (1.0 - self.dropout), 0.0)
+        z = dropout(z, self.dropout, key) if training else z
         z = self.hidden(z.reshape(z.shape[0], -1))
         z = nnx.leaky_relu(self.hidden_norm(z, use_running_average=not training))
         z = self.feature_norm(self.feature(z), use_running_average=not training)
@@ -160,7 +160,7 @@ class StyleNetwork(nnx.Module):
 @functools.lru_cache(maxsize=8)
 def _blank(config: ClassifierConfig):
     """Return a network's structure and the shapes of its weights and batch statistics."""
-    network = nnx.eval_shape(lambda: StyleNetwork(config, rngs=nnx.Rngs(0)))
+    network = nnx.eval_shape(lambda: StyleNetwork(config, rngs=LayerKeys(jax.random.key(0))))
     return nnx.split(network, nnx.Param, nnx.BatchStat)
 
 
@@ -403,13 +403,9 @@ def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, .
             clips.append(clip)
     length = np.array([len(part) for part in frames])
     return _Takes(
-        window=window,
-        frames=np.concatenate(frames),
-        first=np.cumsum(length) - length,
-        length=length,
-        styles=np.array(labels, np.int32),
-        clips=np.array(clips, np.int32),
-    )
+        window=window, frames=np.concatenate(frames), first=np.cumsum(length) - length, length=length,
+        styles=np.array(labels, np.int32), clips=np.array(clips, np.int32),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -491,7 +487,7 @@ class StyleTask:
 
     def init(self, key):
         """Return initial weights and batch statistics."""
-        _, params, statistics = nnx.split(StyleNetwork(self.network, rngs=nnx.Rngs(key)), nnx.Param, nnx.BatchStat)
+        _, params, statistics = nnx.split(StyleNetwork(self.network, rngs=LayerKeys(key)), nnx.Param, nnx.BatchStat)
         return params, statistics
 
     def draw(self, state: TrainingState | None, key):
@@ -523,16 +519,11 @@ def _style_task(
     starts, take = takes.starts(config.stride)
     count = np.bincount(takes.styles[take], minlength=len(styles))
     return StyleTask(
-        packed.fingerprint,
-        styles,
-        network,
-        config,
-        frames=jnp.asarray(takes.frames),
-        starts=jnp.asarray(starts, jnp.int32),
-        first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
+        packed.fingerprint, styles, network, config, frames=jnp.asarray(takes.frames),
+        starts=jnp.asarray(starts, jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
         count=jnp.asarray(count, jnp.int32),
         mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
-    )
+    )  # fmt: skip
 
 
 def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
@@ -550,16 +541,9 @@ def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
 
 
 def train_classifier(
-    packed: PackedMotion,
-    *,
-    num_steps: int = 600,
-    batch_size: int = 128,
-    seed: int = 0,
-    styles=None,
-    profile: Profile | str = "none",
-    progress: bool = True,
-    **sizes,
-) -> StyleClassifier:
+    packed: PackedMotion, *, num_steps: int = 600, batch_size: int = 128, seed: int = 0, styles=None,
+    profile: Profile | str = "none", progress: bool = True, **sizes,
+) -> StyleClassifier:  # fmt: skip
     """Train a style classifier on a data set's training clips and try it on the held-out ones.
 
     Cross entropy, Adam from 1e-3, windows every 10 frames and dropout 0.5 are CAMDM's. Ours: the

@@ -5,15 +5,16 @@ Source: CAMDM's released evaluation code (its feature extraction).
 
 from __future__ import annotations
 
-import tomllib
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.rotations import matrix_from_yaw, yaw_from_direction
 from f3amd_lib.motion.skeleton import Skeleton
 
-_JOINTS = tomllib.loads((resources.files("f3amd_lib.measures") / "classifier_joints.toml").read_text(encoding="utf-8"))
+_JOINTS = read_toml(Path(__file__).with_name("classifier_joints.toml"))
 _CONVENTIONS = _JOINTS["conventions"]
 
 CLASSIFIER_JOINTS = tuple(_JOINTS["joints"])
@@ -51,10 +52,6 @@ def classifier_joints(skeleton: Skeleton) -> tuple[int, ...]:
     return tuple(names.index(name) for name in _CONVENTIONS[nearest])
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-8)
-
-
 def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
     """Reduce joint positions to what the classifier sees: posture, without place and direction.
 
@@ -90,8 +87,8 @@ def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
     body = positions[..., list(classifier_joints(skeleton)), :]
     body = body - body[..., :1, :]
     at = {joint: body[..., index, :] for index, joint in enumerate(CLASSIFIER_JOINTS)}
-    across = _unit(at["left clavicle"] - at["right clavicle"])
-    across = across + _unit(at["left hip"] - at["right hip"])
+    across = unit(at["left clavicle"] - at["right clavicle"])
+    across = across + unit(at["left hip"] - at["right hip"])
     # cross(a, +Y) = (-a_z, 0, a_x)
     forward = np.stack([-across[..., 2], np.zeros(across.shape[:-1]), across[..., 0]], axis=-1)
     turned = body @ np.swapaxes(matrix_from_yaw(-yaw_from_direction(forward)), -1, -2)

@@ -91,13 +91,9 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
 
 
 def noisy_motion(
-    motion: Motion,
-    seed: int = 0,
-    strength: float = 1.0,
-    *,
-    rotation_scale: float = ROTATION_NOISE,
+    motion: Motion, seed: int = 0, strength: float = 1.0, *, rotation_scale: float = ROTATION_NOISE,
     root_scale: float = ROOT_NOISE,
-) -> Motion:
+) -> Motion:  # fmt: skip
     """Add Gaussian noise to every frame by itself: the right motion, trembling.
 
     Args:

@@ -440,7 +440,7 @@ def camdm_orientation_error(yaw, path):
       ValueError: for NaN or shapes that do not fit.
 
     Source: the released CAMDM code ("orien_error"), angles and cut as there. It takes the facing
-    from shoulders and hips together; use the `yaw` you mean (`facing_yaw` takes the hips).
+    from shoulders and hips together, and so does `camdm_metrics` (`facing_yaw` with `shoulders`).
     """
     angle, wanted = (np.arctan2(np.cos(each), np.sin(each))[..., 0] for each in _shown_and_wanted_yaw(yaw, path))
     return _angle_error(angle, wanted, np.ones(angle.shape, dtype=bool))
@@ -530,7 +530,7 @@ def camdm_metrics(positions, path: RootPath, skeleton: Skeleton) -> dict[str, fl
 
     Source: the released CAMDM code.
     """
-    yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64))
+    yaw = facing_yaw(skeleton, np.asarray(positions, dtype=np.float64), shoulders=True)
     values = {
         "camdm_trajectory_error_deg": camdm_trajectory_error(positions, path),
         "camdm_orientation_error_deg": camdm_orientation_error(yaw, path),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
+
+from f3amd_lib.ground.files import read_toml
 
 _SHOWN_UNITS = {"deg": "°", "cm/frame^2": "cm/frame²"}
 
@@ -32,7 +33,7 @@ class Metric:
         return f"{self.heading} ({self.shown_unit})" if self.unit else self.heading
 
 
-_REGISTRY = tomllib.loads((resources.files("f3amd_lib.measures") / "metrics.toml").read_text(encoding="utf-8"))
+_REGISTRY = read_toml(Path(__file__).with_name("metrics.toml"))
 
 METRICS = {
     name: Metric(name, **({"heading": name.replace("_", " "), "key": name} | fields))

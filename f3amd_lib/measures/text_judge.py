@@ -170,18 +170,22 @@ def train_judge(
     *,
     checkpoint: Path | None = None,
     progress: bool = True,
+    stop_at: float | None = None,
     **sizes,
-) -> TextJudge:
+) -> TextJudge | None:
     """Train a judge; with a checkpoint a killed training goes on where it was.
 
     Args:
       data, encoder, training, **sizes: as in `judge_task`.
       checkpoint: file of the training state.
       progress: show a progress bar.
+      stop_at: as for `optimise`; where it comes first, the answer is None.
     """
     training = training or EvaluatorTraining()
     task, normaliser = judge_task(data, encoder, training, **sizes)
-    state, history = optimise(task, checkpoint=checkpoint, progress=progress)
+    state, history = optimise(task, checkpoint=checkpoint, checkpoint_every=200, stop_at=stop_at, progress=progress)
+    if int(state.step) < training.num_steps:
+        return None
     identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}
     record = run_record(profile="none", dataset=data, seed=training.seed, **identity, history=history)
     return TextJudge(task.network, state.params, normaliser, data.skeleton, encoder.identity, record)

@@ -12,7 +12,6 @@ looked at it and accepts the change on purpose (`--accept`).
 
 from __future__ import annotations
 
-import argparse
 import functools
 import inspect
 import json
@@ -24,9 +23,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pandas as pd
+import tyro
 
 from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file, paper_folders
+from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.reports import judgements as judging
@@ -42,19 +42,6 @@ from f3amd_lib.reports.evidence import (
     recorded_evidence,
 )
 from f3amd_lib.reports.gate import LEAST_SHARE, why_not_judged
-from f3amd_lib.reports.judgements import (
-    FAILS,
-    HOLDS,
-    IN_PART,
-    LARGER,
-    OPEN,
-    REMARK,
-    UNJUDGED,
-    UNMEASURED,
-    VERDICTS,
-    Family,
-    combine,
-)
 
 log = logging.getLogger("f3amd")
 
@@ -65,7 +52,7 @@ statements of a claim come from one data set."""
 PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
-_MARKS = {HOLDS: "✓", IN_PART: "±", LARGER: ">", FAILS: "✗", OPEN: "≈", UNJUDGED: "○", REMARK: "·"}
+_MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
 _SYNTHETIC = "synthetic (procedural, no real motion)"
 
 
@@ -89,7 +76,7 @@ class Statement:
     rule: Callable[[Evidence], judging.Finding]
     optional: bool = False
     remark: bool = False
-    verdict: str = REMARK
+    verdict: str = judging.REMARK
     figure: str = ""
     reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sources: tuple[Source, ...] = ()
@@ -99,12 +86,13 @@ class Statement:
         """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
         evidence.sources.clear()
         evidence.trained.clear()
+        evidence.told.clear()
         try:
             verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
-            return replace(self, verdict=UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
+            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
         reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
-        verdict = REMARK if self.remark else UNJUDGED if reasons else verdict
+        verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
         sources = tuple(dict.fromkeys(evidence.sources))
         return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources)
 
@@ -156,7 +144,7 @@ _RANGES = {
 }
 
 
-def _read_models(value, families: Mapping, where: str) -> Setting | Family | list[Setting]:
+def _read_models(value, families: Mapping, where: str) -> Setting | judging.Family | list[Setting]:
     if isinstance(value, list):
         return [_read_models(item, families, where) for item in value]
     value = {"model": value} if isinstance(value, str) else value
@@ -164,7 +152,7 @@ def _read_models(value, families: Mapping, where: str) -> Setting | Family | lis
         check_entry(value, where, ("family",), ("window",))
         family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
         chosen = {key: [{"model": model, "window": window} for model in family[key]] for key in ("models", "required")}
-        return Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
+        return judging.Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
     check_entry(value, where, ("model",), ("steps", "window"))
     check_model(value["model"], where)
     return Setting(**value)
@@ -207,7 +195,7 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
     Raises:
       ValueError: for what is missing, unknown or twice; the message says file, claim and statement.
     """
-    check_entry(about, where, ("groups", "claim"), ("thresholds", "families"))
+    check_entry(about, where, ("groups", "claim"), ("page", "thresholds", "families"))
     claims: dict[str, Claim] = {}
     for entry in about["claim"]:
         here = f"{where}, claim {entry.get('id')}"
@@ -276,24 +264,24 @@ class Judgement:
     @property
     def verdict(self) -> str:
         """The verdict of our records."""
-        return combine(statement.verdict for statement in self.ours)
+        return judging.combine(statement.verdict for statement in self.ours)
 
     @property
     def paper_verdict(self) -> str:
         """The verdict of the paper's own tables."""
-        return combine(statement.verdict for statement in self.paper)
+        return judging.combine(statement.verdict for statement in self.paper)
 
 
 def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     """Leave out what was not measured and need not be."""
-    return tuple(s for s in statements if not (s.optional and s.verdict == UNMEASURED))
+    return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
 
 
 def _says_more(statement: Statement) -> int:
     """Rank what is known of a statement: a verdict, a figure without one, a row that is missing, a table that is."""
-    if statement.verdict == UNMEASURED:
+    if statement.verdict == judging.UNMEASURED:
         return 0 if statement.no_table else 1
-    return 2 if statement.verdict == UNJUDGED else 3
+    return 2 if statement.verdict == judging.UNJUDGED else 3
 
 
 def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
@@ -319,7 +307,7 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
     dataset = max(tried, key=lambda data: max((_says_more(s) for s in tried[data] if not s.remark), default=0))
     ours = tried[dataset]
-    nothing = combine(statement.verdict for statement in ours) == UNMEASURED
+    nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
     return Judgement(claim, ours, paper, "" if nothing else dataset)
 
 
@@ -349,8 +337,10 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
 
 def _figures(statements: Sequence[Statement]) -> str:
     """Return all figures in one line, each with a mark for its verdict; or why there are none, or no verdict."""
-    measured = [f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (UNMEASURED, REMARK)]
-    gaps = [s.figure for s in statements if s.verdict == UNMEASURED]
+    measured = [
+        f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (judging.UNMEASURED, judging.REMARK)
+    ]
+    gaps = [s.figure for s in statements if s.verdict == judging.UNMEASURED]
     if measured:
         if gaps:
             measured.append(f"{len(gaps)} of {len(gaps) + len(measured)} not measured")
@@ -409,7 +399,9 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
             text = f"{found.figure} · {found.verdict}" if found.verdict else found.figure
             why = "; ".join(f"{reason}: {', '.join(models)}" for reason, models in found.reasons.items())
             text += f" ({why})" if why else ""
-            rows[found.says][column] = f"{UNMEASURED} ({found.figure})" if found.verdict == UNMEASURED else text
+            rows[found.says][column] = (
+                f"{judging.UNMEASURED} ({found.figure})" if found.verdict == judging.UNMEASURED else text
+            )
     return pd.DataFrame(row for row in rows.values() if row["ours"] or row["the paper's tables"])
 
 
@@ -418,23 +410,14 @@ _HEAD = """# Claims ledger
 {count} claims of the {name} paper, each judged by a rule (`f3amd_lib/papers/{paper}/claims.toml`). This page is
 generated by `python -m f3amd_lib.reports.claims` from committed records; nothing in it was typed.
 
-The thresholds that the first ledger had, on 21 November 2026, still stand. A first quality table of ours was known
-then; times, foot spectra, graded corruptions, noise use and walking were not. How statements are judged was made
-stricter after that, with our figures known.
-
-- **ours**: from our records; real motion (`bandai`) decides, else `synthetic`, which is labelled.
-  Times on a GPU decide claims about a GPU, times on a CPU those about a CPU. Networks of a record
-  under `laptop` were trained for minutes on two cores, those under `gpu` with {steps:,} steps of {batch} windows,
-  {seen:.0f} million in all{share}.
-- **the paper's tables**: the same rule on the paper's own figures, which have no intervals:
+{preface}
+- **the paper's tables**: the same rule on the paper's own figures, {intervals}:
   {setting}.
 - A claim **holds in part** where only some of its statements do, or only some were measured; a statement on
   many figures where at least half of them do, and the count stands beside it. It **does not hold** where more
   than half lie outside. A gain beyond the stated range is another number: it is **larger than stated**. What
   lies inside its own interval **cannot be told apart**. Intervals are those of a mean or a median, 95 %.
-- Quality is **not judged** on a network that was trained with less than {least:g} % of the paper's windows
-  ({windows}),
-  whose held-out loss was still falling, or that does not walk; its figures are shown all the same.
+- {unjudged}; its figures are shown all the same.
 - Marks: {marks}.
   Statements in brackets are remarks, which decide nothing.
 """
@@ -458,29 +441,28 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
     whose = {"ours": "verdict", "the paper's tables": "paper_verdict"}
     counts = pd.DataFrame(
         {"verdict": verdict} | {name: int((frame[column] == verdict).sum()) for name, column in whose.items()}
-        for verdict in VERDICTS
+        for verdict in judging.VERDICTS
     )
     marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
-    about = load_paper_file("paper", paper)
-    gpu = load_profile("gpu", "100style")
-    seen, training = gpu.train_steps * gpu.batch_size, about.get("training", {})
+    about, words = load_paper_file("paper", paper), load_paper_file("claims", paper)["page"]
+    gpu, training = load_profile("gpu", "100style"), about.get("training", {})
+    seen, whole = gpu.train_steps * gpu.batch_size, training.get("windows", {}).get("32")
+    fields = {
+        "steps": gpu.train_steps,
+        "batch": gpu.batch_size,
+        "seen": seen / 1e6,
+        "share": f", {100.0 * seen / whole:.0f} % of the paper's length" if whole else "",
+        "least": 100.0 * LEAST_SHARE,
+        "windows": training.get("says", "their number is not known"),
+    }
     head = _HEAD.format(
-        count=len(load_claims(paper)),
-        name=about["name"],
-        setting=about["setting"],
-        paper=paper,
-        marks=marks,
-        least=100.0 * LEAST_SHARE,
-        windows=training.get("says", "their number is not known"),
-        steps=gpu.train_steps,
-        batch=gpu.batch_size,
-        seen=seen / 1e6,
-        share=f", {100.0 * seen / training['windows']['32']:.0f} % of the paper's length" if training else "",
-    )
+        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks,
+        **{key: text.strip().format(**fields) for key, text in words.items()},
+    )  # fmt: skip
     parts = [head, markdown_table(counts)]
     paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]
     frame["ours"] = frame["verdict"] + ": " + frame["ours"]
-    frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != UNMEASURED, "no figures")
+    frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
     frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
     short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
     for group in frame["group"].unique():
@@ -571,33 +553,36 @@ def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, ac
     return changes
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; see the module's first lines.
+def main(accept: bool = False, paper: str | None = None) -> int:
+    """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
 
     Args:
-      arguments: words after the program's name; those of the process by default.
+      accept: take changed verdicts for right and write them down.
+      paper: whose claims; each paper's if none.
 
     Returns:
       Exit status: 0 if the ledger was written, 1 if a verdict changed and was not accepted, 2 for
       records, or a paper's file, that are broken.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m f3amd_lib.reports.claims",
-        description="Judge a paper's claims from records; writes paper_figures/claims.md.",
-    )
-    parser.add_argument("--accept", action="store_true", help="take changed verdicts for right and write them down")
-    parser.add_argument("--paper", choices=paper_folders(), default="f3amd", help="whose claims (default: f3amd)")
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    path = ledger_path(options.paper)
+    return max(_written(name, accept) for name in ([paper] if paper else claimed_papers()))
+
+
+def claimed_papers() -> list[str]:
+    """Return the papers whose claims are judged, as their folders are called."""
+    return [paper for paper in paper_folders() if has_paper_file("claims", paper)]
+
+
+def _written(paper: str, accept: bool) -> int:
+    """Write a paper's ledger; return the exit status of `main`."""
+    path = ledger_path(paper)
     try:
-        changes = write_ledger(path, judge_claims(paper=options.paper), accept=options.accept)
+        changes = write_ledger(path, judge_claims(paper=paper), accept=accept)
     except ValueError as error:
         log.error("Stopped: %s", error)
         return 2
     for change in changes:
         log.info("%s", change)
-    if changes and not options.accept:
+    if changes and not accept:
         log.error("Nothing was written. If these are right: --accept")
         return 1
     log.info("%s is up to date", path.relative_to(repository_root()))
@@ -605,4 +590,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    sys.exit(tyro.cli(main))

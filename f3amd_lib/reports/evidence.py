@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import load_paper_file, load_paper_table
+from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
 from f3amd_lib.measures.walking import CHECKS
@@ -136,21 +137,7 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
 
 # ------------------------------------------------------------------------------------------- tables
 
-SCHEMAS: dict[str, tuple[str, ...]] = {
-    "quality": ("model", "window_frames", "steps", "metric"),
-    "quality_by_round": ("model", "window_frames", "steps", "metric", "round"),
-    "quality_by_epoch": ("model", "epoch", "metric"),
-    "corruptions": ("corruption", "strength", "metric"),
-    "foot_spectrum": ("model", "window_frames", "steps", "band", "metric"),
-    "synthesis_time": ("model", "window_frames", "steps", "framework", "device", "characters"),
-    "training_time": ("model", "window_frames", "device", "batch_size"),
-    "gradient_norm": ("sigma",),
-    "x0_by_sigma": ("model", "sigma"),
-    "trained": ("model", "window_frames", "metric"),
-    "walking": ("model", "steps", "metric"),
-    "input_use": ("model", "metric"),
-    "recipes": ("recipe", "steps"),
-}
+SCHEMAS: dict[str, list[str]] = read_toml(Path(__file__).with_name("schemas.toml"))
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (in the last two
 a column of another name) and, where it was repeated, `low` and `high`."""
 
@@ -168,13 +155,17 @@ NINE_METRICS = {
 JUDGED_METRICS = NINE_METRICS | {"IRD_excess": ("cm", "down")}
 """Those nine, and the excess form of IRD, which stands beside the literal one."""
 
+OF_TEXT = tuple(name for name in SCHEMAS if name.startswith("text_"))
+"""Tables of text to motion. Each row also names `trained`, the model that was (a smaller one of ours may stand in for
+the paper's), and `windows`, the motions that it was trained on."""
+
 OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma")
 """Tables that say how well a network does: it must have passed the gate (`reports.gate`)."""
 
 PUBLISHED_CAMDM = "CAMDM published"
 """Row of the network with the weights that CAMDM's authors published: no preset of ours."""
 
-REFERENCE_ROWS = ("real", "frozen pose", "shuffled frames", "noisy motion", PUBLISHED_CAMDM)
+REFERENCE_ROWS = ("real", "frozen pose", "shuffled frames", "noisy motion", PUBLISHED_CAMDM, "CAMDM, leading")
 """Names in the model column that are no presets."""
 
 
@@ -222,6 +213,7 @@ class Evidence:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
       sources: the tables that were looked into, in that order and as often; whoever asks clears the list first.
       trained: (model, window) of the trained networks whose quality was looked up; cleared likewise.
+      told: of text to motion, model -> (what was trained in its place, motions it saw); cleared likewise.
     """
 
     def __init__(self, framework: str, load: Callable):
@@ -229,6 +221,7 @@ class Evidence:
         self.framework = framework
         self.sources: list[Source] = []
         self.trained: list[tuple[str, int]] = []
+        self.told: dict[str, tuple[str, int]] = {}
         self._load = functools.cache(load)
 
     @property
@@ -266,7 +259,10 @@ class Evidence:
         for column, wanted in row.items():
             table = table[table[column] == wanted]
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
-            self.trained.append((row["model"], row.get("window_frames", 32)))
+            network = row["model"].split(",")[0]  # "CAMDM, leading" is CAMDM, sampled in another way
+            self.trained.append((network, row.get("window_frames", 32)))
+        if name in OF_TEXT and not self.printed:
+            self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
         return table
 
     def figure(self, name: str, device: str | None = None, value: str = "value", **row) -> Figure:
@@ -358,8 +354,11 @@ def _with_interval_of_median(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**known)
 
 
-def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
-    """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken."""
+def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] = ()) -> pd.DataFrame:
+    """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken.
+
+    `others` are models that are no presets.
+    """
     keys = list(SCHEMAS[name])
     table = table.rename(columns={_VALUES.get(name, "value"): "value"})
     if name == "walking" and "metric" not in table:  # a row per style and seed, its figures side by side
@@ -383,7 +382,8 @@ def _checked(name: str, table: pd.DataFrame, where: str) -> pd.DataFrame:
         if rows.any():
             raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")
     for model in table["model"].unique() if "model" in table else ():
-        check_model(model, where)
+        if model not in others:
+            check_model(model, where)
     if "device" in table and not set(table["device"]) <= {"CPU", "GPU"}:
         raise ValueError(f"{where}: device must be CPU or GPU, got {table['device'].unique()}")
     return table
@@ -397,6 +397,12 @@ def check_model(model: str, where: str) -> None:
         known = False
     if not known:
         raise ValueError(f"{where}: unknown model {model!r}{nearest_hint(model, [*presets.PRESETS, *REFERENCE_ROWS])}")
+
+
+@functools.cache
+def _others() -> frozenset[str]:
+    """Return the models of other authors that any paper's tables name."""
+    return frozenset(name for paper in paper_folders() for name in load_paper_file("paper", paper).get("others", ()))
 
 
 def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
@@ -433,7 +439,8 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
         if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
             raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
-        table = _checked(name, table, str(path))
+        others = _others() if name in OF_TEXT else ()
+        table = _checked(name, table, str(path), others)
         if "device" in table and record.get("device_platform") == "cpu":
             # PyTorch finds its own device; the record tells that of JAX.
             own = table.get("framework", pd.Series("jax", index=table.index)) != "torch"
@@ -446,27 +453,34 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
 
 @functools.cache
 def paper_evidence(paper: str = "f3amd") -> Evidence:
-    """Return a paper's own tables in the form of our records, without intervals.
+    """Return a paper's own tables in the form of our records, with intervals where it prints some.
 
     Raises:
       ValueError: if two tables print different figures of one row.
     """
     about = load_paper_file("paper", paper)
+    others = about.get("others", ())
     parts: dict[str, list[pd.DataFrame]] = {}
     for entry in about.get("table", ()):
         printed = load_paper_table(entry["number"], paper)
-        labels, known = printed["model"], entry.get("models", {})
+        labels, known = printed["model"], entry.get("models", {}) | {name: name for name in others}
         names = {label: known.get(label) or presets.find_preset(label).name for label in labels.unique()}
         framework = np.where(labels.str.contains("PyTorch"), "torch", "iree")
         printed = printed.assign(model=labels.map(names), framework=framework, **entry.get("columns", {}))
+        if "ci95" in printed:
+            half = pd.to_numeric(printed["ci95"], errors="coerce")
+            printed = printed.assign(low=printed["value"] - half, high=printed["value"] + half)
         name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")
-        for which, rows in printed.groupby(name):
+        printed["metric"] = printed["metric"].replace(about.get("metrics", {}))
+        for which, rows in [(entry["record"], printed)] if "record" in entry else printed.groupby(name):
             parts.setdefault(which, []).append(rows)
     tables = {}
     for name, some in parts.items():
         # A row that several tables print is one row.
-        rows = pd.concat(some)[[*SCHEMAS[name], "unit", "value"]].drop_duplicates([*SCHEMAS[name], "value"])
-        tables[name] = _checked(name, rows, f"the paper's {name}")
+        rows = pd.concat(some)
+        rows = rows[[*SCHEMAS[name], "unit", "value", *(bound for bound in ("low", "high") if bound in rows)]]
+        rows = rows.drop_duplicates([*SCHEMAS[name], "value"])
+        tables[name] = _checked(name, rows, f"the paper's {name}", others)
 
     def load(name: str):
         if name not in tables:

@@ -4,7 +4,8 @@ A network that was stopped after minutes, or whose feet slide, says what brief t
 nothing of the paper's. Its figures are shown, and no verdict is drawn from them. Asked are the
 length of its training, as a share of the paper's windows, whether its held-out loss was flat at the
 end, and whether it walks (`measures.walking.CHECKS`). A network that the claim itself calls poor
-need not walk. All of this is ours.
+need not walk. A network of text to motion must be as large as the paper's and have seen as large a
+share of its motions. All of this is ours.
 """
 
 from __future__ import annotations
@@ -70,4 +71,10 @@ def why_not_judged(
     for model, window in networks:
         for fault in _faults(evidence, model, window, paper_windows.get(str(window)), model not in poor):
             lacking.setdefault(fault, []).append(model)
+    for model, (trained, windows) in evidence.told.items():
+        if trained != model:
+            lacking.setdefault("a smaller network of ours in its place", []).append(trained)
+        if windows < LEAST_SHARE * paper_windows.get("text", 0):
+            share = f"trained {100.0 * windows / paper_windows['text']:.2g} % of the paper's motions"
+            lacking.setdefault(share, []).append(trained)
     return lacking

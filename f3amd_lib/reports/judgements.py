@@ -28,6 +28,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.measures.distributions import mean_and_interval
+from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.reports.evidence import (
     JUDGED_METRICS,
     NINE_METRICS,
@@ -261,6 +262,44 @@ def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None
     if ratio_to is not None:
         found = ratio(found, evidence.figure(table, **(row | ratio_to)))
     return _compared(found, bounds), text.format(figure_text(found, unit))
+
+
+# ---------------------------------------------------------------------------------- rows of a table
+
+
+def _harms(evidence: Evidence, table: str, metric: str, rows, pairs, among) -> list[Figure]:
+    """Return, for pairs (better, worse) of rows, how many times worse the second is."""
+    figures = [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
+    down = METRICS[metric].better == "down"
+    return [ratio(figures[worse], figures[better]) if down else ratio(figures[better], figures[worse])
+            for better, worse in pairs]  # fmt: skip
+
+
+def _values(evidence: Evidence, table: str, metric: str, rows, among) -> list[str]:
+    return [number_text(evidence.figure(table, **(among or {}), **row, metric=metric).value) for row in rows]
+
+
+def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
+    """Judge whether rows stand in this order, best first: each against the next.
+
+    Args:
+      evidence: of one paper or data set.
+      table: a table of `evidence.SCHEMAS`.
+      metric: of `measures/metrics.toml`, which says what is better.
+      rows: columns of each row.
+      among: columns that all rows share.
+    """
+    pairs = [(place, place + 1) for place in range(len(rows) - 1)]
+    verdict = majority(map(ordered, _harms(evidence, table, metric, rows, pairs, among)))
+    return verdict, ", ".join(_values(evidence, table, metric, rows, among))
+
+
+def leads(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
+    """Judge whether the first row is better than every other; arguments as of `ranked`."""
+    pairs = [(0, place) for place in range(1, len(rows))]
+    verdict = every(map(ordered, _harms(evidence, table, metric, rows, pairs, among)))
+    first, *others = _values(evidence, table, metric, rows, among)
+    return verdict, f"{first} against {', '.join(others)}"
 
 
 # ------------------------------------------------------------------------------------------- times
@@ -740,7 +779,8 @@ def gradient_growth(evidence: Evidence, bounds) -> Finding:
 KINDS = {
     kind.__name__: kind
     for kind in (
-        figure, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above, saving, mean_saving,
+        figure, ranked, leads, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above,
+        saving, mean_saving,
         jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
         worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
         window_gain, steady_over_steps, change_between_steps, moved_by_inputs, drift, better_graded, steady_over_noise,

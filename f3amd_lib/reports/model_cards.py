@@ -11,12 +11,13 @@ import hashlib
 import logging
 import re
 import sys
-from importlib import resources
 from pathlib import Path
 
 import jax
+import numpy as np
 import pandas as pd
 
+from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import markdown_table
@@ -47,24 +48,12 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     value = measured[measured["steps"] == measured["steps"].max()].set_index("metric")["value"]
     real = real.set_index("metric")["value"]
     limits = []
-    if value.get("x0_error_ratio", 0.0) > 0.5:
-        limits.append("It hardly uses its noisy input: every seed gives nearly the same motion.")
-    if value.get("stepping_rate", 1e9) < 0.8 * real.get("stepping_rate", 0.0):
-        limits.append(
-            f"It steps too rarely: {value['stepping_rate']:.1f} times a second, where the source "
-            f"steps {real['stepping_rate']:.1f} times."
-        )
-    if value.get("slide_speed", 0.0) > 12.0:
-        limits.append(
-            f"It skates: its lower toe moves over the ground at {value['slide_speed']:.0f} cm/s "
-            f"(median), where that of the source moves at {real['slide_speed']:.0f}."
-        )
-    if value.get("floor_penetration", 0.0) > 1.0:
-        limits.append(
-            f"Toes sink: in the worst frame of a walk by {value['floor_penetration']:.1f} cm on average over styles."
-        )
-    if value.get("joint_acceleration", 0.0) > 1.5 * real.get("joint_acceleration", 1e9):
-        limits.append("It trembles: joints accelerate more than 1.5 times as much as in real motion.")
+    for limit in read_toml(Path(__file__).with_name("limits.toml"))["limit"]:
+        figure, source = value.get(limit["metric"], np.nan), real.get(limit["metric"], np.nan)
+        bound = limit["bound"] * (source if limit.get("of_real") else 1.0)
+        # What was not measured is beyond no bound.
+        if figure > bound if limit["sign"] == ">" else figure < bound:
+            limits.append(limit["says"].format(value=figure, real=source))
     return limits
 
 
@@ -84,7 +73,9 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     path = Path(path)
     trained = load_model(path)
     record, recipe = trained.record, trained.record["training"]
-    windows = recipe["num_steps"] * recipe["batch_size"]
+    # A model may be trained in several legs, of which the recipe is the last's.
+    windows = record.get("windows_seen", recipe["num_steps"] * recipe["batch_size"])
+    steps, legs = windows // recipe["batch_size"], record.get("schedule_note")
     passes = windows / record["num_train_windows"]
     history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
     figures, limits = "Not measured by the protocol yet.", []
@@ -102,26 +93,19 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     if passes < 20:
         limits.append("It was trained far shorter than the paper's models.")
-    template = (resources.files("f3amd_lib.reports") / "model_card.template").read_text(encoding="utf-8")
+    template = Path(__file__).with_name("model_card.template").read_text(encoding="utf-8")
     return template.format(
-        trained=trained,
-        record=record,
-        recipe=recipe,
-        file=path.name,
-        megabytes=path.stat().st_size / 1e6,
+        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(trained.params)),
         weights_type=describe(path).get("weights", "bfloat16"),
         terms=": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else "",
-        styles=", ".join(trained.styles),
-        windows=windows,
-        passes=passes,
-        date=record["date_utc"][:10],
+        styles=", ".join(trained.styles), steps=steps, legs=f" ({legs})" if legs else "",
+        windows=windows, passes=passes, date=record["date_utc"][:10],
         commit=(record["git_commit"] or "unknown")[:10],
         state=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        loss=history["held_out_loss"].dropna().iloc[-1],
-        measured=figures,
+        loss=history["held_out_loss"].dropna().iloc[-1], measured=figures,
         limits="\n".join(f"- {limit}" for limit in limits),
-    )
+    )  # fmt: skip
 
 
 def checksums(folder: Path) -> str:
@@ -179,7 +163,8 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     cards = []
     for path in sorted(folder.glob("*/*.safetensors")):
         card = path.with_suffix(".md")
-        card.write_text(model_card(path, committed_quality(path.parent.name)), encoding="utf-8")
+        with whole_file(card, overwrite=True) as temporary:
+            temporary.write_text(model_card(path, committed_quality(path.parent.name)), encoding="utf-8")
         cards.append(card)
     (folder / "checksums.txt").write_text(checksums(folder), encoding="utf-8")
     return cards

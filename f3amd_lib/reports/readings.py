@@ -14,12 +14,22 @@ from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
+from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
 from f3amd_lib.networks.presets import PRESETS
+from f3amd_lib.training.latent_motion import LatentMotionTraining
 from f3amd_lib.training.recipe import TrainingConfig
+from f3amd_lib.training.text_motion import TextMotionTraining
 
 _CONFIGS = {
     config.__name__: {field.name: field.default for field in dataclasses.fields(config)}
-    for config in (F3AMDConfig, CAMDMConfig, TrainingConfig)
+    for config in (
+        F3AMDConfig,
+        CAMDMConfig,
+        TrainingConfig,
+        MaskedACMDMConfig,
+        TextMotionTraining,
+        LatentMotionTraining,
+    )  # fmt: skip
 }
 
 

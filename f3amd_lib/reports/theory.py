@@ -12,6 +12,7 @@ from flax import nnx
 from f3amd_lib.diffusion import samplers, schedules
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.networks.attention import TransformerBlock
+from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.spectral import FNOBlock, SpectralConvolution, count_modes
 from f3amd_lib.reports.evidence import Figure
@@ -76,7 +77,7 @@ def reaches_data(_, update) -> Finding:
 
 def _operations(block: type, frames: int, width: int, *sizes) -> int:
     """Count the operations of a block on one window, without building its weights."""
-    built = nnx.eval_shape(lambda: block(*sizes, rngs=nnx.Rngs(params=jax.random.key(0))))
+    built = nnx.eval_shape(lambda: block(*sizes, rngs=LayerKeys(jax.random.key(0))))
     graph, state = nnx.split(built)
     window = jax.ShapeDtypeStruct((1, frames, width), jnp.float32)
     return count_flops(lambda state, z: nnx.merge(graph, state)(z), state, window)
