@@ -199,6 +199,7 @@ def test_later_blocks_change_nothing_before_them():
     assert float(jnp.abs(earlier[:, 6] - first[:, 6]).max()) > 1e-4
 
 
+@pytest.mark.slow
 def test_a_cache_stands_for_the_clean_blocks_before():
     network, told = stirred(fresh(config_of(block_frames=4, patch="pair"))), condition((8, 6))
     context = network.encode(told)

@@ -25,6 +25,7 @@ def test_a_cast_network_computes_in_the_other_type_and_leaves_the_first_alone():
     assert 1e-5 < gap < 0.1 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_rollouts_in_bfloat16_stay_near_and_come_as_float32():
     path = named_path("straight", 2 * WINDOW, speed=1.0)
     run = lambda dtype, seed=0: MotionGenerator(tiny_trained(), 2, dtype=dtype).rollout(path, "calm", seed=seed).frames

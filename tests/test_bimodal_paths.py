@@ -85,6 +85,7 @@ def test_exact_denoiser_has_the_lowest_error_of_all():
         assert np.mean((other - paths) ** 2) > error
 
 
+@pytest.mark.slow
 def test_noise_levels_may_differ_from_path_to_path():
     paths, _ = real_paths(DATA, 3)
     levels, side = np.array([0.1, 2.0, 30.0]), np.array([0, 1, 2])
@@ -190,6 +191,7 @@ def test_trainings_that_differ_in_noise_alone_are_compiled_once(trained):
     assert advance_program._cache_size() == compiled
 
 
+@pytest.mark.slow
 def test_a_short_training_learns_the_mean_and_the_sides(trained):
     network, losses, _ = trained
     assert losses.shape == (400,) and losses[-50:].mean() < 0.2 * losses[:5].mean()
@@ -198,6 +200,7 @@ def test_a_short_training_learns_the_mean_and_the_sides(trained):
     assert table.loc[True, "as_told"] > 0.95
 
 
+@pytest.mark.slow
 def test_a_trained_network_comes_near_the_exact_error_and_not_below(trained):
     sigmas = PRESERVING.levels[[3, 5, 7]]
     found = toy.error_table(trained[0], sigmas, num_samples=1000)["x0_error"]

@@ -267,6 +267,7 @@ def train_forward(config: ClassifierConfig, windows, key):
     return features, network, network.blocks[0].convolution(windows)
 
 
+@pytest.mark.slow
 def test_in_training_the_batch_itself_is_the_norm_and_dropout_blanks():
     windows = np.random.default_rng(1).normal(3.0, 2.0, (500, WINDOW, NUM_CHANNELS))
     one, network, convolved = train_forward(CONFIG, windows, jax.random.key(0))
@@ -319,6 +320,7 @@ def test_a_mirrored_style_is_the_same_style(trained):
     assert np.mean(predicted == STYLES.index("Runner")) > 0.8
 
 
+@pytest.mark.slow
 def test_same_seed_same_classifier_and_another_seed_another(packed):
     one, again, other = (train_classifier(packed, seed=seed, **BRIEF) for seed in (4, 4, 5))
     assert same_tree((one.params, one.statistics), (again.params, again.statistics))

@@ -76,6 +76,7 @@ def close(first, second, characters=slice(None)):
 # --- who a character is ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_characters_do_not_depend_on_the_chunk(generator, eleven, tmp_path):
     close(generate_crowd(generator, 11, FRAMES, tmp_path, chunk=7), eleven)
 

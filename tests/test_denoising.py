@@ -89,6 +89,7 @@ def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
     assert lowest == pytest.approx(four.levels[0]) and highest == pytest.approx(four.sigma_max)
 
 
+@pytest.mark.slow
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
     trained = model_that(lambda x_noisy: x_noisy)
     generator = MotionGenerator(trained, 1)

@@ -126,6 +126,7 @@ def test_weights_go_back_into_the_network(network):
     assert np.array_equal(again, network.embed_motion(motion, jnp.array([8, 8])))
 
 
+@pytest.mark.slow
 def test_a_few_steps_lower_the_loss():
     task = toy(True)
     _, history = optimise(task, stop_after=12, chunk=4, progress=False)

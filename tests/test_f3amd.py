@@ -184,6 +184,7 @@ def test_residual_prior_weighs_each_cosine_mode_apart():
     np.testing.assert_allclose(run(network, x_noisy, sigma), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_every_parameter_learns():
     network = make_network(history_anchor=True, residual_prior=True)
     x_noisy, wanted = draw(2, WINDOW, CHANNELS), draw(2, WINDOW, CHANNELS, seed=9)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.data.text_motions import ClipTable
@@ -168,8 +169,9 @@ def test_a_target_is_the_guided_teachers_step_and_then_the_targets_jump(start):
     """Algorithm 1, lines 9 and 10, worked out again point by point, with another target than the student."""
     target = jax.tree.map(lambda leaf: 1.1 * leaf, start.params["student"])
     latent, text = TASK.clips.draw(jax.random.key(1), 6)
-    drawn = TASK.questions(target, latent, text, jax.random.key(4))
-    teacher, follower = network_with(TEACHER, TEACHER_WEIGHTS), network_with(TASK.student_config, target)
+    drawn = jax.jit(TASK.questions)(target, latent, text, jax.random.key(4))
+    teacher = Compiled(network_with(TEACHER, TEACHER_WEIGHTS))
+    follower = Compiled(network_with(TASK.student_config, target))
     for row in range(6):
         one = functools.partial(jax.lax.dynamic_slice_in_dim, start_index=row, slice_size=1)
         state, time, w = one(drawn.state), int(drawn.time[row]), float(drawn.guidance[row])
@@ -184,28 +186,36 @@ def test_a_target_is_the_guided_teachers_step_and_then_the_targets_jump(start):
 
 def test_each_player_learns_from_its_own_loss_alone(batch, start):
     """Algorithm 1's signs: the student raises the score of what it makes; the heads lower it, and raise the data's."""
-    params, terms_of = start.params, lambda params: TASK.loss(params, None, batch, None)[1][0]
-    gradient, terms = jax.jit(jax.grad(lambda p: TASK.loss(p, None, batch, None)[0])), jax.jit(terms_of)
-    moved = gradient(params)
+    params = start.params
+
+    def losses(params):
+        loss, (terms, _) = TASK.loss(params, None, batch, None)
+        return {**terms, "sum": loss}
+
+    @jax.jit
+    def losses_and_gradients(params):
+        found, pull = jax.vjp(losses, params)
+        return found, {name: pull({key: jnp.float32(key == name) for key in found})[0] for name in found}
+
+    terms = lambda params: losses_and_gradients(params)[0]
+    before, gradients = losses_and_gradients(params)
     norm = lambda tree: float(np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(tree))))
-    only = lambda name: jax.jit(jax.grad(lambda p: terms_of(p)[name]))(params)
-    consistency, adversarial, critic = (only(name) for name in ("consistency", "adversarial", "discriminator"))
+    consistency, adversarial, critic = (gradients[name] for name in ("consistency", "adversarial", "discriminator"))
     assert norm(critic["student"]) == norm(adversarial["discriminator"]) == norm(consistency["discriminator"]) == 0
     assert norm(adversarial["student"]) > 0 and norm(consistency["student"]) > 0
     wanted = jax.tree.map(lambda a, b: a + 0.1 * b, consistency["student"], adversarial["student"])
-    for found, expected in zip(
-        jax.tree.leaves(moved), [*jax.tree.leaves(critic["discriminator"]), *jax.tree.leaves(wanted)], strict=True
-    ):
+    parts = [*jax.tree.leaves(critic["discriminator"]), *jax.tree.leaves(wanted)]
+    for found, expected in zip(jax.tree.leaves(gradients["sum"]), parts, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-6)
     step = lambda branch, direction: {
         **params, branch: jax.tree.map(lambda p, g: p - 1e-2 * g, params[branch], direction[branch])
     }  # fmt: skip
-    before = terms(params)
     assert terms(step("student", adversarial))["adversarial"] < before["adversarial"]
     better = terms(step("discriminator", critic))
     assert better["discriminator"] < before["discriminator"] and better["adversarial"] > before["adversarial"]
 
 
+@pytest.mark.slow
 def test_the_loop_keeps_the_target_and_trains_both_and_resumes(start, tmp_path):
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (start.params, start.ema)), strict=True))
     keep = jax.tree.map(jnp.copy, start)
@@ -239,14 +249,15 @@ def test_players_may_learn_by_turns(start):
             assert same == (branch != learner)
 
 
+@pytest.mark.slow
 def test_latent_consistency_is_distilled_without_phases():
     task = distillation(consistency="latent", num_phases=1, adversarial_weight=0.0)
     state = initial_state(task)
     assert set(state.params) == {"student"}
-    drawn = task.questions(state.ema["student"], *task.clips.draw(jax.random.key(1), 8), jax.random.key(4))
+    drawn = jax.jit(task.questions)(state.ema["student"], *task.clips.draw(jax.random.key(1), 8), jax.random.key(4))
     assert not drawn.edge.any()
-    loss, (terms, _) = task.loss(state.params, None, drawn, None)
-    student = network_with(task.student_config, state.params["student"])
+    loss, (terms, _) = jax.jit(task.loss)(state.params, None, drawn, None)
+    student = Compiled(network_with(task.student_config, state.params["student"]))
     eps = student(drawn.state, drawn.time, student.encode(drawn.text), drawn.guidance)
     end = latent_consistency_end(SCHEDULE, drawn.state, eps, drawn.time)
     wanted = np.sqrt((end - drawn.target) ** 2 + 0.25) - 0.5
@@ -292,7 +303,7 @@ def toys():
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_students_learn_where_the_flow_goes(toys):
     """Over three seeds a student of M steps ends near the exact flow, its teacher in one step does not."""
     noise = normal(11, 512, 1, 1)
@@ -317,9 +328,11 @@ def test_students_learn_where_the_flow_goes(toys):
 # ------------------------------------------------------------------------------------------------------------ sampling
 
 
+@pytest.mark.slow
 def test_samples_are_calls_of_the_network_at_the_papers_times():
     student = student_of(network_with(TEACHER, TEACHER_WEIGHTS), jax.random.key(0))
     student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
+    student = Compiled(student)
     text, noise, empty = normal(1, 3, 4), normal(2, 3, 2, 3), normal(4, 4)
     context, told = student.encode(text), jnp.full(3, 14.0)
     state = noise
@@ -328,7 +341,7 @@ def test_samples_are_calls_of_the_network_at_the_papers_times():
     made = sample_student(student, SCHEDULE, text, noise, num_steps=2)
     np.testing.assert_allclose(made, state, atol=1e-4)
     assert np.abs(sample_student(student, SCHEDULE, text, noise, num_steps=2, guidance=5.0) - made).max() > 1e-3
-    teacher = network_with(TEACHER, TEACHER_WEIGHTS)
+    teacher = Compiled(network_with(TEACHER, TEACHER_WEIGHTS))
     ask = lambda text: teacher(noise, 999, teacher.encode(text))
     wanted = jump(SCHEDULE, noise, 7.5 * ask(text) - 6.5 * ask(jnp.stack([empty] * 3)), 999, 0)
     np.testing.assert_allclose(

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks import presets
@@ -24,8 +25,8 @@ from f3amd_lib.networks.motionpcm import (
 
 SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32}
 RNGS = nnx.Rngs(0)
-TEACHER = LatentDenoiser(LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=RNGS)
-CODER = LatentAutoencoder(LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), rngs=RNGS)
+TEACHER = Compiled(LatentDenoiser(LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=RNGS))
+CODER = Compiled(LatentAutoencoder(LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), rngs=RNGS))
 
 
 def normal(seed, *shape):
@@ -93,7 +94,7 @@ def test_a_latent_has_one_size_and_padding_changes_nothing():
 def test_the_second_half_is_handed_the_first_in_reverse():
     config = SkipTransformerConfig(**{**SMALL, "depth": 5})
     body = SkipTransformer(config, rngs=nnx.Rngs(1))
-    outputs = list(body.outputs(normal(0, 1, 4, 16)))
+    outputs = nnx.jit(lambda body, z: list(body.outputs(z)))(body, normal(0, 1, 4, 16))
     assert len(outputs) == 5
     joined = lambda number, kept, z: body.blocks[number](body.joins[number - 3](jnp.concatenate([z, kept], -1)))
     np.testing.assert_allclose(joined(3, outputs[1], outputs[2]), outputs[3], atol=1e-5)
@@ -113,7 +114,7 @@ def test_waves_are_those_of_the_released_code():
 def test_a_student_is_its_teacher_at_first_whatever_it_is_told():
     state, context = normal(1, 3, 4, 3), TEACHER.encode(normal(2, 3, 5))
     time, told = jnp.asarray([999, 499, 99]), jnp.asarray([0.0, 5.0, 15.0])
-    student, answer = student_of(TEACHER, jax.random.key(9)), TEACHER(state, time, context)
+    student, answer = Compiled(student_of(TEACHER.network, jax.random.key(9))), TEACHER(state, time, context)
     np.testing.assert_array_equal(student(state, time, context, told), answer)
     student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
     moved = student(state, time, context, told)
@@ -138,7 +139,7 @@ def test_each_input_moves_the_answer(change):
 
 
 def test_a_discriminator_reads_every_block_and_lets_the_gradient_through():
-    critic = Discriminator(DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4))
+    critic = Compiled(Discriminator(DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4)))
     context = TEACHER.encode(normal(2, 2, 5))
     scores = lambda state: critic(TEACHER.features(state, jnp.asarray([199, 499]), context))
     state = normal(1, 2, 4, 3)

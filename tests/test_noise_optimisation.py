@@ -64,12 +64,14 @@ def test_a_target_is_met_and_only_its_noise_has_moved():
     assert moved.max() == 0.0
 
 
+@pytest.mark.slow
 def test_noise_of_its_own_does_not_go_together_and_repeated_noise_does():
     noise = normal(1, 4, 64, 5, 3)
     assert np.all(correlation(noise) < 0.1)
     assert np.all(correlation(jnp.broadcast_to(noise[:, :1], noise.shape)) > 1.0)
 
 
+@pytest.mark.slow
 def test_a_network_is_brought_to_its_target():
     """A network as the library has it, under a caption; with the wrong target it is as far as before."""
     network = stirred(fresh(config_of(depth=1, channels=3)))

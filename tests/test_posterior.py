@@ -175,6 +175,7 @@ def test_a_blind_network_has_no_spread_and_one_error(model_that):
     assert by["x0 error"].to_numpy() == pytest.approx(2 * [np.sqrt(np.mean(x0**2))], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_that):
     trained, windows = model_that(lambda x_noisy: x_noisy), tiny_windows()
     draws = 6
@@ -195,6 +196,7 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
     assert (by["low"] < by["value"]).all() and (by["value"] < by["high"]).all()
 
 
+@pytest.mark.slow
 def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
     schedule = variance_preserving_cosine(4)
     config = tiny_camdm(noise_levels=tuple(schedule.levels.tolist()))

@@ -34,6 +34,8 @@ from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData
 
+pytestmark = pytest.mark.slow
+
 STYLES = ("ArmsOverhead", "Zombie")
 SIZES = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
 SMALL = Protocol(STYLES, num_frames=96, num_seeds=2, num_diversity_seeds=2, windows_per_style=3)

@@ -80,6 +80,7 @@ def test_what_cannot_be_done_says_why():
     refused("tf32", workload, precision="tf23")
 
 
+@pytest.mark.slow
 def test_a_group_is_timed_and_counted():
     candidates = [Candidate("F3AMD-FNO-96", steps, 2, "jit", WINDOW) for steps in (1, 2)] + [
         Candidate("CAMDM", 2, 2, name, WINDOW) for name in ("jit", "jit, FFT")
@@ -135,6 +136,7 @@ class Prepared:
     model_config = staticmethod(lambda model, window: tiny(model))
 
 
+@pytest.mark.slow
 def test_measurement_writes_both_tables_and_goes_on_where_it_was(quick_suite):
     profile = load_profile("smoke", "synthetic")
     path = measurements.measure_synthesis_time(Prepared, profile)
@@ -171,6 +173,7 @@ def test_parts_are_left_out():
     refused("Fourier blocks with FiLM", without, network_of(tiny_config(base_block="transformer")), "FiLM")
 
 
+@pytest.mark.slow
 def test_time_of_parts_is_a_share_of_the_whole():
     table = time_breakdown(workload(steps=1), **QUICK)
     assert list(table["without"]) == ["nothing", *PARTS]

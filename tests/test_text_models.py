@@ -29,6 +29,8 @@ from f3amd_lib.training.text_models import (
     train_text_model,
 )
 
+pytestmark = pytest.mark.slow
+
 STYLES = synthetic.STYLES[:2]
 SIZES = {"latent_width": 16, "depth": 1, "num_heads": 2, "channels": 3, "window": 40}
 LATENT = {**SIZES, "channels": 4, "window": 8}

@@ -274,6 +274,7 @@ def test_an_autoencoder_learns(variational):
     assert float(done) < 0.7 * float(before)
 
 
+@pytest.mark.slow
 def test_a_text_decides_what_is_learnt():
     """Two clips that are one value each, and two captions: after some steps each caption brings its own value."""
     states = jnp.stack([jnp.full((8, JOINTS, 3), value) for value in (-1.0, 1.0)])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 from test_acmdm import BATCH, condition, config_of, fresh, normal, stirred
 
@@ -29,7 +30,7 @@ TOLD = condition((8, 6))
 
 @pytest.fixture(scope="module")
 def network():
-    return stirred(fresh(config_of(depth=1)))
+    return Compiled(stirred(fresh(config_of(depth=1))))
 
 
 def test_guidance_of_one_is_the_condition_and_of_zero_none(network):
@@ -43,6 +44,7 @@ def test_guidance_of_one_is_the_condition_and_of_zero_none(network):
 
 
 def test_control_guidance_of_one_and_one_is_the_controlled_network(network):
+    network = network.network  # the branch calls its blocks one by one
     branch = stirred(control_branch(network, 4, jax.random.key(2)), 4)
     control = Control.of(normal(3, BATCH, 32, 5, 3), jnp.zeros((BATCH, 32, 5)).at[:, 3, 1].set(1.0))
     time = jnp.asarray([0.2, 0.6])
@@ -62,7 +64,7 @@ def test_control_guidance_of_one_and_one_is_the_controlled_network(network):
 
 
 def test_whole_motions_are_zero_in_padding_and_an_untrained_network_leaves_the_noise():
-    untrained = fresh(config_of(depth=1))
+    untrained = Compiled(fresh(config_of(depth=1)))
     state = sample_text(untrained, SCHEDULE, TOLD, NOISE, **EULER)
     np.testing.assert_allclose(state, NOISE * TOLD.mask[..., None, None], atol=1e-6)  # a velocity of 0
     assert not np.any(state[1, 6:])
@@ -70,7 +72,8 @@ def test_whole_motions_are_zero_in_padding_and_an_untrained_network_leaves_the_n
 
 def test_both_solvers_follow_one_flow(network):
     """A weak network, so that two hundred steps of Euler are close."""
-    weak = nnx.merge(nnx.graphdef(network), jax.tree.map(lambda leaf: 0.5 * leaf, nnx.state(network)))
+    graph, params = nnx.split(network.network)
+    weak = nnx.merge(graph, jax.tree.map(lambda leaf: 0.5 * leaf, params))
     exact = sample_text(weak, SCHEDULE, TOLD, NOISE, guidance=1.0)
     steps = sample_text(weak, SCHEDULE, TOLD, NOISE, guidance=1.0, sampler="ddim", num_steps=200)
     np.testing.assert_allclose(steps, exact, atol=0.02)
@@ -90,7 +93,7 @@ def test_other_objectives_go_by_their_schedule_and_key():
 
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
 def test_cached_and_uncached_blocks_agree(guidance):
-    network = stirred(fresh(config_of(depth=2, block_frames=3)))  # the last block is short
+    network = Compiled(stirred(fresh(config_of(depth=2, block_frames=3))))  # the last block is short
     cached, uncached = (
         sample_blocks(network, SCHEDULE, TOLD, NOISE, guidance=guidance, cached=cached, **EULER)
         for cached in (True, False)
@@ -100,8 +103,9 @@ def test_cached_and_uncached_blocks_agree(guidance):
     assert not np.any(cached[1, 6:])
 
 
+@pytest.mark.slow
 def test_blocks_do_not_depend_on_later_noise_and_need_a_network_with_blocks(network):
-    blocks = stirred(fresh(config_of(depth=1, block_frames=4)))
+    blocks = Compiled(stirred(fresh(config_of(depth=1, block_frames=4))))
     first = sample_blocks(blocks, SCHEDULE, TOLD, NOISE, guidance=1.0, **EULER)
     later = sample_blocks(blocks, SCHEDULE, TOLD, NOISE.at[:, 6].add(1.0), guidance=1.0, **EULER)
     np.testing.assert_array_equal(later[:, :4], first[:, :4])
@@ -161,16 +165,19 @@ def test_the_prefix_is_shown_clean_in_every_evaluation():
     np.testing.assert_allclose(seen[0][:, 3:], made, atol=1e-6)  # a velocity of 0 leaves the noise
 
 
+@pytest.mark.slow
 def test_masked_sampling_reveals_every_frame_once():
     """The head of an untrained masked network answers v = 0: every frame is the noise of the round that revealed it."""
     network = fresh(config_of(MaskedACMDMConfig, depth=1))
-    state = np.asarray(sample_masked(network, SCHEDULE, TOLD, jax.random.key(0), guidance=1.0, num_rounds=4, **EULER))
+    reveal = lambda network, told, **settings: sample_masked(
+        Compiled(network), SCHEDULE, told, jax.random.key(0), **settings, **EULER
+    )
+    state = np.asarray(reveal(network, TOLD, guidance=1.0, num_rounds=4))
     assert not np.any(state[1, 6:]) and np.isfinite(state).all()
     assert (np.abs(state[0]).max(axis=(1, 2)) > 0).all() and (np.abs(state[1, :6]).max(axis=(1, 2)) > 0).all()
     assert 0.8 < state[0].std() < 1.2
     trained = stirred(network)
     first, other = (
-        sample_masked(trained, SCHEDULE, told, jax.random.key(0), guidance=2.0, num_rounds=3, **EULER)
-        for told in (TOLD, TOLD._replace(pooled=-TOLD.pooled))
+        reveal(trained, told, guidance=2.0, num_rounds=3) for told in (TOLD, TOLD._replace(pooled=-TOLD.pooled))
     )
     assert float(jnp.abs(first - other).max()) > 1e-3
