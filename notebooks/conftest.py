@@ -1,4 +1,4 @@
-"""How nbval runs the notebooks: compiled quickly, but for those that train toys for thousands of steps."""
+"""How nbval runs notebooks: compiled quickly, but for those that train toys in many steps."""
 
 import os
 
@@ -10,5 +10,5 @@ LONG_TRAININGS = ("10_printed_update", "11_one_step")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Choose in the environment, which the kernel of a notebook inherits when its first cell is set up."""
+    """Choose in the environment, which a notebook's kernel inherits before its first cell."""
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(item.path.stem not in LONG_TRAININGS))
