@@ -260,7 +260,8 @@ def train_networks(
     return [PathNetwork(of_seed(number), data, graph) for number in range(len(keys))], np.asarray(terms["by_seed"]).T
 
 
-@functools.partial(jax.jit, static_argnames="config")
+# It runs once, and a program of many random numbers compiles five times as long with all optimisations.
+@functools.partial(jax.jit, static_argnames="config", compiler_options={"xla_backend_optimization_level": 0})
 def _initial_weights(config, keys):
     """Return the weights of a network a key, each leaf [S, ...]."""
     return jax.vmap(lambda key: nnx.state(build_from_config(config, key)))(keys)
