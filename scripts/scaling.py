@@ -10,7 +10,6 @@ begin. Nothing is trained here.
 from __future__ import annotations
 
 import heapq
-import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -111,7 +110,7 @@ def tables() -> dict[str, str]:
         rows.append({"machines": machines, "hours": f"{hours:.1f}", "times as fast": f"{gain:.1f}",
                      "busy": f"{100 * gain / machines:.0f} %"})  # fmt: skip
     last = finished_after(legs, seconds, len(legs))
-    longest = max(last, key=last.get)
+    longest = max(legs, key=lambda leg: last[leg.name])
     state = measured["parameters"] * BYTES_OF_STATE
     shown = pd.DataFrame(
         {
@@ -123,16 +122,19 @@ def tables() -> dict[str, str]:
             "MB/s of gradients": (4 * measured["parameters"] / 1e6 / measured["s_per_step"]).map("{:.0f}".format),
         }
     )
-    facts = pd.DataFrame(
-        [
-            {"what": "legs of the queue", "figure": str(len(legs))},
-            {"what": "hours of all legs, one after the other", "figure": f"{alone / 3600:.1f}"},
-            {"what": "hours of the longest run, whose snapshots follow each other", "figure": f"{last[longest] / 3600:.1f}"},
-            {"what": "which run that is", "figure": f"`{next(leg for leg in legs if leg.name == longest).run.name}`"},
-            {"what": "machines beyond which nothing is gained", "figure": str(enough(legs, seconds))},
-        ]
-    )  # fmt: skip
-    return {"costs": markdown_table(shown), "machines": markdown_table(pd.DataFrame(rows)), "facts": markdown_table(facts)}
+    facts = {
+        "legs of the queue": str(len(legs)),
+        "hours of all legs, one after the other": f"{alone / 3600:.1f}",
+        "hours of the longest run, whose snapshots follow each other": f"{last[longest.name] / 3600:.1f}",
+        "which run that is": f"`{longest.run.name}`",
+        "machines beyond which nothing is gained": str(enough(legs, seconds)),
+    }
+    frames = {
+        "costs": shown,
+        "machines": pd.DataFrame(rows),
+        "facts": pd.DataFrame(facts.items(), columns=["what", "figure"]),
+    }
+    return {name: markdown_table(frame) for name, frame in frames.items()}
 
 
 def enough(legs: Sequence[Leg], seconds: Mapping[str, float]) -> int:
@@ -159,4 +161,4 @@ def written(page: str) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-    sys.stdout.write(json.dumps({"wrote": PAGE.name}) + "\n")
+    sys.stdout.write(f"wrote {PAGE.relative_to(ROOT)}\n")

@@ -15,10 +15,11 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from builders import packed_from, refused, tiny_packed
+from builders import HISTORY, WINDOW, refused, tiny_packed
 
 from f3amd_lib import __main__ as command_line
 from f3amd_lib.experiments import campaign, sweep
@@ -29,8 +30,6 @@ from f3amd_lib.experiments.sweep import Leg, Work, gather, plan, run_leg, run_sw
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile, results_dir
 from f3amd_lib.ground.records import read_table, run_record
-from f3amd_lib.measures.classifier import load_classifier, save_classifier, train_classifier
-from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -50,7 +49,7 @@ def contents(path: Path) -> tuple[bytes, dict]:
     return path.read_bytes(), record
 
 
-def until(condition, seconds: float = 300.0):
+def until(condition, seconds: float = 1200.0):
     """Wait for what workers do; the time is a bound on despair alone."""
     end = time.monotonic() + seconds
     while not (found := condition()):
@@ -127,7 +126,8 @@ def work(tmp_path, monkeypatch, weights, measured) -> Work:
             again=models, summaries=total,
         )  # fmt: skip
         todo = [{"model": "real", "steps": 0, "weights": ""}]
-        todo += [{"model": name, "steps": steps, "weights": f"w{weights[name]:g}"} for name in models for steps in (8, 1)]
+        digest = lambda name: f"w{weights[name]:g}"
+        todo += [{"model": name, "steps": steps, "weights": digest(name)} for name in models for steps in (8, 1)]
         value = lambda row: weights.get(row["model"], 0.1) / 3 + row["steps"]
         rows = lambda row: pd.DataFrame({"seed": [0, 1], "value": [value(row), -value(row)]})
         return records.measure(todo, lambda row: {"walking": rows(row)})
@@ -299,34 +299,28 @@ def test_the_command_gathers_says_what_is_done_and_keeps_what_it_cost(work, monk
 
 # ------------------------------------------------------------------------------------ a worker that is killed
 
-STYLES = ("Neutral", "Old")
-PROTOCOL = Protocol(STYLES, num_frames=66, num_diversity_seeds=2, windows_per_style=1)
-SNAPSHOTS = [(Run(A), 8), (Run(A), 16), (Run(A, "mixed-noise", seed=1), 8)]
+FIRST, SECOND = Run(A, window=WINDOW), Run(A, "mixed-noise", window=WINDOW, seed=1)
+SNAPSHOTS = [(FIRST, 8), (FIRST, 16), (SECOND, 8)]
 
 
 def make_small(folder: Path, waits: bool, setattr=setattr) -> None:
-    """Narrow networks on few clips, here or in a worker; where it waits, only until somebody takes the file away."""
-    build, measure = presets.build_config, campaign.measure_model
-    packed = packed_from(
-        [(synthesize(s, 4.0, k), n, split) for n, s in enumerate(STYLES) for k, split in enumerate((0, 0, 1, 2, 2))],
-        styles=STYLES,
-    )
-    prepared, classifier = PreparedData(packed, 32, 10), folder / "classifier.safetensors"
-    if not classifier.exists():
-        sizes = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
-        save_classifier(classifier, train_classifier(packed, num_steps=60, batch_size=32, progress=False, **sizes))
+    """Narrow networks on few clips, here or in a worker; a quick measurement, which waits while a file says so."""
+    build, prepared = presets.build_config, PreparedData(tiny_packed(), WINDOW, HISTORY)
+    judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(("calm", "proud")), None
 
     def measure_model(generator, *arguments):
         if waits:
             (folder / f"at work {generator.trained.record['training']['seed']} {os.getpid()}").touch()
             while (folder / "wait").exists():
                 time.sleep(0.05)
-        return measure(generator, *arguments)
+        value = sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(generator.trained.params))
+        rows = [{"steps": generator.num_steps, "metric": "weights", "unit": "m", "value": value / 3}]
+        return pd.DataFrame(rows), None
 
     setattr(presets, "build_config", lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8}))
     setattr(campaign, "measure_model", measure_model)
     setattr(sweep, "_opened", lambda profile, source: prepared)
-    setattr(sweep, "protocol_of", lambda *a: (load_classifier(classifier), PROTOCOL, None))
+    setattr(sweep, "protocol_of", lambda *a: judges)
 
 
 @pytest.fixture
@@ -372,17 +366,19 @@ def test_a_worker_killed_in_the_middle_costs_its_leg_and_no_byte(small, start_wo
     expected = contents(alone / "synthetic/smoke/records/campaign.csv")
 
     work = Work(PROFILE, None, small / "results", small / "swept", batch_size=4)
-    legs, killed = plan(["campaign"], [], PROFILE, SNAPSHOTS), SNAPSHOTS[-1][0]
+    legs, killed = plan(["campaign"], [], PROFILE, SNAPSHOTS), SECOND
     (small / "wait").touch()
     trained = []
 
     def kill_one():
-        until(lambda: len(list(small.glob("at work *"))) == 2)
-        (name,) = small.glob(f"at work {killed.seed} *")
-        (state,) = (work.folder / "campaign" / killed.name).glob("*.state.safetensors")
-        trained.extend([state, state.stat().st_mtime_ns])
-        os.kill(int(name.name.split()[-1]), signal.SIGKILL)
-        (small / "wait").unlink()
+        try:
+            until(lambda: len(list(small.glob("at work *"))) == 2)
+            (name,) = small.glob(f"at work {killed.seed} *")
+            (state,) = (work.folder / "campaign" / killed.name).glob("*.state.safetensors")
+            trained.extend([state, state.stat().st_mtime_ns])
+            os.kill(int(name.name.split()[-1]), signal.SIGKILL)
+        finally:
+            (small / "wait").unlink()
 
     with LocalCluster(n_workers=0, dashboard_address=None, silence_logs=logging.CRITICAL) as cluster:
         address = cluster.scheduler_address
