@@ -9,6 +9,7 @@ begin. Nothing is trained here.
 
 from __future__ import annotations
 
+import functools
 import heapq
 import re
 import sys
@@ -99,6 +100,7 @@ def queue_legs(measured: pd.DataFrame) -> tuple[list[Leg], dict[str, float]]:
     return legs, seconds
 
 
+@functools.cache
 def tables() -> dict[str, str]:
     """Return the page's tables, name -> Markdown."""
     measured = costs()

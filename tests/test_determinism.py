@@ -1,6 +1,6 @@
 """Same seed, same machine, same bytes, for all three papers; on another number of threads the same up to rounding.
 
-Each paper's small training, samples and table are made here, in a second process, and in a third one that has a single core.
+Each paper's small training, samples and table are made here, in a second process, and in a third of a single core.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def f3amd(seed: int):
     task = tiny_task(num_steps=4, learning_rate=1e-3, seed=seed)
     state, _ = optimise(task, chunk=2, progress=False)
     path = named_path("circle", 4 * WINDOW, seed=seed)
-    made = MotionGenerator(dataclasses.replace(tiny_trained(), params=state.averaged), 2).rollout(path, "proud", seed=seed)
+    trained = dataclasses.replace(tiny_trained(), params=state.averaged)
+    made = MotionGenerator(trained, 2).rollout(path, "proud", seed=seed)
     figures = first_metrics(made.motion().positions, path, WINDOW, SKELETON)
     return task.draw(state, jax.random.key(seed))[0], state, made.frames, figures
 
@@ -68,7 +69,7 @@ def motionpcm(seed: int):
 
     task = distillation(seed=seed)
     state, _ = optimise(task, chunk=2, progress=False)
-    text, noise = jax.random.normal(jax.random.key(seed), (6, 4)), jax.random.normal(jax.random.key(seed + 1), (6, 2, 3))
+    text, noise = (jax.random.normal(jax.random.key(seed), shape) for shape in ((6, 4), (6, 2, 3)))
     student = network_with(task.student_config, state.params["student"])
     made = sample_student(student, SCHEDULE, text, noise, num_steps=2)
     return task.draw(state, jax.random.key(seed))[0], state, made, {}
