@@ -20,7 +20,7 @@ export F3AMD_PYTHON
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools \
-  lint lab clean site site-tools onnx-tools
+  lint lab clean site site-tools onnx-tools sweep-tools
 
 help: ## Show this list
 	@echo "Targets (first use installs into .venv: some minutes, about 1.4 GB):"
@@ -65,6 +65,10 @@ onnx-tools: $(INSTALLED) ## Add jax2onnx and ONNX Runtime to .venv (about 150 MB
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
 	  -q -r requirements-onnx.txt
 
+sweep-tools: $(INSTALLED) ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
+	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
+	  -q --require-hashes --no-deps -r requirements-sweep.txt
+
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
@@ -81,7 +85,7 @@ test-all: test test-slow test-long test-extras site test-web ## All tests there 
 
 # What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
 # the marker `needs`.
-test-extras: bench-tools onnx-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime or Sphinx
+test-extras: bench-tools onnx-tools sweep-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime, Dask or Sphinx
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
 
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.

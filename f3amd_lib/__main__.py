@@ -732,6 +732,64 @@ def campaign(
     return UNFINISHED if state == "unfinished" else 0
 
 
+def sweep(
+    names: Positional[tuple[str, ...]] = (), *, motion: Data, preset: Repeatable = (), workers: int = 2,
+    scheduler: str | None = None, queue: Path | None = None, batch_size: int = 128, out: Path | None = None,
+) -> int:  # fmt: skip
+    """Do the long queue, or measurements of presets, in several processes; a dead worker costs only its leg.
+
+    Args:
+      names: campaign, or measurements such as quality, walking; a leg each for every preset.
+      preset: this one; repeatable. By default all of the queue, and all that have weights.
+      workers: processes on this machine.
+      scheduler: HOST:PORT of a Dask cluster instead; all its machines see one clone.
+      queue: another file for campaign than papers/f3amd/campaign.toml.
+      batch_size: windows a step of the queue's trainings; the paper's is 512.
+      out: folder for legs, states and weights of the queue, instead of runs/DATA/PROFILE.
+    """
+    import contextlib
+
+    import pandas as pd
+
+    from f3amd_lib.experiments import campaign as long_queue
+    from f3amd_lib.experiments import sweep as engine
+    from f3amd_lib.experiments.measure import protocol_of
+    from f3amd_lib.experiments.runner import Records
+    from f3amd_lib.ground.files import locked
+    from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
+    from f3amd_lib.ground.records import run_record
+
+    profile = load_profile(motion.profile, motion.data)
+    if motion.window not in (None, profile.window):
+        raise ValueError("--window is for f3amd measure quality alone")
+    folder = (out or runs_dir(profile.dataset, profile.name)).resolve()
+    results = results_dir(profile.dataset, profile.name).resolve()
+    work = engine.Work(profile, motion.source, results.parents[1], folder, batch_size)
+    legs = engine.plan(names, preset, profile, long_queue.queue(*([queue] if queue else [])))
+    with contextlib.ExitStack() as held:
+        held.enter_context(locked(folder / "sweep" / ".sweep.lock", "sweeping"))
+        for name in names:
+            place = folder / "campaign" if name == engine.CAMPAIGN else results / "records"
+            held.enter_context(locked(place / f".{name}.lock", f"doing {name}"))
+        prepared, _ = motion.open()  # so that workers find the cache, and the classifier below
+        if not set(names).isdisjoint(engine.THROUGH_CLASSIFIER):
+            protocol_of(prepared, profile, "sweep")
+        record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
+        costs, ended = Records(results / "records", record, {"sweep": ["leg"]}), {}
+        try:
+            for leg, told in engine.run_sweep(work, legs, workers=workers, scheduler=scheduler):
+                ended[leg.name] = told["state"]
+                log.info("%s, %d of %d: %s", leg.name, len(ended), len(legs), told["state"])
+                if told["state"] == "done":
+                    cost = {key: told[key] for key in ("seconds", "state_bytes", "device")}
+                    costs.put("sweep", {"leg": leg.name}, pd.DataFrame([cost | {"model": leg.preset}]))
+        finally:
+            finished = [leg for leg in legs if ended.get(leg.name, "").startswith("done")]
+            for table in engine.gather(work, finished):
+                log.info("wrote        %s", table)
+    return 0 if len(finished) == len(legs) else 1
+
+
 def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> int:
     """Run the numbered notebooks in order; results go under paper_figures/.
 
@@ -798,7 +856,7 @@ def cards() -> int:
     return model_cards.main()
 
 
-RESUMED = ("train", "crowd", "bench", "measure", "campaign", "figures")
+RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
 COMMANDS = (
@@ -814,6 +872,7 @@ COMMANDS = (
     bench,
     measure,
     campaign,
+    sweep,
     figures,
     course,
     claims,

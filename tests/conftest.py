@@ -23,6 +23,7 @@ from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 REMEDY = {
     "sphinx": "make site-tools",
     "selenium": "make web-tools",
+    "distributed": "make sweep-tools",
     "jax2onnx": "make onnx-tools",
     "node": "your system's package manager",
     "wordllama": "make install",

@@ -26,7 +26,7 @@ MACHINES = ("x86_64", "aarch64")
 APART = ("bench", "onnx")
 """Extras with a requirements file of their own, without hashes."""
 
-HASHED = ("web",)
+HASHED = ("sweep", "web")
 """Extras with a requirements file of their own, hashed and in step with the lock."""
 
 CONDA_NAMES = {"flatbuffers": "python-flatbuffers", "matplotlib": "matplotlib-base"}

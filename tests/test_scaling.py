@@ -1,0 +1,50 @@
+"""What more machines bring: the arithmetic by hand, and a page that says what the records say."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+from builders import refused
+
+from f3amd_lib.experiments.sweep import Leg
+
+ROOT = Path(__file__).resolve().parents[1]
+_spec = importlib.util.spec_from_file_location("scaling", ROOT / "scripts" / "scaling.py")
+scaling = sys.modules["scaling"] = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scaling)
+
+LEGS = [Leg("one", "a"), Leg("two", "a", after="one-a"), Leg("one", "b"), Leg("one", "c")]
+SECONDS = {"one-a": 2.0, "two-a": 5.0, "one-b": 4.0, "one-c": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("machines", "ends"),
+    [
+        (1, {"one-a": 2.0, "two-a": 7.0, "one-b": 11.0, "one-c": 12.0}),
+        (2, {"one-a": 2.0, "two-a": 7.0, "one-b": 4.0, "one-c": 5.0}),
+        (100, {"one-a": 2.0, "two-a": 7.0, "one-b": 4.0, "one-c": 1.0}),
+    ],
+)
+def test_machines_take_the_first_leg_that_may_begin(machines, ends):
+    assert scaling.finished_after(LEGS, SECONDS, machines) == ends
+
+
+def test_a_chain_is_no_faster_on_two_machines():
+    assert scaling.enough(LEGS, SECONDS) == 2
+    assert scaling.enough(LEGS[:2], SECONDS) == 1
+    assert scaling.enough([leg for leg in LEGS if leg.after is None], {**SECONDS, "one-b": 1.0}) == 2
+
+
+def test_presets_that_were_not_timed_stand_for_their_kind():
+    timed = ["F3AMD-FNO-96", "F3AMD-Transformer-64", "CAMDM", "F3AMD-FNO-32"]
+    asked = ["F3AMD-FNO-32", "CAMDM-VE", "F3AMD-Transformer-64-linear", "F3AMD-DCT-96"]
+    found = [scaling.timed_as(preset, timed) for preset in asked]
+    assert found == ["F3AMD-FNO-32", "CAMDM", "F3AMD-Transformer-64", "F3AMD-FNO-96"]
+
+
+def test_the_page_says_what_the_records_say():
+    page = scaling.PAGE.read_text(encoding="utf-8")
+    assert scaling.written(page) == page
+    assert "| 37.5 |" not in page or scaling.written(page.replace("37.5", "99.9")) == page  # it can fail
+    refused("no `<!-- costs: begin -->`", scaling.written, page.replace("<!-- costs: begin -->", ""))
