@@ -208,8 +208,7 @@ def test_held_out_losses_of_training_clips_are_not_silent(tmp_path, monkeypatch,
     assert "no clip is held out" in caplog.text
 
 
-def test_the_package_starts_without_jax_in_half_a_second():
-    script = "import sys, time; t = time.perf_counter(); import f3amd_lib; s = time.perf_counter() - t\n"
-    script += "assert not {'jax', 'numpy', 'pandas'} & set(sys.modules); print(s)"
-    times = [float(subprocess.check_output([sys.executable, "-c", script], text=True)) for _ in range(3)]
-    assert min(times) < 0.5
+def test_importing_the_package_imports_nothing_heavy():
+    """What makes `import f3amd_lib` quick: none of its rooms, and none of what they stand on."""
+    script = "import sys; bare = set(sys.modules); import f3amd_lib; print(*sorted(set(sys.modules) - bare))"
+    assert subprocess.check_output([sys.executable, "-c", script], text=True).split() == ["f3amd_lib"]

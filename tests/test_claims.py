@@ -6,6 +6,7 @@ import pytest
 
 from f3amd_lib.benchmarking.timing import median_interval
 from f3amd_lib.diffusion import samplers
+from f3amd_lib.ground import papers
 from f3amd_lib.ground.records import write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
@@ -1128,6 +1129,26 @@ def test_the_paper_is_read_like_our_records():
     assert paper.figure("training_time", "GPU", **row).value == 6.48
     with pytest.raises(NotMeasured, match="the paper prints no CAMDM, 64 frames, 8 steps, FID"):
         paper.quality(Setting(CAMDM, window=64), "FID")
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        ("", "tiny/paper.toml: table 1: t.csv has no window_frames, as rows of 'quality' have .* `record` of its own"),
+        ('record = "qualty"', "tiny/paper.toml: table 1 .*unknown record 'qualty'; did you mean 'quality'"),
+    ],
+)
+def test_a_table_of_a_new_paper_that_fits_no_record_is_refused_by_name(tmp_path, monkeypatch, record, message):
+    folder = tmp_path / "tiny"
+    (folder / "numbers").mkdir(parents=True)
+    table = f'[[table]]\nnumber = "1"\nfile = "t.csv"\ntitle = "FID"\n{record}\n'
+    (folder / "paper.toml").write_text(f'name = "TINY"\nsetting = "paper"\n{table}')
+    (folder / "numbers" / "t.csv").write_text(f"model,steps,metric,unit,better,value\n{FNO},8,FID,,down,1.0\n")
+    monkeypatch.setattr(papers, "_FOLDER", tmp_path)
+    papers.load_paper_file.cache_clear()
+    with pytest.raises(ValueError, match=message):
+        paper_evidence("tiny")
+    papers.load_paper_file.cache_clear()
 
 
 # ------------------------------------------------------------------------------ computed claims

@@ -1,6 +1,9 @@
 """MotionPCM's models as files, and their training by name, one stage after the other."""
 
+import types
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_text_judge import OneVectorAWord
@@ -13,7 +16,7 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
-from f3amd_lib.training import text_models
+from f3amd_lib.training import latent_models, text_models
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.latent_models import (
     is_latent_preset,
@@ -22,6 +25,7 @@ from f3amd_lib.training.latent_models import (
     stands_on,
     train_latent_model,
 )
+from f3amd_lib.training.latent_motion import FrameStatistics
 from f3amd_lib.training.text_models import text_model_files
 
 SIZES = {"window": 2, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}
@@ -63,16 +67,49 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
 
 
-@pytest.mark.slow
-def test_a_student_is_trained_by_name_with_all_before_it(tmp_path, monkeypatch):
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """Three clips of the walker, two of them to train on, and the tiny presets."""
     monkeypatch.setenv("F3AMD_CACHE_DIR", str(tmp_path / "cache"))
+    for name, preset in TINY.items():
+        monkeypatch.setitem(presets.PRESETS, name, preset)
     clips = []
     for seed in range(3):
         motion = resample(synthetic.synthesize(synthetic.STYLES[0], seconds=2.0, seed=seed), 20.0).slice(0, 40)
-        clips.append((f"clip_{seed}", motion, (f"a person walks {seed}",), ("train", "train", "test")[seed], str(seed)))
-    data = text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
-    for name, preset in TINY.items():
-        monkeypatch.setitem(presets.PRESETS, name, preset)
+        clips.append((f"clip_{seed}", motion, (f"a person walks {seed}",), ("train", "test", "train")[seed], str(seed)))
+    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+
+
+def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_used(data, tmp_path, monkeypatch):
+    """A loop that trains nothing: weights of ones, whose moving average is twos."""
+    tasks = {}
+
+    def loop(task, files, record, **leg):
+        tasks[task.name] = task
+        params = jax.tree.map(jnp.ones_like, jax.eval_shape(lambda: task.init(jax.random.key(0))[0]))
+        average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
+        return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
+
+    monkeypatch.setattr(latent_models, "train_in_legs", loop)
+    student = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    teacher = load_latent_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
+    ones, twos = (lambda tree, value=value: all((leaf == value).all() for leaf in jax.tree.leaves(tree))
+                  for value in (1.0, 2.0))  # fmt: skip
+    # The student's moving average is its target and no more; of the others the average is what is used.
+    assert ones(student.params) and twos(teacher.params) and twos(student.autoencoder_params)
+    assert twos(tasks["student"].teacher)
+    assert tasks["latent autoencoder"].clips.length.tolist() == [40, 40]
+    for name in ("latent teacher", "student"):
+        assert tasks[name].clips.count.tolist() == [1, 1]
+        wanted = OneVectorAWord()(["a person walks 0", "a person walks 2"]).pooled
+        np.testing.assert_allclose(tasks[name].clips.pooled, wanted, atol=1e-6)
+    statistics = FrameStatistics.of(data)
+    for kept in (student.statistics, teacher.statistics):
+        np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path):
     made = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     files = {name: text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
     teacher, student = (load_latent_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))

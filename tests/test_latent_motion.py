@@ -9,13 +9,17 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.data.text_motions import ClipTable
+from f3amd_lib.data.text_motions import ClipTable, text_motions
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 from f3amd_lib.generation.latent_motion import sample_latent_student, sample_student, sample_teacher, teacher_prediction
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.redundant import grouped_statistics
+from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig, student_of
 from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.training import latent_motion
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.latent_motion import (
     DistillationTask,
@@ -26,6 +30,7 @@ from f3amd_lib.training.latent_motion import (
     TeacherTask,
     clip_error,
     latent_motion_recipe,
+    latent_table,
 )
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
 
@@ -141,7 +146,100 @@ def test_a_clips_captions_are_its_own_and_some_are_the_empty_one():
     assert set(caption) == {-1, *range(7)}
 
 
+class Looking:
+    """A network that writes down what it is asked, and answers 0."""
+
+    def __init__(self):
+        self.asked = []
+
+    def encode(self, text):
+        return text
+
+    def __call__(self, state, time, context, *guidance, key=None):
+        self.asked.append((state, time, context, *guidance))
+        return jnp.zeros_like(state)
+
+
+def test_a_teacher_is_asked_for_the_noise_at_the_level_that_it_is_told(monkeypatch):
+    network = Looking()
+    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: network)
+    task = TeacherTask(TEACHER, recipe(), SCHEDULE, latents())
+    clean, text = normal(3, 512, 2, 3), normal(4, 512, 4)
+    loss, (terms, _) = task.loss({}, None, (clean, text), jax.random.key(2))
+    ((state, time, context),) = network.asked
+    np.testing.assert_array_equal(context, text)
+    # Levels come from all over the schedule, and each sample has the noise of its own.
+    assert np.min(time) < 20 and np.max(time) > 980 and np.mean(time) == pytest.approx(500, abs=60)
+    alpha, sigma = (np.asarray(share).reshape(-1, 1, 1) for share in shares(SCHEDULE, time))
+    late = np.asarray(time) > 20
+    noise = ((np.asarray(state) - alpha * clean) / sigma)[late]
+    assert noise.std() == pytest.approx(1.0, abs=0.05) and abs(noise.mean()) < 0.05
+    assert abs(np.corrcoef(noise.ravel(), np.asarray(clean)[late].ravel())[0, 1]) < 0.05
+    # Who answers 0 errs by the noise itself.
+    assert float(loss) == pytest.approx(1.0, abs=0.08) and terms["loss"] == loss
+
+
+def test_a_table_has_each_clips_latent_beside_its_captions():
+    clips = []
+    for number, (split, said) in enumerate((("train", 1), ("test", 2), ("train", 1))):
+        motion = resample(synthetic.synthesize(synthetic.STYLES[number], seconds=2.0, seed=number), 20.0).slice(0, 40)
+        clips.append((f"clip {number}", motion, tuple(f"{number} {k}" for k in range(said)), split, "walk"))
+    data = text_motions(clips, skeleton=motion.skeleton, name="three", fps=20.0, licence="", credit="")
+    # Of the training clips alone, however the other one moves.
+    statistics = FrameStatistics.of(data)
+    known = np.concatenate([data.select([number]).redundant_vectors() for number in (0, 2)])
+    np.testing.assert_allclose(statistics.mean, grouped_statistics(known)[0], atol=1e-6)
+    assert np.abs(statistics.mean - grouped_statistics(data.redundant_vectors())[0]).max() > 1e-3
+
+    class Coder(nnx.Module):
+        def encode(self, features, mask):
+            return (features * mask[..., None]).sum(axis=1, keepdims=True), features[:, :1] + 1.0
+
+    pooled, empty = normal(0, 4, 5), normal(1, 5)
+    made = latent_table(Coder(), statistics, data, pooled, empty, num_frames=36, batch=2)
+    assert (made.caption.tolist(), made.count.tolist()) == ([0, 1, 3], [1, 2, 1])
+    np.testing.assert_array_equal(made.pooled, pooled)
+    np.testing.assert_array_equal(made.empty, empty)
+    for number in range(3):
+        features = statistics.normalise(data.select([number]).redundant_vectors())
+        np.testing.assert_allclose(made.mean[number, 0], features[:36].sum(axis=0), rtol=1e-3, atol=1e-2)
+        np.testing.assert_allclose(made.log_variance[number, 0], features[0] + 1.0, atol=1e-4)
+
+
 # -------------------------------------------------------------------------------------------------------- distillation
+
+
+def test_a_student_begins_as_its_teacher(start):
+    teacher = network_with(TEACHER, TEACHER_WEIGHTS)
+    student = network_with(TASK.student_config, start.params["student"])
+    state, text, time = normal(1, 3, 2, 3), normal(2, 3, 4), jnp.asarray([999, 499, 99])
+    told = student(state, time, student.encode(text), jnp.asarray([5.0, 10.0, 15.0]))
+    np.testing.assert_allclose(told, teacher(state, time, teacher.encode(text)), atol=1e-6)
+
+
+def test_the_target_is_the_moving_average(start):
+    """Other weights of the student change nothing of what it is asked; another average changes the target."""
+    moved = jax.tree.map(lambda leaf: 1.1 * leaf, start.params)
+    draw = jax.jit(lambda state: TASK.draw(state, jax.random.key(3))[0].target)
+    target = draw(start)
+    np.testing.assert_array_equal(draw(start._replace(params=moved)), target)
+    assert np.abs(draw(start._replace(ema=moved)) - target).max() > 1e-3
+
+
+def test_each_sample_is_told_its_own_guidance_and_jumps_to_its_own_edge(batch, monkeypatch):
+    network = Looking()
+    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: network)
+    task, batch = distillation(adversarial_weight=0.0), batch._replace(edge=10 * jnp.arange(8))
+    loss, _ = task.loss({"student": {}}, None, batch, None)
+    for seen, wanted in zip(network.asked[0], (batch.state, batch.time, batch.text, batch.guidance), strict=True):
+        np.testing.assert_array_equal(seen, wanted)
+    assert len(set(np.asarray(batch.guidance).tolist())) == 8
+    end = [
+        jump(SCHEDULE, z[None], 0 * z[None], t, s)[0]
+        for z, t, s in zip(batch.state, batch.time, batch.edge, strict=True)
+    ]
+    wanted = np.sqrt((np.stack(end) - batch.target) ** 2 + 0.25) - 0.5
+    assert float(loss) == pytest.approx(float(wanted.mean()), rel=1e-4)
 
 
 def test_what_is_asked_lies_in_its_phase(batch, start):

@@ -180,11 +180,21 @@ def test_another_paper_brings_a_file_of_its_own(tmp_path):
     assert wide.training["loss"] == {"ird": 0.0, "foot": 2.0}
 
 
-@pytest.mark.parametrize("wrong", ["netwrok = {}", 'like = ["Wdie"]', 'diffusion = { kind = "none" }'])
-def test_a_preset_that_makes_no_sense_is_refused(tmp_path, wrong):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ('family = "F3AMD"\nnetwrok = {}', "unknown key 'netwrok'; did you mean 'network'"),
+        ('like = ["Wdie"]', "unknown preset above it in this file 'Wdie'; did you mean 'Wide'"),
+        ('like = ["CAMDM"]', "unknown preset above it in this file 'CAMDM'"),  # of another paper
+        ('family = "F3AMD"\ndiffusion = { kind = "none" }', "none"),
+        ('family = "F3MAD"', "unknown family 'F3MAD'; did you mean 'F3AMD'"),
+        ("network = {}", "unknown family None"),
+    ],
+)
+def test_a_preset_that_makes_no_sense_is_refused_by_file_and_name(tmp_path, wrong, message):
     path = tmp_path / "presets.toml"
-    path.write_text(ANOTHER_PAPER + f'[presets.Wrong]\nsource = "ours"\nfamily = "F3AMD"\n{wrong}\n')
-    with pytest.raises((TypeError, KeyError, ValueError)):
+    path.write_text(ANOTHER_PAPER + f'[presets.Wrong]\nsource = "ours"\n{wrong}\n')
+    with pytest.raises(ValueError, match=f"presets.toml: presets.Wrong: .*{message}"):
         presets.read_presets(path)
 
 

@@ -1,6 +1,7 @@
 """The protocol: what is measured on what, with intervals, in tidy rows."""
 
 import dataclasses
+import types
 
 import jax
 import numpy as np
@@ -129,6 +130,48 @@ def test_a_models_rows_are_tidy(measured):
     assert one(rows, "joint_acceleration", 0) != one(rows, "joint_acceleration", 1)
     assert list(rounds) == ["model", "window_frames", "steps", "metric", "round", "value"]
     assert set(rounds["round"]) == {1, 2, 3}
+
+
+def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, generator, classifier, monkeypatch):
+    """Of two styles and two seeds, with stand-ins that write down what they are given."""
+    walked, judged, told = {}, [], []
+
+    def rollout(paths, styles, *, seed):
+        walked.update(paths=paths, styles=list(styles))
+        motion = lambda number: types.SimpleNamespace(number=number)
+        return types.SimpleNamespace(window=32, motion=motion)
+
+    walker = types.SimpleNamespace(trained=generator.trained, num_steps=1, rollout=rollout)
+    monkeypatch.setattr(module, "style_floor", lambda packed, style: float(STYLES.index(style)))
+    monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {})
+    monkeypatch.setattr(module, "_style_means", lambda figures, styles: {})
+    monkeypatch.setattr(module, "classify_windows", lambda classifier, motions, styles: told.append((motions, styles)))
+    monkeypatch.setattr(module, "_distribution_figures", lambda *given: {})
+    monkeypatch.setattr(module, "_diversities", lambda *given: {})
+    monkeypatch.setattr(module, "_rounds", lambda *given: None)
+    keys = {METRICS[name].key: 0.0 for name in ("x0_error_ratio", "seed_spread")}
+    monkeypatch.setattr(module, "noise_use", lambda *given, seed: keys)
+    measure_model(walker, packed, classifier, SMALL, None)
+    assert walked["styles"] == [*STYLES, *STYLES]
+    assert [motion.number for motion, *_ in judged] == [0, 1, 2, 3]
+    for number, (_, path, window, floor) in enumerate(judged):
+        assert path is walked["paths"][number] and window == 32
+        assert floor == STYLES.index(walked["styles"][number])
+    # Seeds walk paths of their own.
+    assert np.abs(walked["paths"][0].position - walked["paths"][2].position).max() > 0.1
+    assert [[motion.number for motion in motions] for motions, _ in told] == [[0, 1], [2, 3]]
+    assert all(styles == list(STYLES) for _, styles in told)
+
+
+def test_real_windows_are_training_windows_and_real_rows_are_not(packed, classifier):
+    """FID compares with the training clips; the row `real` is made of both held-out splits."""
+    known = classifier.references["train"]
+    assert set(np.asarray(packed.clip_split)[known.clips]) == {0}
+    counted = sum(len(features) for features in module.real_features(packed, classifier, STYLES, 32).values())
+    assert 0 < counted <= len(known.features)
+    clips, labels = module._held_out_clips(packed, STYLES, 32)
+    assert set(np.asarray(packed.clip_split)[clips]) == {1, 2}
+    assert [packed.styles[packed.clip_style[clip]] for clip in clips] == labels.tolist()
 
 
 def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, classifier):

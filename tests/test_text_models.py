@@ -1,6 +1,7 @@
 """Models of text to motion as files, their training by name, and the command that makes motion of a caption."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -131,6 +132,34 @@ def test_other_files_are_refused(folder, tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------------------- training
+
+
+def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_path, monkeypatch):
+    """A loop that trains nothing: weights of ones, whose moving average is twos."""
+    given = {}
+
+    def loop(task, files, record, *, held_out, **leg):
+        given[task.name] = task, held_out
+        params = jax.tree.map(jnp.ones_like, jax.eval_shape(lambda: task.init(jax.random.key(0))[0]))
+        average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
+        return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
+
+    monkeypatch.setattr(text_models, "train_in_legs", loop)
+    monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
+    made = train_text_model(data, ENCODER, PROFILE, "tiny+control", folder=tmp_path, **QUIET)
+    for weights in (made.params, made.branch, given["control branch"][0].base):
+        assert all((leaf == 2.0).all() for leaf in jax.tree.leaves(weights))
+    axes, clips = data.normaliser(), {name: data.members(name) for name in ("train", "validation")}
+    assert [len(of) for of in clips.values()] == [8, 2]
+    for task, held_out in given.values():
+        assert len(task.clips.length) == 8
+        frames, condition = jax.tree.leaves(task.clips.frames)[0], held_out[-2] if len(held_out) == 4 else held_out[1]
+        np.testing.assert_allclose(frames[:64], axes.normalise(data.clip(clips["train"][0])), atol=1e-5)
+        known = [axes.normalise(data.clip(number)) for number in clips["validation"]]
+        for motion, mask in zip(held_out[0], np.asarray(condition.mask), strict=True):
+            motion = np.asarray(motion)[mask]
+            starts = range(64 - len(motion) + 1)
+            assert any(np.allclose(motion, clip[s : s + len(motion)], atol=1e-5) for clip in known for s in starts)
 
 
 def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(folder, data, tmp_path):

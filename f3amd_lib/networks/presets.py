@@ -22,6 +22,7 @@ from f3amd_lib.diffusion.flow import default_sampler
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.papers import check_entry, find_entry
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
@@ -98,15 +99,26 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
 
 
 def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
-    """Return the presets of a paper's file by name, and its forms by what follows a name."""
+    """Return the presets of a paper's file by name, and its forms by what follows a name.
+
+    Raises:
+      ValueError: naming file and preset, for a key, family, schedule or preset to be like that is not known.
+    """
     table = read_toml(path)
     rows, named = {}, {"forms": {}, "presets": {}}
+    keys = [field.name for field in dataclasses.fields(Preset)] + ["like"]
     for kind in named:
         for name, row in table.get(kind, {}).items():
+            where = f"{path}: {kind}.{name}"
+            check_entry(row, where, ["source"], keys)
             own = {key: row.pop(key) for key in ("source", "paper_names", "windows") if key in row}
-            lower = [rows[other] for other in row.pop("like", ())]
+            lower = [find_entry(rows, other, "preset above it in this file", where) for other in row.pop("like", ())]
             rows[name] = functools.reduce(laid_over, [*lower, row])
-            named[kind][name] = _preset(name, path.parent.name, **own, **rows[name])
+            find_entry(FAMILIES, rows[name].get("family"), "family", where)
+            try:
+                named[kind][name] = _preset(name, path.parent.name, **own, **rows[name])
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from error
     return named["presets"], named["forms"]
 
 

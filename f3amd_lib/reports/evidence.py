@@ -17,7 +17,7 @@ import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
+from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
 from f3amd_lib.measures.walking import CHECKS
@@ -456,7 +456,7 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
     """Return a paper's own tables in the form of our records, with intervals where it prints some.
 
     Raises:
-      ValueError: if two tables print different figures of one row.
+      ValueError: if two tables print different figures of one row, or one is of no known form.
     """
     about = load_paper_file("paper", paper)
     others = about.get("others", ())
@@ -473,6 +473,13 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
         name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")
         printed["metric"] = printed["metric"].replace(about.get("metrics", {}))
         for which, rows in [(entry["record"], printed)] if "record" in entry else printed.groupby(name):
+            where = f"{paper}/paper.toml: table {entry['number']}"
+            columns = [*find_entry(SCHEMAS, which, "record", f"{where} (see reports/schemas.toml)"), "unit"]
+            if missing := [column for column in columns if column not in rows]:
+                raise ValueError(
+                    f"{where}: {entry['file']} has no {', '.join(missing)}, as rows of {which!r} have "
+                    "(reports/schemas.toml); add it, or give the table a `record` of its own"
+                )
             parts.setdefault(which, []).append(rows)
     tables = {}
     for name, some in parts.items():
