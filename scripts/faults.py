@@ -171,7 +171,7 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
         "",
         f"{caught} of {len(rows)} planted faults are caught by tests. {len(faults) - len(rows)} more are listed and",
         "not planted yet: `python scripts/faults.py` goes on with those, and with what slipped through. It plants each",
-        "fault in a copy of the tree and runs the tests that should notice; `make test` runs them without it.",
+        "fault in a copy of the tree and runs the tests that should notice; `make test` and `make test-slow` run them without it.",
         "`tests/faults.toml` has the texts, `docs/faults.csv` the rows; the script writes this page from both.",
         "",
         "| area | fault | file | caught by |",
