@@ -95,3 +95,46 @@ WRONG["C7.b"] = [
     (lambda s, S, w: (_tilted_and_guided(s, S, w)[0], s / w), "guided samples is too large"),
     (lambda s, S, w: s / w, "two numbers"),
 ]
+
+# C8 Consistency ---------------------------------------------------------------------------------
+
+RIGHT["C8.a"] = [
+    lambda x, sigma, edge, s: x * np.hypot(s, edge) / np.hypot(s, sigma),
+    lambda x, sigma, edge, s: jnp.asarray(x) * jnp.sqrt((s**2 + edge**2) / (s**2 + sigma**2)),
+    lambda x, sigma, edge, s: np.exp(0.5 * np.log((s**2 + edge**2) / (s**2 + sigma**2))) * x,
+]
+WRONG["C8.a"] = [
+    (lambda x, sigma, edge, s: x * (s**2 + sigma * edge) / (s**2 + sigma**2), "one step of DDIM"),
+    (lambda x, sigma, edge, s: x * s**2 / (s**2 + sigma**2), "best guess"),
+    (lambda x, sigma, edge, s: x * s / np.hypot(s, sigma), "without noise"),
+    (lambda x, sigma, edge, s: x * edge / sigma, "another place"),  # the noise alone
+    (lambda x, sigma, edge, s: x * np.hypot(s, sigma) / np.hypot(s, edge), "another place"),  # upwards
+    (lambda x, sigma, edge, s: x * (s**2 + edge**2) / (s**2 + sigma**2), "another place"),  # variances
+]
+
+
+def _consistency_target(denoise, student, x, sigma, lower, edge):
+    guess = denoise(x, sigma)
+    neighbour = guess + lower / sigma * (x - guess)
+    return neighbour if lower <= edge else student(neighbour, lower, edge)
+
+
+def _neighbour(denoise, x, sigma, lower):
+    return x + (lower - sigma) * (x - denoise(x, sigma)) / sigma
+
+
+RIGHT["C8.b"] = [
+    _consistency_target,
+    lambda d, f, x, s, lower, e: f(_neighbour(d, x, s, lower), lower, e) if lower > e else _neighbour(d, x, s, lower),
+    lambda d, f, x, s, lower, e: jnp.where(
+        lower > e, f(_neighbour(d, x, s, lower), lower, e), _neighbour(d, x, s, lower)
+    ),
+]
+WRONG["C8.b"] = [
+    (lambda d, f, x, s, lower, e: f(_neighbour(d, x, s, lower), lower, e), "nothing is left to ask"),
+    (lambda d, f, x, s, lower, e: _neighbour(d, x, s, lower), "this is the neighbour"),
+    (lambda d, f, x, s, lower, e: f(_neighbour(d, x, s, lower), s, e), "told so"),
+    (lambda d, f, x, s, lower, e: f(x, lower, e), "about x itself"),
+    (lambda d, f, x, s, lower, e: f(d(x, s), lower, e), "no neighbour"),
+    (lambda d, f, x, s, lower, e: d(x, s), "another one"),
+]
