@@ -171,9 +171,9 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
     lines = [
         "# Planted faults",
         "",
-        f"{caught} of {len(rows)} planted faults are caught by tests. {waiting}`python scripts/faults.py` plants what has no",
-        "row yet, and what slipped through: each fault in a copy of the tree, in which the tests that should notice are",
-        "run. `make test` runs them without it.",
+        f"{caught} of {len(rows)} planted faults are caught by tests. {waiting}`python scripts/faults.py` plants",
+        "what has no row yet, and what slipped through: each fault in a copy of the tree, in which the tests that",
+        "should notice are run. `make test` runs them without it.",
         "`tests/faults.toml` has the texts, `docs/faults.csv` the rows; the script writes this page from both.",
         "",
         "| area | fault | file | caught by |",
