@@ -166,12 +166,14 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
     rows = [(fault, results[fault.name]) for fault in faults if fault.name in results]
     rows.sort(key=lambda pair: pair[0].area)
     caught = sum(row["caught"] == "yes" for _, row in rows)
+    left = len(faults) - len(rows)
+    waiting = f"{left} more are listed and not planted yet; " if left else ""
     lines = [
         "# Planted faults",
         "",
-        f"{caught} of {len(rows)} planted faults are caught by tests. {len(faults) - len(rows)} more are listed and",
-        "not planted yet: `python scripts/faults.py` goes on with those, and with what slipped through. It plants each",
-        "fault in a copy of the tree and runs the tests that should notice; `make test` and `make test-slow` run them without it.",
+        f"{caught} of {len(rows)} planted faults are caught by tests. {waiting}`python scripts/faults.py` plants",
+        "what has no row yet, and what slipped through: each fault in a copy of the tree, in which the tests that",
+        "should notice are run. `make test` and `make test-slow` run them without it.",
         "`tests/faults.toml` has the texts, `docs/faults.csv` the rows; the script writes this page from both.",
         "",
         "| area | fault | file | caught by |",

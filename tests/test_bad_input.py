@@ -137,6 +137,17 @@ def test_too_many_too_large_and_too_much_are_refused(tmp_path, monkeypatch, limi
     refused(match, open_dataset, "folder", path=path)
 
 
+@pytest.mark.parametrize("name", ["", ".", "./"])
+def test_a_member_without_a_name_is_no_file(tmp_path, name):
+    path = _zip(tmp_path / "forged.zip", TEXT.encode())
+    known = [clip.name for clip in open_dataset("folder", path=path).clips]
+    with zipfile.ZipFile(path, "a") as file:
+        member = zipfile.ZipInfo("forged")
+        member.filename = name
+        file.writestr(member, b"nobody's")
+    assert [clip.name for clip in open_dataset("folder", path=path).clips] == known
+
+
 def test_an_ordinary_zip_is_read(tmp_path):
     assert len(open_dataset("folder", path=_zip(tmp_path / "a.zip", TEXT.encode())).clips) == 1
 

@@ -213,12 +213,14 @@ class _Archive:
     def names(self) -> list[str]:
         """Return the relative paths of all files, sorted, without macOS's `._` forks and `__MACOSX` folders."""
         if self.is_zip:
-            names = [info.filename for info in self._zip().infolist() if not info.is_dir()]
+            names = [info.filename for info in self._zip().infolist() if not info.filename.endswith("/")]
         else:
             top = Path(self.path)
             names = [item.relative_to(top).as_posix() for item in top.rglob("*") if item.is_file()]
         parts = {name: PurePosixPath(name).parts for name in names}
-        return sorted(name for name in names if not parts[name][-1].startswith("._") and "__MACOSX" not in parts[name])
+        # A forged archive may call a member "" or ".": no file.
+        real = (name for name in names if parts[name] and not parts[name][-1].startswith("._"))
+        return sorted(name for name in real if "__MACOSX" not in parts[name])
 
     def bvh_files(self) -> list[str]:
         """Return the relative paths of all BVH files, sorted."""
