@@ -344,7 +344,8 @@ def start_worker(small):
 
     def start(address: str) -> subprocess.Popen:
         words = ["worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard", "--preload", str(preload)]
-        started.append(subprocess.Popen([sys.executable, "-m", "dask", *words], cwd=small))
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+        started.append(subprocess.Popen([sys.executable, "-m", "dask", *words], cwd=small, env=environment))
         return started[-1]
 
     yield start
@@ -383,6 +384,8 @@ def test_a_worker_killed_in_the_middle_costs_its_leg_and_no_byte(small, start_wo
     with LocalCluster(n_workers=0, dashboard_address=None, silence_logs=logging.CRITICAL) as cluster:
         address = cluster.scheduler_address
         workers = [start_worker(address) for _ in range(2)]
+        until(lambda: len(cluster.scheduler.workers) == 2 or any(worker.poll() is not None for worker in workers))
+        assert [worker.poll() for worker in workers] == [None, None]
         killer = threading.Thread(target=kill_one)
         killer.start()
         states = run_sweep(work, legs, scheduler=address)
