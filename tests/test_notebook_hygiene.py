@@ -30,7 +30,7 @@ ALL_WEIGHTS = 20_000_000  # bytes of f3amd_lib/pretrained/ together
 _FOLDERS = "|".join(("root", "work", "tmp", r"home/[\w.-]+", r"Users/[\w.-]+", "opt", "mnt"))
 MACHINE_PATH = re.compile(rf"(?<![\w.\-/:<>])/(?:{_FOLDERS})/|\b[A-Z]:\\\\?(?:Users|Temp)\b")
 
-BINARY = {".png", ".gif", ".npz", ".safetensors", ".jpg", ".pdf"}
+BINARY = {".png", ".gif", ".webp", ".npz", ".safetensors", ".jpg", ".pdf"}
 
 
 def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:

@@ -154,16 +154,16 @@ def grid(items: list[str]) -> str:
 
 
 def moving_markdown(dataset: str = "", *, with_credit: bool = True) -> str:
-    """Return animations (GIF) and players (HTML, behind a picture of what they play), with their terms."""
+    """Return animations (GIF, WebP) and players (HTML, behind a picture of what they play), with their terms."""
     items = []
     for folder in result_folders(dataset or "*"):
         credit = credit_line(folder) if with_credit else label_of(folder)
-        for path in sorted([*(folder / "media").glob("*.gif"), *(folder / "media").glob("*.html")]):
+        for path in sorted(path for path in (folder / "media").iterdir() if path.suffix in (".gif", ".webp", ".html")):
             notebook = notebooks_by_number().get(path.name[:2])
             source = f" From [notebook {path.name[:2]}](/{relative(notebook)})." if notebook else ""
             title = f"{words(path.stem).capitalize()} ({folder.parent.name})"
             posters = (path.with_suffix(".png"), folder / "figures" / f"{path.stem}.png")
-            if path.suffix == ".gif":
+            if path.suffix != ".html":
                 caption = f"**{title}.**{source} {credit}"
                 items.append(picture(path, f"Animation: {title}", caption, classes="moving"))
             else:

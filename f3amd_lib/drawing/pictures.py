@@ -326,7 +326,7 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
         axis.axis("off")
     for axis, (title, (motions, colors)) in zip(axes.flat, crowds.items(), strict=False):
         axis.set(xlim=(left, right), ylim=(low, high), aspect="equal")
-        _draw_crowd(axis, motions, colors, frame, camera, 72.0 * 0.97 * panel / (right - left))
+        draw_crowd(axis, motions, colors, frame, camera, 72.0 * 0.97 * panel / (right - left))
         heading, _, note = title.partition("\n")
         if heading:
             axis.set_title(heading, pad=16 if note else 6)
@@ -334,13 +334,23 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
     return figure
 
 
-def _draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) -> None:
+def draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) -> None:
+    """Draw a moment of a crowd as a camera sees it: ground, footprints of the last 1.5 s, bodies, far ones paler.
+
+    Args:
+      axis: one metre at the camera's target is one unit of it.
+      motions: of everybody.
+      colors: one each.
+      frame: of the motions.
+      camera: with a distance that is finite.
+      scale: of a metre, in 1/72 inch.
+    """
     bodies = [drawn_points(motion, np.array([frame]))[0] for motion in motions]
     depths = camera.distance - camera.project([points[0] for points in bodies])[:, 2]
     axis.add_collection(_ground_lines(camera, 2.0, 8.0 * camera.distance, "#E6E6E6"))
     for k in np.argsort(-depths):
         motion, color = motions[k], np.array(to_rgb(colors[k]))
-        paler = 0.4 * (depths[k] - depths.min()) / max(np.ptp(depths), 1e-6)
+        paler = 0.4 * (depths[k] - depths.min()) / max(np.ptp(depths), 3.0)  # who walk abreast look alike
         tints = {"left": color + 0.22 * (1 - color), "right": 0.82 * color, "middle": color, "head": color}
         tints = {side: tint + paler * (1 - tint) for side, tint in tints.items()}
         past = motion.positions[max(0, frame - round(1.5 * motion.fps)) : frame + 1, _toes(motion)]
