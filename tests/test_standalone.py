@@ -1,4 +1,4 @@
-"""The standalone notebook: it needs numpy and matplotlib alone, and says what the library says.
+"""The standalone notebook: beside Python it needs numpy and matplotlib alone, and says what the library says.
 
 It holds copies of the library's formulas, so that a teacher can drop one file into any course.
 Here the copies are held against the originals, by value.
@@ -6,6 +6,7 @@ Here the copies are held against the originals, by value.
 
 import ast
 import builtins
+import re
 from pathlib import Path
 
 import jax
@@ -17,7 +18,7 @@ import pytest
 from f3amd_lib.diffusion import oracles, samplers, schedules
 
 PATH = Path(__file__).resolve().parents[1] / "notebooks/standalone/sampler_theory_standalone.ipynb"
-ALLOWED = {"numpy", "matplotlib"}
+ALLOWED = {"numpy", "matplotlib", "math"}
 LEVELS = [(128.0, 82.3), (2.0, 0.5), (2.0, 1.9), (0.3, 0.01), (0.01, 0.0)]
 
 
@@ -41,19 +42,24 @@ def imported_packages(source: str) -> set[str]:
     return names
 
 
-@pytest.fixture(scope="module")
-def standalone() -> dict:
-    """Names that the cells tagged `functions` define, run where nothing but numpy can be had."""
+def run_cells(sources) -> dict:
+    """Run cells in one namespace, where what they may not import cannot be had; return their names."""
 
     def only_allowed(name, *args, **kwargs):
         if name.split(".")[0] not in ALLOWED:
             raise ImportError(f"{name} is not to be had here")
         return builtins.__import__(name, *args, **kwargs)
 
-    namespace = {"np": np, "__builtins__": vars(builtins) | {"__import__": only_allowed}}
-    for source in code_cells("functions"):
+    namespace = {"__builtins__": vars(builtins) | {"__import__": only_allowed}}
+    for source in sources:
         exec(compile(source, PATH.name, "exec"), namespace)
     return namespace
+
+
+@pytest.fixture(scope="module")
+def standalone() -> dict:
+    """Names that the cells with imports and those tagged `functions` define."""
+    return run_cells(code_cells()[:1] + code_cells("functions"))
 
 
 @pytest.fixture
@@ -68,6 +74,39 @@ MIXTURES = [([-1.0, 1.0], 0.3), ([[-1.2, -0.8], [1.3, -0.6], [0.0, 1.3]], 0.15)]
 
 def test_the_notebook_imports_numpy_and_matplotlib_and_nothing_else():
     assert set().union(*map(imported_packages, code_cells())) == ALLOWED
+    with pytest.raises(ImportError, match="f3amd_lib.diffusion is not to be had"):
+        run_cells(["from f3amd_lib.diffusion import samplers"])
+
+
+def checked_statements(source: str) -> list[str]:
+    """What a cell hands to `check`, which prints a statement with its truth and stops at a false one."""
+    calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    checks = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "check"]
+    return [ast.literal_eval(key) for call in checks for key in call.args[0].keys]
+
+
+def test_each_section_checks_statements_and_shows_that_they_hold(standalone):
+    notebook = nbformat.read(PATH, as_version=4)
+    headings, section = {}, None
+    for cell in notebook.cells:
+        found = re.findall(r"^## (\d+)\.", cell.source, flags=re.M) if cell.cell_type == "markdown" else []
+        section = int(found[-1]) if found else section
+        if found:
+            headings[section] = 0
+        elif cell.cell_type == "code" and (statements := checked_statements(cell.source)):
+            assert "nbval-check-output" in cell.metadata.tags  # the committed words are compared with new ones
+            shown = "".join(output.get("text", "") for output in cell.outputs)
+            assert [line for line in statements if f"{line}: True\n" not in shown] == []
+            headings[section] += len(statements)
+    without = [number for number, count in headings.items() if not count]
+    assert list(headings) == list(range(1, 14)) and without == [1]  # section 1 only defines
+
+
+def test_a_false_statement_stops_the_notebook(standalone, capsys):
+    standalone["check"]({"one is one": True})
+    with pytest.raises(AssertionError, match="one is two"):
+        standalone["check"]({"one is two": np.bool_(False), "never reached": True})
+    assert capsys.readouterr().out == "one is one: True\none is two: False\n"
 
 
 @pytest.mark.parametrize(
@@ -95,7 +134,7 @@ def test_every_function_of_the_notebook_is_compared_here(standalone):
         "GaussianMixture", "add_noise", "alpha_bar_from_sigma", "sigma_from_alpha_bar",
         "log_snr_from_sigma", "sigma_at", "rho_grid", "probability_flow_slope", "euler_step",
         "heun_step", "walk", "ddim_step", "ddim_step_vp", "ve_step", "vp_step", "fitted_order",
-        "ddpm_posterior", "ddpm_step",
+        "ddpm_posterior", "ddpm_step", "below", "at_quantile", "exact_flow", "eta_step", "multistep_walk",
     }  # fmt: skip
 
 
@@ -123,6 +162,18 @@ def test_eq08_noise_and_labels_are_the_librarys(standalone, states, sigma):
     np.testing.assert_allclose(
         standalone["sigma_from_alpha_bar"](share), schedules.sigma_from_alpha_bar(share), rtol=1e-14
     )
+
+
+@pytest.mark.parametrize(("sigma", "sigma_next"), [(100.0, 0.01), (0.5, 2.0)])
+def test_the_exact_flow_is_the_librarys(standalone, sigma, sigma_next):
+    mixture = oracles.GaussianMixture([-1.0, 1.0], 0.3)
+    share = np.array([[0.001], [0.3], [0.5], [0.99]])
+    x = standalone["at_quantile"](mixture, share, sigma)
+    np.testing.assert_allclose(standalone["below"](mixture, x, sigma), share, atol=1e-12)
+    np.testing.assert_allclose(mixture._tails(x, sigma)[0], share, atol=1e-12)
+    there = standalone["exact_flow"](mixture, x, sigma, sigma_next)
+    np.testing.assert_allclose(there, mixture.flow(x, sigma, sigma_next), atol=1e-9)
+    assert np.abs(there - x).max() > 0.1
 
 
 @pytest.mark.parametrize("rho", [3.0, 7.0])
@@ -154,6 +205,12 @@ def test_appendix_f_steps_are_the_librarys(standalone, states, sigma, sigma_next
         samplers.probability_flow_slope(x, x0_hat, sigma),
         **exact,
     )
+    for eta, step in ((0.0, samplers.ddim_step), (1.0, samplers.ddpm_step)):
+        fresh = (noise,) if eta else ()
+        here = standalone["eta_step"](x, x0_hat, sigma, sigma_next, eta, noise)
+        np.testing.assert_allclose(here, step(x, x0_hat, sigma, sigma_next, *fresh), **exact)
+    half = standalone["eta_step"](0.0, 0.0, sigma, sigma_next, 0.5, noise)  # the fresh part of it
+    np.testing.assert_allclose(2 * half, samplers.ddpm_step(0.0, 0.0, sigma, sigma_next, noise), **exact)
     powers = [1.0 / (1.0 + level**2) for level in (sigma, sigma_next)]
     np.testing.assert_allclose(
         standalone["ddim_step_vp"](x, x0_hat, *powers), samplers.ddim_step_vp(x, x0_hat, *powers), **exact
@@ -178,14 +235,19 @@ def test_walks_end_where_the_librarys_samplers_end(standalone, step, sampler, nu
     np.testing.assert_allclose(states[-1], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_the_notebooks_truth_is_the_exact_flow(standalone):
-    """Section 6 measures errors against Heun with many steps; the library knows the exact flow."""
-    library = oracles.GaussianMixture([-1.0, 1.0], 0.3)
-    grid = standalone["rho_grid"](4096)
-    start = 128.0 * np.random.default_rng(4).standard_normal((50, 1))
-    truth = standalone["walk"](standalone["heun_step"], library.denoise, start, grid)[-1]
-    exact = library.denoise(library.flow(start, 128.0, 0.01), 0.01)
-    assert np.abs(truth - exact).mean() < 2e-6  # Heun's own error at 512 steps is 5e-5
+@pytest.mark.parametrize(("in_log", "expected"), [(True, 2.0), (False, 2.0)])
+def test_multistep_walks_approach_the_exact_flow_by_their_order(standalone, in_log, expected):
+    mixture = oracles.GaussianMixture([-1.0, 1.0], 0.3)
+    start = 100.0 * np.linspace(-1.9, 1.9, 20)[:, None]
+    truth, counts = mixture.flow(start, 100.0, 0.01), np.array([128, 256, 512])
+    grids = [np.geomspace(100.0, 0.01, count + 1) for count in counts]
+    ends = [standalone["multistep_walk"](mixture.denoise, start, grid, in_log)[-1] for grid in grids]
+    errors = [np.abs(end - truth).mean() for end in ends]
+    assert standalone["fitted_order"](counts, errors) == pytest.approx(expected, abs=0.15)
+    # Its first step remembers nothing, and is Euler's.
+    states = standalone["multistep_walk"](mixture.denoise, start, grids[0], in_log)
+    euler = standalone["euler_step"](mixture.denoise, start, *grids[0][:2])
+    np.testing.assert_allclose(states[1], euler, rtol=1e-12)
 
 
 def test_fitted_order_is_the_power_of_the_fall(standalone):
