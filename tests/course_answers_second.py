@@ -1,4 +1,4 @@
-"""Answers to the exercises of the course, 06 to 10: right forms and wrong answers."""
+"""Answers to the exercises of the course, 06 to 08: right forms and wrong answers."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -8,6 +8,7 @@ import re
 
 import course_answers_first
 import course_answers_second
+import course_answers_third
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -460,8 +461,8 @@ WRONG["12.e"] = [
 
 # The course, notebooks/course/ ------------------------------------------------------------------
 
-RIGHT |= course_answers_first.RIGHT | course_answers_second.RIGHT
-WRONG |= course_answers_first.WRONG | course_answers_second.WRONG
+RIGHT |= course_answers_first.RIGHT | course_answers_second.RIGHT | course_answers_third.RIGHT
+WRONG |= course_answers_first.WRONG | course_answers_second.WRONG | course_answers_third.WRONG
 
 # ------------------------------------------------------------------------------------------------
 
