@@ -272,7 +272,8 @@ _PREFACE = """\
 Docstrings, names of tests and sections of notebooks say which equation they are about, and these tables are read off
 them. All equations that carry a number are here, and of those without one Appendix F of F3AMD. *Cited only* says why
 no function computes an equation. A dash means that no test or no section of a notebook names it. Functions stand in
-`f3amd_lib/`; [the library](/docs/api/index.md) has their docstrings.
+`f3amd_lib/`; [the library](/docs/api/index.md) has their docstrings. [Where we differ](differences.md) says why a
+formula here is not always the one in print.
 """
 
 
