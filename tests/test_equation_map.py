@@ -1,12 +1,15 @@
 """The map from equations to code, and the list of open points."""
 
+import ast
 import json
+import re
 import shutil
 
 import pandas as pd
 import pytest
 
 from f3amd_lib.ground import papers
+from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
@@ -16,9 +19,11 @@ from f3amd_lib.reports.equation_map import (
     _patterns,
     equation_labels,
     equation_map,
+    equations_markdown,
     mentioned_equations,
     notebook_sections,
     running_times,
+    unknown_equations,
 )
 from f3amd_lib.reports.readings import fill_reading, readings_table
 
@@ -38,6 +43,7 @@ from f3amd_lib.reports.readings import fill_reading, readings_table
         (r"with $\alpha_t = \sqrt{\alpha}$", {"alpha_t"}),
         (r"$\bar\alpha_t$, alpha_bar_t and my_alpha_t", set()),
         ("noise of F3AMD Eq. 8", {"Eq. 8"}),
+        ("a cosine (Nichol and Dhariwal 2021, Eq. 7)", set()),
     ],
 )
 def test_mentions_are_read(text, expected):
@@ -141,6 +147,71 @@ def test_every_equation_that_is_used_has_a_figure_that_a_notebook_draws(whole_ma
     assert "02_schedule" in rows.loc["Eq. 9", "figures"].split(", ")
     assert "2.3" in rows.loc["Eq. 9", "cells"].split(", ")
     assert "02_paths" in rows.loc["Appendix F", "figures"].split(", ")
+
+
+# --------------------------------------------------------------------------------------------- the page, and all papers
+
+
+@pytest.mark.parametrize("paper", papers.paper_folders())
+def test_every_numbered_equation_of_a_paper_has_code_or_a_reason(paper):
+    about = papers.load_paper_file("paper", paper)
+    numbers = [int(label[4:]) for label in equation_labels(paper) if label.startswith("Eq. ")]
+    assert numbers == [*range(1, about["numbered_equations"] + 1)]
+    computed = dict(equation_map(paper=paper)[["equation", "functions"]].itertuples(index=False))
+    for entry in about["equation"]:
+        assert bool(computed[entry["label"]]) != bool(entry.get("cited_only")), entry["label"]
+
+
+def test_the_committed_page_is_what_the_code_says():
+    page = (repository_root() / "docs/equations.md").read_text(encoding="utf-8")
+    assert page == equations_markdown(), "write it again: python -m f3amd_lib.reports.equation_map"
+    for paper in papers.paper_folders():
+        about = papers.load_paper_file("paper", paper)
+        table = page.split(f"## {about['name']}\n")[1].split("\n## ")[0]
+        assert [line.split(" | ")[0][2:] for line in table.splitlines()[3:]] == equation_labels(paper)
+
+
+def test_the_page_follows_a_checkout(tmp_path):
+    for folder in ("f3amd_lib/networks", "notebooks/course"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "f3amd_lib/networks/block.py").write_text('def add():\n    """Sum (Eq. 4), ACMDM Eq. 1."""\n')
+    write_notebook(tmp_path / "notebooks/course/04_grids.ipynb", ("text", "## C4.1 Grid\n\nThat of ACMDM Eq. 2."))
+    f3amd, acmdm, motionpcm = equations_markdown(root=tmp_path).split("\n## ")[1:]
+    assert "| Eq. 4 | 3.4.2 | FNO block: the sum of both | `networks/block.add` | – | – |" in f3amd
+    assert "`networks/block.add` | – | – |" in acmdm and "networks" not in motionpcm
+    assert "| – | – | [C4.1](/notebooks/course/04_grids.ipynb) |" in acmdm
+    assert equation_map(root=tmp_path, paper="acmdm")["cells"].tolist() == ["", ""]  # without the course
+
+
+@pytest.mark.parametrize(
+    ("text", "unknown"),
+    [
+        ("Eq. 9, MotionPCM Eqs 15 to 19 and ACMDM Eq. 2", []),
+        ("noise (Ho et al. 2020, Eq. 77; Nichol and Dhariwal 2021, Eq. 17)", []),
+        ("the step of Eq. 15", ["F3AMD Eq. 15"]),
+        ("ACMDM Eqs 2 and 3", ["ACMDM Eq. 3"]),
+        ("MotionPCM Eq. 20", ["MotionPCM Eq. 20"]),
+        ("as in CAMDM Eq. 3", ["CAMDM Eq. 3"]),
+    ],
+)
+def test_equations_that_no_paper_has_are_found(text, unknown):
+    assert unknown_equations(text) == unknown
+
+
+def test_docstrings_and_tests_name_equations_that_are_printed():
+    root, wrong, known = repository_root(), [], {paper: set(equation_labels(paper)) for paper in papers.paper_folders()}
+    numbered = re.compile(r"^test_(?:([a-z0-9]+)_)?eq(\d\d)(?:_to_eq(\d\d))?_")
+    files = [*sorted((root / "f3amd_lib").rglob("*.py")), *sorted((root / "tests").glob("test_*.py"))]
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                continue
+            wrong += [f"{path.name}: {name}" for name in unknown_equations(ast.get_docstring(node) or "")]
+            for paper, *numbers in numbered.findall(getattr(node, "name", "")):
+                labels = {f"Eq. {int(number)}" for number in numbers if number}
+                if not labels <= known.get(paper or "f3amd", set()):
+                    wrong.append(f"{path.name}: {node.name}")
+    assert len(files) > 100 and wrong == []
 
 
 def record_of_a_run(root, dataset, *, seconds, finished=(True, True), **changes):

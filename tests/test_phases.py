@@ -72,7 +72,8 @@ def test_a_cut_that_makes_no_sense_is_refused():
 # ----------------------------------------------------------------------------------------------------------------- jump
 
 
-def test_motionpcm_eq08_to_eq10_a_jump_is_ddims_step_and_the_identity_at_its_own_end():
+def test_motionpcm_eq08_a_jump_is_ddims_step_and_the_identity_at_its_own_end():
+    """MotionPCM Eq. 10 is this jump, to the end of a phase."""
     state, eps, time = normal(0, 3, 4, 2), normal(1, 3, 4, 2), jnp.asarray([999, 499, 1])
     np.testing.assert_allclose(jump(SCHEDULE, state, eps, time, time), state, atol=2e-6)
     # It lands where one x0 and one noise say, whatever the noise: every point of the line jumps to the same end.
@@ -81,6 +82,20 @@ def test_motionpcm_eq08_to_eq10_a_jump_is_ddims_step_and_the_identity_at_its_own
     np.testing.assert_allclose(jump(SCHEDULE, on_line(time), eps, time, edge), on_line(edge), atol=3e-5)
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(jump(SCHEDULE, on_line(time), -eps, time, edge), on_line(edge), atol=3e-5)
+
+
+def test_motionpcm_eq15_to_eq19_the_integral_of_a_jump_leads_where_ddim_does():
+    """Lemma 1, with the integral of MotionPCM Eq. 8 taken in 20,000 pieces over the log of alpha / sigma."""
+    state, eps = np.array([1.7, -0.4]), np.array([0.3, 1.1])
+    for time, edge in ((999, 499), (499, 199), (99, 0)):
+        (alpha, sigma), (alpha_next, sigma_next) = (shares(SCHEDULE, t, np) for t in (time, edge))
+        lam = np.linspace(np.log(alpha / sigma), np.log(alpha_next / sigma_next), 20_001)
+        integral = np.trapezoid(np.exp(-lam), lam)
+        printed = lambda sign: alpha_next / alpha * state + sign * alpha_next * eps * integral  # noqa: B023
+        ddim = alpha_next * (state - sigma * eps) / alpha + sigma_next * eps
+        np.testing.assert_allclose(printed(-1), ddim, atol=1e-6)
+        np.testing.assert_allclose(jump(SCHEDULE, state, eps, time, edge), ddim, atol=1e-12)
+        assert np.abs(printed(1) - ddim).min() > 0.1
 
 
 def perturbed(x0, eps, time):
@@ -154,7 +169,7 @@ def test_motionpcm_eq13_the_discriminators_loss_is_2_at_0_and_0_at_the_margins()
     assert hinge(scores - 1, scores + 1) == 4.0  # what Eq. 13 prints would be 0 here
 
 
-def test_latent_consistency_is_the_identity_at_time_0_and_the_clean_estimate_elsewhere():
+def test_motionpcm_eq09_latent_consistency_is_the_identity_at_time_0_and_the_clean_estimate_elsewhere():
     assert [float(x) for x in consistency_scales(0)] == [1.0, 0.0]
     c_skip, c_out = consistency_scales(1)
     assert (float(c_skip), float(c_out)) == pytest.approx((0.25 / 100.25, 10 / np.sqrt(100.25)))
@@ -210,12 +225,12 @@ def perfect_student(phases):
 
 @pytest.mark.parametrize("num_phases", [1, 2, 4])
 def test_a_perfect_student_walks_the_oracles_flow_from_edge_to_edge(num_phases):
+    """And from anywhere in a phase it says the same end: what "consistent" means (MotionPCM Eqs 4 and 5)."""
     phases, noise = cut_phases(1000, 100, num_phases), np.asarray(normal(3, 64, 1), np.float64)
     student, state = perfect_student(phases), noise
     for time, edge in zip(phases.visited[:-1], phases.visited[1:], strict=True):
         state = jump(SCHEDULE, state, student(state, time), time, edge)
         np.testing.assert_allclose(state, exact_flow(noise, 999, edge), atol=1e-9)
-    # And from anywhere in a phase it says the same end: what "consistent" means (MotionPCM Eqs 4 and 5).
     for time, number in zip(phases.times, phases.phase, strict=True):
         here, edge = exact_flow(noise, 999, time), int(phases.edges[number])
         end = jump(SCHEDULE, here, student(here, time), int(time), edge)

@@ -87,9 +87,9 @@ def beside(x, state):
 
 
 def jump(schedule: NoiseSchedule, state, eps, time, time_next):
-    """Move a state along the straight line that one noise estimate says (MotionPCM Eqs 8 and 10).
+    """Move a state along the straight line that one noise estimate says (MotionPCM Eqs 8, 10, 15, 16 and 19).
 
-        x0 = (z - sigma_t eps) / alpha_t,   z' = alpha_s x0 + sigma_s eps
+        x0 = (z - sigma eps) / alpha,   z' = alpha' x0 + sigma' eps
 
     To the end of a phase it is the consistency map f_m, to the solver's next point a step of DDIM (Lemma 1). From a
     time to itself it is the identity, for any eps.

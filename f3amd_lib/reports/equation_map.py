@@ -6,6 +6,8 @@ equations stand in its `paper.toml`. This module collects them, together with th
 notebooks that mention the same equation, and the figures that these sections draw. Nothing is
 imported for it: source files are parsed. How long a notebook runs is read off the records of
 complete runs.
+
+`python -m f3amd_lib.reports.equation_map` writes the maps of all papers to docs/equations.md.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import pandas as pd
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.tables import markdown_table
 
 _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
 
@@ -29,6 +32,8 @@ _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
 _MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|(?<!\\bar\\)(?<!\w)({marks})(?!\w))"
 _TEST_NAME = r"test_(?:({papers})_)?(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|({marks}))_"
 _DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
+_OTHERS = re.compile(r"et al\.|\b(?:19|20)\d\d\b")  # a citation, whose equations are not ours to find
+_NAMED = re.compile(r"\b([A-Z][\w-]*)\s+Eqs?\.?\s+\d")
 
 
 def equation_labels(paper: str = _DEFAULT) -> list[str]:
@@ -51,18 +56,44 @@ def mentioned_equations(text: str, paper: str = _DEFAULT) -> set[str]:
     """Return the labels of a paper's equations that a text mentions.
 
     "Eqs 2-4" stands for three, of the paper named before it ("F3AMD Eqs 2-4") or of F3AMD. An
-    equation of a paper that has no folder here is left out: it follows "et al." in the same clause
-    ("Zhou et al. 2019, Eq. 15").
+    equation of a paper that has no folder here is left out: it follows "et al." or a year in the same
+    clause ("Zhou et al. 2019, Eq. 15").
     """
+    return _mentions(text, paper) & set(equation_labels(paper))
+
+
+def unknown_equations(text: str) -> list[str]:
+    """Return equations that a text names and no paper has: a number beyond the last, or a name without a folder.
+
+    Citations are left out, as in `mentioned_equations`.
+    """
+    unknown = set()
+    for paper in paper_folders():
+        name = load_paper_file("paper", paper)["name"]
+        unknown |= {f"{name} {label}" for label in _mentions(text, paper) - set(equation_labels(paper))}
+    names = {load_paper_file("paper", paper)["name"] for paper in paper_folders()}
+    for clause in _clauses(text):
+        for match in _NAMED.finditer(clause):
+            if match[1] not in names and not _OTHERS.search(clause[: match.start()]):
+                unknown.add(match[0])
+    return sorted(unknown)
+
+
+def _clauses(text: str) -> list[str]:
+    return re.split(r"[;()]|\.\s*\n", text)
+
+
+def _mentions(text: str, paper: str) -> set[str]:
+    """Return labels as a text has them, whether or not the paper has such equations."""
     pattern, _, names, _ = _patterns(paper)
     found = set()
-    for clause in re.split(r"[;()]|\.\s*\n", text):
+    for clause in _clauses(text):
         for match in pattern.finditer(clause):
             name, numbers, mark = match.groups()
-            if "et al." in clause[: match.start()] or names.get(name, _DEFAULT) != paper:
+            if _OTHERS.search(clause[: match.start()]) or names.get(name, _DEFAULT) != paper:
                 continue
             found |= {mark} if mark else {f"Eq. {number}" for number in _numbers(numbers)}
-    return found & set(equation_labels(paper))
+    return found
 
 
 def _numbers(text: str) -> set[int]:
@@ -75,19 +106,20 @@ def _numbers(text: str) -> set[int]:
     return numbers
 
 
-def equation_map(*, root=None, paper: str = _DEFAULT) -> pd.DataFrame:
+def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> pd.DataFrame:
     """Collect where each equation of a paper lives.
 
     Args:
       root: a checkout with `f3amd_lib`, `tests` and `notebooks`; by default the one in use. A
         folder that is absent (an installed package has no tests) gives empty cells.
       paper: its folder in `f3amd_lib/papers`.
+      course: look into the notebooks of the course, too.
 
     Returns:
       One row per equation of its `paper.toml`: equation, section (of the paper), what, functions, tests,
       notebooks, cells (numbers of the notebooks' sections that speak of it: "2.3" is in notebook
-      02), figures (files that these sections draw). The last five hold names joined by ", ", ""
-      where there are none.
+      02, "C4.1" in the course's 04), figures (files that these sections draw). The last five hold
+      names joined by ", ", "" where there are none.
     """
     root = Path(root) if root is not None else repository_root()
     kinds = ("functions", "tests", "notebooks", "cells", "figures")
@@ -104,7 +136,8 @@ def equation_map(*, root=None, paper: str = _DEFAULT) -> pd.DataFrame:
         for name, labels in _tests(path, paper):
             for label in labels:
                 places[label]["tests"].append(f"{path.stem}: {name}")
-    for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb")):
+    folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
+    for path in (path for folder in folders for path in sorted(folder.glob("[0-9][0-9]_*.ipynb"))):
         # The reading guide shows this very map and explains none of it; solutions only repeat.
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
@@ -168,8 +201,8 @@ class Section:
 
     @property
     def number(self) -> str:
-        """The heading's own number, "2.3"; "" if it has none, as "What we learned" has."""
-        found = re.match(r"\d+\.\d+(?= )", self.heading)
+        """The heading's own number, "2.3" or "C4.1"; "" if it has none, as "What we learned" has."""
+        found = re.match(r"C?\d+\.\d+(?= )", self.heading)
         return found[0] if found else ""
 
 
@@ -229,6 +262,80 @@ def _notebook_text(path: Path) -> str:
     return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
 
 
+# ------------------------------------------------------------------------------------------------------------- the page
+
+_PREFACE = """\
+# Every equation, and where it is
+
+*Written by `python -m f3amd_lib.reports.equation_map`; a test compares this page with what that writes.*
+
+Docstrings, names of tests and sections of notebooks say which equation they are about, and these tables are read off
+them. All equations that carry a number are here, and of those without one Appendix F of F3AMD. *Cited only* says why
+no function computes an equation. A dash means that no test or no section of a notebook names it. Functions stand in
+`f3amd_lib/`; [the library](/docs/api/index.md) has their docstrings. [Where we differ](differences.md) says why a
+formula here is not always the one in print.
+"""
+
+
+def equations_markdown(*, root=None) -> str:
+    """Return the page docs/equations.md: for each paper a table of its equations with functions, tests and sections.
+
+    Args:
+      root: as in `equation_map`.
+
+    An equation that no function computes has the reason in its place, `cited_only` in `paper.toml`.
+    """
+    root = Path(root) if root is not None else repository_root()
+    papers = sorted(paper_folders(), key=lambda paper: paper != _DEFAULT)
+    return _PREFACE + "".join(f"\n{_paper_markdown(root, paper)}" for paper in papers)
+
+
+def _paper_markdown(root: Path, paper: str) -> str:
+    about, rows = load_paper_file("paper", paper), equation_map(root=root, paper=paper, course=True)
+    reasons = [entry.get("cited_only", "") for entry in about["equation"]]
+    table = pd.DataFrame(
+        {
+            "equation": rows["equation"],
+            "section": rows["section"],
+            "what it says": rows["what"],
+            "functions": [
+                _code(names.replace(": ", ".")) or (f"*cited only:* {reason}" if reason else "–")
+                for names, reason in zip(rows["functions"], reasons, strict=True)
+            ],
+            "tests": [_first_tests(names) or "–" for names in rows["tests"]],
+            "notebooks": [_section_links(root, cells) or "–" for cells in rows["cells"]],
+        }
+    )
+    text = re.sub(r" {2,}", " ", re.sub(r"-{4,}", "---", markdown_table(table)))  # without columns of blanks
+    return f"## {about['name']}\n\n{text}"
+
+
+def _code(names: str) -> str:
+    return ", ".join(f"`{name}`" for name in names.split(", ") if name)
+
+
+def _first_tests(names: str) -> str:
+    """Return the first test of each file, and how many more it has."""
+    files: dict[str, list[str]] = {}
+    for name in filter(None, names.split(", ")):
+        file, test = name.split(": ")
+        files.setdefault(file, []).append(test)
+    return "; ".join(
+        f"`tests/{file}.py`: `{tests[0]}`" + (f" and {len(tests) - 1} more" if len(tests) > 1 else "")
+        for file, tests in files.items()
+    )
+
+
+def _section_links(root: Path, cells: str) -> str:
+    """Return sections as links to their notebooks: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
+    links = []
+    for cell in filter(None, cells.split(", ")):
+        folder = root / "notebooks" / ("course" if cell[0] == "C" else "")
+        (path,) = folder.glob(f"{int(cell.lstrip('C').split('.')[0]):02d}_*.ipynb")
+        links.append(f"[{cell}](/{path.relative_to(root).as_posix()})")
+    return ", ".join(links)
+
+
 def running_times(*, root=None) -> pd.DataFrame:
     """Collect how long each notebook ran, from the records of complete runs.
 
@@ -259,3 +366,7 @@ def running_times(*, root=None) -> pd.DataFrame:
     names = [path.stem for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb"))]
     table = pd.DataFrame(columns, index=pd.Index(names, name="notebook"))
     return table.reset_index()
+
+
+if __name__ == "__main__":
+    (repository_root() / "docs/equations.md").write_text(equations_markdown(), encoding="utf-8")

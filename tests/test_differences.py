@@ -1,0 +1,90 @@
+"""The page of differences: each row says where it is shown, and that place is there."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from f3amd_lib.reports.equation_map import notebook_sections
+
+ROOT = Path(__file__).resolve().parents[1]
+TEXT = (ROOT / "docs/differences.md").read_text(encoding="utf-8")
+ROWS = [
+    [cell.strip() for cell in line.strip("|").split(" | ")]
+    for line in TEXT.splitlines()
+    if line.startswith("| ") and not line.startswith("| in print")
+]
+
+
+def missing(see: str) -> list[str]:
+    """Which references of a cell lead nowhere: links, functions, tests and open points."""
+    wrong = []
+    for text, path in re.findall(r"\[([^\]]+)\]\(([^)]+)\)", see):
+        file = ROOT / path.lstrip("/") if path.startswith("/") else ROOT / "docs" / path
+        there = file.is_file()
+        if there and file.suffix == ".ipynb" and "." in text:
+            there = text in [section.number for section in notebook_sections(file)]
+        wrong += [] if there else [f"[{text}]({path})"]
+    return wrong + [name for name in re.findall(r"`([^`]+)`", see) if not named(name)]
+
+
+def named(name: str) -> bool:
+    """Whether `room/module.function`, `tests/test_x.test_y`, `paper/readings: point` or a CSV file is there."""
+    if name.endswith(".csv"):
+        return (ROOT / "f3amd_lib" / name).is_file()
+    paper, _, point = name.partition("/readings: ")
+    if point:
+        readings = ROOT / f"f3amd_lib/papers/{paper}/readings.toml"
+        return readings.is_file() and point in [
+            entry["point"] for entry in tomllib.loads(readings.read_text(encoding="utf-8"))["reading"]
+        ]
+    module, *names = name.split(".")
+    path = (ROOT if module.startswith("tests/") else ROOT / "f3amd_lib") / f"{module}.py"
+    if not path.is_file():
+        return False
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    for wanted in names:
+        found = [node for node in body if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == wanted]
+        if not found:
+            return False
+        body = found[0].body
+    return True
+
+
+def test_there_are_rows_on_all_three_papers():
+    assert len(ROWS) >= 30 and {len(row) for row in ROWS} == {4} and all(all(row) for row in ROWS)
+    assert len({row[0] for row in ROWS}) == len(ROWS)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row[0][:40] for row in ROWS])
+def test_a_row_says_where_it_is_shown_and_that_is_there(row):
+    assert re.search(r"`|\]\(", row[3]) and missing(row[3]) == []
+
+
+def test_every_link_of_the_page_leads_to_a_file():
+    links = re.findall(r"\[[^\]]+\]\([^)]+\)", TEXT)
+    assert len(links) > 30 and missing(" ".join(links)) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "[2.9](/notebooks/02_sampler_theory.ipynb)",
+        "[2.3](/notebooks/02_sampler.ipynb)",
+        "`diffusion/samplers.ddim_stride`",
+        "`diffusion/schedules.NoiseSchedule.tims`",
+        "`tests/test_samplers.test_nothing`",
+        "`papers/acmdm/numbers/acmdm_table44.csv`",
+        "`acmdm/readings: direction of space`",
+        "`mdm/readings: direction of time`",
+    ],
+)
+def test_a_reference_that_leads_nowhere_is_found(wrong):
+    right = "[2.3](/notebooks/02_sampler_theory.ipynb), `diffusion/schedules.NoiseSchedule.times`"
+    assert missing(f"{right}, {wrong}") == [wrong.strip("`")]
+
+
+def test_the_semester_ends_with_it():
+    assert "(differences.md)" in (ROOT / "docs/semester.md").read_text(encoding="utf-8").splitlines()[-1]
