@@ -70,3 +70,52 @@ WRONG["C9.b"] = [
     (lambda matrix: (0.0, np.sqrt(2) * abs(np.trace(matrix))), "random signs the spread is too small"),
     (lambda matrix: np.trace(matrix), "two numbers"),
 ]
+
+# C10 Rounds -------------------------------------------------------------------------------------
+
+
+def _one_by_one(a, beta, rounds):
+    error = 0.0
+    for _ in range(rounds):
+        error = a * error + beta
+    return error
+
+
+RIGHT["C10.a"] = [
+    _one_by_one,
+    lambda a, beta, rounds: beta * rounds if a == 1 else beta * (a**rounds - 1) / (a - 1),
+    lambda a, beta, rounds: jnp.asarray([beta * sum(a**k for k in range(rounds))]),
+    # The power of a matrix that carries the error and a 1.
+    lambda a, beta, rounds: np.linalg.matrix_power(np.array([[a, beta], [0.0, 1.0]]), rounds)[0, 1],
+]
+WRONG["C10.a"] = [
+    (lambda a, beta, rounds: rounds * beta, "sum of equal faults"),
+    (lambda a, beta, rounds: beta * a**rounds, "one fault that went through"),
+    (lambda a, beta, rounds: beta / (1 - a), "where a stable rollout ends"),
+    (lambda a, beta, rounds: a * _one_by_one(a, beta, rounds), "a round off"),
+    (lambda a, beta, rounds: _one_by_one(a, beta, rounds + 1), "a round off"),
+    (lambda a, beta, rounds: beta * (np.float64(a) ** rounds - 1) / (np.float64(a) - 1 + 1e-300), "for a = 1"),
+    (lambda a, beta, rounds: _one_by_one(a, beta, rounds) if rounds else beta, "no error yet"),
+    (lambda a, beta, rounds: beta * a ** (rounds - 1), "write down the first three"),
+]
+
+
+def _share(q, sigma_max):
+    return q / np.hypot(q, sigma_max)
+
+
+RIGHT["C10.b"] = [
+    lambda a, q, sigma_max: (a * (1 - _share(q, sigma_max)), _share(q, sigma_max) * sigma_max),
+    lambda a, q, sigma_max: jnp.array([a - a / jnp.hypot(1, sigma_max / q), 1 / jnp.hypot(1 / q, 1 / sigma_max)]),
+    lambda a, q, sigma_max: np.array([a, sigma_max]) * [1 - _share(q, sigma_max), _share(q, sigma_max)],
+]
+WRONG["C10.b"] = [
+    (lambda a, q, sigma_max: RIGHT["C10.b"][0](a, q, sigma_max)[::-1], "other order"),
+    (lambda a, q, sigma_max: (a, q), "this gain is the data's"),
+    (lambda a, q, sigma_max: (a * _share(q, sigma_max), q), "what is lost of the gain"),
+    (lambda a, q, sigma_max: (a * (1 - _share(q, sigma_max) ** 2), q), "flow keeps"),  # shares of variances
+    (lambda a, q, sigma_max: (a * sigma_max / np.hypot(q, sigma_max), q), "flow keeps"),
+    (lambda a, q, sigma_max: (a * (1 - _share(q, sigma_max)), q), "this width is the data's"),
+    (lambda a, q, sigma_max: (a * (1 - _share(q, sigma_max)), sigma_max), "the noise is too large"),
+    (lambda a, q, sigma_max: a * (1 - _share(q, sigma_max)), "two numbers"),
+]
