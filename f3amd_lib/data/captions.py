@@ -30,6 +30,16 @@ def other_side(text: str) -> str:
     return re.sub(r"\b(left|right)\b", lambda found: _SIDES[found[0]], text)
 
 
+def caption_wordings(content: str, *, held_out: bool = False) -> tuple[str, ...]:
+    """Return the actions that captions of a content name, such as "raises the left hand".
+
+    Args:
+      content: one of `CAPTIONED`.
+      held_out: those that training never sees, instead of the others.
+    """
+    return tuple(_WORDS["content"][content]["held_out" if held_out else "action"])
+
+
 def plain_style(style: str) -> str:
     """Return a style of either part of the set without its number, by one name: "1-old" is "elderly"."""
     style = style.partition("-")[2]
@@ -87,15 +97,17 @@ def compose_captions(name: str, content: str, style: str, motion: Motion, *, cou
     for kind, known in (("content", content), ("style", style)):
         if known not in _WORDS[kind]:
             raise ValueError(f"no words for {kind} {known!r} in captions.toml{nearest_hint(known, _WORDS[kind])}")
-    about, who = _WORDS["content"][content], _WORDS["style"][style]
-    actions, who = (about["held_out"], who["held_out"]) if held_out else (about["action"], who)
-    detail = measured_detail(about["detail"], motion) if "detail" in about else ""
+    content_words, style_words = _WORDS["content"][content], _WORDS["style"][style]
+    actions = caption_wordings(content, held_out=held_out)
+    if held_out:
+        style_words = style_words["held_out"]
+    detail = measured_detail(content_words["detail"], motion) if "detail" in content_words else ""
     every = [
-        pattern.format(subject=subject, action=action, detail=said, manner=manner)
+        pattern.format(subject=subject, action=action, detail=known_detail, manner=manner)
         for pattern in _WORDS["patterns"]
-        for subject, manner in zip(who["subject"], who["manner"], strict=True)
+        for subject, manner in zip(style_words["subject"], style_words["manner"], strict=True)
         for action in actions
-        for said in dict.fromkeys(("", detail))
+        for known_detail in dict.fromkeys(("", detail))
     ]
     rank = lambda text: hashlib.sha256(f"{name}: {text}".encode()).digest()
     return tuple(sorted(dict.fromkeys(every), key=rank)[:count])

@@ -41,9 +41,9 @@ def layout_skeleton(layout: str) -> Skeleton:
     """Return the skeleton of a published layout, bones of length 1; ValueError for another name."""
     if layout not in LAYOUTS:
         raise ValueError(f"unknown layout {layout!r}{nearest_hint(layout, LAYOUTS)}")
-    about = LAYOUTS[layout]
-    rest = [[(axis == way[-1:]) * (-1.0 if way[:1] == "-" else 1.0) for axis in "xyz"] for way in about["rest"]]
-    return Skeleton(about["joints"], about["parents"], rest)
+    described = LAYOUTS[layout]
+    rest = [[(axis == way[-1:]) * (-1.0 if way[:1] == "-" else 1.0) for axis in "xyz"] for way in described["rest"]]
+    return Skeleton(described["joints"], described["parents"], rest)
 
 
 def read_caption_line(line: str, where: str) -> tuple[str, float, float]:
@@ -131,9 +131,9 @@ def read_humanml3d(
     """
     folder = Path(folder).expanduser()
     fix = "fetch or write the folder again"
-    skeleton, about = _skeleton_of(folder, layout, fix)
-    fewest = about["fewest_frames"] if fewest_frames is None else fewest_frames
-    joints, fps = skeleton.num_joints, about["fps"]
+    skeleton, described = _skeleton_of(folder, layout, fix)
+    fewest = described["fewest_frames"] if fewest_frames is None else fewest_frames
+    joints, fps = skeleton.num_joints, described["fps"]
     clips, skipped, seen = [], [], {}
     for split, file in _SPLIT_FILES.items():
         for number, name in enumerate(_lines(folder / file, fix), 1):
@@ -162,9 +162,9 @@ def read_humanml3d(
     if not clips:
         raise ValueError(f"{folder}: no clip of {fewest} to {MOST_FRAMES} frames; {fix}")
     names, captions, splits, positions, wide = zip(*clips, strict=True)
-    pairs = about.get("pairs", {})
+    pairs = described.get("pairs", {})
     return TextMotions(
-        name=about.get("name", folder.name),
+        name=described.get("name", folder.name),
         skeleton=skeleton,
         fps=fps,
         positions=np.concatenate(positions),
@@ -173,8 +173,8 @@ def read_humanml3d(
         captions=captions,
         splits=splits,
         pairs=tuple(pairs.get(name, name) for name in names),
-        licence=about.get("licence", "as its owner says"),
-        credit=about.get("credit", ""),
+        licence=described.get("licence", "as its owner says"),
+        credit=described.get("credit", ""),
         skipped=tuple(skipped),
         vectors=np.concatenate(wide) if vectors else None,
     )
@@ -197,7 +197,7 @@ def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list
     if not lines:
         raise ValueError(f"{path}: holds no caption; write one, or take the id out of the split files")
     clips = [(name, tuple(whole), slice(None))] if whole else []
-    return clips + [(clip, tuple(said), slice(first, last)) for (clip, first, last), said in parts.items()]
+    return clips + [(clip, tuple(captions), slice(first, last)) for (clip, first, last), captions in parts.items()]
 
 
 def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, dict]:
@@ -205,22 +205,23 @@ def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, 
     own = folder / "skeleton.json"
     if layout is None and own.is_file():
         try:
-            about = json.loads(own.read_text(encoding="utf-8"))
-            skeleton = Skeleton(about["joints"], about["parents"], np.array(about["offsets"], np.float64))
-            about = {"fewest_frames": 1} | about | {"fps": float(about["fps"])}
-            if not (0.0 < about["fps"] <= 1000.0 and isinstance(about.get("pairs", {}), dict)):
+            described = json.loads(own.read_text(encoding="utf-8"))
+            skeleton = Skeleton(described["joints"], described["parents"], np.array(described["offsets"], np.float64))
+            described = {"fewest_frames": 1} | described | {"fps": float(described["fps"])}
+            if not (0.0 < described["fps"] <= 1000.0 and isinstance(described.get("pairs", {}), dict)):
                 raise ValueError("its rate or its pairs are none")
-            texts = [about.get(key, "") for key in ("name", "licence", "credit")]
-            if not all(isinstance(text, str) for text in [*skeleton.names, *texts, *about.get("pairs", {}).values()]):
+            texts = [described.get(key, "") for key in ("name", "licence", "credit")]
+            pairs = described.get("pairs", {}).values()
+            if not all(isinstance(text, str) for text in [*skeleton.names, *texts, *pairs]):
                 raise ValueError("its names and terms must be text")
         except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); {fix}") from error
-        return skeleton, about
+        return skeleton, described
     if layout is None:
         ids = [line.strip() for line in _lines(folder / "train.txt", fix) if line.strip()]
         first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
         joints = (0, *_load(first, fix).shape)[-2]
-        known = {len(about["joints"]): name for name, about in LAYOUTS.items()}
+        known = {len(described["joints"]): name for name, described in LAYOUTS.items()}
         if joints not in known:
             raise ValueError(
                 f"{first}: has {joints} joints, HumanML3D has 22 and KIT-ML 21; a skeleton.json tells others"
@@ -278,10 +279,10 @@ def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = N
     _write(folder / "train_val.txt", members["train"] + members["validation"])
     _write(folder / "all.txt", data.names)
     skeleton = data.skeleton
-    about = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
-    about |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
-    about["pairs"] = dict(zip(data.names, data.pairs, strict=True))
-    _write(folder / "skeleton.json", [json.dumps(about, indent=1)])
+    described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
+    described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
+    described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
+    _write(folder / "skeleton.json", [json.dumps(described, indent=1)])
     return folder
 
 
@@ -381,5 +382,5 @@ def captioned_motions(
             clips.append((f"M{short}", mirror(seen), said, splits[short], short))
     if not clips:
         raise ValueError(f"data set {dataset.name!r}: no captioned motion has {fewest_frames} frames at {fps:g} fps")
-    about = {name: getattr(dataset, name) for name in ("name", "licence", "credit")}
-    return text_motions(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **about)
+    described = {name: getattr(dataset, name) for name in ("name", "licence", "credit")}
+    return text_motions(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **described)

@@ -267,12 +267,12 @@ def _read_packed(path: Path) -> PackedMotion:
     text, checksum = arrays.pop("text").tobytes(), arrays.pop("checksum").tobytes()
     if _checksum(arrays, text).encode("ascii") != checksum:
         raise ValueError(f"{path}: checksum differs, the file was altered; delete it, pack again")
-    about = json.loads(text)
-    if about["format"] != _FORMAT:
-        raise ValueError(f"{path}: is of format {about['format']}, this version reads {_FORMAT}; pack again")
-    names, parents, end_sites = (_tuples(about[name]) for name in ("joint_names", "joint_parents", "end_sites"))
+    description = json.loads(text)
+    if description["format"] != _FORMAT:
+        raise ValueError(f"{path}: is of format {description['format']}, this version reads {_FORMAT}; pack again")
+    names, parents, end_sites = (_tuples(description[name]) for name in ("joint_names", "joint_parents", "end_sites"))
     skeleton = Skeleton(names, parents, arrays.pop("offsets"), end_sites)
-    texts = {name: _tuples(about[name]) for name in _TEXTS}
+    texts = {name: _tuples(description[name]) for name in _TEXTS}
     texts["mirror_styles"] = frozenset(texts["mirror_styles"])
     return PackedMotion(skeleton=skeleton, **arrays, **texts)
 

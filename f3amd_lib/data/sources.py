@@ -278,7 +278,7 @@ def _find_archive(name: str, path) -> _Archive:
     folder = Path(archive.path)
     zips = [item.name for item in sorted(folder.iterdir()) if item.suffix.lower() == ".zip" and item.is_file()]
     zips = [item for item in zips if name in item.lower() and not item.startswith("._")]
-    usual = [item for item in _SETS[name]["usual"] if item in zips]
+    usual = [item for item in _SETS[name].get("usual", ()) if item in zips]
     if len(zips) > 1 and not usual:
         what = f"several archives may be meant ({', '.join(zips)})"
         raise ValueError(f"{folder}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
@@ -287,13 +287,18 @@ def _find_archive(name: str, path) -> _Archive:
 
 def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
-    about, folder = _SETS[name], pooch.os_cache("f3amd")
+    published, folder = _SETS[name], pooch.os_cache("f3amd")
+    if "url" not in published:
+        raise ValueError(
+            f"data set {name!r} is downloaded from nowhere; set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
+        )
     pooch.get_logger().setLevel("WARNING")
+    url, digest, file = published["url"], published.get("hash"), published["file"]
     try:
-        return pooch.retrieve(about["url"], about.get("hash"), fname=about["file"], path=folder, progressbar=True)
+        return pooch.retrieve(url, digest, fname=file, path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         raise ValueError(
-            f"data set {name!r} could not be downloaded from {about['url']} ({type(error).__name__}: {error}); fetch "
+            f"data set {name!r} could not be downloaded from {url} ({type(error).__name__}: {error}); fetch "
             f"it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip file or its folder"
         ) from error
 

@@ -143,6 +143,19 @@ class TextMotions:
         start = np.cumsum([0, *self.lengths[list(clips)]])
         return dataclasses.replace(self, positions=self.positions[rows], start=start, vectors=vectors, **chosen)
 
+    def cut(self, most_frames: int) -> TextMotions:
+        """Return the same clips, of each no more than its first frames, so that all begin at the origin.
+
+        Raises:
+          ValueError: for fewer than 24 frames, or a number that is no multiple of 4.
+        """
+        if most_frames < FEWEST_FRAMES or most_frames % UNIT:
+            raise ValueError(f"clips can be cut to a multiple of {UNIT} from {FEWEST_FRAMES} on, got {most_frames}")
+        kept = np.minimum(self.lengths, most_frames)
+        rows = np.concatenate([first + np.arange(count) for first, count in zip(self.start, kept, strict=False)])
+        vectors = None if self.vectors is None else self.vectors[rows]
+        return dataclasses.replace(self, positions=self.positions[rows], start=np.cumsum([0, *kept]), vectors=vectors)
+
     def normaliser(self) -> AxisNormaliser:
         """Return mean and deviation of x, y and z over the training clips."""
         return AxisNormaliser.of(self.select(self.members("train")).positions)
@@ -174,7 +187,7 @@ def going_on(positions) -> np.ndarray:
 _LISTS = ("names", "captions", "splits", "pairs")
 
 
-def text_motions(clips, *, skeleton: Skeleton, **about) -> TextMotions:
+def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
     """Put a data set together from motions, each moved to its canonical start.
 
     Args:
@@ -193,7 +206,7 @@ def text_motions(clips, *, skeleton: Skeleton, **about) -> TextMotions:
         captions=captions,
         splits=splits,
         pairs=pairs,
-        **about,
+        **attributes,
     )
 
 
@@ -220,30 +233,30 @@ def bandai_text_motions(packed: PackedMotion, *, mirrored: bool = True, held_out
     """
     if packed.dataset != "bandai":
         raise ValueError(f"captions are composed for data set 'bandai', not for {packed.dataset!r}")
-    about = {
+    labels = {
         clip: (content, plain_style(packed.styles[packed.clip_style[clip]]))
         for clip, content in enumerate(packed.clip_contents)
         if content in CAPTIONED
     }
-    strata = [(packed.clip_names[clip], pair) for clip, pair in about.items()]
+    strata = [(packed.clip_names[clip], pair) for clip, pair in labels.items()]
     splits = assign_splits(strata, percent=HELD_OUT_PERCENT)
     skipped = [(name, "too short") for name, _ in packed.skipped]
     clips = []
     for clip, name in enumerate(packed.clip_names):
-        if clip not in about:
+        if clip not in labels:
             skipped.append((name, f"no words for content {packed.clip_contents[clip]!r}"))
             continue
         motion = resample(packed.motion(clip), FPS)
         length = min(motion.num_frames, MOST_FRAMES) // UNIT * UNIT
         motion = motion.slice(0, length)
-        content, style = shown_content(about[clip][0], motion), about[clip][1]
+        content, style = shown_content(labels[clip][0], motion), labels[clip][1]
         captions = compose_captions(name, content, style, motion, held_out=held_out_wording)
         clips.append((name, motion, captions, splits[name], f"{content}, {style}"))
         if mirrored:
             swapped, seen = tuple(map(other_side, captions)), Motion.from_positions(motion.skeleton, motion.positions)
             clips.append((f"M{name}", mirror(seen), swapped, splits[name], f"{other_side(content)}, {style}"))
-    about = {name: getattr(packed, name) for name in ("skeleton", "licence", "credit")}
-    return text_motions(clips, name="bandai", fps=FPS, skipped=tuple(skipped), **about)
+    attributes = {name: getattr(packed, name) for name in ("skeleton", "licence", "credit")}
+    return text_motions(clips, name="bandai", fps=FPS, skipped=tuple(skipped), **attributes)
 
 
 # ------------------------------------------------------------------------------------------ batches

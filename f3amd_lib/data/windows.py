@@ -297,23 +297,22 @@ def fit_normaliser(windows: WindowSet, key, *, num_samples: int = 8192) -> Norma
     Deviations are kept above 0.02, so that a joint which hardly moves does not turn rounding of the
     packed rotations into signal.
     """
-    num_samples = min(num_samples, 4 * windows.num_windows)
+    return _fit_normaliser(windows, key, min(num_samples, 4 * windows.num_windows))
 
-    @jax.jit
-    def measure(windows, key):
-        batch = sample_windows(windows, key, num_samples)
-        flat = batch.future.reshape(-1, batch.future.shape[-1])
-        mean, deviation = flat.mean(axis=0), flat.std(axis=0)
-        # A random turn makes x and z alike, of the root and of its rotation: measure
-        # them as one, around zero, so that turning commutes with normalising.
-        for first in (0, 3, 6):
-            pair = jnp.array([first, first + 2])
-            mean = mean.at[pair].set(0.0)
-            deviation = deviation.at[pair].set(jnp.sqrt(jnp.mean(flat[:, pair] ** 2)))
-        deviation = jnp.maximum(deviation, 0.02)
-        return Normaliser(mean, deviation, deviation[0])
 
-    return measure(windows, key)
+@functools.partial(jax.jit, static_argnames="num_samples")
+def _fit_normaliser(windows: WindowSet, key, num_samples: int) -> Normaliser:
+    batch = sample_windows(windows, key, num_samples)
+    flat = batch.future.reshape(-1, batch.future.shape[-1])
+    mean, deviation = flat.mean(axis=0), flat.std(axis=0)
+    # A random turn makes x and z alike, of the root and of its rotation: measure
+    # them as one, around zero, so that turning commutes with normalising.
+    for first in (0, 3, 6):
+        pair = jnp.array([first, first + 2])
+        mean = mean.at[pair].set(0.0)
+        deviation = deviation.at[pair].set(jnp.sqrt(jnp.mean(flat[:, pair] ** 2)))
+    deviation = jnp.maximum(deviation, 0.02)
+    return Normaliser(mean, deviation, deviation[0])
 
 
 def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8, split: str = "train") -> dict:

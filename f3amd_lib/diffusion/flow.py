@@ -25,7 +25,7 @@ def default_sampler(objective: str, schedule: NoiseSchedule) -> str:
     return DORMAND_PRINCE if objective == "v" and schedule.kind == "straight" else schedule.sampler
 
 
-def told_time(schedule: NoiseSchedule, t):
+def network_time(schedule: NoiseSchedule, t):
     """Return what a network is told of schedule time, any shape: t, or of K levels the number, 0 the least noisy."""
     return t if schedule.levels is None else len(schedule.levels) * (1.0 - t) - 1.0
 
@@ -36,7 +36,7 @@ def solve(
     """Walk from noise to a clean state (ACMDM Eqs 1 and 2, backwards).
 
     Args:
-      predict: `predict(state, time)`, the state alpha x0 + sigma eps and what `told_time` tells, a scalar.
+      predict: `predict(state, time)`, the state alpha x0 + sigma eps and what `network_time` tells, a scalar.
       objective: what it answers, of `predictions.OBJECTIVES`.
       schedule: that it was trained on.
       noise: standard normal, [B, ...].
@@ -60,7 +60,7 @@ def solve(
     endless = bool(np.isinf(levels[0]))
     if endless and objective == "eps":
         raise ValueError(f"the first step of {schedule.kind!r} sees noise alone: predict 'x0' or 'v' there, not 'eps'")
-    told = jnp.asarray(told_time(schedule, np.append(schedule.times(num_steps), 1.0)))
+    times = jnp.asarray(network_time(schedule, np.append(schedule.times(num_steps), 1.0)))
     alphas, sigmas = jnp.asarray(alphas), jnp.asarray(sigmas)
     visited = sigmas if endless else levels
 
@@ -69,7 +69,7 @@ def solve(
         place = jnp.argmin(jnp.abs(visited - level))
         alpha, sigma = alphas[place], sigmas[place]
         state = x_noisy if endless else alpha * x_noisy
-        return clean_estimate(objective, predict(state, told[place]), state, alpha, sigma)
+        return clean_estimate(objective, predict(state, times[place]), state, alpha, sigma)
 
     return sample(sampler, denoise, visited[0] * noise, visited, alphas=alphas if endless else None, key=key)
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.diffusion.predictions import clean_estimate
-from f3amd_lib.diffusion.samplers import Visited, sample, walk
+from f3amd_lib.diffusion.samplers import Visited, ddim_step, sample, walk
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import array_module
 from f3amd_lib.ground.names import nearest_hint
@@ -122,6 +122,23 @@ def target_end(schedule: NoiseSchedule, state, eps, time, edge):
       edge: time of the phase's end, like time.
     """
     return jnp.where(beside(time <= edge, state), state, jump(schedule, state, eps, time, edge))
+
+
+def consistency_answer(teacher: Callable, target: Callable, x_noisy, sigma, sigma_next):
+    """Return what a denoiser of one step has to say at a point of its teacher's walk: MotionPCM's target with M = 1.
+
+    The teacher takes one DDIM step, and the target says where the path ends from there; at level 0 it has ended. The
+    state is the variance-exploding one, in which a jump to the data is the clean estimate itself.
+
+    Args:
+      teacher, target: denoisers, `(x_noisy, sigma [B]) -> x0_hat`.
+      x_noisy: states, [B, ...].
+      sigma, sigma_next: levels of the walk, [B], sigma > sigma_next >= 0.
+    """
+    solved = ddim_step(x_noisy, teacher(x_noisy, sigma), beside(sigma, x_noisy), beside(sigma_next, x_noisy))
+    # A denoiser is not asked at level 0; what it says in that place is not taken.
+    answer = target(solved, jnp.where(sigma_next > 0.0, sigma_next, sigma))
+    return jnp.where(beside(sigma_next > 0.0, x_noisy), answer, solved)
 
 
 def noise_travel(schedule: NoiseSchedule, state, time, time_next, noise):

@@ -540,7 +540,11 @@ def _open_array(folder: Path, name: str, settings: dict, mode: str = "r") -> np.
     if not path.is_file():
         raise ValueError(f"{path}: missing; the crowd has to be made anew")
     with errors_name(path):
-        array = np.lib.format.open_memmap(path, mode)
+        try:
+            array = np.lib.format.open_memmap(path, mode)
+        # What numpy and Python's own tokenizer raise over damaged bytes is no closed list.
+        except Exception as error:
+            raise ValueError(f"is not a whole array ({error}); the crowd has to be made anew") from error
         if (array.shape, array.dtype) != (_shape(name, settings), np.dtype(_ARRAYS[name])):
             raise ValueError(f"holds {array.dtype} {array.shape}, which is not what {_SETTINGS} says")
         return array

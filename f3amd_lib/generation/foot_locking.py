@@ -231,13 +231,34 @@ def _shortest_turn(first, second) -> np.ndarray:
     return Rotation.from_rotvec(unit(axis) * angle[:, None]).as_matrix()
 
 
-def _bend_leg(hip, knee, ankle, thigh_turn, across, line, reach):
+def knee_axes(hip, knee, ankle, thigh_turn, across) -> np.ndarray:
+    """Return the axis of each knee's bend, as the thigh sees it, [T, 3]; the longer, the more it bends.
+
+    Args:
+      hip, knee, ankle: [T, 3].
+      thigh_turn: the thigh's global rotations, [T, 3, 3].
+      across: from the right hip to the left one, [T, 3]: the axis of a leg that is straight throughout.
+    """
+    axis = np.cross(unit(knee - hip), unit(ankle - knee))
+    return np.einsum("tba,tb->ta", thigh_turn, axis + 1e-3 * across)
+
+
+def leg_reach(hip, knee, ankle) -> np.ndarray:
+    """Return how long the line from hip to ankle may become, [T, 2]: what `bend_leg` takes.
+
+    A leg yields from the first length on and never gets longer than the second; one that is straighter already stays.
+    """
+    length = np.linalg.norm(knee - hip, axis=-1) + np.linalg.norm(ankle - knee, axis=-1)
+    before = np.linalg.norm(ankle - hip, axis=-1)
+    return np.stack([np.maximum(before, share * length) for share in (_STRAIGHT, 0.9995)], axis=-1)
+
+
+def bend_leg(hip, knee, ankle, usual, line, reach):
     """Bend a knee and turn a hip until the ankle lies where it shall.
 
     Args:
       hip, knee, ankle: as they were, [T, 3].
-      thigh_turn: the thigh's global rotations, [T, 3, 3].
-      across: from the right hip to the left one, [T, 3].
+      usual: the axis about which this knee usually bends, of length 1, [T, 3].
       line: from hip to ankle as it shall be, [T, 3].
       reach: how long that line may be, [T, 2]: yields from the first length on, to the second.
 
@@ -253,8 +274,6 @@ def _bend_leg(hip, knee, ankle, thigh_turn, across, line, reach):
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
     # The knee's axis; in a straight leg the usual one of this motion, which keeps the knee's side.
     axis = np.cross(thigh, shank)
-    local = np.einsum("tba,tb->a", thigh_turn, axis + 1e-3 * across)
-    usual = thigh_turn @ unit(local)
     straight = np.maximum(0.03 - (axis * usual).sum(axis=-1, keepdims=True), 0.0)
     axis = axis + straight * usual
     axis = unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
@@ -299,9 +318,7 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     lowered, targets, reaches = np.zeros(motion.num_frames), [], []
     for foot, chain in enumerate(chains):
         hip, _, ankle, toe = np.moveaxis(positions[:, chain], 1, 0)
-        length = np.linalg.norm(skeleton.offsets[chain[1:3]], axis=-1).sum()
-        before = np.linalg.norm(ankle - hip, axis=-1)
-        reach = np.stack([np.maximum(before, part * length) for part in (_STRAIGHT, 0.9995)], -1)
+        reach = leg_reach(*np.moveaxis(positions[:, chain[:3]], 1, 0))
         target, lack = _plan_toe(hip, ankle, toe, contacts[:, foot], floor, reach[:, 0], fps)
         lowered = np.maximum(lowered, lack)
         targets.append(target)
@@ -314,7 +331,8 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     across = positions[:, chains[0, 0]] - positions[:, chains[1, 0]]
     for chain, target, reach in zip(chains, targets, reaches, strict=True):
         hip, knee, ankle, _ = np.moveaxis(positions[:, chain], 1, 0)
-        turns = _bend_leg(hip, knee, ankle, turned[:, chain[0]], across, target - hip - drop, reach)
+        usual = turned[:, chain[0]] @ unit(knee_axes(hip, knee, ankle, turned[:, chain[0]], across).sum(axis=0))
+        turns = bend_leg(hip, knee, ankle, usual, target - hip - drop, reach)
         frames = [turned[:, skeleton.parents[chain[0]]]]
         frames += [turn @ turned[:, joint] for turn, joint in zip(turns, chain[:2], strict=True)]
         frames += [turned[:, chain[2]]]

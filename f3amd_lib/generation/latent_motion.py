@@ -1,6 +1,7 @@
 """From noise and a caption to motion by MotionPCM: a student in M jumps, its teacher by DDIM, MotionLCM's way.
 
-All draw a latent; `decode_latent` makes redundant vectors of it, and `motion.redundant` positions.
+All draw a latent; `decode_latent` makes redundant vectors of it, and `motion.redundant` positions. `latent_motions`
+does all of it for a model as its file has it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from f3amd_lib.data.text_motions import frame_mask
 from f3amd_lib.diffusion.phases import (
     LATENT_CONSISTENCY_TIMES,
     cut_phases,
@@ -19,7 +22,10 @@ from f3amd_lib.diffusion.phases import (
     sample_latent_consistency,
 )
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.motion.redundant import positions_from_redundant
 from f3amd_lib.networks.motionpcm import LatentAutoencoder, LatentDenoiser
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.latent_models import LatentModel
 
 Predict = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -101,3 +107,114 @@ def decode_latent(autoencoder: LatentAutoencoder, statistics, latent, mask):
       mask: frames to make, [B, L].
     """
     return statistics.restore(autoencoder.decode(latent, mask))
+
+
+TEACHER_STEPS = 50
+"""Of DDIM, where nothing else is asked (MotionPCM section 4.1)."""
+
+LATENT_CONSISTENCY_GUIDANCE = {1: 7.0, 2: 11.5, 4: 12.5}
+"""w by number of steps that is MotionLCM V2's guidance of 8, 12.5 and 13.5 (released configuration)."""
+
+
+def steps_of(trained: LatentModel, num_steps: int | None = None) -> int:
+    """Return the steps that a model takes: a student its M, MotionLCM's 1, 2 or 4, a teacher as many as are asked for.
+
+    Args:
+      trained: a teacher or a student.
+      num_steps: asked for; by default the model's own: M, 1 or 50.
+
+    Raises:
+      ValueError: for an autoencoder alone, or a number of steps that a student was not trained for.
+    """
+    if trained.config is None:
+        raise ValueError(f"{trained.name} is an autoencoder alone: it needs a teacher or a student to make motion")
+    levels, told = len(trained.schedule.levels), trained.training
+    if not trained.config.guidance_features:
+        fits = range(1, levels + 1)
+        own = min(TEACHER_STEPS, levels)
+    elif told["consistency"] == "latent":
+        fits, own = tuple(LATENT_CONSISTENCY_TIMES), 1
+    else:
+        fits, own = (told["num_phases"],), told["num_phases"]
+    if (num_steps or own) not in fits:
+        known = " or ".join(map(str, fits)) if len(fits) < 4 else f"1 to {levels}"
+        raise ValueError(f"{trained.name} takes {known} steps, got {num_steps}; see f3amd presets --paper motionpcm")
+    return num_steps or own
+
+
+def latent_sampler(trained: LatentModel, num_steps: int | None = None, guidance: float | None = None) -> Callable:
+    """Return `draw(text, mask, key)`, compiled once for a shape: redundant vectors [B, L, 12 J - 1].
+
+    Args:
+      trained: a teacher or a student.
+      num_steps: as `steps_of` has it.
+      guidance: w of MotionPCM Eq. 11; by default the paper's 14 of a student, 6.5 of a teacher, MotionLCM's own.
+
+    Raises:
+      ValueError: as `steps_of`.
+    """
+    steps, config, schedule = steps_of(trained, num_steps), trained.config, trained.schedule
+    is_teacher, is_latent = not config.guidance_features, trained.training["consistency"] == "latent"
+    usual = TEACHER_GUIDANCE if is_teacher else LATENT_CONSISTENCY_GUIDANCE[steps] if is_latent else STUDENT_GUIDANCE
+    how = {"num_steps": steps, "guidance": usual if guidance is None else guidance}
+
+    @jax.jit
+    def draw(params, autoencoder, text, mask, key):
+        network, (key_noise, key_fresh) = network_with(config, params), jax.random.split(key)
+        noise = jax.random.normal(key_noise, config.state_shape(len(text)))
+        if is_teacher:
+            latent = sample_teacher(network, schedule, text, jnp.zeros(text.shape[-1]), noise, **how)
+        elif is_latent:
+            latent = sample_latent_student(network, schedule, text, noise, key_fresh, **how)
+        else:
+            latent = sample_student(network, schedule, text, noise, skip=trained.training["skip"], **how)
+        return decode_latent(network_with(trained.autoencoder, autoencoder), trained.statistics, latent, mask)
+
+    return lambda text, mask, key: draw(trained.params, trained.autoencoder_params, jnp.asarray(text), mask, key)
+
+
+def latent_motions(trained: LatentModel, pooled, num_frames, key, *, draw: Callable | None = None, **how) -> np.ndarray:
+    """Draw a motion for each caption.
+
+    Args:
+      trained: a teacher or a student.
+      pooled: captions, [B, W].
+      num_frames: of each motion, [B] or one for all.
+      key: JAX random key.
+      draw: a `latent_sampler` of the model that is compiled already.
+      **how: num_steps and guidance of a new one.
+
+    Returns:
+      Positions, [B, L, J, 3], metres, starting over the origin facing +Z; L the longest; 0 in the padding.
+
+    Raises:
+      ValueError: as `steps_of`, or for more frames than the model was trained on.
+    """
+    lengths = np.broadcast_to(num_frames, len(pooled))
+    if lengths.max() > trained.most_frames:
+        raise ValueError(f"{trained.name} makes up to {trained.most_frames} frames, got {lengths.max()}")
+    mask = frame_mask(lengths, int(lengths.max()))
+    made = positions_from_redundant((draw or latent_sampler(trained, **how))(pooled, mask, key))
+    return np.asarray(made) * np.asarray(mask)[..., None, None]
+
+
+def reconstruction(trained: LatentModel, vectors, mask) -> tuple[np.ndarray, np.ndarray]:
+    """Return what an autoencoder makes of motions, by the mean of its latent.
+
+    Args:
+      trained: any model of the paper; its autoencoder is asked.
+      vectors: redundant vectors, [B, L, 12 J - 1].
+      mask: frames that are motion, [B, L].
+
+    Returns:
+      (redundant vectors; positions [B, L, J, 3], metres), which mean nothing in the padding.
+    """
+
+    @jax.jit
+    def draw(params, vectors):
+        autoencoder, features = network_with(trained.autoencoder, params), trained.statistics.normalise(vectors)
+        mean, _ = autoencoder.encode(features * mask[..., None], mask)
+        made = decode_latent(autoencoder, trained.statistics, mean, mask)
+        return made, positions_from_redundant(made)
+
+    return tuple(map(np.asarray, draw(trained.autoencoder_params, jnp.asarray(vectors))))

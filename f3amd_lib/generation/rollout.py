@@ -66,6 +66,7 @@ class MotionGenerator:
         network = trained.network()
         self._network = network if dtype == jnp.float32 else cast_network(network, dtype)
         self._run = jax.jit(self._rounds)
+        self.sample = jax.jit(self.sample_window)  # compiled once for each number of rows
 
     def sample_window(self, key, condition: Condition, noise=None):
         """Sample one window, [B, T, C] in network units, for an already normalised condition.

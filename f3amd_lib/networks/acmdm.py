@@ -61,6 +61,8 @@ class ACMDMConfig(CheckedConfig):
       latent_width: d; the paper has 64 a head.
       depth, num_heads: blocks and attention heads, which the paper keeps equal.
       text_width: W of the caption's embedding: 512 for CLIP ViT-B/32.
+      text_scale: what an embedding is multiplied by first: more than 1 where an encoder's vectors are short, so that a
+        short training hears them (ours).
       conditioning: "adaln", or "concatenation": time and text are two tokens before the frames (the
         paper says no more).
       objective: what the answer is: "v", "eps" or "x0".
@@ -79,6 +81,7 @@ class ACMDMConfig(CheckedConfig):
         "objective": OBJECTIVES,
     }
     may_be_zero: ClassVar[tuple[str, ...]] = ("block_frames",)
+    from_data: ClassVar[tuple[str, ...]] = ("num_joints", "text_width")
 
     num_joints: int
     channels: int = 4
@@ -88,6 +91,7 @@ class ACMDMConfig(CheckedConfig):
     depth: int = 8
     num_heads: int = 8
     text_width: int = 512
+    text_scale: float = 1.0
     conditioning: str = "adaln"
     objective: str = "v"
     block_frames: int = 0
@@ -125,8 +129,8 @@ class ACMDMConfig(CheckedConfig):
         pooled, mask = condition
         if pooled.ndim != 2 or pooled.shape[1] != self.text_width:
             raise ValueError(f"pooled text must be [B, {self.text_width}], got {pooled.shape}")
-        if mask.ndim != 2 or len(mask) != len(pooled) or not 0 < mask.shape[1] <= self.window:
-            raise ValueError(f"mask must be [{len(pooled)}, at most {self.window} frames], got {mask.shape}")
+        if mask.ndim != 2 or mask.shape[0] != pooled.shape[0] or not 0 < mask.shape[1] <= self.window:
+            raise ValueError(f"mask must be [{pooled.shape[0]}, at most {self.window} frames], got {mask.shape}")
 
 
 def rotary_base(num_tokens: int) -> int:
@@ -265,7 +269,7 @@ class Trunk(nnx.Module):
           ValueError: if its shapes do not fit the config.
         """
         self.config.check_condition(condition)
-        return TextContext(self.text(condition.pooled), condition.mask)
+        return TextContext(self.text(self.config.text_scale * condition.pooled), condition.mask)
 
     def tokens(self, state):
         """Cut a state [B, l, J, C] into patches, frame after frame: [B, l * patches, P * C]."""
@@ -279,7 +283,7 @@ class Trunk(nnx.Module):
         """Lay patches together again: the inverse of `tokens`."""
         config = self.config
         joints = config.num_patches * config.patch_joints
-        state = tokens.reshape(len(tokens), -1, joints, tokens.shape[-1] // config.patch_joints)
+        state = tokens.reshape(tokens.shape[0], -1, joints, tokens.shape[-1] // config.patch_joints)
         return state[:, :, : config.num_joints]
 
     def conditioned(self, time, context: TextContext):
@@ -324,7 +328,7 @@ class ACMDM(Trunk):
 
         Args:
           state: noisy motion alpha x0 + sigma eps, [B, l, J, C], at most `window` frames.
-          time: what `flow.told_time` tells, [B], or [B, l] for a time of its own a frame.
+          time: what `flow.network_time` tells, [B], or [B, l] for a time of its own a frame.
           context: from `encode`; its mask has the frames of `past`, too.
           residuals: what a control branch adds after each block, [B, tokens, d] each.
           past: what `remember` made of the frames before the state.
@@ -354,8 +358,8 @@ class ACMDM(Trunk):
         if state.ndim != 4 or state.shape[2:] != (config.num_joints, config.channels) or frames > config.window:
             wanted = f"[B, at most {config.window}, {config.num_joints}, {config.channels}]"
             raise ValueError(f"state must be {wanted}, got {state.shape} after {before // config.num_patches} frames")
-        if context.mask.shape != (len(state), frames):
-            raise ValueError(f"the mask must be [{len(state)}, {frames}], got {context.mask.shape}")
+        if context.mask.shape != (state.shape[0], frames):  # B may be a name, when a program is made
+            raise ValueError(f"the mask must be [{state.shape[0]}, {frames}], got {context.mask.shape}")
         x = self.patch(self.tokens(state))
         num_tokens = x.shape[1]
         time = jnp.asarray(time, x.dtype)

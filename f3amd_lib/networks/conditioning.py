@@ -7,7 +7,7 @@ enters every backbone block, by FiLM or by one of the three ways that the paper 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +47,8 @@ class ConditionedConfig(NetworkConfig):
       num_styles: S, width of the one-hot style.
       num_history: H, past frames seen (section 4.5: 10).
     """
+
+    from_data: ClassVar[tuple[str, ...]] = ("channels", "num_styles")
 
     num_styles: int
     num_history: int = 10

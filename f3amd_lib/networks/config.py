@@ -28,6 +28,8 @@ class CheckedConfig:
     """For each field that names a variant: the names there are."""
 
     may_be_zero: ClassVar[tuple[str, ...]] = ()
+    from_data: ClassVar[tuple[str, ...]] = ()
+    """Fields that the data decide, not the model."""
 
     def __post_init__(self):
         for field in dataclasses.fields(self):

@@ -39,12 +39,15 @@ class SkipTransformerConfig(CheckedConfig):
       num_heads, hidden_width: of a block.
       dropout: in training.
       num_positions: entries of each learned table of positions; no sequence is longer.
+      position_start: how these tables begin: "uniform", from 0 to 1 (MotionLCM V2), or "waves", sinusoids, from which a
+        short training learns an order of frames that it does not find in noise (ours).
 
     Raises:
       ValueError: for a size that makes no sense, or an even depth.
     """
 
     may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+    choices: ClassVar[dict[str, tuple[str, ...]]] = {"position_start": ("uniform", "waves")}
 
     window: int = 16
     channels: int = 32
@@ -54,6 +57,7 @@ class SkipTransformerConfig(CheckedConfig):
     hidden_width: int = 1024
     dropout: float = 0.1
     num_positions: int = 500
+    position_start: str = "uniform"
 
     def __post_init__(self):
         super().__post_init__()
@@ -90,7 +94,9 @@ class SkipTransformer(nnx.Module):
 
 
 def position_table(config: SkipTransformerConfig, rngs: nnx.Rngs) -> nnx.Param:
-    """Return learned positions [num_positions, D], from 0 to 1 at first."""
+    """Return learned positions [num_positions, D], which begin as the config says."""
+    if config.position_start == "waves":
+        return nnx.Param(waves(jnp.arange(config.num_positions), config.latent_width, config.latent_width / 2))
     return nnx.Param(jax.random.uniform(rngs.params(), (config.num_positions, config.latent_width)))
 
 
@@ -166,16 +172,20 @@ class LatentDenoiserConfig(SkipTransformerConfig):
       text_width: W of a caption's embedding: 768 of Sentence-T5.
       time_features: waves of the time.
       guidance_features: waves of the guidance; 0 for a teacher, which is not told it.
+      text_scale: what embeddings are multiplied by; the offline encoder's are a third long, so that a short training
+        would hardly hear them.
     """
 
     family: ClassVar[str] = "latent denoiser"
     objective: ClassVar[str] = "eps"
     sampler: ClassVar[str] = "ddim"
     may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "guidance_features")
+    from_data: ClassVar[tuple[str, ...]] = ("text_width",)
 
     text_width: int = 768
     time_features: int = 768
     guidance_features: int = 0
+    text_scale: float = 1.0
 
     def state_shape(self, batch: int) -> tuple[int, ...]:
         """Return the shape of a noisy latent, [B, window, channels]."""
@@ -213,7 +223,7 @@ class LatentDenoiser(nnx.Module):
 
     def encode(self, text):
         """Return the token of captions [B, text_width]: [B, D]."""
-        return self.text(text)
+        return self.text(self.config.text_scale * text)
 
     def _tokens(self, state, time, context, guidance):
         config = self.config

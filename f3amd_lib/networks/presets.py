@@ -256,19 +256,27 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
 
     Args:
       paper: its folder.
-      **settings: of the data, as for `build_config`.
+      **settings: of the data, for whichever family asks for them (`CheckedConfig.from_data`).
 
     Returns:
       Columns model, window, latent_width, depth, parameters, mflop_per_evaluation (of one
       character; see `count_model_flops`), diffusion, sampler, source (the paper's tables, or "ours").
+
+    Raises:
+      ValueError: for an unknown paper, a setting of no family, or one that is needed and missing.
     """
+    known = {name for config, _ in FAMILIES.values() for name in config.from_data}
+    for name in settings:
+        find_entry(dict.fromkeys(known), name, "setting of the data", "presets")
     columns = "model window latent_width depth parameters mflop_per_evaluation diffusion sampler source"
     rows = []
     for preset in of_paper(paper).values():
-        if not hasattr(FAMILIES[preset.family][0], "state_shape"):  # an autoencoder denoises nothing
+        family = FAMILIES[preset.family][0]
+        if not hasattr(family, "state_shape"):  # an autoencoder denoises nothing
             continue
+        of_data = {name: settings[name] for name in family.from_data if name in settings}
         for window in preset.windows:
-            config = build_config(preset.name, **settings, window=window)
+            config = build_config(preset.name, **of_data, window=window)
             mflop = round(count_model_flops(config)[1] / 1e6, 2)
             sizes = window, config.latent_width, config.depth, count_parameters(config), mflop
             sampler = getattr(config, "sampler", None)

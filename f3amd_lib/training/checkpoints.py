@@ -21,7 +21,7 @@ from flax import nnx
 from safetensors import SafetensorError, safe_open
 from safetensors.flax import save_file
 
-from f3amd_lib.data.features import Normaliser
+from f3amd_lib.data.features import Normaliser, frame_positions
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.skeleton import Skeleton
@@ -125,6 +125,11 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
 
 
+def file_kind(path) -> str | None:
+    """Return what a weights file says that it holds, such as "trained model"; ValueError if it cannot be read."""
+    return _read(Path(path))[1].get("kind")
+
+
 def weights_digest(params: Any) -> str:
     """Return 12 hex digits that tell one set of weights from another."""
     return _checksum(_named_leaves(params), "")[:12]
@@ -140,6 +145,12 @@ def errors_name(path: Path):
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def check_kind(metadata: dict, kind: str) -> None:
+    """Raise a ValueError where a file's description is of another kind."""
+    if metadata.get("kind") != kind:
+        raise ValueError(f"holds a {metadata.get('kind')}, not a {kind}")
 
 
 def describe_skeleton(skeleton: Skeleton) -> dict:
@@ -202,6 +213,24 @@ class TrainedModel:
     def network(self):
         """Return the network with its weights."""
         return network_with(self.config, self.params)
+
+    @functools.cached_property
+    def _compiled(self):
+        network = self.network()
+        return jax.jit(network.encode), jax.jit(lambda context, x_noisy, sigma: network(x_noisy, sigma, context))
+
+    def denoiser(self, condition):
+        """Return `denoise(x_noisy, sigma) -> x0_hat` under a normalised condition of B rows; compiled once for each B.
+
+        Both sides are [B, T, C] in network units; sigma is a scalar.
+        """
+        encode, denoise = self._compiled
+        context = encode(condition)
+        return lambda x_noisy, sigma: denoise(context, x_noisy, jnp.asarray(sigma, x_noisy.dtype))
+
+    def joint_positions(self, x0_hat) -> np.ndarray:
+        """Return the joints [..., J, 3], metres, of features [..., C] in network units; nothing is compiled."""
+        return frame_positions(self.skeleton, np.asarray(self.normaliser.denormalise(x0_hat)))
 
     def style_index(self, style: str) -> int:
         """Return a style's place in the one-hot vector; ValueError lists the styles."""
@@ -318,8 +347,7 @@ def load_model(path: Path) -> TrainedModel:
 
 def _model_template(metadata: dict) -> dict:
     """Return the shapes that a trained model's description speaks of."""
-    if metadata.get("kind") != "trained model":
-        raise ValueError(f"holds a {metadata.get('kind')}, not a trained model")
+    check_kind(metadata, "trained model")
     single = jax.ShapeDtypeStruct
     config = config_from_dict(metadata["model"])
     return {

@@ -86,7 +86,7 @@ def weights_identity(model: NetworkConfig, config: TrainingConfig, dataset_finge
 class Constants:
     """What is known of the training windows as a whole, compiled into the step.
 
-    The same object means the same numbers. (As arguments of the step they would be rounded
+    Equal numbers mean the same program. (As arguments of the step they would be rounded
     differently, and a run would not repeat an earlier one to the bit.)
 
     Attributes:
@@ -96,6 +96,16 @@ class Constants:
 
     normaliser: Normaliser
     mean_poses: jax.Array
+
+    @functools.cached_property
+    def _bytes(self) -> bytes:
+        return b"".join(np.asarray(leaf).tobytes() for leaf in (*self.normaliser, self.mean_poses))
+
+    def __eq__(self, other):
+        return isinstance(other, Constants) and self._bytes == other._bytes
+
+    def __hash__(self):
+        return hash(self._bytes)
 
 
 @functools.partial(

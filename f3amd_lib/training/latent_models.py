@@ -7,6 +7,7 @@ Each stage leaves one file that is whole in itself, with the autoencoder that it
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,39 +15,30 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from f3amd_lib.data.text_encoders import TextEncoder
-from f3amd_lib.data.text_motions import TextMotions, clip_table
-from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
+from f3amd_lib.data.text_encoders import TextEncoder, words_of
+from f3amd_lib.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
-from f3amd_lib.networks.presets import Preset, config_from_dict
-from f3amd_lib.training.checkpoints import (
-    describe_skeleton,
-    described_skeleton,
-    errors_name,
-    load_tree,
-    network_with,
-    packed_shapes,
-    packed_weights,
-    save_tree,
-    unpacked_weights,
-    weights_digest,
-    weights_shapes,
-)
+from f3amd_lib.networks.presets import Preset
+from f3amd_lib.training.captioned_models import load_captioned_model, save_captioned_model
+from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
 from f3amd_lib.training.latent_motion import (
     DistillationTask,
     FrameStatistics,
     LatentAutoencoderTask,
+    LatentMotionTraining,
     LatentTable,
     TeacherTask,
     latent_motion_recipe,
     latent_table,
 )
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
-from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files
+from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files, text_model_folders
 
 _KIND = "latent motion model"
 
@@ -64,6 +56,7 @@ class LatentModel:
       config, params: of teacher (the moving average) or student; None for an autoencoder alone.
       schedule: the noise schedule it was trained with.
       text_encoder: identity of the encoder whose pooled vectors it reads; zeros stand for no caption.
+      words: of all captions that it was trained with.
     """
 
     name: str
@@ -77,6 +70,17 @@ class LatentModel:
     params: Any = None
     schedule: NoiseSchedule | None = None
     text_encoder: str = ""
+    words: tuple[str, ...] = ()
+
+    @property
+    def training(self) -> dict:
+        """How it was trained: the settings of `LatentMotionTraining`."""
+        return self.record["identity"]["training"]
+
+    @property
+    def most_frames(self) -> int:
+        """Frames of the longest clip that it was trained on."""
+        return self.training["num_frames"]
 
 
 def save_latent_model(path: Path, trained: LatentModel, dtype=jnp.bfloat16) -> None:
@@ -87,23 +91,11 @@ def save_latent_model(path: Path, trained: LatentModel, dtype=jnp.bfloat16) -> N
       trained: the model.
       dtype: of the weights, as for `checkpoints.save_model`.
     """
-    tree = {"autoencoder": packed_weights(trained.autoencoder_params, dtype), **trained.statistics._asdict()}
-    if trained.config is not None:
-        tree["params"] = packed_weights(trained.params, dtype)
-    tree["offsets"] = jnp.asarray(trained.skeleton.offsets, jnp.float32)
-    metadata = {
-        "kind": _KIND,
-        "name": trained.name,
-        "autoencoder": trained.autoencoder.to_dict(),
-        "model": None if trained.config is None else trained.config.to_dict(),
-        "diffusion": None if trained.schedule is None else trained.schedule.to_dict(),
-        "weights": jnp.dtype(dtype).name,
-        "fps": trained.fps,
-        "text_encoder": trained.text_encoder,
-        **describe_skeleton(trained.skeleton),
-        "record": trained.record,
-    }
-    save_tree(path, tree, metadata)
+    weights = {"autoencoder": trained.autoencoder_params}
+    save_captioned_model(
+        path, _KIND, trained, autoencoder=trained.autoencoder, weights=weights, arrays=trained.statistics._asdict(),
+        extra={}, dtype=dtype,
+    )  # fmt: skip
 
 
 def load_latent_model(path: Path) -> LatentModel:
@@ -113,34 +105,17 @@ def load_latent_model(path: Path) -> LatentModel:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
     with errors_name(path):
-        tree, metadata = load_tree(path, _template)
+        common, autoencoder, tree, _ = load_captioned_model(path, _KIND, _shapes)
+        statistics = FrameStatistics(tree["mean"], tree["deviation"])
         return LatentModel(
-            name=metadata["name"],
-            autoencoder=config_from_dict(metadata["autoencoder"]),
-            autoencoder_params=unpacked_weights(tree["autoencoder"]),
-            statistics=FrameStatistics(tree["mean"], tree["deviation"]),
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            fps=metadata["fps"],
-            record=metadata["record"],
-            config=None if metadata["model"] is None else config_from_dict(metadata["model"]),
-            params=unpacked_weights(tree["params"]) if "params" in tree else None,
-            schedule=None if metadata["diffusion"] is None else schedule_from_dict(metadata["diffusion"]),
-            text_encoder=metadata["text_encoder"],
+            autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **common
         )
 
 
-def _template(metadata: dict) -> dict:
-    """Return the shapes that a model's description speaks of."""
-    if metadata.get("kind") != _KIND:
-        raise ValueError(f"holds a {metadata.get('kind')}, not a {_KIND}")
-    autoencoder = config_from_dict(metadata["autoencoder"])
-    shapes = {"autoencoder": weights_shapes(autoencoder)}
-    if metadata["model"] is not None:
-        shapes["params"] = weights_shapes(config_from_dict(metadata["model"]))
+def _shapes(metadata: dict, config: LatentDenoiserConfig | None, autoencoder: LatentAutoencoderConfig):
+    """Return the shapes of further weights, and of the statistics."""
     numbers = jax.ShapeDtypeStruct((autoencoder.features,), jnp.float32)
-    tree = {name: packed_shapes(shape, metadata["weights"]) for name, shape in shapes.items()}
-    offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)
-    return tree | {"mean": numbers, "deviation": numbers, "offsets": offsets}
+    return {}, {"mean": numbers, "deviation": numbers}
 
 
 # ------------------------------------------------------------------------------------------------------------- training
@@ -168,12 +143,66 @@ def stands_on(preset: Preset) -> str:
     return next(name for name, other in presets.PRESETS.items() if fits(other))
 
 
+DEFAULT_STUDENT = "MotionPCM-M1-small"
+"""The model that `f3amd text --model motionpcm` means where no other is named."""
+
+
+def find_latent_model(dataset: str, name: str) -> Path:
+    """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
+
+    Args:
+      dataset: that it was trained on.
+      name: of a teacher's or a student's preset, or of the paper, "motionpcm", for `DEFAULT_STUDENT`.
+
+    Raises:
+      ValueError: if there is none, saying how to train it.
+    """
+    name = DEFAULT_STUDENT if name.lower() == "motionpcm" else presets.find_preset(name).name
+    for folder in text_model_folders(dataset):
+        if (path := folder / f"{name}.safetensors").is_file():
+            return path
+    raise ValueError(
+        f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
+    )
+
+
 def captioned_latents(before: LatentModel, data: TextMotions, encoder: TextEncoder, num_frames: int) -> LatentTable:
     """Return the latents of clips with their captions' embeddings; the zero vector stands for no caption."""
     captions = [caption for several in data.captions for caption in several]
     pooled = pooled_captions(captions, encoder)
     model = network_with(before.autoencoder, before.autoencoder_params)
     return latent_table(model, before.statistics, data, pooled, jnp.zeros_like(pooled[0]), num_frames)
+
+
+def _clips(part: TextMotions, encoder: TextEncoder, before: LatentModel | None, statistics, config):
+    """Return the clips of a split as a stage draws them: vectors for the autoencoder, else latents."""
+    if before is None:
+        return clip_table(part, statistics.normalise(part.redundant_vectors()))[0]
+    return captioned_latents(before, part, encoder, config.num_frames)
+
+
+def held_out_clips(clips: ClipTable | LatentTable, config: LatentMotionTraining):
+    """Return a batch of other clips for the losses on them: (features, mask), or (latents, captions)."""
+    if isinstance(clips, LatentTable):
+        return clips.draw(jax.random.key(0), config.batch_size)
+    batch = draw_clips(jax.random.key(0), clips, config.batch_size, config.num_frames)
+    return batch.motion, batch.mask
+
+
+def _task(preset: Preset, config: LatentMotionTraining, data: TextMotions, encoder, before: LatentModel | None):
+    """Return the training of a preset's stage, still without clips; `before` is what it stands on, or None."""
+    stage = stage_of(preset)
+    if stage == "autoencoder":
+        model = presets.build_config(preset.name, features=12 * data.skeleton.num_joints - 1)
+        return LatentAutoencoderTask(model, config, None, None, data.fingerprint)
+    fingerprint = f"{data.fingerprint} on "
+    if stage == "teacher":
+        width = pooled_captions(["a person walks"], encoder).shape[-1]
+        model = presets.build_config(preset.name, text_width=width)
+        fingerprint += weights_digest(before.autoencoder_params)
+        return TeacherTask(model, config, preset.diffusion, None, fingerprint)
+    fingerprint += weights_digest(before.params)
+    return DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
 
 
 def train_latent_model(
@@ -187,7 +216,7 @@ def train_latent_model(
     Args:
       data: captioned clips.
       encoder: of the captions.
-      profile: how long; "gpu" by the paper's recipe, else by the short ones.
+      profile: how long, each stage its recipe's share of it; "gpu" by the paper's recipe, else by the short ones.
       name: of a preset of MotionPCM.
       batch_size: instead of the recipe's.
       folder: where files go instead of `runs/`.
@@ -208,42 +237,35 @@ def train_latent_model(
             return None
     settings = {"seed": profile.seed} | ({} if batch_size is None else {"batch_size": batch_size})
     recipe = stage if profile.name == "gpu" else f"short-{stage}"
-    config = latent_motion_recipe(recipe, profile.train_steps, preset.name, **settings)
-    train = data.select(data.members("train"))
-    if stage == "autoencoder":
-        statistics = FrameStatistics.of(data)
-        table, _ = clip_table(train, statistics.normalise(train.redundant_vectors()))
-        model = presets.build_config(preset.name, features=table.frames.shape[-1])
-        task = LatentAutoencoderTask(model, config, table, statistics, data.fingerprint)
-    else:
-        statistics, table = before.statistics, captioned_latents(before, train, encoder, config.num_frames)
-        stood_on = before.autoencoder_params if stage == "teacher" else before.params
-        fingerprint = f"{data.fingerprint} on {weights_digest(stood_on)}"
-        if stage == "teacher":
-            model = presets.build_config(preset.name, text_width=table.pooled.shape[-1])
-            task = TeacherTask(model, config, preset.diffusion, table, fingerprint)
-        else:
-            task = DistillationTask(before.config, before.params, config, before.schedule, table, fingerprint)
+    share = load_paper_file("recipes", "motionpcm")[recipe].get("share", 1.0)
+    config = latent_motion_recipe(recipe, max(1, round(share * profile.train_steps)), preset.name, **settings)
+    # A finished model is only read, and its clips need not be encoded for that.
+    task = _task(preset, config, data, encoder, before)
     if files.model.exists():
         return of_this_training(load_latent_model(files.model), task, files)
+    statistics = FrameStatistics.of(data) if before is None else before.statistics
+    clips, watched = (_clips(data.select(data.members(split)), encoder, before, statistics, config)
+                      for split in ("train", "validation"))  # fmt: skip
+    task = dataclasses.replace(task, clips=clips, **({"statistics": statistics} if before is None else {}))
     record = run_record(
         profile=profile, dataset=data, seed=config.seed, model=preset.name, identity=task.identity(),
-        num_train_clips=train.num_clips,
+        num_train_clips=len(data.members("train")),
     )  # fmt: skip
     with alone_with(files):
-        state, _ = train_in_legs(task, files, record, held_out=None, **leg)
+        state, _ = train_in_legs(task, files, record, held_out=held_out_clips(watched, config), **leg)
     if int(state.step) < config.num_steps:
         return None
     about = {"skeleton": data.skeleton, "fps": data.fps, "record": record, "statistics": statistics}
     if stage == "autoencoder":
-        made = LatentModel(preset.name, model, state.averaged, **about)
+        made = LatentModel(preset.name, task.model_config, state.averaged, **about)
     else:
         # A student's moving average is its target; what is used is the student.
         student = stage == "student"
+        said = [caption for clip in data.members("train") for caption in data.captions[clip]]
         made = LatentModel(
             preset.name, before.autoencoder, before.autoencoder_params, **about, schedule=task.schedule,
             config=task.student_config if student else task.model_config, text_encoder=encoder.identity,
-            params=state.params["student"] if student else state.averaged,
+            params=state.params["student"] if student else state.averaged, words=words_of(said),
         )  # fmt: skip
     save_latent_model(files.model, made)
     return load_latent_model(files.model)

@@ -108,8 +108,8 @@ def loss_terms(
         return _mean(difference * difference, weights)
 
     positions_hat = frame_positions(skeleton, future_hat)
-    positions = frame_positions(skeleton, future)
-    before = frame_positions(skeleton, last_history)
+    real = frame_positions(skeleton, jnp.concatenate([last_history[:, None], future], axis=1))
+    before, positions = real[:, 0], real[:, 1:]
     step_hat = positions_hat[:, 1:] - positions_hat[:, :-1]
     step = positions[:, 1:] - positions[:, :-1]
     toes = jnp.array(skeleton.toes)

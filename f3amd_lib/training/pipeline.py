@@ -236,7 +236,8 @@ def train_in_legs(
       (state, history); the state is short of the task's steps where `stop_at` came first.
     """
     state, rows = _begun(files, task, mesh)
-    num_steps = task.config.num_steps
+    # At least two chunks, so that the shortest run can be stopped on its way, too.
+    every = max(1, min(max(5, task.config.num_steps // 20), task.config.num_steps // 2))
 
     def keep(row: dict) -> None:
         rows.append(row)
@@ -247,9 +248,9 @@ def train_in_legs(
         task,
         state,
         checkpoint=files.state,
-        checkpoint_every=max(1, num_steps // 20),
+        checkpoint_every=every,
         held_out=held_out,
-        chunk=max(1, min(50, num_steps // 20)),
+        chunk=min(50, every),
         mesh=mesh,
         on_chunk=keep,
         **leg,

@@ -37,8 +37,6 @@ _UNUSED = re.compile(r"(.*\.)?(pe|style_feature_process\.(weight|bias))")
 """A table of sinusoids, which is computed here, and a layer that the released forward pass never calls."""
 
 _NAMES = load_paper_file("camdm_release")
-_BLOCK = {"hidden": "linear1", "output": "linear2", "attention.output": "self_attn.out_proj"}
-_NORMS = {"attention_norm": "norm1", "output_norm": "norm2"}
 _BLOCK = "seqEncoder.layers.{}"
 
 
@@ -71,18 +69,26 @@ def published_arrays(path) -> dict[str, np.ndarray]:
     """Read the arrays of a checkpoint that was converted to safetensors or npz.
 
     Raises:
-      ValueError: for a file of another kind, such as the pickle itself.
+      ValueError: naming the file, if it is missing, damaged or of another kind, such as the pickle itself.
     """
     path = Path(path)
-    if path.suffix == ".safetensors":
-        return load_file(path)
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    raise ValueError(
-        f"{path}: a PyTorch checkpoint is a pickle, which may run code and is not opened here: "
-        "write its arrays to a .safetensors or .npz file first, as docs/training.md shows"
-    )
+    if path.suffix not in (".safetensors", ".npz"):
+        raise ValueError(
+            f"{path}: a PyTorch checkpoint is a pickle, which may run code and is not opened here: "
+            "write its arrays to a .safetensors or .npz file first, as docs/training.md shows"
+        )
+    try:
+        if path.suffix == ".safetensors":
+            arrays = load_file(path)
+        else:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+    # What zip, numpy and Python's own tokenizer raise over damaged bytes is no closed list.
+    except Exception as error:
+        raise ValueError(f"{path}: not a whole file of arrays ({error}); convert the checkpoint again") from error
+    if odd := [name for name, array in arrays.items() if getattr(array, "dtype", np.dtype(object)).kind not in "fiu"]:
+        raise ValueError(f"{path}: {odd[0]!r} holds no real numbers; convert the checkpoint again")
+    return arrays
 
 
 def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CAMDM:

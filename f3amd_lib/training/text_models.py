@@ -24,7 +24,7 @@ from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.data.text_encoders import TextEncoder, embed_captions, words_of
 from f3amd_lib.data.text_motions import UNIT, AxisNormaliser, TextMotions, bandai_text_motions, clip_table, pad_motions
-from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
+from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record
@@ -34,20 +34,8 @@ from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.acmdm_control import ControlBranch
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
-from f3amd_lib.networks.presets import config_from_dict
-from f3amd_lib.training.checkpoints import (
-    describe_skeleton,
-    described_skeleton,
-    errors_name,
-    load_tree,
-    network_with,
-    packed_shapes,
-    packed_weights,
-    save_tree,
-    unpacked_weights,
-    weights_digest,
-    weights_shapes,
-)
+from f3amd_lib.training.captioned_models import load_captioned_model, save_captioned_model
+from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
 from f3amd_lib.training.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.optimise import Task, differences
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles, alone_with, train_in_legs
@@ -135,35 +123,19 @@ def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
       trained: the model.
       dtype: of the weights, as for `checkpoints.save_model`.
     """
-    codec, weights = trained.codec, {}
-    if trained.config is not None:
-        weights["params"] = trained.params
+    codec = trained.codec
+    arrays = {"axes": codec.axes._asdict()}
     if codec.autoencoder is not None:
-        weights["autoencoder"] = codec.params
-    if trained.branch is not None:
-        weights["branch"] = trained.branch
-    tree = {name: packed_weights(params, dtype) for name, params in weights.items()}
-    tree["axes"] = codec.axes._asdict()
-    if codec.autoencoder is not None:
-        tree["latent"] = codec.latent._asdict()
-    tree["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
-    tree["offsets"] = jnp.asarray(trained.skeleton.offsets, jnp.float32)
-    metadata = {
-        "kind": _KIND,
-        "name": trained.name,
-        "model": None if trained.config is None else trained.config.to_dict(),
-        "autoencoder": None if codec.autoencoder is None else codec.autoencoder.to_dict(),
-        "diffusion": None if trained.schedule is None else trained.schedule.to_dict(),
+        arrays["latent"] = codec.latent._asdict()
+    arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
+    extra = {
         "controlled": trained.branch is not None,
-        "weights": jnp.dtype(dtype).name,
-        "fps": trained.fps,
-        "text_encoder": trained.text_encoder,
-        "words": list(trained.words),
         "start_shapes": {caption: list(np.shape(state)) for caption, state in trained.starts.items()},
-        **describe_skeleton(trained.skeleton),
-        "record": trained.record,
     }
-    save_tree(path, tree, metadata)
+    weights = {"autoencoder": codec.params, "branch": trained.branch}
+    save_captioned_model(
+        path, _KIND, trained, autoencoder=codec.autoencoder, weights=weights, arrays=arrays, extra=extra, dtype=dtype
+    )
 
 
 def load_text_model(path: Path) -> TextModel:
@@ -173,50 +145,29 @@ def load_text_model(path: Path) -> TextModel:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
     with errors_name(path):
-        tree, metadata = load_tree(path, _template)
-        config, autoencoder = (_config(metadata[what]) for what in ("model", "autoencoder"))
-        weights = {what: unpacked_weights(tree[what]) for what in ("params", "autoencoder", "branch") if what in tree}
+        common, autoencoder, tree, metadata = load_captioned_model(path, _KIND, _shapes)
         axes, latent = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
                         for what in ("axes", "latent"))  # fmt: skip
         return TextModel(
-            name=metadata["name"],
-            codec=MotionCodec(axes, autoencoder, weights.get("autoencoder"), latent),
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            fps=metadata["fps"],
-            record=metadata["record"],
-            config=config,
-            params=weights.get("params"),
-            schedule=None if metadata["diffusion"] is None else schedule_from_dict(metadata["diffusion"]),
-            text_encoder=metadata["text_encoder"],
-            words=tuple(metadata["words"]),
+            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent),
             starts={caption: np.asarray(state) for caption, state in tree["starts"].items()},
-            branch=weights.get("branch"),
+            branch=tree.get("branch"),
+            **common,
         )
 
 
-def _config(values: dict | None):
-    return None if values is None else config_from_dict(values)
-
-
-def _template(metadata: dict) -> dict:
-    """Return the shapes that a model's description speaks of."""
-    if metadata.get("kind") != _KIND:
-        raise ValueError(f"holds a {metadata.get('kind')}, not a {_KIND}")
+def _shapes(metadata: dict, config: ACMDMConfig | None, autoencoder: AutoencoderConfig | None) -> tuple[dict, dict]:
+    """Return the shapes of the branch's weights, and of normalisers and first frames."""
     single = jax.ShapeDtypeStruct
     numbers = lambda width: {what: single((width,), jnp.float32) for what in AxisNormaliser._fields}
-    config, autoencoder = (_config(metadata[what]) for what in ("model", "autoencoder"))
-    shapes, tree = {}, {"axes": numbers(3)}
-    if config is not None:
-        shapes["params"] = weights_shapes(config)
+    weights, arrays = {}, {"axes": numbers(3)}
     if autoencoder is not None:
-        shapes["autoencoder"] = weights_shapes(autoencoder)
-        tree["latent"] = numbers(autoencoder.latent_channels)
+        arrays["latent"] = numbers(autoencoder.latent_channels)
     if metadata["controlled"]:
         frames = 1 if autoencoder is None else autoencoder.frames_per_latent
-        shapes["branch"] = nnx.state(nnx.eval_shape(lambda: ControlBranch(config, frames, rngs=nnx.Rngs(0))))
-    tree |= {what: packed_shapes(shape, metadata["weights"]) for what, shape in shapes.items()}
-    tree["starts"] = {name: single(tuple(shape), jnp.float32) for name, shape in metadata["start_shapes"].items()}
-    return tree | {"offsets": single((len(metadata["joints"]), 3), jnp.float32)}
+        weights["branch"] = nnx.state(nnx.eval_shape(lambda: ControlBranch(config, frames, rngs=nnx.Rngs(0))))
+    arrays["starts"] = {name: single(tuple(shape), jnp.float32) for name, shape in metadata["start_shapes"].items()}
+    return weights, arrays
 
 
 # ---------------------------------------------------------------------------------------------------------------- data
@@ -362,7 +313,8 @@ def train_text_model(
       encoder: of the captions.
       profile: how long; "gpu" by the paper's recipe, else by the short ones.
       name: of a preset of ACMDM, or with "+control" behind it.
-      window: most frames of motion in a state, instead of the preset's.
+      window: most frames of motion in a state, instead of the preset's; longer clips are cut to their first frames, so
+        that all begin where a caption's motion will: at the origin.
       batch_size: instead of the recipe's.
       folder: where files go instead of `runs/`.
       **leg: stop_at and progress, as for `optimise`.
@@ -376,6 +328,7 @@ def train_text_model(
     """
     preset = presets.find_preset(name.removesuffix(CONTROL))
     name = preset.name + (CONTROL if name.endswith(CONTROL) else "")
+    data = data.cut(window) if window and window < data.lengths.max() else data
     earlier = preset.name if name.endswith(CONTROL) else preset.latent
     before = None
     if earlier:
@@ -460,6 +413,12 @@ def first_frames(codec: MotionCodec, data: TextMotions, count: int) -> dict[str,
     return {data.captions[number][0]: state for number, state in zip(shown, states, strict=True)}
 
 
+def text_model_folders(dataset: str) -> list[Path]:
+    """Return where models of a data set may lie, in the order of asking: gpu and laptop runs, then what is shipped."""
+    own = [runs_dir(dataset, profile) / "text" for profile in ("gpu", "laptop")]
+    return [*own, PRETRAINED_DIR / dataset / "text"]
+
+
 def find_text_model(dataset: str, preset: str | None = None, *, control: bool = False) -> Path:
     """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
 
@@ -471,13 +430,8 @@ def find_text_model(dataset: str, preset: str | None = None, *, control: bool = 
     Raises:
       ValueError: if there is none, saying how to train it.
     """
-    folders = [
-        runs_dir(dataset, "gpu") / "text",
-        runs_dir(dataset, "laptop") / "text",
-        PRETRAINED_DIR / dataset / "text",
-    ]
     wanted = None if preset is None else presets.find_preset(preset.removesuffix(CONTROL)).name
-    for folder in folders:
+    for folder in text_model_folders(dataset):
         for path in sorted(folder.glob("*.safetensors"), key=lambda path: -path.stat().st_mtime):
             name = path.name.removesuffix(".safetensors")
             fits = name.endswith(CONTROL) == control and wanted in (None, name.removesuffix(CONTROL))

@@ -18,7 +18,7 @@ import optax
 from flax import nnx
 
 from f3amd_lib.data.text_motions import ClipTable, draw_clips
-from f3amd_lib.diffusion.flow import told_time
+from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import nearest_hint, refuse_unknown
@@ -283,7 +283,7 @@ def denoising_loss(network, schedule: NoiseSchedule, x0, condition: TextConditio
     if isinstance(network, MaskedACMDM):
         counted = draw_hidden(key_hidden, mask)
         context = network.look(*spoil(key_spoil, x0, counted), context)
-    prediction = network(state, told_time(schedule, t), context)
+    prediction = network(state, network_time(schedule, t), context)
     return frame_error(prediction, prediction_target(config.objective, x0, noise), counted)
 
 
@@ -395,7 +395,7 @@ def control_loss(
     key_time, key_noise = jax.random.split(key)
     noise, objective = jax.random.normal(key_noise, x0.shape), base.config.objective
     state, t, alpha, sigma = noisy_state(key_time, schedule, x0, noise)
-    prediction = controlled(base, branch, condition, control)(state, told_time(schedule, t))
+    prediction = controlled(base, branch, condition, control)(state, network_time(schedule, t))
     denoising = frame_error(prediction, prediction_target(objective, x0, noise), condition.mask)
     if objective == "v":
         x0_hat = noise + prediction

@@ -5,7 +5,6 @@ What a user asks for is checked here, once; `generation.text_to_motion` has the 
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from f3amd_lib.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
+from f3amd_lib.generation.latent_motion import latent_motions
 from f3amd_lib.generation.text_to_motion import (
     continue_prefix,
     sample_blocks,
@@ -29,6 +29,7 @@ from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
 from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.training.latent_models import LatentModel
 from f3amd_lib.training.text_models import TextModel, controlled_joints
 
 NEAR = 4
@@ -41,7 +42,9 @@ STREAM_PRESET = "ACMDM-n4-PS22-prefix"
 # ------------------------------------------------------------------------------------------------------- what is asked
 
 
-def told_captions(trained: TextModel, encoder, captions: Sequence[str], *, any_words: bool = False) -> np.ndarray:
+def told_captions(
+    trained: TextModel | LatentModel, encoder, captions: Sequence[str], *, any_words: bool = False
+) -> np.ndarray:
     """Return pooled embeddings of captions, [captions, W].
 
     Args:
@@ -62,7 +65,7 @@ def told_captions(trained: TextModel, encoder, captions: Sequence[str], *, any_w
     return embed_captions(list(captions), encoder).pooled
 
 
-def told_frames(trained: TextModel, seconds: float) -> int:
+def told_frames(trained: TextModel | LatentModel, seconds: float) -> int:
     """Return the frames of a length, a multiple of 4; ValueError if the model makes none of that length."""
     least, most = (frames / trained.fps for frames in (FEWEST_FRAMES, trained.most_frames // UNIT * UNIT))
     if not least <= seconds <= most:  # also catches NaN
@@ -105,20 +108,23 @@ def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; write a CSV with the header frame,x,y,z")
-    reader = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-    if (header := [cell.strip() for cell in next(reader, [])]) != ["frame", "x", "y", "z"]:
-        raise ValueError(f"{path}: line 1: the header must be frame,x,y,z, it is {','.join(header) or 'empty'}")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+    if (header := [cell.strip() for cell in "".join(lines[:1]).split(",")]) != ["frame", "x", "y", "z"]:
+        raise ValueError(f"{path}: line 1: the header must be frame,x,y,z, it is {','.join(header)[:80] or 'empty'}")
     points: dict[int, list[float]] = {}
-    for cells in reader:
-        if not "".join(cells).strip():
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
             continue
-        where = f"{path}: line {reader.line_num}:"
+        where = f"{path}: line {number}:"
         try:
-            frame, *point = map(float, cells)
+            frame, *point = map(float, line.split(","))
         except ValueError:
-            raise ValueError(f"{where} {','.join(cells)!r} is not four numbers") from None
+            raise ValueError(f"{where} {line[:80]!r} is not four numbers") from None
         if len(point) != 3 or not all(map(math.isfinite, (frame, *point))):
-            raise ValueError(f"{where} {','.join(cells)!r} is not four finite numbers: frame, x, y, z")
+            raise ValueError(f"{where} {line[:80]!r} is not four finite numbers: frame, x, y, z")
         if frame != int(frame) or not 0 <= frame < num_frames:
             raise ValueError(f"{where} frame {frame:g} is not one of the clip's, 0 to {num_frames - 1}; see --seconds")
         if frame in points:
@@ -150,26 +156,28 @@ def check_solver(num_steps: int | None, guidance: float | None) -> None:
 
 
 def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) -> dict:
-    """Return what the samplers are told: the guidance, and Euler's steps of a flow where a number is given."""
+    """Return what the samplers are told: a guidance, asked for or the model's own, and Euler's steps where given."""
+    guidance = trained.record.get("guidance") if guidance is None else guidance
     told = {} if guidance is None else {"guidance": guidance}
     if num_steps is None:
         return told
     return told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
 
 
-def motions_told(
-    trained: TextModel, pooled, num_frames, key, *,
+def draw_motions(
+    trained: TextModel | LatentModel, pooled, num_frames, key, *,
     guidance: float | None = None, num_steps: int | None = None, control: Control | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Draw a motion for each caption, whole at once, or block by block or masked, as the model is made for.
 
     Args:
-      trained: the model; one of the prefix form goes on from frames and is for `stream_told`.
+      trained: the model; one of the prefix form goes on from frames and is for `stream_motions`. Of MotionPCM
+        a teacher or a student.
       pooled: captions, [B, W].
       num_frames: of each motion, [B] or one for all; multiples of 4.
       key: JAX random key.
-      guidance: w; by default the form's own.
-      num_steps: of Euler's method; by default the model's own sampler.
+      guidance: w; by default what the model's record says (`guidance`), else the form's own.
+      num_steps: of Euler's method; by default the model's own sampler. Of MotionPCM as `latent_motion.steps_of`.
       control: where joints should be, normalised, [B, L, J, 3].
 
     Returns:
@@ -178,6 +186,10 @@ def motions_told(
     Raises:
       ValueError: for a model of the prefix form, or a control and no branch.
     """
+    if isinstance(trained, LatentModel):
+        if control is not None:
+            raise ValueError(f"{trained.name} has no control branch: leave --control out, or name a model of ACMDM")
+        return latent_motions(trained, pooled, num_frames, key, num_steps=num_steps, guidance=guidance)
     if trained.starts:
         raise ValueError(
             f"{trained.name} goes on from earlier frames: use it for a stream (--then), or another --model"
@@ -190,7 +202,7 @@ def motions_told(
     shape = (*condition.mask.shape, config.num_joints, config.channels)
     key_noise, key_solver = jax.random.split(key)
     asked = _asked(trained, guidance, num_steps)
-    if control is not None and guidance is not None:
+    if control is not None and "guidance" in asked:
         asked["text_scale"] = asked.pop("guidance")
 
     @jax.jit
@@ -218,7 +230,7 @@ def control_of(trained: TextModel, joint: int, frames, points, num_frames: int) 
     return Control.of(jnp.asarray(positions), asked)
 
 
-def stream_told(
+def stream_motions(
     trained: TextModel, pooled, windows: Sequence[int], key, *,
     guidance: float | None = None, num_steps: int | None = None, starts=None,
 ) -> np.ndarray:  # fmt: skip
@@ -232,7 +244,7 @@ def stream_told(
       pooled: captions in their order, [captions, W].
       windows: how many windows each is told for.
       key: JAX random key; it also chooses the start.
-      guidance, num_steps: as for `motions_told`.
+      guidance, num_steps: as for `draw_motions`.
       starts: captions of `trained.starts` embedded, [starts, W], to begin near the first caption; by default anyhow.
 
     Returns:

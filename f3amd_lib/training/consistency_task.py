@@ -1,0 +1,152 @@
+"""Distil a trained denoiser of locomotion into one step: consistency along its own walk (MotionPCM, one phase).
+
+The student begins as its teacher. At a level of the teacher's grid it is asked for the end of the path, and its answer
+has to be the one that its moving average gives a step of the teacher's further on; from the last level that step is the
+end itself. How far two answers are apart, the teacher's own training loss says, with the answer in the data's place.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import optax
+import pandas as pd
+
+from f3amd_lib.data.windows import WindowSet, spread_windows
+from f3amd_lib.diffusion.phases import consistency_answer
+from f3amd_lib.diffusion.samplers import add_noise
+from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.training.checkpoints import TrainedModel, load_model, network_with, save_model, weights_digest
+from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
+from f3amd_lib.training.losses import loss_terms, total_loss
+from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.pipeline import PreparedData, alone_with, as_trained, model_files, train_in_legs
+from f3amd_lib.training.recipe import paper_recipe
+
+TEACHER_STEPS = 8
+"""Levels of the teacher's walk: the steps that F3AMD's tables count as many."""
+
+_HELD_OUT_WINDOWS = 128
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("denoising", "teacher"), meta_fields=("num_teacher_steps",)
+)
+@dataclass(frozen=True, eq=False)
+class ConsistencyTask:
+    """A student of one step to distil from a frozen denoiser (a `training.optimise.Task`).
+
+    Attributes:
+      denoising: the teacher's own training: network, windows, disturbances, loss. Its moving average is the target.
+      teacher: frozen weights, with which the student begins.
+      num_teacher_steps: levels of the walk that is distilled.
+
+    Source: MotionPCM section 4.2 with M = 1 and without a discriminator, in the variance-exploding state.
+    """
+
+    name: ClassVar[str] = "student of one step"
+
+    denoising: DenoisingTask
+    teacher: Any
+    num_teacher_steps: int = TEACHER_STEPS
+
+    @property
+    def config(self):
+        """How it is trained; the loop reads steps, seed and moving average."""
+        return self.denoising.config
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """As the config says."""
+        return self.denoising.optimiser
+
+    def identity(self) -> dict:
+        """Return all that decides the weights."""
+        about = {"num_teacher_steps": self.num_teacher_steps, "weights": weights_digest(self.teacher)}
+        return self.denoising.identity() | {"teacher": about}
+
+    def init(self, key):
+        """Return the teacher's weights."""
+        return self.teacher, None
+
+    def draw(self, state: TrainingState, key):
+        """Draw windows as the teacher saw them, and the target's weights; return with the key of the loss."""
+        (batch, _), key_loss = self.denoising.draw(state, key)
+        return (batch, state.ema), key_loss
+
+    def loss(self, params, statistics, drawn, key):
+        """Return (loss, (terms, statistics)) of what `draw` drew."""
+        batch, target = drawn
+        terms = self._terms(params, target, batch, key, training=True)
+        return terms["loss"], (terms, statistics)
+
+    def held_out_terms(self, params, statistics, windows: WindowSet, key) -> dict:
+        """Return the mean loss terms on windows of another split, of weights against themselves."""
+        return self._terms(params, params, spread_windows(windows, _HELD_OUT_WINDOWS), key, training=False)
+
+    def _terms(self, params, target, batch, key, *, training: bool) -> dict:
+        task, config = self.denoising, self.denoising.config
+        key_point, key_noise, key_history = jax.random.split(key, 3)
+        x0, condition = network_inputs(batch, task.normaliser)
+        if training:
+            condition = task._disturbed(condition, key_history)
+        student, answering, teacher = (
+            network_with(task.model_config, weights) for weights in (params, target, self.teacher)
+        )
+        context = {id(network): network.encode(condition) for network in (student, answering, teacher)}
+        denoiser = lambda network: lambda x_noisy, sigma: network(x_noisy, sigma, context[id(network)])
+        levels = jnp.asarray(config.diffusion.grid(self.num_teacher_steps), jnp.float32)
+        point = jax.random.randint(key_point, (len(x0),), 0, self.num_teacher_steps)
+        sigma, sigma_next = levels[point], levels[point + 1]
+        x_noisy = add_noise(x0, sigma[:, None, None], jax.random.normal(key_noise, x0.shape))
+        answer = consistency_answer(denoiser(teacher), denoiser(answering), x_noisy, sigma, sigma_next)
+        answer = jax.lax.stop_gradient(answer)
+        x0_hat = denoiser(student)(x_noisy, sigma)
+        metres, wanted = map(task.normaliser.denormalise, (x0_hat, answer))
+        terms = loss_terms(
+            task.skeleton, x0_hat, answer, metres, wanted, batch.history[:, -1], config.loss.ird_form
+        )  # fmt: skip
+        return {"loss": total_loss(terms, config.loss), **terms}
+
+
+def distil(
+    prepared: PreparedData, profile: Profile, teacher: TrainedModel, folder, *, num_steps: int, batch_size: int = 64,
+    learning_rate: float = 2e-4, ema_decay: float = 0.95, **leg,
+) -> tuple[TrainedModel | None, pd.DataFrame]:  # fmt: skip
+    """Distil a trained model into one step, going on from a training state if there is one.
+
+    Args:
+      prepared: the data that it was trained on.
+      profile: names the data set, and gives the seed.
+      teacher: the model; its own training loss and disturbances are kept.
+      folder: where files go.
+      num_steps, batch_size, learning_rate, ema_decay: of the distillation.
+      **leg: stop_at and progress, as for `optimise`.
+
+    Returns:
+      (student, history); the student is None where `stop_at` came first.
+
+    Raises:
+      ValueError: if a training state of other settings lies there.
+    """
+    settings = {"batch_size": batch_size, "learning_rate": learning_rate, "ema_decay": ema_decay, "seed": profile.seed}
+    config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
+    task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params)
+    files = model_files(profile, teacher.name, folder=Path(folder))
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=config.seed, model=teacher.name, training=config.to_dict(),
+        held_out_split=prepared.held_out_split, num_train_windows=int(task.denoising.windows.num_windows),
+        distilled_from=weights_digest(teacher.params),
+    )  # fmt: skip
+    with alone_with(files):
+        state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)
+    if int(state.step) < num_steps:
+        return None, history
+    save_model(files.model, as_trained(prepared, task.denoising, teacher.name, state.params, record))
+    return load_model(files.model), history
