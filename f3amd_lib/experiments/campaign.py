@@ -26,11 +26,12 @@ from f3amd_lib.experiments.runner import Records
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.papers import check_entry
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.networks import presets
-from f3amd_lib.training.checkpoints import save_model, weights_digest
+from f3amd_lib.training.checkpoints import errors_name, save_model, weights_digest
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
@@ -80,23 +81,34 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
     """Return (run, windows seen) of every snapshot, in the order in which they are to be trained.
 
     Raises:
-      ValueError: for an unknown preset or recipe.
+      ValueError: naming the file, and the run in it, for what is no TOML, an unknown key, preset or recipe, or a value
+        that makes no sense.
     """
     snapshots = []
-    for row in read_toml(path)["run"]:
-        runs = [("paper", presets.find_preset(name).name) for name in row.get("presets", ())]
-        runs += [(name, find_recipe(name).preset) for name in row.get("recipes", ())]
-        for recipe, preset in runs:
-            for seed in row.get("seeds", [0]):
-                run = Run(preset, recipe, row.get("window", 32), seed)
-                snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
+    with errors_name(path):
+        table = read_toml(path)
+        check_entry(table, str(path), ["run"])
+        for number, row in enumerate(table["run"], 1):
+            where = f"{path}: run {number}"
+            check_entry(row, where, ["windows"], ["presets", "recipes", "seeds", "window"])
+            row = {"seeds": [0], "window": 32, **row}
+            numbers = ("windows", row["windows"], 1), ("seeds", row["seeds"], 0), ("window", [row["window"]], 2)
+            for key, values, least in numbers:
+                if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
+                    raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
+            runs = [("paper", presets.find_preset(name).name) for name in row.get("presets", ())]
+            runs += [(name, find_recipe(name).preset) for name in row.get("recipes", ())]
+            for recipe, preset in runs:
+                for seed in row["seeds"]:
+                    run = Run(preset, recipe, row["window"], seed)
+                    snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
     return snapshots
 
 
 def run_campaign(
     prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
     batch_size: int = 128, only: Iterable[str] = (), budget_s: float | None = None,
-    snapshots: list[tuple[Run, int]] | None = None, progress: bool = True,
+    snapshots: list[tuple[Run, int]] | None = None, known: Path | None = None, progress: bool = True,
 ) -> Iterator[tuple[str, int, str]]:  # fmt: skip
     """Train and measure what the queue still lacks, until it is done or the time is over.
 
@@ -108,6 +120,7 @@ def run_campaign(
       only: names of presets; all by default.
       budget_s: seconds; the run under way stops with a checkpoint when they are over.
       snapshots: see `queue`, which is the default.
+      known: folder of another run's records, whose snapshots count as measured.
       progress: show progress bars.
 
     Yields:
@@ -118,8 +131,8 @@ def run_campaign(
     """
     snapshots, only = queue() if snapshots is None else snapshots, list(only)
     for name in only:
-        if name not in (known := {run.preset for run, _ in snapshots}):
-            raise ValueError(f"the queue has no {name!r}{nearest_hint(name, known)}")
+        if name not in (queued := {run.preset for run, _ in snapshots}):
+            raise ValueError(f"the queue has no {name!r}{nearest_hint(name, queued)}")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     stop_at = None if budget_s is None else time.monotonic() + budget_s
     record = run_record(
@@ -127,7 +140,8 @@ def run_campaign(
         batch_size=batch_size,
         protocol=dataclasses.asdict(protocol), classifier_weights=weights_digest(classifier.params),
     )  # fmt: skip
-    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {"campaign": ["run", "windows"]})
+    folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {"campaign": ["run", "windows"]}
+    records = Records(folder_of_records, record, keys, known=known)
     for run, windows in snapshots:
         key = {"run": run.name, "windows": windows}
         if only and run.preset not in only:
@@ -168,9 +182,9 @@ def _measured(
         for count in STEPS_MEASURED
     ]
     tables.append(pd.DataFrame([{"steps": 0, "metric": "held_out_loss", "value": loss}]))
-    told = {
+    columns = {
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
         "device": jax.devices()[0].device_kind,
     }  # fmt: skip
-    return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**told)
+    return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**columns)

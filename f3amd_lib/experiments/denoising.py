@@ -51,10 +51,9 @@ def root_mean_square(squares, scale: float = CM) -> dict:
     return interval
 
 
-def _joint_error(trained: TrainedModel, x0_hat, batch: Batch):
-    predicted = frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
-    real = frame_positions(trained.skeleton, batch.future)
-    return CM * jnp.mean(jnp.linalg.norm(predicted - real, axis=-1))
+def _joint_error(trained: TrainedModel, x0_hat, batch: Batch) -> float:
+    real = frame_positions(trained.skeleton, np.asarray(batch.future))
+    return CM * float(np.mean(np.linalg.norm(trained.joint_positions(x0_hat) - real, axis=-1)))
 
 
 def x0_error_by_sigma(
@@ -76,16 +75,12 @@ def x0_error_by_sigma(
     """
     batch = held_out_batch(windows, trained, num_samples)
     x0, condition = network_inputs(batch, trained.normaliser)
-    network = trained.network()
-    noise = jax.random.normal(jax.random.key(seed), x0.shape)
-
-    @jax.jit
-    def measure(sigma):
-        x0_hat = network(add_noise(x0, sigma, noise), sigma, network.encode(condition))
-        error = jnp.sqrt(jnp.mean((x0_hat - x0) ** 2))
-        return error, _joint_error(trained, x0_hat, batch)
-
-    rows = [(float(sigma), *map(float, measure(jnp.float32(sigma))), float(sigma)) for sigma in sigmas]
+    denoise = trained.denoiser(condition)
+    noise, rows = jax.random.normal(jax.random.key(seed), x0.shape), []
+    for sigma in map(float, sigmas):
+        x0_hat = denoise(add_noise(x0, sigma, noise), sigma)
+        error = float(jnp.sqrt(jnp.mean((x0_hat - x0) ** 2)))
+        rows.append((sigma, error, _joint_error(trained, x0_hat, batch), sigma))
     return pd.DataFrame(rows, columns=["sigma", "x0_error", "joint_error_cm", "input_error"])
 
 
@@ -133,18 +128,18 @@ def window_quality(generator: MotionGenerator, windows: WindowSet, *, num_sample
     trained = generator.trained
     batch = held_out_batch(windows, trained, num_samples)
     _, condition = network_inputs(batch, trained.normaliser)
-    x0_hat = jax.jit(generator.sample_window)(jax.random.key(seed), condition)
-    predicted = frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
-    real = frame_positions(trained.skeleton, batch.future)
-    before = frame_positions(trained.skeleton, batch.history[:, -1])
+    x0_hat = generator.sample(jax.random.key(seed), condition)
+    predicted = trained.joint_positions(x0_hat)
+    real = frame_positions(trained.skeleton, np.asarray(batch.future))
+    before = frame_positions(trained.skeleton, np.asarray(batch.history[:, -1]))
 
     def seam(positions):
-        return float(CM * jnp.mean(jnp.linalg.norm(positions[:, 0] - before, axis=-1)))
+        return float(CM * np.mean(np.linalg.norm(positions[:, 0] - before, axis=-1)))
 
     return {
-        "joint_error_cm": float(_joint_error(trained, x0_hat, batch)),
-        "joint_acceleration_cm": float(np.mean(joint_acceleration(np.asarray(predicted)))),
-        "real_joint_acceleration_cm": float(np.mean(joint_acceleration(np.asarray(real)))),
+        "joint_error_cm": _joint_error(trained, x0_hat, batch),
+        "joint_acceleration_cm": float(np.mean(joint_acceleration(predicted))),
+        "real_joint_acceleration_cm": float(np.mean(joint_acceleration(real))),
         "seam_cm": seam(predicted),
         "real_seam_cm": seam(real),
     }
@@ -159,14 +154,8 @@ def seed_spread(
     """
     trained = generator.trained
     condition = held_out_condition(windows, trained, num_conditions)
-
-    @jax.jit
-    def sample_positions(key):
-        x0_hat = generator.sample_window(key, condition)
-        return frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
-
     keys = jax.random.split(jax.random.key(seed), num_seeds)
-    return diversity(np.stack([np.asarray(sample_positions(key)) for key in keys], axis=1))
+    return diversity(np.stack([trained.joint_positions(generator.sample(key, condition)) for key in keys], axis=1))
 
 
 def noise_use(generator: MotionGenerator, windows: WindowSet, *, low_sigma: float = 0.1, seed: int = 0) -> dict:
@@ -232,15 +221,7 @@ def input_use(
       Rows metric "use_of_x" and "use_of_sigma": value, low, high (cm of joints relative to the root;
       roots of `estimate_variances`, root mean square over conditions with its 95 % interval), repeats.
     """
-    network = trained.network()
-    context = jax.jit(network.encode)(condition)
-    denoise = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, context))
-
-    @jax.jit
-    def relative_joints(x0_hat):
-        positions = frame_positions(trained.skeleton, trained.normaliser.denormalise(x0_hat))
-        return positions - positions[..., :1, :]
-
+    denoise = trained.denoiser(condition)
     sigmas = trained.diffusion.grid(min(num_levels, len(getattr(trained.config, "noise_levels", ())) or num_levels))
     shape = (len(condition.style), trained.config.window, trained.config.channels)
     estimates = []
@@ -248,7 +229,8 @@ def input_use(
         key_init, key_steps = jax.random.split(key)
         x_init = float(sigmas[0]) * jax.random.normal(key_init, shape)
         visited = list(walk(trained.diffusion.sampler, denoise, x_init, sigmas, key=key_steps))[:-1]
-        estimates.append([np.asarray(relative_joints(one.x0_hat)) for one in visited])
+        joints = trained.joint_positions(np.stack([one.x0_hat for one in visited]))
+        estimates.append(joints - joints[..., :1, :])
     by_condition = np.moveaxis(np.array(estimates), 2, 0).swapaxes(1, 2)  # [B, L, S, T, J, 3]
     squares = np.array([estimate_variances(one) for one in by_condition])
     return pd.DataFrame(

@@ -105,13 +105,15 @@ def snapshot(
 
 
 def learning_curve(
-    prepared: PreparedData, preset: str, *, seed: int = 0, progress: bool = False, **settings
-) -> pd.DataFrame:
+    prepared: PreparedData, preset: str, *, network: Mapping | None = None, seed: int = 0, progress: bool = False,
+    **settings,
+) -> pd.DataFrame:  # fmt: skip
     """Train a preset for a short while and watch its loss.
 
     Args:
       prepared: the data.
       preset: see `presets.find_preset`.
+      network: fields of the preset's network to change.
       seed: of weights and batches.
       progress: show a bar of the steps.
       **settings: fields of `TrainingConfig` in place of `SHORT_RUN`'s.
@@ -125,7 +127,7 @@ def learning_curve(
       TrainingDiverged: if the loss stops being a number.
     """
     recipe = short_recipe(preset, seed=seed, **{**SHORT_RUN, **settings})
-    task = prepared.task(preset, recipe)
+    task = prepared.task(preset, recipe, network=network)
     held_out = prepared.windows(prepared.held_out_split)
     chunk = max(1, recipe.num_steps // 10)
     state = initial_state(task)

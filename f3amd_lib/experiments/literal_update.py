@@ -78,7 +78,7 @@ def walk_windows(
     """
     batch = held_out_batch(windows, trained, num_windows)
     _, condition = network_inputs(batch, trained.normaliser)
-    real = np.asarray(frame_positions(trained.skeleton, batch.future))
+    real = frame_positions(trained.skeleton, np.asarray(batch.future))
     walked = walk_conditions(trained, condition, steps, spacing=spacing, num_seeds=num_seeds, seed=seed)
     return WindowWalks(real, walked)
 
@@ -101,11 +101,8 @@ def walk_conditions(
     """
     if num_seeds < 2:
         raise ValueError(f"num_seeds must be at least 2 for a spread over seeds, got {num_seeds}")
-    network = trained.network()
-    context = jax.jit(network.encode)(condition)
     # One compiled evaluation serves every update and number of steps.
-    denoise = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, context))
-    joints = jax.jit(lambda x: frame_positions(trained.skeleton, trained.normaliser.denormalise(x)))
+    denoise = trained.denoiser(condition)
     grids = {number: trained.diffusion.grid(number, spacing).astype(np.float32) for number in steps}
     made = {(update, number): [] for number in steps for update in UPDATES}
     shape = (len(condition.style), trained.config.window, trained.config.channels)
@@ -113,7 +110,7 @@ def walk_conditions(
         noise = jax.random.normal(key, shape)
         for (update, number), draws in made.items():
             *_, end = walk(UPDATES[update], denoise, grids[number][0] * noise, grids[number])
-            draws.append(np.asarray(joints(end.x_noisy)))
+            draws.append(trained.joint_positions(end.x_noisy))
     return {way: np.stack(draws) for way, draws in made.items()}
 
 

@@ -20,9 +20,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.experiments import literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.denoising import (
@@ -48,7 +51,9 @@ from f3amd_lib.experiments.recipes import RECIPE_STEPS, RECIPES, train_recipe
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.generation.blending import blend_rollout
 from f3amd_lib.generation.foot_locking import lock_rollout
+from f3amd_lib.generation.online_feet import lock_rollout_online
 from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
@@ -56,7 +61,9 @@ from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
-from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
+from f3amd_lib.training.consistency_task import distil
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.published import NAME as PUBLISHED
 from f3amd_lib.training.published import published_model
@@ -83,6 +90,14 @@ PRECISION_SEEDS = 5
 
 SNAPSHOTS = 10
 """Measurements on the way of a training in `measure_quality_by_epoch`."""
+
+ONE_STEP_MODELS = ("CAMDM", "F3AMD-FNO-96-plus")
+"""Models that `measure_one_step` distils."""
+
+STUDENT_STEPS, STUDENT_BATCH = {"smoke": 4, "laptop": 300, "gpu": 20_000}, 32
+"""Optimiser steps of a student by profile, and windows of each."""
+
+_TIMED_CHARACTERS = 32
 
 _PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
 
@@ -273,8 +288,15 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     return records.measure(todo, walk)
 
 
-TREATMENTS = {"as made": (0, False), "blended": (4, False), "feet locked": (0, True), "blended, feet locked": (4, True)}
-"""What is done to a rollout where people look at it -> frames blended after a seam, whether feet are locked."""
+TREATMENTS: dict[str, tuple[int, Callable | None]] = {
+    "as made": (0, None),
+    "blended": (4, None),
+    "feet locked": (0, lock_rollout),
+    "blended, feet locked": (4, lock_rollout),
+    "blended, feet locked online": (4, lock_rollout_online),
+}
+"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
+is the steer page's: it sees no frame ahead."""
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -298,19 +320,19 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
     def treat(row: Mapping) -> dict:
         if not row["steps"]:
             clips = reference_clips(packed, styles, window=profile.window)
-            shown = [("as made", 0, packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
+            walks = [("as made", 0, packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
         else:
-            generator, shown = MotionGenerator(trained[row["model"]], row["steps"]), []
+            generator, walks = MotionGenerator(trained[row["model"]], row["steps"]), []
             for seed in seeds:
                 made = generator.rollout(evaluation_paths(packed, styles, num_frames, seed=seed), styles, seed=seed)
                 for treatment, (blend_frames, lock) in TREATMENTS.items():
                     treated = blend_rollout(made, blend_frames)
-                    treated = lock_rollout(treated) if lock else treated
-                    shown += [(treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles)]
+                    treated = lock(treated) if lock else treated
+                    walks += [(treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles)]
         figures = [
             {"treatment": treatment, "seed": seed, "style": style}
             | walking_figures(motion, profile.window, floors[style])
-            for treatment, seed, style, motion in shown
+            for treatment, seed, style, motion in walks
         ]
         return {"feet": pd.DataFrame(figures)}
 
@@ -390,8 +412,8 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
         motions = [rollout.motion(character) for character in range(len(styles))]
         feet[name, profile.window, profile.num_steps] = list(zip(styles, motions, strict=True))
     digests = {name: [digest] for name, digest in _digests(trained).items()}
-    about = {"num_frames": profile.rollout_frames, "styles": styles, "weights_digests": digests}
-    record = _record(prepared, profile, "foot_spectrum", **about)
+    settings = {"num_frames": profile.rollout_frames, "styles": styles, "weights_digests": digests}
+    record = _record(prepared, profile, "foot_spectrum", **settings)
     return write_table(_records_dir(profile) / "foot_spectrum.csv", sensitivity.foot_spectrum(feet), record)
 
 
@@ -605,6 +627,74 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     )
 
 
+DISTILLED = ", distilled"
+"""Added to the name of a network in rows of its student of one step."""
+
+
+def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Distil trained models into one step and run the evaluation protocol on the students; long.
+
+    Returns:
+      The table `records/one_step.csv`; beside it `one_step_by_seed.csv`.
+    """
+    packed, asked = prepared.packed, _names(models)
+    classifier, protocol, record = protocol_of(prepared, profile, "one_step")
+    held_out, num_steps = prepared.windows(prepared.held_out_split), STUDENT_STEPS[profile.name]
+    known = available_models(profile)
+    trained = _trained(prepared, profile, asked or [name for name in ONE_STEP_MODELS if name in known])
+    folder, digests = runs_dir(profile.dataset, profile.name) / "one_step", _digests(trained)
+    record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
+    records = Records(
+        _records_dir(profile), record, {"one_step_by_seed": ["model", "window_frames", "steps"]}, again=asked,
+        summaries={"one_step": ("one_step_by_seed", summarise)},
+    )  # fmt: skip
+
+    def score(row: Mapping) -> dict:
+        teacher = trained[row["model"].removesuffix(DISTILLED)]
+        student, _ = distil(prepared, profile, teacher, folder, num_steps=num_steps, batch_size=STUDENT_BATCH)
+        made = MotionGenerator(student, 1)
+        rows, _ = measure_model(made, packed, classifier, protocol, held_out, name=row["model"])
+        return {"one_step_by_seed": rows}
+
+    shared = {"window_frames": profile.window, "steps": 1}
+    todo = [{"model": name + DISTILLED, **shared, "weights": digest} for name, digest in digests.items()]
+    return records.measure(todo, score)
+
+
+def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Time a window for 32 characters at 8, 4, 2 and 1 steps, by turns: what a student of one step is compared by.
+
+    A student is as large as its teacher and takes its teacher's time at one step.
+
+    Returns:
+      The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
+    """
+    names = _names(models) or [name for name in (*ONE_STEP_MODELS, "F3AMD-FNO-96") if name in available_models(profile)]
+    trained = _trained(prepared, profile, names)
+    batch, rounds = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS), {}
+
+    def compiled(model: TrainedModel, steps: int) -> Callable:
+        sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
+        _, condition = network_inputs(batch, model.normaliser)
+
+        @jax.jit
+        def draw(params, condition, key):
+            return sample_round(network_with(model.config, params), condition, sigmas, key, sampler=sampler)
+
+        return lambda: draw(model.params, condition, jax.random.key(0)).block_until_ready()
+
+    rounds = {(name, steps): compiled(model, steps) for name, model in trained.items() for steps in STEPS}
+    rows = [
+        {"model": name, "steps": steps, "characters": _TIMED_CHARACTERS, "milliseconds": 1000.0 * timing.median}
+        | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}
+        for (name, steps), timing in take_turns(rounds, min_rounds=30, min_seconds=5.0).items()
+    ]
+    path = _records_dir(profile) / "round_times.csv"
+    digests = {name: [digest] for name, digest in _digests(trained).items()}
+    write_table(path, pd.DataFrame(rows), _record(prepared, profile, "round_times", weights_digests=digests))
+    return path
+
+
 MEASUREMENTS: dict[str, Callable] = {
     "learning": measure_learning,
     "precision": measure_precision,
@@ -620,5 +710,7 @@ MEASUREMENTS: dict[str, Callable] = {
     "trained": measure_trained,
     "foot_spectrum": measure_foot_spectrum,
     "sensitivity": measure_sensitivity,
+    "one_step": measure_one_step,
+    "round_times": measure_round_times,
 }
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""

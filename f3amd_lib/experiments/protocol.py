@@ -403,10 +403,10 @@ def measure_real(
     motions, figures = [], []
     for clip in clips:
         whole = packed.motion(int(clip))
-        shown = whole if model == "real" else corrupt(model, whole, seed=int(clip))
-        motions.append(shown)
+        motion = whole if model == "real" else corrupt(model, whole, seed=int(clip))
+        motions.append(motion)
         floor = float(packed.floor_shift[clip])
-        values = _figures_without_classifier(shown, own_path(whole), window, floor)
+        values = _figures_without_classifier(motion, own_path(whole), window, floor)
         figures.append({name: value for name, value in values.items() if name not in _GROWS_WITH_LENGTH})
     seen = classify_windows(classifier, motions, labels)
     real = real_features(packed, classifier, protocol.styles, window)

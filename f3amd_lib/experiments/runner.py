@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from f3amd_lib.ground.records import kept_rows, write_table
+from f3amd_lib.ground.records import kept_rows, others_rows, write_table
 
 log = logging.getLogger("f3amd")
 
@@ -25,39 +25,43 @@ class Records:
       record: from `run_record`, for all of them.
       keys: table -> columns that name a measurement: rows that agree in them are replaced together.
       again: models that are measured again though they have rows.
+      known: folder of another run's tables; what they have counts as measured, and they are only read.
       summaries: further tables, written after each row: name -> (table, function of its rows).
     """
 
     def __init__(
         self, folder: Path, record: dict, keys: Mapping[str, Sequence[str]], *, again: Collection[str] = (),
-        summaries: Mapping[str, tuple[str, Callable[[pd.DataFrame], pd.DataFrame]]] = {},
+        known: Path | None = None, summaries: Mapping[str, tuple[str, Callable[[pd.DataFrame], pd.DataFrame]]] = {},
     ):  # fmt: skip
         self.folder, self.record, self.keys = Path(folder), record, keys
         self.again, self.summaries = again, summaries
         self.tables = {name: kept_rows(self.path(name), record) for name in keys}
+        self.known = {} if known is None else {name: others_rows(known / f"{name}.csv", record) for name in keys}
 
     def path(self, name: str) -> Path:
         """Return where a table lies."""
         return self.folder / f"{name}.csv"
 
-    def _same(self, name: str, row: Mapping) -> pd.Series:
+    def _same(self, rows: pd.DataFrame, name: str, row: Mapping) -> pd.Series:
         """Tell which rows of a table are named as this one."""
-        rows = self.tables[name]
         return (rows[list(self.keys[name])] == [row[key] for key in self.keys[name]]).all(axis=1)
 
     def has(self, name: str, row: Mapping) -> bool:
         """Tell whether a table has rows of this name that agree in all columns of `row`, weights among them."""
-        rows = self.tables[name]
-        if rows is None or row.get("model") in self.again or not set(row) <= set(rows):
+        if row.get("model") in self.again:
             return False
-        rows = rows[self._same(name, row)]
-        return len(rows) > 0 and all((rows[column] == value).all() for column, value in row.items())
+        for rows in (self.tables[name], self.known.get(name)):
+            if rows is not None and set(row) <= set(rows):
+                rows = rows[self._same(rows, name, row)]
+                if len(rows) > 0 and all((rows[column] == value).all() for column, value in row.items()):
+                    return True
+        return False
 
     def put(self, name: str, row: Mapping, rows: pd.DataFrame) -> None:
         """Put rows in place of those that have the same name, after all others, and write the table."""
         rows, earlier = rows.assign(**row), self.tables[name]
         if earlier is not None:
-            rows = pd.concat([earlier[~self._same(name, row)], rows])
+            rows = pd.concat([earlier[~self._same(earlier, name, row)], rows])
         self.tables[name] = rows
         self._write(name, rows, name)
 

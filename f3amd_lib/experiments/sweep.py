@@ -248,16 +248,11 @@ def _results_at(place: Path) -> Iterator[None]:
 
 def _snapshot(work: Work, leg: Leg, prepared: PreparedData) -> str:
     """Train the queue's run up to a snapshot and measure it, unless somebody has."""
-    # What `f3amd campaign` has measured counts: a training that is further on is not begun anew.
-    there, here = work.records(work.results), work.records(work.place(leg))
-    if not (here / "campaign.csv").exists() and (there / "campaign.csv").exists():
-        here.mkdir(parents=True, exist_ok=True)
-        for ending in (".json", ".csv"):
-            shutil.copyfile(there / f"campaign{ending}", here / f"campaign{ending}")
     classifier, protocol, _ = protocol_of(prepared, work.profile, CAMPAIGN)
     ((*_, state),) = run_campaign(
         prepared, work.profile, classifier, protocol, folder=work.folder / CAMPAIGN, batch_size=work.batch_size,
-        snapshots=[(leg.run, leg.windows)], progress=False,
+        # What `f3amd campaign` has measured counts: a training that is further on is not begun anew.
+        snapshots=[(leg.run, leg.windows)], known=work.records(work.results), progress=False,
     )  # fmt: skip
     return "done before" if state == "measured before" else "done"
 

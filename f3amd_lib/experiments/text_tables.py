@@ -1,11 +1,13 @@
-"""Tables of text to motion: `f3amd measure text_table1`, rows from `papers/acmdm/experiments.toml`.
+"""Tables of text to motion: `f3amd measure text_table1`, rows from `papers/PAPER/experiments.toml`.
 
-Each row's model is trained first, if it is not, by `training.text_models`; then it makes a motion for each held-out
-clip's caption, and the judge looks. A row is kept as soon as it is measured; a leg that is out of time goes on there.
+Each row's model is trained first, if it is not, by `training.text_models` or, for MotionPCM's, by
+`training.latent_models`; then it makes a motion for each held-out clip's caption, and the judge looks. A row is kept as
+soon as it is measured; a leg that is out of time goes on there.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -17,21 +19,24 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.data.text_encoders import TextEncoder, embed_captions
-from f3amd_lib.data.text_motions import TextMotions, pad_motions
+from f3amd_lib.data.text_motions import TextMotions, frame_mask, pad_motions
 from f3amd_lib.experiments.runner import Records
+from f3amd_lib.generation.captioned_motion import draw_motions
+from f3amd_lib.generation.latent_motion import latent_motions, latent_sampler, reconstruction
 from f3amd_lib.generation.noise_optimisation import control_distance, optimise_noise
 from f3amd_lib.generation.text_to_motion import continue_prefix, sample_control, sample_text
-from f3amd_lib.generation.told_motion import motions_told
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
 from f3amd_lib.measures.text_metrics import control_errors, foot_skating_ratio
+from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.evaluator_task import EvaluatorTraining
+from f3amd_lib.training.latent_models import LatentModel, is_latent_preset, train_latent_model
 from f3amd_lib.training.text_models import (
     CONTROL,
     JUDGE,
@@ -41,8 +46,13 @@ from f3amd_lib.training.text_models import (
     train_text_model,
 )
 
-TABLES = ("text_table1", "text_tableA1", "text_table3", "text_tableA5")
-"""Those that `measure_text_table` knows."""
+PAPERS = {
+    "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_tableA5"),
+    "motionpcm": ("text_pcm1", "text_pcm2", "text_pcm3", "text_pcm4"),
+}
+"""Paper -> its tables that `measure_text_table` knows."""
+
+TABLES = tuple(name for names in PAPERS.values() for name in names)
 
 HELD = ("pelvis", "left_foot", "right_foot")
 """Joints that stay where they are in upper-body editing (ACMDM section 4.4)."""
@@ -74,13 +84,19 @@ class Bench:
         told = [said[generator.integers(len(said))] for said in self.real.captions]
         return told, embed_captions(told, self.encoder).pooled
 
-    def quality(self, make: Callable) -> pd.DataFrame:
-        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3]."""
+    def quality(self, make: Callable | None) -> pd.DataFrame:
+        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3].
+
+        None makes the real clips themselves.
+        """
         skating, lengths = [], self.real.lengths
 
         def system(repeat: int):
             told, pooled = self.captions(repeat)
-            made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
+            if make is None:
+                made = [self.real.clip(number) for number in range(len(lengths))]
+            else:
+                made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
             motions = [motion[:length] for motion, length in zip(made, lengths, strict=True)]
             share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
             skating.append({"metric": "foot_skating", "value": share})
@@ -93,6 +109,13 @@ class Bench:
         table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
         return table[["metric", "value", "low", "high"]]
 
+    def record(self, profile: Profile, data: TextMotions, measurement: str, **extra) -> dict:
+        """Return the record of a measurement with this judge."""
+        return run_record(
+            profile=profile, dataset=data, seed=profile.seed, measurement=measurement, settings=dict(self.settings),
+            judge_weights=weights_digest(self.judge.params), text_encoder=self.encoder.identity, **extra,
+        )  # fmt: skip
+
     def num_steps(self, trained: TextModel) -> int | None:
         """Return Euler's steps of a flow; other schedules walk the levels that they have."""
         return self.settings["num_steps"] if trained.schedule.kind == "straight" else None
@@ -104,7 +127,7 @@ class Bench:
 def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
     """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
     how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
-    return bench.quality(lambda pooled, lengths, key: motions_told(trained, pooled, lengths, key, **how))
+    return bench.quality(lambda pooled, lengths, key: draw_motions(trained, pooled, lengths, key, **how))
 
 
 def after_first_frames(trained: TextModel, starts, pooled, lengths, key, num_steps: int | None) -> np.ndarray:
@@ -147,7 +170,7 @@ def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: M
     def make(pooled, lengths, key):
         starts = true
         if row["first_prefix"] == "generated":
-            starts = motions_told(first, pooled, count, jax.random.fold_in(key, 1), num_steps=bench.num_steps(first))
+            starts = draw_motions(first, pooled, count, jax.random.fold_in(key, 1), num_steps=bench.num_steps(first))
         return after_first_frames(trained, starts, pooled, lengths, key, bench.num_steps(trained))
 
     return bench.quality(make)
@@ -248,9 +271,80 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     return pd.concat([table["value"].mean().reset_index(), pd.DataFrame([taken])])
 
 
+# ------------------------------------------------------------------------------------------------------------ MotionPCM
+
+_SENTENCES = 30
+
+
+def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> float:
+    """Return the seconds of one sentence by itself, from caption to vectors of a frame; joints are not counted.
+
+    The median of 30, after one that compiles; all are as long as the model's longest clip.
+    """
+    told, times = bench.captions(0)[0], []
+    mask = frame_mask([trained.most_frames], trained.most_frames)
+    for number in range(_SENTENCES + 1):
+        started = time.perf_counter()
+        pooled = embed_captions([told[number % len(told)]], bench.encoder).pooled
+        jax.block_until_ready(draw(pooled, mask, jax.random.key(number)))
+        times.append(time.perf_counter() - started)
+    return float(np.median(times[1:]))
+
+
+def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return the figures of a teacher or a student of MotionPCM in so many steps; without a model, of real motion."""
+    if trained is None:
+        return bench.quality(None)
+    draw = latent_sampler(trained, row.get("steps"))
+    made = bench.quality(lambda *asked: latent_motions(trained, *asked, draw=draw))
+    if not about.get("timed"):
+        return made
+    taken = {"metric": "sampling_seconds", "value": sentence_seconds(bench, trained, draw)}
+    return pd.concat([made, pd.DataFrame([taken])])
+
+
+def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return how well an autoencoder gives held-out motion back: FID, joint and feature error (MotionPCM Table 3).
+
+    Joints are compared after the roots of each frame were laid on each other. The feature error is the norm of a clip's
+    difference in network units, summed over clips, divided by their frames (MotionLCM V2's code). Kept movement (ours)
+    is the variance over a clip's frames, over that of the real clip: a pose that only glides along has nearly none.
+    """
+    real, most = bench.real, int(bench.real.lengths.max())
+    vectors = real.redundant_vectors()
+    clips = [vectors[first:last] for first, last in zip(real.start[:-1], real.start[1:], strict=True)]
+    motions, apart, moved = [], [], []
+    spread = lambda vectors: np.sum(np.var(vectors / np.asarray(trained.statistics.deviation), axis=0))
+    for begin in range(0, len(clips), 64):
+        padded = pad_motions(clips[begin : begin + 64], most)
+        made, positions = reconstruction(trained, padded.motion, padded.mask)
+        for number, length in enumerate(np.asarray(padded.length)):
+            motions.append(positions[number, :length])
+            away = (made[number, :length] - clips[begin + number]) / np.asarray(trained.statistics.deviation)
+            apart.append(np.linalg.norm(away))
+            moved.append([spread(made[number, :length]), spread(clips[begin + number])])
+    local = lambda motion: motion - motion[:, :1]
+    errors = [
+        np.linalg.norm(local(motion) - local(real.clip(number)), axis=-1).mean(axis=-1)
+        for number, motion in enumerate(motions)
+    ]
+    made = np.zeros((len(motions), most, *real.positions.shape[1:]), np.float32)
+    for room, motion in zip(made, motions, strict=True):
+        room[: len(motion)] = motion
+    own = pd.DataFrame([
+        {"metric": "reconstruction_error", "value": 1000.0 * float(np.concatenate(errors).mean())},
+        {"metric": "feature_error", "value": float(np.sum(apart) / real.lengths.sum())},
+        {"metric": "kept_movement", "value": float(np.divide(*np.sum(moved, axis=0)))},
+    ])  # fmt: skip
+    return pd.concat([bench.quality(lambda *asked: made), own])
+
+
 # ----------------------------------------------------------------------------------------------------------- the runner
 
-KINDS = {"whole": whole_rows, "autoregressive": autoregressive_rows, "control": control_rows}
+KINDS = {
+    "whole": whole_rows, "autoregressive": autoregressive_rows, "control": control_rows, "latent": latent_rows,
+    "reconstruction": reconstruction_rows,
+}  # fmt: skip
 
 
 def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> TextJudge | None:
@@ -266,6 +360,35 @@ def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, f
     return judge
 
 
+REAL = "Real"
+"""The row of real motion, which no model makes."""
+
+
+def _judged(model: TextModel | LatentModel):
+    """Return the weights that a row is about."""
+    if isinstance(model, LatentModel):
+        return model.autoencoder_params if model.config is None else model.params
+    return model.params if model.branch is None else model.branch
+
+
+def bench_of(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> Bench | None:
+    """Return what rows are measured with; the judge is trained if it is not, None where `stop_at` comes first.
+
+    Args:
+      data, encoder, profile: as of `measure_text_table`; the judge learns from whole clips and is asked about the first
+        `most_frames` of so many held-out ones as the profile's settings say.
+      folder: where the judge lies instead of `runs/`.
+      **leg: stop_at and progress, as for `optimise`.
+    """
+    judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
+    if judge is None:
+        return None
+    settings = load_paper_file("experiments", "acmdm")["settings"][profile.name]
+    real = judged_clips(data.cut(settings["most_frames"]))
+    chosen = np.random.default_rng(profile.seed).permutation(real.num_clips)[: settings["clips"]]
+    return Bench(judge, encoder, real.select(np.sort(chosen)), settings, profile.seed)
+
+
 def measure_text_table(
     name: str, data: TextMotions, encoder: TextEncoder, profile: Profile, *,
     models: Iterable[str] | None = None, folder=None, rows: Iterable[Mapping] | None = None, **leg,
@@ -277,44 +400,52 @@ def measure_text_table(
       data, encoder: captioned motion, and what embeds captions.
       profile: says how long each row is trained and how often it is measured.
       models: rows of these models alone, which are measured again.
-      folder: where weights lie instead of `runs/`.
+      folder: where judge and weights lie instead of `runs/`.
       rows: instead of the file's.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       The table, `records/<name>.csv`; None where the time was over first.
     """
-    about, asked = load_paper_file("experiments", "acmdm")[name], list(models or ())
-    judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
-    if judge is None:
+    about = load_paper_file("experiments", next(paper for paper, names in PAPERS.items() if name in names))[name]
+    asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, **leg)
+    if bench is None:
         return None
-    settings = load_paper_file("experiments", "acmdm")["settings"][profile.name]
-    bench = Bench(judge, encoder, judged_clips(data), settings, profile.seed)
-    record = run_record(
-        profile=profile, dataset=data, seed=profile.seed, measurement=name, settings=dict(settings),
-        judge_weights=weights_digest(judge.params), text_encoder=encoder.identity,
-    )  # fmt: skip
+    settings, record = bench.settings, bench.record(profile, data, name)
+    # ACMDM's models of a table are all trained alike, and briefly, apart from those that `f3amd text` is to find.
+    apart = folder or runs_dir(profile.dataset, profile.name) / "text_tables"
+    cut, most_frames = data.cut(settings["most_frames"]), settings["most_frames"]
+    brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
     rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
     keys = [column for column in rows[0] if column not in ("trained", "first")]
     records = Records(results_dir(profile.dataset, profile.name) / "records", record, {name: keys}, again=asked)
-    trained = lambda preset: train_text_model(data, encoder, profile, preset, folder=folder, **leg)
+
+    def trained(preset: str) -> TextModel | LatentModel | None:
+        if is_latent_preset(preset.removesuffix(CONTROL)):  # these see clips of a length of their own
+            return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
+        own = "window" in presets.find_preset(preset.removesuffix(CONTROL)).network
+        window = None if own else most_frames
+        return train_text_model(cut, encoder, brief, preset, window=window, folder=apart, **leg)
+
     for row in rows:
         if asked and row["model"] not in asked:
             continue
-        branch = about["kind"] == "control" and row["section"] != "noise optimisation"
-        model, first = trained(row["trained"] + (CONTROL if branch else "")), None
-        if model is not None and model.starts and row["first_prefix"] == "generated":
-            first = trained(row["first"])
-            model = None if first is None else model
-        if model is None:
-            return None
+        model = first = None
+        if row["trained"] != REAL:
+            branch = about["kind"] == "control" and row["section"] != "noise optimisation"
+            model = trained(row["trained"] + (CONTROL if branch else ""))
+            if model is not None and "first" in row:
+                first = trained(row["first"])
+                model = None if first is None else model
+            if model is None:
+                return None
         if leg.get("stop_at") is not None and time.monotonic() >= leg["stop_at"]:
             return None
-        told = model.record["identity"]["training"]
-        named = row | {
-            "windows": told["num_steps"] * told["batch_size"],
-            "weights": weights_digest(model.params if model.branch is None else model.branch),
-        }
+        named = row | {"windows": 0, "weights": weights_digest(bench.judge.params)}
+        if model is not None:
+            told = model.record["identity"]["training"]
+            steps = model.record.get("stopped_at_step", told["num_steps"])
+            named |= {"windows": steps * told["batch_size"], "weights": weights_digest(_judged(model))}
 
         def measured(row: Mapping, model=model, first=first) -> dict:
             return {name: KINDS[about["kind"]](bench, model, row, about, first)}

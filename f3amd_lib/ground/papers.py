@@ -70,9 +70,6 @@ def find_entry(known: Mapping, name, what: str, where: str):
     return known[name]
 
 
-PAPER_SETTING: str = load_paper_file("paper")["setting"]
-"""Label of the F3AMD paper's column: its data and, for times, its hardware and compiler."""
-
 PAPER_TABLES = {entry["number"]: (entry["file"], entry["title"]) for entry in load_paper_file("paper")["table"]}
 """Table number of the F3AMD paper -> (file, title in our words)."""
 
@@ -93,13 +90,13 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     Raises:
       ValueError: if there is no such table.
     """
-    about = load_paper_file("paper", paper)
-    entries = {entry["number"]: entry for entry in about.get("table", ())}
+    description = load_paper_file("paper", paper)
+    entries = {entry["number"]: entry for entry in description.get("table", ())}
     if number not in entries:
         known = f"Tables {next(iter(entries))} to {next(reversed(entries))}" if entries else "no tables"
-        raise ValueError(f"the {about['name']} paper has {known}, not {number!r}")
+        raise ValueError(f"the {description['name']} paper has {known}, not {number!r}")
     frame = _read_table(number, paper).copy()
-    frame.attrs = {"table": number, "title": entries[number]["title"], "setting": about["setting"]}
+    frame.attrs = {"table": number, "title": entries[number]["title"], "setting": description["setting"]}
     return frame
 
 

@@ -39,12 +39,14 @@ _CIRCUMSTANCES = (
 
 ON_WEIGHTS = frozenset(
     "quality quality_by_seed quality_by_round literal_update literal_update_by_seed literal_update_windows noise_use "
-    "x0_by_sigma posterior precision walking foot_spectrum gradient_norm".split()
+    "x0_by_sigma input_use posterior precision walking feet trained foot_spectrum gradient_norm "
+    "round_times".split()
 )
 """Tables that were measured on trained models: what they say goes with the weights."""
 
 THROUGH_CLASSIFIER = frozenset(
-    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling".split()
+    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling "
+    "campaign".split()
 )
 """Tables with FID or EMD: what they say goes with the style classifier."""
 
@@ -139,8 +141,8 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
         _refuse_foreign(path, record_path, record)
 
     text = frame.to_csv(index=False, lineterminator="\n")
-    about = {"file": path.name, "rows": len(frame), "columns": [str(column) for column in frame.columns]}
-    described = _plain(record) | {"table": about | {"sha256": _text_hash(text)}}
+    description = {"file": path.name, "rows": len(frame), "columns": [str(column) for column in frame.columns]}
+    described = _plain(record) | {"table": description | {"sha256": _text_hash(text)}}
     # Each file appears whole. Should the run die between the two, the checksum tells.
     contents = {path: text, record_path: json.dumps(described, indent=2, ensure_ascii=False) + "\n"}
     for file, content in contents.items():
@@ -370,6 +372,18 @@ def kept_rows(path, record: dict) -> pd.DataFrame | None:
         kept = set_aside_table(path)
         log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
         return None
-    for column in {"unit", "weights"} & set(rows):
-        rows[column] = rows[column].fillna("")  # CSV knows no empty text
-    return rows
+    return _with_empty_texts(rows)
+
+
+def others_rows(path, record: dict) -> pd.DataFrame | None:
+    """Return the rows that another run left which asked for the same, or None; its table is only read."""
+    try:
+        rows, theirs = read_table(path)
+    except (ValueError, FileNotFoundError):
+        return None
+    return _with_empty_texts(rows) if record_hash(theirs) == record_hash(record) else None
+
+
+def _with_empty_texts(rows: pd.DataFrame) -> pd.DataFrame:
+    """CSV knows no empty text."""
+    return rows.assign(**{column: rows[column].fillna("") for column in ("unit", "weights") if column in rows})

@@ -39,7 +39,14 @@ from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.attention import dropout
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.spectral import TemporalConvolution
-from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, load_tree, save_tree
+from f3amd_lib.training.checkpoints import (
+    check_kind,
+    describe_skeleton,
+    described_skeleton,
+    errors_name,
+    load_tree,
+    save_tree,
+)
 from f3amd_lib.training.optimise import TrainingState, optimise
 
 ACCURACY_BAR = 0.8
@@ -705,8 +712,7 @@ def load_classifier(path: Path) -> StyleClassifier:
 
 def _template(metadata: dict) -> dict:
     """Return the shapes that a classifier's description speaks of."""
-    if metadata.get("kind") != "style classifier":
-        raise ValueError(f"holds a {metadata.get('kind')}, not a style classifier")
+    check_kind(metadata, "style classifier")
     config = ClassifierConfig.from_dict(metadata["classifier"])
     _, params, statistics = _blank(config)
     shape = jax.ShapeDtypeStruct

@@ -42,7 +42,14 @@ from f3amd_lib.measures.text_metrics import (
 from f3amd_lib.motion.redundant import canonical_start, essential_features
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.text_motion import TextMotionConfig
-from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, load_tree, save_tree
+from f3amd_lib.training.checkpoints import (
+    check_kind,
+    describe_skeleton,
+    described_skeleton,
+    errors_name,
+    load_tree,
+    save_tree,
+)
 from f3amd_lib.training.evaluator_task import (
     EvaluatorTask,
     EvaluatorTraining,
@@ -203,8 +210,7 @@ def load_judge(path: Path) -> TextJudge:
     """Read a judge written by `save_judge`; ValueError names a file that is missing, damaged or of another kind."""
 
     def template(metadata: dict) -> dict:
-        if metadata.get("kind") != "text-to-motion judge":
-            raise ValueError(f"holds a {metadata.get('kind')}, not a text-to-motion judge")
+        check_kind(metadata, "text-to-motion judge")
         config = TextMotionConfig(**metadata["network"])
         numbers = jax.ShapeDtypeStruct((config.features,), jnp.float32)
         offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)

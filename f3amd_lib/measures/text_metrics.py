@@ -117,6 +117,24 @@ def multimodality(motion, generator: np.random.Generator, count: int = 10) -> fl
 
 # ------------------------------------------------------------------------------------------ joints
 
+RAISED = -0.27
+"""Height of a wrist over the head joint, metres, from which a hand is up: the middle of the gap in Bandai's training
+clips, where hands that are raised or waved come above -0.18 and the other hand stays below -0.37."""
+
+
+def raised_hands(skeleton: Skeleton, positions) -> np.ndarray:
+    """Say which hands go up: [..., 2] of bool, left and right.
+
+    Args:
+      skeleton: whose head and wrists are known.
+      positions: [..., L, J, 3], metres.
+
+    Source: ours.
+    """
+    height = np.asarray(positions)[..., 1]
+    wrists = height[..., [skeleton.role("left_wrist"), skeleton.role("right_wrist")]]
+    return np.max(wrists - height[..., [skeleton.role("head")]], axis=-2) > RAISED
+
 
 def foot_skating_ratio(skeleton: Skeleton, positions, fps: float = 20.0) -> float:
     """Share of steps from frame to frame in which a toe glides on the floor.
