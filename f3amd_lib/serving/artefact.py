@@ -188,7 +188,7 @@ def read_manifest(folder) -> dict:
         raise ValueError(f"{path}: no such file, so this folder is no artefact")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not readable as JSON ({error}); restore a whole copy") from None
     found = manifest.get("format") if isinstance(manifest, dict) else None
     if found != FORMAT:

@@ -54,13 +54,39 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
       ImportError: if jax2onnx is not installed, saying how to install it.
       ValueError: for another family, less than one character, or unknown `weights`.
     """
-    if weights not in WEIGHTS:
-        raise ValueError(f"unknown weights {weights!r}{nearest_hint(weights, WEIGHTS)}")
-    if batch is not None and batch < 1:
-        raise ValueError(f"batch must be at least 1 character, got {batch}")
     config = network.config
     if not isinstance(config, ConditionedConfig):
-        raise ValueError(f"only networks of history, path and style are exported as ONNX, got {type(config).__name__}")
+        raise ValueError(f"only networks of history, path and style are exported here, got {type(config).__name__}")
+
+    def denoise(network, x_noisy, sigma, history, path, style):
+        return network(x_noisy, sigma, network.encode(Condition(history, path, style)))
+
+    return onnx_program(network, denoise, input_shapes(config, check_batch(batch)), "x0_hat", weights=weights)
+
+
+def check_batch(batch: int | None) -> int | str:
+    """Return the first number of an input's shape: `batch`, or the name "B" for any; ValueError below 1."""
+    if batch is not None and batch < 1:
+        raise ValueError(f"batch must be at least 1 character, got {batch}")
+    return "B" if batch is None else batch
+
+
+def onnx_program(network, evaluate, shapes: dict[str, tuple], output: str, *, weights: str = "float32") -> bytes:
+    """Return one evaluation of a network as an ONNX program, weights inside.
+
+    Args:
+      network: with its weights.
+      evaluate: `evaluate(network, *inputs)`, one array.
+      shapes: input -> shape, in the order of a call; the first number may be "B", for any. All are float32.
+      output: its name.
+      weights: one of `WEIGHTS`.
+
+    Raises:
+      ImportError: if jax2onnx is not installed, saying how to install it.
+      ValueError: for unknown `weights`.
+    """
+    if weights not in WEIGHTS:
+        raise ValueError(f"unknown weights {weights!r}{nearest_hint(weights, WEIGHTS)}")
     try:
         import jax2onnx
     except ImportError as error:
@@ -69,15 +95,11 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
     # Some weights are kept in bfloat16, which few runtimes compute in; widening them changes nothing.
     graph, state = nnx.split(network)
     network = nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(jnp.float32), state))
-
-    def denoise(x_noisy, sigma, history, path, style):
-        return network(x_noisy, sigma, network.encode(Condition(history, path, style)))
-
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of every shape that it does not need to know
-    shapes = input_shapes(config, "B" if batch is None else batch)
     model = jax2onnx.to_onnx(
-        denoise, list(shapes.values()), model_name="denoiser", input_names=list(shapes), output_names=["x0_hat"]
-    )
+        lambda *inputs: evaluate(network, *inputs), list(shapes.values()), model_name="denoiser",
+        input_names=list(shapes), output_names=[output],
+    )  # fmt: skip
     if weights != "float32":
         _store_small(model.graph, weights)
     return model.SerializeToString()
@@ -120,8 +142,8 @@ def _store_small(graph, weights: str) -> None:
     graph.node.extend(nodes)
 
 
-class OnnxDenoiser:
-    """An ONNX program run by ONNX Runtime on this processor, callable as `denoise(x_noisy, sigma)` after `given`."""
+class OnnxProgram:
+    """An ONNX program run by ONNX Runtime on this processor, callable as `program(name=array, ...)`."""
 
     def __init__(self, program: bytes):
         try:
@@ -131,11 +153,18 @@ class OnnxDenoiser:
         self._session = onnxruntime.InferenceSession(program, providers=["CPUExecutionProvider"])
         self.input_shapes = {item.name: tuple(item.shape) for item in self._session.get_inputs()}
 
+    def __call__(self, **inputs) -> np.ndarray:
+        """Return the one output; inputs are given to it as float32."""
+        return self._session.run(None, {name: np.asarray(value, np.float32) for name, value in inputs.items()})[0]
+
+
+class OnnxDenoiser(OnnxProgram):
+    """A program of `denoiser_program`, callable as `denoise(x_noisy, sigma)` after `given`."""
+
     def __call__(self, x_noisy, sigma, history, path, style) -> np.ndarray:
         """Return x0_hat, [B, T, C]; sigma is [B] or one level for all."""
         sigma = np.broadcast_to(np.asarray(sigma, np.float32), (len(history),))
-        values = [np.asarray(value, np.float32) for value in (x_noisy, sigma, history, path, style)]
-        return self._session.run(None, dict(zip(INPUTS, values, strict=True)))[0]
+        return super().__call__(x_noisy=x_noisy, sigma=sigma, history=history, path=path, style=style)
 
     def given(self, condition: Condition):
         """Return the callable that samplers take, under one condition."""
@@ -239,20 +268,29 @@ def export_onnx(
     Raises:
       ImportError, ValueError: as `denoiser_program`; or if a file is there and `overwrite` is false.
     """
-    folder = Path(folder)
-    if not overwrite and (folder / PROGRAM).exists():
-        raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
+    folder = free_folder(folder, overwrite)
     network = trained.network()
     program = denoiser_program(network, batch=batch, weights=weights)
     error = largest_difference(program, network, trained.diffusion.grid(num_steps)[:-1])
     card = model_card(trained, num_steps)
     card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
+    examples = {path.stem: path.read_bytes() for path in sorted(EXAMPLES.glob("*.txt"))}  # they run beside a card
+    return write_export(folder, program, card, examples)
+
+
+def free_folder(folder, overwrite: bool) -> Path:
+    """Return a folder as a path; ValueError if an export is in it that may not be replaced."""
+    if not overwrite and (Path(folder) / PROGRAM).exists():
+        raise ValueError(f"{Path(folder) / PROGRAM}: exists already; pass --overwrite or another --out")
+    return Path(folder)
+
+
+def write_export(folder: Path, program: bytes, card: dict, beside: dict[str, bytes] | None = None) -> Path:
+    """Write a program, its card and what lies beside them, each file whole or not at all; return the folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()}
-    files |= {
-        path.stem: path.read_bytes()
-        for path in sorted(EXAMPLES.glob("*.txt"))  # no modules: they run beside a card
-    }
+    for path in EXAMPLES.glob("*.txt"):  # those of an export that is replaced would not fit the new card
+        (folder / path.stem).unlink(missing_ok=True)
+    files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()} | (beside or {})
     for name, content in files.items():
         with whole_file(folder / name, overwrite=True) as temporary:
             Path(temporary).write_bytes(content)

@@ -18,8 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, is_head
+from f3amd_lib.generation.foot_locking import leg_chains
 from f3amd_lib.generation.steering import first_pose, usual_pace
 from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.serving.npm_packages import package_credit, package_file
 from f3amd_lib.serving.onnx_export import denoiser_program, model_card
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -33,12 +35,27 @@ MODULES = (
 )
 """Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
 
+_FEET = (
+    "A foot that carries is held where it stands, by a rule of ours that looks at each frame as it comes; the network "
+    "never hears of it. Without the tick you see the feet as the network moves them. The command rollout has a better "
+    "rule, which knows the whole walk before it begins."
+)
+_NO_FEET = "Feet are not held: the legs of this skeleton are not hip, knee, ankle and toe."
+
 _MARKS = {"past": "#b5651d", "taken": "#1b7f4d", "dropped": "#4f7fbf", "target": TARGET_COLOR, "seam": "#d33f3f"}
 
 
+RUNTIMES = {
+    "wasm": ("dist/ort.wasm.bundle.min.mjs", "dist/ort-wasm-simd-threaded.wasm"),
+    "webgpu": ("dist/ort.webgpu.bundle.min.mjs", "dist/ort-wasm-simd-threaded.asyncify.wasm"),
+}
+"""What runs the network -> the script of ONNX Runtime, and its program; the second one also runs without WebGPU."""
+
+
 def steer_page(
-    trained: TrainedModel, *, num_steps: int = 8, weights: str = "int8", program: bytes | None = None
-) -> str:
+    trained: TrainedModel, *, num_steps: int = 8, weights: str = "int8", program: bytes | None = None,
+    runtime: str = "wasm",
+) -> str:  # fmt: skip
     """Return a page on which one steers characters of a model, HTML; it needs no other file and no network.
 
     Args:
@@ -46,11 +63,15 @@ def steer_page(
       num_steps: of the sampler; the page also offers 1.
       weights: how they are stored, see `onnx_export.WEIGHTS`.
       program: from `onnx_export.denoiser_program`, for any number of characters, instead of exporting here.
+      runtime: "wasm"; or "webgpu", which takes the graphics card where the browser lends it, and WebAssembly where it
+        does not. That page is larger.
 
     Raises:
-      ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, or a model that lacks
-        a starting pose for one of its styles.
+      ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, an unknown runtime, or a
+        model that lacks a starting pose for one of its styles.
     """
+    if runtime not in RUNTIMES:
+        raise ValueError(f"unknown runtime {runtime!r}{nearest_hint(runtime, RUNTIMES)}")
     if trained.diffusion.sampler != "ddim":
         raise ValueError(
             f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
@@ -65,15 +86,18 @@ def steer_page(
     poses = [
         first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in zip(trained.styles, paces, strict=True)
     ]
+    legs = _legs(trained.skeleton)
     files = {name: package_file("three", path) if path else (WEB / name).read_bytes() for name, _, path in MODULES}
     files |= {
-        "worker": _worker().encode(),
-        "wasm": package_file("onnxruntime-web", "dist/ort-wasm-simd-threaded.wasm"),
+        "worker": _worker(RUNTIMES[runtime][0]).encode(),
+        "wasm": package_file("onnxruntime-web", RUNTIMES[runtime][1]),
         "program": program,
         "poses": np.asarray(poses, np.float32).tobytes(),
     }
     data = {
-        "card": _used(card) | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")},
+        "card": _used(card)
+        | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
+        | {"legs": legs, "webgpu": runtime == "webgpu"},
         "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
         "head": _head(trained.skeleton),
@@ -100,6 +124,8 @@ def steer_page(
         credit=html.escape(credit),
         licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
         steps=steps,
+        feet=" checked" if legs else " disabled",
+        about_feet=_FEET if legs else _NO_FEET,
         style=string.Template((WEB / "steer.css").read_text(encoding="utf-8")).substitute(
             marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
         ),
@@ -124,13 +150,13 @@ def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **option
     return path
 
 
-def _worker() -> str:
-    """Return the worker as one classic script: a browser lets a page on a disk start no other.
+def _worker(script: str) -> str:
+    """Return the worker, with a bundle of ONNX Runtime, as one classic script: a page on a disk may start no other.
 
     Raises:
       ValueError: if ONNX Runtime's bundle is not written as expected.
     """
-    bundle = package_file("onnxruntime-web", "dist/ort.wasm.bundle.min.mjs").decode("utf-8")
+    bundle = package_file("onnxruntime-web", script).decode("utf-8")
     body, _, names = bundle.partition("export{")
     names, closed, rest = names.partition("};")
     pairs = [name.split(" as ") for name in names.split(",")]
@@ -163,6 +189,14 @@ def _head(skeleton) -> tuple[int, int] | None:
     """Return the head joint and its parent, or None."""
     heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
     return (heads[0], skeleton.parents[heads[0]]) if heads and skeleton.parents[heads[0]] >= 0 else None
+
+
+def _legs(skeleton) -> list[list[int]] | None:
+    """Return hip, knee, ankle and toe of both legs, or None where they are others."""
+    try:
+        return leg_chains(skeleton).tolist()
+    except ValueError:
+        return None
 
 
 def _first_styles(styles) -> tuple[str, str]:

@@ -1,4 +1,5 @@
-// Sampling, kinematics and conditions of a character that is steered: f3amd_lib/generation/steering.py once more, for pages.
+// Sampling, kinematics, conditions and feet of a character that is steered: f3amd_lib/generation/steering.py and online_feet.py
+// once more, for pages.
 // Metres, radians, +Y up; a frame is root x, y, z, then six numbers a joint (two columns of its rotation). Arrays are flat,
 // Float64Array, frame after frame. tests/test_steer_page.py holds these functions to Python's, to 1e-4.
 
@@ -152,8 +153,8 @@ export function blendSeam(history, window, frames) {
 
 // -------------------------------------------------------------------------------------------------------------- kinematics
 
-// Joints, then tips, of a frame: Float64Array of 3 numbers a point. A skeleton has parents, offsets, end_sites [[joint, offset]].
-export function jointPositions(skeleton, frame) {
+// Joints, then tips, of a frame, and the joints' global rotations. A skeleton has parents, offsets, end_sites [[joint, offset]].
+function pose(skeleton, frame) {
   const joints = skeleton.parents.length, points = new Float64Array(3 * (joints + skeleton.end_sites.length)), turned = [];
   for (let joint = 0; joint < joints; joint++) {
     const parent = skeleton.parents[joint], own = columns(frame, 3 + 6 * joint);
@@ -170,7 +171,127 @@ export function jointPositions(skeleton, frame) {
     const step = timesVector(turned[joint], offset);
     points.set(step.map((value, i) => points[3 * joint + i] + value), 3 * (joints + tip));
   });
-  return points;
+  return { points, turned };
+}
+
+// Float64Array of 3 numbers a point, joints and then tips.
+export const jointPositions = (skeleton, frame) => pose(skeleton, frame).points;
+
+// -------------------------------------------------------------------------------------------------------- feet that stand
+
+const RUN_OUT = 30, LET_GO = 12, PAUSE = 6, SLACK = 0.02, FARTHEST = 0.25, STRAIGHT = 0.985;
+
+const add = (a, b) => a.map((value, i) => value + b[i]), subtract = (a, b) => a.map((value, i) => value - b[i]);
+const scale = (a, factor) => a.map((value) => factor * value), dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const unit = (a) => scale(a, 1 / Math.max(Math.hypot(...a), 1e-12));
+
+function shortestTurn(first, second) {
+  const axis = cross(first, second);
+  return matrixFromVector(scale(unit(axis), Math.atan2(Math.hypot(...axis), dot(first, second))));
+}
+
+// The axis of a knee's bend, as the thigh sees it; `across` goes from the right hip to the left one.
+function kneeAxis(hip, knee, ankle, thighTurn, across) {
+  const axis = cross(unit(subtract(knee, hip)), unit(subtract(ankle, knee)));
+  return timesVector(transposed(thighTurn), add(axis, scale(across, 1e-3)));
+}
+
+// How long the line from hip to ankle may become: it yields from the first length on, to the second.
+function legReach(hip, knee, ankle) {
+  const length = Math.hypot(...subtract(knee, hip)) + Math.hypot(...subtract(ankle, knee));
+  const before = Math.hypot(...subtract(ankle, hip));
+  return [STRAIGHT, 0.9995].map((share) => Math.max(before, share * length));
+}
+
+// Rotations, to multiply from the left to those of thigh and shank, that bring the ankle to the end of `line` from the hip.
+function bendLeg(hip, knee, ankle, usual, line, [near, far]) {
+  const down = subtract(knee, hip), on = subtract(ankle, knee), thigh = unit(down), shank = unit(on);
+  const upper = Math.hypot(...down), lower = Math.hypot(...on), wished = Math.hypot(...line), room = Math.max(far - near, 1e-9);
+  const length = Math.min(wished, near) - room * Math.expm1(-Math.max(wished - near, 0) / room);
+  const cosine = (length ** 2 - upper ** 2 - lower ** 2) / (2 * upper * lower);
+  const angle = Math.acos(Math.min(Math.max(cosine, -1), 1));
+  let axis = cross(thigh, shank);
+  axis = add(axis, scale(usual, Math.max(0.03 - dot(axis, usual), 0)));
+  axis = unit(subtract(axis, scale(thigh, dot(axis, thigh))));
+  const bent = add(scale(thigh, Math.cos(angle)), scale(cross(axis, thigh), Math.sin(angle)));
+  const hipTurn = shortestTurn(unit(add(scale(thigh, upper), scale(bent, lower))), unit(line));
+  return [hipTurn, times(hipTurn, shortestTurn(shank, bent))];
+}
+
+// What is kept of the frames before, after a history whose feet stay as they are. legs: hip, knee, ankle, toe of left and right.
+export function startFeet(skeleton, legs, history) {
+  const toes = history.map((frame) => {
+    const { points } = pose(skeleton, frame);
+    return legs.map((leg) => Array.from(points.subarray(3 * leg[3], 3 * leg[3] + 3)));
+  });
+  const both = (make) => [0, 1].map(make), none = () => [0, 0, 0];
+  let feet = {
+    floor: Math.min(...toes.flat().map((toe) => toe[1])), locking: false, usual: 0, carries: both(() => false),
+    pause: both(() => 0), anchor: both((k) => [toes[0][k][0], toes[0][k][2]]), shown: toes[0], pace: both(none), off: both(none),
+    offPace: both(none), toe: toes[0], calm: both(() => 0), lowest: both((k) => toes[0][k][1]), axis: both(none),
+  };
+  for (const frame of history) ({ feet } = lockFrame(skeleton, legs, feet, frame, false));
+  return feet;
+}
+
+// Settle the feet of one frame: {feet, frame}. What each step is for stands in online_feet.py.
+export function lockFrame(skeleton, legs, feet, frame, locking) {
+  const { points, turned } = pose(skeleton, frame), both = (make) => [0, 1].map(make);
+  const joints = legs.map((leg) => leg.map((joint) => Array.from(points.subarray(3 * joint, 3 * joint + 3))));
+  const toe = joints.map((leg) => leg[3]);
+
+  const velocity = both((k) => scale(subtract(toe[k], feet.toe[k]), FPS));
+  const calm = both((k) => feet.calm[k] + 0.7 * (Math.hypot(velocity[k][0], velocity[k][2]) - feet.calm[k]));
+  const usual = feet.usual + (Math.min(...calm) - feet.usual) / FPS;
+  const lowest = both((k) => Math.min(toe[k][1], feet.lowest[k] + 0.03 / FPS));
+  const above = both((k) => Math.max(toe[k][1] - Math.min(lowest[k], feet.floor + 0.04), 0));
+  const unrest = both((k) => above[k] / 0.03 + calm[k] / Math.max(3 * usual, 0.45));
+  const pause = both((k) => Math.max(feet.pause[k] - 1, 0));
+  const carries = both((k) => {
+    const [sure, share, height] = feet.carries[k] ? [1.0, 0.8, 0.08] : [0.8, 0.6, 0.06];
+    return locking && pause[k] === 0 && (unrest[k] < sure || (unrest[k] < share * unrest[1 - k] && above[k] < height));
+  });
+
+  const kept = { floor: feet.floor, locking, usual, carries, pause, toe, calm, lowest, anchor: [], shown: [], pace: [], off: [], offPace: [], axis: [] };
+  const settled = Float64Array.from(frame), across = subtract(joints[0][0], joints[1][0]);
+  for (let k = 0; k < 2; k++) {
+    const [hip, knee, ankle] = joints[k], [upper, lower, heel] = legs[k];
+    const foot = subtract(toe[k], ankle), level = feet.floor + Math.max(foot[1], 0), reach = legReach(hip, knee, ankle);
+    const going = add(feet.shown[k], scale(feet.pace[k], 1 / FPS));
+    const anchor = carries[k] && !feet.carries[k]
+      ? [going[0] + feet.pace[k][0] / RUN_OUT, going[2] + feet.pace[k][2] / RUN_OUT] : feet.anchor[k];
+    const stand = [anchor[0], level, anchor[1]];
+    if (carries[k]) {
+      const away = Math.hypot(anchor[0] - toe[k][0], anchor[1] - toe[k][2]);
+      if (away > FARTHEST || Math.hypot(...subtract(subtract(stand, foot), hip)) > reach[1] + SLACK) {
+        carries[k] = false;
+        pause[k] = PAUSE;
+      }
+    }
+    const goal = carries[k] ? stand : [toe[k][0], locking ? Math.max(toe[k][1], level) : toe[k][1], toe[k][2]];
+    const rate = carries[k] ? RUN_OUT : LET_GO, fade = Math.exp(-rate / FPS);
+    const push = scale(add(feet.offPace[k], scale(feet.off[k], rate)), 1 / FPS);
+    let off = scale(add(feet.off[k], push), fade), offPace = scale(subtract(feet.offPace[k], scale(push, rate)), fade);
+    if (carries[k] !== feet.carries[k] || locking !== feet.locking) {
+      off = subtract(going, goal);
+      offPace = carries[k] ? feet.pace[k] : subtract(feet.pace[k], velocity[k]);
+    }
+    const shown = add(goal, off);
+    if (locking) shown[1] = Math.max(shown[1], level);
+
+    const axis = add(scale(feet.axis[k], 0.97), kneeAxis(hip, knee, ankle, turned[upper], across));
+    const line = subtract(subtract(shown, foot), hip);
+    const [thigh, shank] = bendLeg(hip, knee, ankle, timesVector(turned[upper], unit(axis)), line, reach);
+    const frames = [turned[skeleton.parents[upper]], times(thigh, turned[upper]), times(shank, turned[lower]), turned[heel]];
+    [upper, lower, heel].forEach((joint, i) => {
+      const [x, y] = times(transposed(frames[i]), frames[i + 1]);
+      settled.set([...x, ...y], 3 + 6 * joint);
+    });
+    const own = { anchor, shown, pace: scale(subtract(shown, feet.shown[k]), FPS), off, offPace, axis };
+    for (const [name, value] of Object.entries(own)) kept[name][k] = value;
+  }
+  return { feet: kept, frame: settled };
 }
 
 // ---------------------------------------------------------------------------------------------------------------- characters

@@ -258,7 +258,7 @@ export async function start(data, files, workerUrl) {
   const { card } = data, $ = (id) => document.getElementById(id), canvas = $("view");
   const picture = new Picture(canvas, data), network = new Network(workerUrl);
   const styleOf = (name) => card.styles.indexOf(name);
-  const options = { steps: document.querySelector("input[name=steps]:checked").value, count: 1, hop: HOP, made: false };
+  const options = { steps: document.querySelector("input[name=steps]:checked").value, count: 1, hop: HOP, made: false, locking: $("feet").checked };
   const tapes = []; // per character: its points, frame by frame; all end at the same frame
   let newest = 0, clock = 0, pending = false, last = null, seams = [], times = [], drawn = [], waits = 0, rounds = 0, record = [];
   const frameAt = (tape, frame) => tape[Math.min(Math.max(0, tape.length - 1 - newest + frame), tape.length - 1)];
@@ -270,7 +270,9 @@ export async function start(data, files, workerUrl) {
   });
 
   const poses = new Float32Array(files.poses.buffer);
-  await network.ask("open", { card, wasm: files.wasm.buffer, program: files.program, poses });
+  const { runs, instead } = await network.ask("open", { card, wasm: files.wasm.buffer, program: files.program, poses });
+  $("where").textContent = { webgpu: "on the graphics card, by WebGPU", wasm: "in WebAssembly on one thread" }[runs];
+  if (instead) $("where").textContent += ` (not by WebGPU: ${instead})`;
 
   const ownStyle = (k) => (k === 0 ? styleOf($("first").value) : (styleOf($("first").value) + 37 * k) % card.styles.length);
   function weights(k) {
@@ -311,12 +313,12 @@ export async function start(data, files, workerUrl) {
     const one = { speed: wish.speed * pace() * (+$("speed").value / 100), direction: wish.direction };
     last = await network.ask("round", {
       wishes: tapes.map(() => one), styles: tapes.map((_, k) => weights(k)), sigmas: card.sigmas[options.steps],
-      hop: options.hop, blend: BLEND, noise,
+      hop: options.hop, blend: BLEND, noise, locking: options.locking,
     });
     seams.push({ frame: newest, x: last.made[0].history.at(-1)[0], z: last.made[0].history.at(-1)[2] });
     seams = seams.slice(-20);
-    last.made.forEach(({ frames }, k) => {
-      for (const frame of frames) tapes[k].push(jointPositions(card.skeleton, frame));
+    last.made.forEach(({ shown }, k) => {
+      for (const frame of shown) tapes[k].push(jointPositions(card.skeleton, frame));
       tapes[k].splice(0, Math.max(0, tapes[k].length - 120));
     });
     newest += options.hop;
@@ -402,6 +404,7 @@ export async function start(data, files, workerUrl) {
   for (const input of document.querySelectorAll("input[name=count]"))
     input.addEventListener("change", () => { options.count = +input.value; options.hop = HOP; });
   $("made").addEventListener("change", () => { options.made = $("made").checked; $("legend").hidden = !options.made; });
+  $("feet").addEventListener("change", () => { options.locking = $("feet").checked; });
   // Who has chosen by mouse wants to steer again: arrows would turn the choice over instead.
   $("panel").addEventListener("click", (event) => {
     if (event.detail > 0 && !event.target.closest("select, details")) setTimeout(() => canvas.focus());
@@ -424,19 +427,19 @@ export async function start(data, files, workerUrl) {
   return {
     state: () => ({
       clock, newest, rounds, waits, hop: options.hop, ms: times.length ? median(times) : null, timed: times.length, rate: rate(),
-      count: tapes.length, targets: last?.targets, around: picture.around, frozen,
+      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs,
     }),
     record: () => record,
     forget: () => { record = []; waits = 0; },
     // One round of given numbers from a fresh start, with the game stopped: for tests.
-    async rehearse({ places, wishes: given, styles, noise, sigmas, hop, blend }) {
+    async rehearse({ places, wishes: given, styles, noise, sigmas, hop, blend, locking }) {
       frozen = true;
       while (pending) await new Promise((done) => setTimeout(done, 10));
       await network.ask("characters", { places, keep: false });
       const made = [];
       for (const one of noise)
-        made.push((await network.ask("round", { wishes: given, styles, sigmas, hop, blend, noise: Float32Array.from(one) })).made);
-      return made.map((characters) => characters.map(({ frames }) => frames.map((frame) => Array.from(frame))));
+        made.push((await network.ask("round", { wishes: given, styles, sigmas, hop, blend, locking, noise: Float32Array.from(one) })).made);
+      return made.map((characters) => characters.map(({ shown }) => shown.map((frame) => Array.from(frame))));
     },
   };
 }

@@ -1,7 +1,7 @@
-// The network, in a worker: ONNX Runtime in WebAssembly, one thread, all characters in one call. The page sends what the
-// player wishes, and gets frames back.
+// The network, in a worker: ONNX Runtime in WebAssembly on one thread, or by WebGPU, all characters in one call. The page
+// sends what the player wishes, and gets frames back.
 import * as ort from "onnxruntime-web";
-import { advance, normalNumbers, startCharacter } from "./motion.js";
+import { advance, lockFrame, normalNumbers, startCharacter, startFeet } from "./motion.js";
 
 let card, session, poses, characters = [], draw = normalNumbers(1);
 
@@ -26,20 +26,44 @@ const answers = {
     ({ card } = message);
     poses = frameList(message.poses, card.num_history * card.channels).map((pose) => frameList(pose, card.channels));
     Object.assign(ort.env.wasm, { wasmBinary: message.wasm, numThreads: 1, proxy: false });
-    session = await ort.InferenceSession.create(message.program, { executionProviders: ["wasm"] });
-    return {};
+    const create = (provider) => ort.InferenceSession.create(message.program, { executionProviders: [provider] });
+    if (card.webgpu) {
+      try {
+        if (!(await self.navigator.gpu?.requestAdapter())) throw new Error("this browser lends no graphics card");
+        session = await create("webgpu");
+        return { runs: "webgpu" };
+      } catch (error) {
+        session = await create("wasm");
+        return { runs: "wasm", instead: String(error?.message ?? error) };
+      }
+    }
+    session = await create("wasm");
+    return { runs: "wasm" };
   },
   // Characters that are there stay; new ones start at {x, z, yaw, style}. noise of a seed, for tests.
   characters({ places, seed, keep }) {
     if (seed !== undefined) draw = normalNumbers(seed);
-    characters = places.map((place, k) =>
-      (keep && characters[k]) || startCharacter(poses[place.style], place.x, place.z, place.yaw));
+    characters = places.map((place, k) => {
+      if (keep && characters[k]) return characters[k];
+      const character = startCharacter(poses[place.style], place.x, place.z, place.yaw);
+      if (card.legs) character.feet = startFeet(card.skeleton, card.legs, character.history);
+      return character;
+    });
     return { histories: characters.map(({ history }) => history) };
   },
-  async round({ wishes, styles, sigmas, hop, blend, noise }) {
+  // `shown` has the feet held, if they shall be; histories stay what the network made.
+  async round({ wishes, styles, sigmas, hop, blend, noise, locking = false }) {
     const began = performance.now();
     const drawn = noise ?? draw(characters.length * card.window * card.channels);
     const made = await advance(card, characters, wishes, styles, denoise, drawn, sigmas, hop, blend);
+    characters.forEach((character, k) => {
+      made[k].shown = made[k].frames.map((frame) => {
+        if (!character.feet) return frame;
+        const settled = lockFrame(card.skeleton, card.legs, character.feet, frame, locking);
+        character.feet = settled.feet;
+        return settled.frame;
+      });
+    });
     return { made, targets: characters.map(({ target }) => target), ms: performance.now() - began };
   },
 };
