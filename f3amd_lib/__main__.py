@@ -152,18 +152,17 @@ def presets(
 
     Args:
       paper: its folder in `f3amd_lib/papers`.
-      channels: of F3AMD and CAMDM: features a frame, 6 J + 3.
-      styles: of F3AMD and CAMDM: how many.
-      joints: of ACMDM: J.
-      text_width: of ACMDM and MotionPCM: numbers in a caption's embedding; by default those of the paper's encoder.
+      channels: features a frame, 6 J + 3, for networks of the families F3AMD and CAMDM.
+      styles: how many, for the same.
+      joints: J, for ACMDM's.
+      text_width: for ACMDM's and MotionPCM's: numbers in a caption's embedding; by default the paper's encoder's.
     """
     from f3amd_lib.ground.tables import markdown_table
     from f3amd_lib.networks import presets
 
     text = {} if text_width is None else {"text_width": text_width}
-    sizes = {"f3amd": {"channels": channels, "num_styles": styles}, "acmdm": {"num_joints": joints, **text}}
-    sizes = sizes.get(paper, text)
-    log.info("%s", markdown_table(presets.table(paper, **sizes)))
+    of_data = {"channels": channels, "num_styles": styles, "num_joints": joints, **text}
+    log.info("%s", markdown_table(presets.table(paper, **of_data)))
 
 
 def train(
@@ -351,12 +350,15 @@ def text(
     Args:
       caption: such as "an elderly person raises the left hand".
       then: what the person does after that, without a stop; repeatable. Needs a model of the prefix form.
-      model: a preset, such as ACMDM-S-PS22-raw-n3; by default the newest that is trained.
+      model: a preset, such as ACMDM-S-PS22-raw-n3; by default the newest of ACMDM's that is trained.
+        motionpcm stands for MotionPCM-M1-small.
       data: the data set that it was trained on.
       weights: a weights file instead.
       seconds: of each caption.
-      guidance: how hard the caption pushes; by default the paper's 3 (control 2.5, a stream 4).
-      steps: of Euler's method; by default the model's own sampler, which may choose its steps itself.
+      guidance: how hard the caption pushes; by default the model's own, else the paper's 3 (control 2.5, a stream 4,
+        MotionPCM 14).
+      steps: of Euler's method; by default the model's own sampler, which may choose its steps itself. A student of
+        MotionPCM takes as many as it was trained for, its teacher (MotionPCM-teacher-small) any number.
       seed: of the noise.
       control: CSV with the header frame,x,y,z: where a joint should be, frames from 0, metres. Needs a control branch.
       joint: that is controlled: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
@@ -370,40 +372,48 @@ def text(
     import numpy as np
 
     from f3amd_lib.data.text_encoders import check_captions, embed_captions, load_text_encoder
-    from f3amd_lib.generation import told_motion
+    from f3amd_lib.generation import captioned_motion
     from f3amd_lib.motion.inverse_kinematics import fitted
     from f3amd_lib.motion.skeleton import Motion
     from f3amd_lib.serving.player import Character, Scene
+    from f3amd_lib.training.latent_models import find_latent_model, is_latent_preset, load_latent_model
     from f3amd_lib.training.text_models import find_text_model, load_text_model
 
     captions = [caption, *then]
     check_captions(captions)
-    told_motion.check_solver(steps, guidance)
+    captioned_motion.check_solver(steps, guidance)
+    latent = model is not None and (model.lower() == "motionpcm" or is_latent_preset(model))
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
+    if latent and (then or control):
+        raise ValueError(f"{model} makes whole motions of one caption: leave out --then and --control")
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
     targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
     Model(overwrite=overwrite).check_free(*targets)
-    preset = model or (told_motion.STREAM_PRESET if then else None)
-    trained = load_text_model(weights or find_text_model(data, preset, control=control is not None))
+    preset = model or (captioned_motion.STREAM_PRESET if then else None)
+    if latent:
+        trained = load_latent_model(weights or find_latent_model(data, model))
+    else:
+        trained = load_text_model(weights or find_text_model(data, preset, control=control is not None))
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
     log.info("terms        %s", trained.record.get("dataset_licence"))
     encoder = load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
-    pooled = told_motion.told_captions(trained, encoder, captions, any_words=any_words)
+    pooled = captioned_motion.told_captions(trained, encoder, captions, any_words=any_words)
     key, how, points, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, None, ()
-    if then or trained.starts:
-        windows = told_motion.told_windows(trained, seconds)
+    if then or getattr(trained, "starts", ()):
+        windows = captioned_motion.told_windows(trained, seconds)
         starts = embed_captions(list(trained.starts), encoder).pooled
-        positions = told_motion.stream_told(trained, pooled, [windows] * len(captions), key, starts=starts, **how)
-        each = windows * told_motion.window_frames(trained)
+        counts = [windows] * len(captions)
+        positions = captioned_motion.stream_motions(trained, pooled, counts, key, starts=starts, **how)
+        each = windows * captioned_motion.window_frames(trained)
         boundaries = range(len(positions) - each * len(captions), len(positions), each)
     else:
-        num_frames = told_motion.told_frames(trained, seconds)
+        num_frames = captioned_motion.told_frames(trained, seconds)
         if control is not None:
-            which = told_motion.find_joint(trained, joint)
-            frames, points = told_motion.read_control_csv(control, num_frames)
-            how["control"] = told_motion.control_of(trained, which, frames, points, num_frames)
-        positions = told_motion.motions_told(trained, pooled, num_frames, key, **how)[0]
+            which = captioned_motion.find_joint(trained, joint)
+            frames, points = captioned_motion.read_control_csv(control, num_frames)
+            how["control"] = captioned_motion.control_of(trained, which, frames, points, num_frames)
+        positions = captioned_motion.draw_motions(trained, pooled, num_frames, key, **how)[0]
     title = ", then ".join(captions)
     motion, residual = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, title))
     log.info("bones        joints moved by %.1f cm on average, %.1f cm at most, so that bones keep their lengths",
@@ -462,7 +472,7 @@ def _num_frames(seconds: float) -> int:
 def crowd(
     model: Model, characters: int = 1024, seconds: float = 32 / 30, style: Repeatable = (), seed: int = 0,
     chunk: int | None = None, plan: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="[METRES]")] = None,
-    pictures: bool = False, raw: bool = False, out: Path = Path("out/crowd"),
+    pictures: bool = False, format: str | None = None, raw: bool = False, out: Path = Path("out/crowd"),
 ) -> None:  # fmt: skip
     """Animate any number of characters, streamed to a folder; goes on where it was stopped.
 
@@ -474,7 +484,8 @@ def crowd(
       chunk: characters at once.
       plan: paths that keep this far apart at every frame, 0.8 without a number.
       pictures: draw OUT.png and the player page OUT.html as well, with seams blended and feet held.
-      raw: draw them as the network made them; the folder holds that in any case.
+      format: write everybody to OUT_motions/, too, finished like the pictures: bvh, glb or csv; several with commas.
+      raw: draw and write them as the network made them; the folder holds that in any case.
       out: folder to write to.
     """
     from f3amd_lib.generation.crowd import generate_crowd
@@ -483,8 +494,10 @@ def crowd(
     if plan is not None and len(plan) > 1:
         raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
     drawn = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")] if pictures else []
+    formats = _motion_formats(format) if format else []
+    motions = out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
-    model.check_free(*drawn)
+    model.check_free(*drawn, *([motions] if formats else []))
     generator = model.generator()
     started = time.perf_counter()
     made = generate_crowd(
@@ -494,43 +507,67 @@ def crowd(
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     log.info("took         %.0f s", time.perf_counter() - started)
+    window = None if raw else generator.trained.config.window
+    lock = bool(drawn or formats) and not raw and _has_legs(made.skeleton)
+    shown = lambda character: _finished(made.motion(character), window, lock)
     if pictures:
-        _crowd_pictures(made, *drawn, window=None if raw else generator.trained.config.window)
+        _crowd_pictures(made, shown, *drawn)
     for file in drawn:
         log.info("wrote        %s", file)
+    if formats:
+        _crowd_motions(made, shown, motions, formats)
+        log.info("wrote        %s: everybody as %s", motions, ", ".join(formats))
 
 
-def _finished(motion, window: int, lock: bool):
-    """Blend a motion's seams and hold its feet, as where people look."""
+def _finished(motion, window: int | None, lock: bool):
+    """Blend a motion's seams over 4 frames, unless `window` is None, and hold its feet, as where people look."""
     from f3amd_lib.data.features import motion_from_frames, world_frames
     from f3amd_lib.generation.blending import blend_seams
     from f3amd_lib.generation.foot_locking import lock_feet
 
+    if window is None:
+        return motion
     frames = blend_seams(world_frames(motion), window, min(4, window))
     motion = motion_from_frames(motion.skeleton, frames, motion.fps, motion.name)
     return lock_feet(motion) if lock else motion
 
 
-def _crowd_pictures(crowd, still: Path, page: Path, *, window: int | None) -> None:
-    """Draw a crowd half way through, and write a page that plays up to 100 of it.
-
-    Seams of windows are blended over 4 frames and feet held where they stand, unless `window` is None.
-    """
-    from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
-    from f3amd_lib.drawing.style import save_figure
+def _crowd_credit(crowd) -> str:
     from f3amd_lib.generation.generated import generated_credit
-    from f3amd_lib.serving.player import Character, Scene, write_player
 
     made_by = crowd.settings["model"]
-    motions = [crowd.motion(k) for k in range(min(100, len(crowd)))]
-    if window is not None:
-        lock = _has_legs(crowd.skeleton)
-        motions = [_finished(motion, window, lock) for motion in motions]
+    return generated_credit(made_by["name"], made_by["dataset_credit"], made_by["dataset_licence"])
+
+
+def _crowd_motions(crowd, shown, folder: Path, formats) -> None:
+    """Write a file a character and format, one after the other, so that no crowd is too large: NUMBER_STYLE.bvh.
+
+    Files of an earlier crowd are removed first; what else lies there stays.
+    """
+    digits = len(str(len(crowd) - 1))
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in folder.glob("*"):
+        if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
+            file.unlink()
+    for character in range(len(crowd)):
+        motion = shown(character)
+        name = f"{character:0{digits}d}_{crowd.style(character)}"
+        for ending in formats:
+            _write_motion(folder / f"{name}{ending}", motion, _crowd_credit(crowd), False)
+
+
+def _crowd_pictures(crowd, shown, still: Path, page: Path) -> None:
+    """Draw a crowd half way through, and write a page that plays up to 100 of it; `shown` gives a motion by number."""
+    from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
+    from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.serving.player import Character, Scene, write_player
+
+    name = crowd.settings["model"]["name"]
+    motions = [shown(k) for k in range(min(100, len(crowd)))]
     colors = crowd_colors([motion.name for motion in motions])
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
-    credit = generated_credit(made_by["name"], made_by["dataset_credit"], made_by["dataset_licence"])
-    write_player(page, Scene(characters, title=made_by["name"]), strip=False, credit=credit)
-    save_figure(crowd_figure({made_by["name"]: (motions, colors)}, crowd.num_frames // 2), still)
+    write_player(page, Scene(characters, title=name), strip=False, credit=_crowd_credit(crowd))
+    save_figure(crowd_figure({name: (motions, colors)}, crowd.num_frames // 2), still)
 
 
 def export(
@@ -550,12 +587,13 @@ def export(
     """
     if "onnx" in target:
         from f3amd_lib.serving.onnx_export import export_onnx
+        from f3amd_lib.serving.onnx_text import export_text_onnx, load_text_or_latent
 
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
-        folder = export_onnx(
-            model.load(), out, num_steps=model.steps, batch=characters, weights=stored, overwrite=model.overwrite
-        )
+        how = {"num_steps": model.steps, "batch": characters, "weights": stored, "overwrite": model.overwrite}
+        captioned = model.weights and load_text_or_latent(model.weights)
+        folder = export_text_onnx(captioned, out, **how) if captioned else export_onnx(model.load(), out, **how)
     else:
         from f3amd_lib.serving.export import export_model
 
@@ -571,17 +609,18 @@ def export(
         log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)
 
 
-def steer(model: Model, stored: str = "int8", out: Path = Path("out/steer.html")) -> None:
+def steer(model: Model, stored: str = "int8", runtime: str = "wasm", out: Path = Path("out/steer.html")) -> None:
     """Write a page on which one steers the model by keys, mouse, touch or gamepad; it needs no server.
 
     Args:
       stored: how weights are kept: int8, float16, float32.
+      runtime: what runs the network: wasm; or webgpu, where the browser has it, in a larger page.
       out: page to write.
     """
     from f3amd_lib.serving.steer import write_steer
 
     model.check_free(out)
-    page = write_steer(out, model.load(), num_steps=model.steps, weights=stored)
+    page = write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime)
     log.info("wrote        %s (%.1f MB): open it in a browser", page, page.stat().st_size / 1e6)
 
 
@@ -634,25 +673,26 @@ def measure(
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
-      names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_table1,
-        text_tableA1, text_table3, text_tableA5, by name alone.
+      names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_judge,
+        hands, text_table1, text_tableA1, text_table3, text_tableA5, text_pcm1 to text_pcm4, by name
+        alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
     """
-    from f3amd_lib.experiments import text_tables
     from f3amd_lib.experiments.measure import MEASUREMENTS
+    from f3amd_lib.experiments.text_probes import TEXT_MEASUREMENTS
     from f3amd_lib.ground.files import locked
     from f3amd_lib.ground.names import nearest_hint
     from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.networks import presets
 
     for name in names:
-        if name not in (known := [*MEASUREMENTS, *text_tables.TABLES]):
+        if name not in (known := [*MEASUREMENTS, *TEXT_MEASUREMENTS]):
             raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, known)}")
-    if of_text := [name for name in names if name in text_tables.TABLES]:
+    if of_text := [name for name in names if name in TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
-            raise ValueError(f"{', '.join(of_text)}: measure tables of text to motion by a call of their own")
+            raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
         return _measure_text(of_text, motion, model, minutes)
     models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
@@ -668,9 +708,9 @@ def measure(
 
 
 def _measure_text(names, motion: Data, models, minutes) -> int:
-    """Train and measure the rows of tables of text to motion."""
+    """Measure text to motion; what a table's rows need is trained on the way."""
     from f3amd_lib.data.text_encoders import load_text_encoder
-    from f3amd_lib.experiments.text_tables import measure_text_table
+    from f3amd_lib.experiments.text_probes import TEXT_MEASUREMENTS
     from f3amd_lib.ground.files import locked
     from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.training.text_models import open_text_motions
@@ -681,7 +721,7 @@ def _measure_text(names, motion: Data, models, minutes) -> int:
     stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
     for name in names:
         with locked(records / f".{name}.lock", f"measuring {name}"):
-            table = measure_text_table(name, data, encoder, profile, models=models, stop_at=stop_at)
+            table = TEXT_MEASUREMENTS[name](data, encoder, profile, models=models, stop_at=stop_at)
         if table is None:
             log.info("%-12s unfinished: call again to go on", name)
             return UNFINISHED

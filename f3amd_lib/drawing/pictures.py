@@ -159,6 +159,10 @@ def film_strip(
         _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
+    # One scale for all rows, wide enough for the arms of the last pose.
+    ends = np.array([poses.get_xlim() for poses in axes[:, 0]])
+    for poses in axes[:, 0]:
+        poses.set_xlim(ends[:, 0].min(), ends[:, 1].max())
     for side in ("left", "right"):
         axes[0, 0].plot([], [], color=LIMB_COLORS[side], linewidth=3, label=side)
     if any(_toes(motion) for motion, *_ in rows):
@@ -205,7 +209,8 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, *, scale: float = 6
         if numbered:
             axis.text(place * SLOT, -0.14, f"{place + 1}", fontweight="bold", **center)
         axis.text(place * SLOT, -0.32 if numbered else -0.1, f"{frame / motion.fps:.1f} s", color="#666666", **center)
-    axis.set_xlim(-0.55 * SLOT, (len(chosen) - 0.45) * SLOT)
+    drawn = axis.dataLim.intervalx  # bodies and dots; neither limbs nor shadows are cut off
+    axis.set_xlim(min(-0.55 * SLOT, drawn[0] - 0.05), max((len(chosen) - 0.45) * SLOT, drawn[1] + 0.05))
     axis.set_ylim(-0.5, max(1.7, points[..., 1].max() + 0.2))
     axis.set_aspect("equal", adjustable="box", anchor="W")
     axis.axis("off")
@@ -219,17 +224,20 @@ def _draw_plan(axis, motion: Motion, chosen, path) -> None:
     axis.plot(*root.T, color=TRAIL_COLOR, linewidth=1.6, label="walked")
     everything = np.concatenate([root, target])
     extent = np.ptp(everything, axis=0).max()
-    reach = 0.09 * max(extent, 1.0)
-    yaw = _facing(motion)
+    reach, side = 0.09 * max(extent, 1.0), max(1.25 * extent, 2.0)
+    yaw, numbered = _facing(motion), np.full(2, np.inf)
     for place, frame in enumerate(chosen, start=1):
         angle = 0.0 if yaw is None else yaw[frame]
         ahead, beside = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
         if yaw is not None:
             axis.plot(*np.stack([root[frame], root[frame] + reach * ahead]).T, color="#1A1A1A", linewidth=1.4)
         axis.plot(*root[frame], "o", color="#1A1A1A", markersize=3.5)
-        axis.text(*(root[frame] - 0.8 * reach * beside), f"{place}", fontsize=7, ha="center", va="center")
+        # A figure is as high as 6 % of the side: dots that are nearer to each other share one.
+        if np.linalg.norm(root[frame] - numbered) > 0.06 * side:
+            numbered = root[frame]
+            axis.text(*(numbered - 0.8 * reach * beside), f"{place}", fontsize=7, ha="center", va="center")
     # A square window with some air, never narrower than 2 m: a standing figure is no path.
-    frame_from_above(axis, everything, half=0.5 * max(1.25 * extent, 2.0))
+    frame_from_above(axis, everything, half=0.5 * side)
     axis.locator_params(nbins=4)
     axis.set_xlabel("x (m)", fontsize=8, labelpad=1)
     axis.set_ylabel("z (m)", fontsize=8, labelpad=1)
@@ -302,7 +310,7 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
     where the lower toe was in the last second and a half: feet that stand leave dots, feet that slide strokes.
 
     Args:
-      crowds: title (a second line stands smaller below it) -> (motions, a colour for each).
+      crowds: title (further lines stand smaller below it) -> (motions, a colour for each).
       frame: of the motions.
       columns: panels in a row.
       width: of the figure, inches.
@@ -320,7 +328,9 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
     around = np.array(list(itertools.product((-0.8, 0.8), (0.0, 2.0), (-0.8, 0.8))))
     seen = camera.project(_on_ground(roots)[:, None] + around)[..., :2].reshape(-1, 2)
     (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
-    height = rows * (panel * (high - low) / (right - left) + (0.42 if any(crowds) else 0.0))
+    most_lines = max(len(title.splitlines()) for title in crowds)
+    # As high as its panels are at equal scale, and room for titles and for what may stand below all.
+    height = rows * (panel * (high - low) / (right - left) + (0.13 + 0.2 * most_lines if most_lines else 0.0)) + 0.2
     figure, axes = new_figure(width, height, rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
@@ -329,8 +339,9 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
         draw_crowd(axis, motions, colors, frame, camera, 72.0 * 0.97 * panel / (right - left))
         heading, _, note = title.partition("\n")
         if heading:
-            axis.set_title(heading, pad=16 if note else 6)
-        axis.text(0.0, 1.015, note, transform=axis.transAxes, fontsize=9, color="#444444")
+            axis.set_title(heading, pad=6 + 12 * len(note.splitlines()))
+        # A long note does not make its panel narrower.
+        axis.text(0.0, 1.015, note, transform=axis.transAxes, fontsize=9, color="#444444", in_layout=False)
     return figure
 
 

@@ -286,7 +286,8 @@ def equations_markdown(*, root=None) -> str:
     An equation that no function computes has the reason in its place, `cited_only` in `paper.toml`.
     """
     root = Path(root) if root is not None else repository_root()
-    papers = sorted(paper_folders(), key=lambda paper: paper != _DEFAULT)
+    papers = [paper for paper in paper_folders() if load_paper_file("paper", paper).get("equation")]
+    papers.sort(key=lambda paper: paper != _DEFAULT)
     return _PREFACE + "".join(f"\n{_paper_markdown(root, paper)}" for paper in papers)
 
 

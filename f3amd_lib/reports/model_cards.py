@@ -11,6 +11,7 @@ import hashlib
 import logging
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -18,13 +19,16 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import markdown_table
-from f3amd_lib.measures.registry import SHOWN
+from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.reports.quality_tables import figure_text, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
+from f3amd_lib.training.latent_models import is_latent_preset, load_latent_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
+from f3amd_lib.training.text_models import load_text_model
 
 log = logging.getLogger("f3amd")
 
@@ -98,7 +102,7 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
         trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(trained.params)),
         weights_type=describe(path).get("weights", "bfloat16"),
-        terms=": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else "",
+        terms=_terms(record),
         styles=", ".join(trained.styles), steps=steps, legs=f" ({legs})" if legs else "",
         windows=windows, passes=passes, date=record["date_utc"][:10],
         commit=(record["git_commit"] or "unknown")[:10],
@@ -108,10 +112,113 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     )  # fmt: skip
 
 
+def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
+    """Write the card of a model of text to motion.
+
+    Args:
+      path: the weights.
+      hands: `records/hands.csv`, or None; rows of other weights are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    path = Path(path)
+    trained = load_text_model(path)
+    record, recipe = trained.record, trained.record["identity"]["training"]
+    # A model may be trained in several legs, of which the recipe is the last's.
+    motions = record.get("motions_seen", recipe["num_steps"] * recipe["batch_size"])
+    steps, legs = motions // recipe["batch_size"], record.get("schedule_note")
+    paper = load_paper_file("paper", "acmdm")["training"]
+    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
+    measured = "Not measured yet."
+    if hands is not None:
+        own = hands[(hands["weights"] == weights_digest(trained.params)) | hands["model"].isin(["real clips"])]
+        if own["weights"].notna().any():
+            columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
+            counts = own.fillna({"wording": "clips"}).groupby(["model", "wording"], sort=False)[columns].sum()
+            counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
+            measured = f"Which hand goes up where the caption says left or right:\n\n{markdown_table(counts)}"
+    template = Path(__file__).with_name("text_model_card.template").read_text(encoding="utf-8")
+    return template.format(
+        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
+        count=sum(leaf.size for leaf in jax.tree.leaves((trained.params, trained.codec.params))),
+        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record),
+        state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
+        if trained.codec.autoencoder else "positions of joints",
+        seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
+        paper=paper["says"], steps=steps, legs=f" ({legs})" if legs else "",
+        guidance=f"{record['guidance']:g}" if "guidance" in record else "the paper's 3",
+        passes=motions / record["num_train_clips"], date=record["date_utc"][:10],
+        commit=(record["git_commit"] or "unknown")[:10],
+        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        loss=history["held_out_loss"].dropna().iloc[-1], measured=measured, words=len(trained.words),
+    )  # fmt: skip
+
+
+def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
+    """Write the card of a model of MotionPCM.
+
+    Args:
+      path: the weights.
+      tables: `records/text_pcm*.csv` by name, those that there are.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    path = Path(path)
+    trained = load_latent_model(path)
+    record, recipe = trained.record, trained.training
+    motions = recipe["num_steps"] * recipe["batch_size"]
+    paper = load_paper_file("paper", "motionpcm")["training"]
+    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
+    shown = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance", "sampling_seconds"]
+    rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
+            for name, table in tables.items() if "steps" in table]  # fmt: skip
+    measured = "Not measured yet."
+    if rows and len(own := pd.concat(rows)):
+        own = own.assign(text=own["value"].map("{:.3g}".format))
+        wide = own.drop_duplicates(["steps", "metric"]).pivot(index="steps", columns="metric", values="text")
+        wide = wide[[metric for metric in shown if metric in wide]].fillna("–")
+        wide.columns = [METRICS[metric].title for metric in wide.columns]
+        measured = (
+            f"On held-out captions, by a judge of ours, in 16 bits:\n\n{markdown_table(wide.reset_index())}\n\n"
+            "Figures of one judge compare with each other alone."
+        )
+    movement = "Its autoencoder was trained as briefly, and vague where that was too short"
+    if (table := tables.get("text_pcm3")) is not None:
+        kept = table.set_index("metric")["value"].get("kept_movement", float("nan"))
+        movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
+    template = Path(__file__).with_name("latent_model_card.template").read_text(encoding="utf-8")
+    is_student = bool(trained.config.guidance_features)
+    return template.format(
+        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
+        count=sum(leaf.size for leaf in jax.tree.leaves((trained.params, trained.autoencoder_params))),
+        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record),
+        what=f"student of {recipe['num_phases']} step{'s' * (recipe['num_phases'] > 1)}" if is_student
+        else "teacher, sampled by DDIM",
+        seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
+        paper=paper["says"], passes=motions / record["num_train_clips"], date=record["date_utc"][:10],
+        commit=(record["git_commit"] or "unknown")[:10],
+        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        loss=history["held_out_loss"].dropna().iloc[-1], measured=measured, words=len(trained.words),
+        latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}", movement=movement,
+    )  # fmt: skip
+
+
+def _terms(record: dict) -> str:
+    return ": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else ""
+
+
 def checksums(folder: Path) -> str:
     """Return lines for `sha256sum --check` of all weights below a folder."""
     folder = Path(folder)
-    files = sorted(folder.glob("*/*.safetensors"))
+    files = sorted(folder.rglob("*.safetensors"))
     return "".join(
         f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n" for file in files
     )
@@ -150,6 +257,27 @@ def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(window_frames=32)
 
 
+def committed_hands(dataset: str) -> pd.DataFrame | None:
+    """Return what is on record of the hands that captions raise, or None."""
+    path = repository_root() / "paper_figures" / dataset / "laptop" / "records" / "hands.csv"
+    return read_table(path)[0] if path.exists() else None
+
+
+def committed_latent_tables(dataset: str) -> dict[str, pd.DataFrame]:
+    """Return what is on record of MotionPCM's models, by table."""
+    folder = repository_root() / "paper_figures" / dataset / "laptop" / "records"
+    return {path.stem: read_table(path)[0] for path in sorted(folder.glob("text_pcm*.csv"))}
+
+
+def card_of(path: Path) -> str:
+    """Return the card of a shipped file, `<data set>/NAME` or `<data set>/text/NAME`, from committed results."""
+    if path.parent.name == "text" and is_latent_preset(path.stem):
+        return latent_model_card(path, committed_latent_tables(path.parent.parent.name))
+    if path.parent.name == "text":
+        return text_model_card(path, committed_hands(path.parent.parent.name))
+    return model_card(path, committed_quality(path.parent.name))
+
+
 def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     """Write the card beside every weights file below a folder, and `checksums.txt`.
 
@@ -161,10 +289,10 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     """
     folder = Path(folder)
     cards = []
-    for path in sorted(folder.glob("*/*.safetensors")):
+    for path in sorted(folder.rglob("*.safetensors")):
         card = path.with_suffix(".md")
         with whole_file(card, overwrite=True) as temporary:
-            temporary.write_text(model_card(path, committed_quality(path.parent.name)), encoding="utf-8")
+            temporary.write_text(card_of(path), encoding="utf-8")
         cards.append(card)
     (folder / "checksums.txt").write_text(checksums(folder), encoding="utf-8")
     return cards
