@@ -6,7 +6,7 @@
 
 A fault is a text of a file and what it is replaced by. A text that does not occur exactly once is refused: the code
 has moved on, and the fault with it. Before a fault is planted its tests must pass. Rows are written one by one, so that
-a run that was stopped goes on; `docs/faults.md` is written from them.
+a run that was stopped goes on; `docs/faults.md` is written from them, and from what `scripts/fuzz.py --keep` counted.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST, RESULTS, PAGE = ROOT / "tests" / "faults.toml", ROOT / "docs" / "faults.csv", ROOT / "docs" / "faults.md"
+FUZZ = ROOT / "docs" / "fuzz.csv"
 COLUMNS = ("name", "area", "file", "caught", "by", "seconds", "fault")
 BAR = 0.95
 
@@ -174,7 +175,7 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
         f"{caught} of {len(rows)} planted faults are caught by tests. {waiting}`python scripts/faults.py` plants",
         "what has no row yet, and what slipped through: each fault in a copy of the tree, in which the tests that",
         "should notice are run. `make test` and `make test-slow` run them without it.",
-        "`tests/faults.toml` has the texts, `docs/faults.csv` the rows; the script writes this page from both.",
+        "`tests/faults.toml` has the texts, `docs/faults.csv` the rows; the script writes this page.",
         "",
         "| area | fault | file | caught by |",
         "|---|---|---|---|",
@@ -182,7 +183,34 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
     for fault, row in rows:
         by = row["by"].removeprefix("tests/") if row["caught"] == "yes" else "**nothing**"
         lines.append(f"| {fault.area} | {fault.name} | `{fault.file.removeprefix('f3amd_lib/')}` | {by} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_fuzzed()]) + "\n"
+
+
+def _fuzzed() -> list[str]:
+    """Return the part of the page on damaged files, from what `scripts/fuzz.py --keep` counted."""
+    with FUZZ.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    files, others = (sum(int(row[column]) for row in rows) for column in ("files", "other_errors"))
+    lines = [
+        "",
+        "## Damaged files",
+        "",
+        f"`python scripts/fuzz.py --keep` damaged {files:,} files at random and read them. {others} of them gave",
+        "another error than a `ValueError` that names the file. How many each reader was given, and for how long:",
+        "",
+        "| reader | files | other errors | minutes | seed |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        told = row["reader"], f"{int(row['files']):,}", row["other_errors"], row["minutes"], row["seed"]
+        lines.append(f"| {' | '.join(told)} |")
+    lines += [
+        "",
+        "What it found is mended, and each find is a test: a control file that is no text, a queue that is no TOML,",
+        "the head of a crowd's array, a manifest nested too deep for Python (`tests/test_bad_input.py`), published",
+        "weights cut short (`tests/test_published.py`).",
+    ]
+    return lines
 
 
 def _write(faults: list[Fault], results: dict[str, dict[str, str]]) -> None:
@@ -220,6 +248,7 @@ def main() -> int:
         "MPLBACKEND": "Agg",
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
     }
+    _write(faults, results)
     sound: set[tuple[str, ...]] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         tree = Path(folder) / "tree"

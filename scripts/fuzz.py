@@ -2,6 +2,7 @@
 
     python scripts/fuzz.py bvh --minutes 10
     python scripts/fuzz.py --minutes 2          each reader in turn
+    python scripts/fuzz.py bvh --keep           counts go to docs/fuzz.csv; scripts/faults.py shows them on its page
 
 What a reader lets through is written to --out with its traceback. Make a test of it.
 """
@@ -9,6 +10,7 @@ What a reader lets through is written to --out with its traceback. Make a test o
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import logging
 import random
@@ -25,14 +27,19 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+
 from f3amd_lib.data.humanml3d import read_caption_table, read_humanml3d, write_humanml3d
 from f3amd_lib.data.packed import load_packed, pack, save_packed
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.data.text_motions import text_motions
+from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.records import kept_rows, read_table, write_table
 from f3amd_lib.motion.bvh import format_bvh, read_bvh
 from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+COUNTS = Path(__file__).resolve().parents[1] / "docs" / "fuzz.csv"
 
 WORDS = (
     "0 -1 1e308 1e-320 nan inf 99999999999999999999 \ud800 \x00 { } [ ] # , \" ' null true [[[[[[[[ Frames: CHANNELS "
@@ -130,6 +137,67 @@ def _make_humanml3d(folder: Path) -> None:
     write_humanml3d(folder / "set", data)
 
 
+def _make_crowd(folder: Path) -> None:
+    from f3amd_lib.generation import crowd
+    from f3amd_lib.training.checkpoints import describe_skeleton
+
+    out, skeleton = folder / "crowd", walk().skeleton
+    out.mkdir()
+    settings = {"format": crowd.FORMAT, "num_characters": 3, "num_frames": 40, "fps": 30.0, "styles": ["calm", "proud"]}
+    settings |= describe_skeleton(skeleton) | {"offsets": skeleton.offsets.tolist()}
+    crowd._lay_out(out, settings)
+    crowd._write_settings(out, settings, finished=3)
+
+
+def _read_crowd(folder: Path) -> None:
+    from f3amd_lib.generation.crowd import read_crowd
+
+    crowd = read_crowd(folder / "crowd")
+    if len(crowd) != 3 or crowd.num_frames != 40:
+        raise AssertionError("a damaged crowd was read as another")
+
+
+def _make_manifest(folder: Path) -> None:
+    from f3amd_lib.serving import artefact
+
+    manifest = {"format": artefact.FORMAT, "files": {"round.mlirbc": {"bytes": 3, "sha256": "00"}}}
+    text = json.dumps(manifest | {"sha256": artefact.manifest_digest(manifest)}, indent=1)
+    (folder / artefact.MANIFEST).write_text(text)
+
+
+def _read_manifest(folder: Path) -> None:
+    from f3amd_lib.serving.artefact import read_manifest
+
+    read_manifest(folder)
+
+
+def _read_control(folder: Path) -> None:
+    from f3amd_lib.generation.captioned_motion import read_control_csv
+
+    read_control_csv(folder / "control.csv", 40)
+
+
+def _read_queue(folder: Path) -> None:
+    from f3amd_lib.experiments.campaign import queue
+
+    queue(folder / "queue.toml")
+
+
+def _make_published(folder: Path) -> None:
+    from safetensors.numpy import save_file
+
+    arrays = {"embed.weight": np.ones((3, 4), np.float32), "embed.bias": np.zeros(3)}
+    save_file(arrays, folder / "a.safetensors")
+    np.savez(folder / "a.npz", **arrays)
+
+
+def _read_published(folder: Path) -> None:
+    from f3amd_lib.training.published import published_arrays
+
+    for path in (folder / "a.safetensors", folder / "a.npz"):
+        published_arrays(path)
+
+
 READERS = {
     "bvh": Reader(lambda f: (f / "a.bvh").write_text(format_bvh(walk(4))), lambda f: read_bvh(f / "a.bvh"), "a.bvh"),
     "path": Reader(
@@ -155,6 +223,22 @@ READERS = {
     "humanml3d": Reader(
         _make_humanml3d, lambda f: read_humanml3d(f / "set", vectors=True, fewest_frames=2), "set/**/*"
     ),
+    "control": Reader(
+        lambda f: (f / "control.csv").write_text("frame,x,y,z\n0,0,1,0\n9,0.5,1.5,0.25\n39,1e-1,2,3\n"),
+        _read_control,
+        "control.csv",
+    ),
+    "queue": Reader(
+        lambda f: (f / "queue.toml").write_text(
+            '[[run]]\npresets = ["F3AMD-FNO-32"]\nseeds = [0, 1]\nwindows = [200, 400]\n'
+            '[[run]]\nrecipes = ["mixed-noise"]\nwindow = 64\nwindows = [400]\n'
+        ),
+        _read_queue,
+        "queue.toml",
+    ),
+    "crowd": Reader(_make_crowd, _read_crowd, "crowd/*"),
+    "manifest": Reader(_make_manifest, _read_manifest, "manifest.json"),
+    "published": Reader(_make_published, _read_published, "a.*"),
 }
 
 
@@ -184,6 +268,19 @@ def attack(name: str, folder: Path, *, seconds: float = float("inf"), cases: int
         yield number, error, path, data
 
 
+def keep(row: dict, path: Path = COUNTS) -> None:
+    """Put a reader's counts in the place of its earlier ones; rows stand in the order of `READERS`."""
+    rows = {}
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = {earlier["reader"]: earlier for earlier in csv.DictReader(file)}
+    rows[row["reader"]] = row
+    with whole_file(path, overwrite=True) as part, part.open("w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, list(row), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows[name] for name in READERS if name in rows)
+
+
 def main() -> int:
     """Attack the readers that are named; status 1 if one let something through."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -191,6 +288,7 @@ def main() -> int:
     options.add_argument("--minutes", type=float, default=1.0, help="of each reader")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--out", type=Path, default=Path("runs/fuzz"))
+    options.add_argument("--keep", action="store_true", help="write the counts to docs/fuzz.csv")
     asked, found = options.parse_args(), 0
     logging.disable(logging.CRITICAL)  # broken tables are set aside with a warning
     warnings.simplefilter("ignore")
@@ -212,6 +310,9 @@ def main() -> int:
                     (asked.out / f"{name}-{number}.txt").write_text("".join(traceback.format_exception(error)))
                     print(f"{name}: {what}: {str(error)[:200]!r}, kept as {kept}", flush=True)
         found += len(seen)
+        if asked.keep:
+            counts = {"files": number, "other_errors": sum(seen.values())}
+            keep({"reader": name, **counts, "minutes": f"{asked.minutes:g}", "seed": asked.seed})
         print(f"{name}: {number} files, {len(seen)} kinds of error let through {json.dumps(seen)}", flush=True)
     return 1 if found else 0
 

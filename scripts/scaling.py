@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pandas as pd
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+
 from f3amd_lib.experiments.campaign import STEPS_MEASURED, queue
 from f3amd_lib.experiments.sweep import CAMPAIGN, Leg, plan
 from f3amd_lib.ground.profiles import load_profile

@@ -9,12 +9,16 @@ it: nothing is blended, no foot is held.
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
 from f3amd_lib.drawing.pictures import draw_crowd
 from f3amd_lib.drawing.stick_figures import TARGET_COLOR, Camera

@@ -8,16 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.text_motions import TextMotions, text_motions
 from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
+from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
-from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
@@ -63,6 +66,32 @@ def straight_motion(num_frames: int = 120, step=(0.03, 0.0, 0.04)) -> Motion:
     root = np.array([0.3, 0.9, -0.2]) + np.arange(num_frames)[:, None] * np.array(step)
     rotations = np.broadcast_to(np.eye(3), (num_frames, SKELETON.num_joints, 3, 3))
     return Motion(SKELETON, root, rotations, name="straight")
+
+
+def stiff_walk(step: float, num_frames: int = 60) -> Motion:
+    """A stiff figure at `step` metres a frame along +Z."""
+    return straight_motion(num_frames, (0.0, 0.0, step))
+
+
+def walks_and_runs() -> PackedMotion:
+    """Calm walks 1.2 m/s and has a run in the test split; of proud only fast test clips exist."""
+    train, validation, test = 0, 1, 2
+    made = packed_from(
+        [
+            (stiff_walk(0.04), 0, train),
+            (stiff_walk(0.04), 0, train),
+            (stiff_walk(0.12), 0, train),
+            (stiff_walk(0.03), 1, train),
+            (stiff_walk(0.042), 0, test),
+            (stiff_walk(0.12), 0, test),
+            (stiff_walk(0.09), 1, test),
+            (stiff_walk(0.15), 1, test),
+            (stiff_walk(0.04, 9), 0, test),
+            (stiff_walk(0.045), 0, validation),
+        ]
+    )
+    made.floor_shift[:] = np.linspace(0.01, 0.10, 10)
+    return made
 
 
 def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedMotion:
@@ -129,16 +158,10 @@ def network_of(config: NetworkConfig) -> nnx.Module:
     return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, state))
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _evaluate(graph, state, x_noisy, sigma, condition):
-    network = nnx.merge(graph, state)
-    return network(x_noisy, sigma, network.encode(condition))
-
-
 def evaluate(network, x_noisy, sigma, condition):
-    """Encode and denoise under jit, which is compiled once per config and shape."""
-    graph, state = nnx.split(network)
-    return _evaluate(graph, state, x_noisy, sigma, condition)
+    """Encode and denoise, compiled once per form of the network and shape."""
+    network = Compiled(network)
+    return network(x_noisy, sigma, network.encode(condition))
 
 
 def draw(*shape, seed: int = 0):
@@ -191,6 +214,21 @@ def same_tree(first, second) -> bool:
     )
 
 
+class AnsweringNetwork:
+    """In the place of a network: answers by a rule, `answer(x_noisy, sigma)`."""
+
+    config = tiny_config()
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def encode(self, condition):
+        return condition
+
+    def __call__(self, x_noisy, sigma, context):
+        return self.answer(x_noisy, sigma)
+
+
 def tiny_trained(record=None, config=None, diffusion=None, **changes) -> TrainedModel:
     """A trained model in form only: initial weights, real normaliser, real seed histories."""
     config = config or tiny_config(**changes)
@@ -223,3 +261,14 @@ def cut_off(png) -> bool:
     with Image.open(png) as image:
         grey = np.asarray(image.convert("L"))
     return bool((np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]]) < 160).any())
+
+
+def captioned_walks(styles, splits, num_frames: int) -> TextMotions:
+    """Six captioned walks a style, 20 frames a second; clips beyond the list of splits are of its last."""
+    clips = []
+    for style in styles:
+        for seed in range(6):
+            walk = synthetic.synthesize(style, seconds=num_frames / 20.0, seed=seed)
+            motion, split = resample(walk, 20.0).slice(0, num_frames), splits[min(seed, len(splits) - 1)]
+            clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
+    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")

@@ -67,6 +67,20 @@ def cache_dir(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.fixture
+def model_that(monkeypatch):
+    """Make a tiny model whose network answers by a rule: `model_that(lambda x_noisy, sigma: ..., **changes)`."""
+    from builders import AnsweringNetwork, tiny_trained
+
+    from f3amd_lib.training.checkpoints import TrainedModel
+
+    def make(answer, **changes):
+        monkeypatch.setattr(TrainedModel, "network", lambda self: AnsweringNetwork(answer))
+        return tiny_trained(**changes)
+
+    return make
+
+
+@pytest.fixture
 def no_network(monkeypatch):
     """Make any download a failure of the test."""
     import pooch

@@ -97,6 +97,10 @@ WRONG["C10.a"] = [
     (lambda a, beta, rounds: beta * (np.float64(a) ** rounds - 1) / (np.float64(a) - 1 + 1e-300), "for a = 1"),
     (lambda a, beta, rounds: _one_by_one(a, beta, rounds) if rounds else beta, "no error yet"),
     (lambda a, beta, rounds: beta * a ** (rounds - 1), "write down the first three"),
+    (
+        lambda a, beta, rounds: rounds * beta if a == 1 else beta * (abs(a) ** rounds - 1) / (a - 1),
+        "a = -0.5",
+    ),  # its sign
 ]
 
 

@@ -52,6 +52,16 @@ STATE = normal(1, BATCH, 8, 5, 4)
 TIME = jnp.asarray([0.3, 0.8])
 
 
+def test_a_captions_vector_is_scaled_and_no_caption_stays_none():
+    plain, scaled = (fresh(config_of(text_scale=scale)) for scale in (1.0, 32.0))
+    told = condition()
+    longer = told._replace(pooled=32.0 * told.pooled)
+    np.testing.assert_allclose(scaled.encode(told).text, plain.encode(longer).text, rtol=1e-5, atol=1e-5)
+    assert not np.allclose(scaled.encode(told).text, plain.encode(told).text, atol=0.1)
+    nothing = told.without_text()
+    np.testing.assert_array_equal(scaled.encode(nothing).text, plain.encode(nothing).text)
+
+
 # ------------------------------------------------------------------------------------------------- against the facts
 
 
@@ -314,7 +324,7 @@ def test_rounds_reveal_few_frames_first_and_all_at_last():
 
 
 def test_presets_are_found_across_papers_and_keep_to_their_own():
-    assert {preset.paper for preset in presets.PRESETS.values()} == {"f3amd", "acmdm", "motionpcm"}
+    assert {preset.paper for preset in presets.PRESETS.values()} >= {"f3amd", "acmdm", "motionpcm"}
     assert set(presets.of_paper()) & set(presets.of_paper("acmdm")) == set()
     # "-raw" ends names of both papers: in one it is a form, in the other a row.
     assert presets.find_preset("F3AMD-FNO-32-raw").network["input_scaling"] is False

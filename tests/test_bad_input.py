@@ -16,6 +16,9 @@ from builders import SKELETON, packed_from, refused, tiny_packed, tiny_trained, 
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import load_packed, pack, packed_dataset, save_packed
 from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.experiments.campaign import Run, queue
+from f3amd_lib.generation.captioned_motion import read_control_csv
+from f3amd_lib.generation.crowd import _open_array
 from f3amd_lib.generation.rollout import MOST_STEPS, MotionGenerator
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.profiles import load_profile
@@ -23,6 +26,7 @@ from f3amd_lib.measures.metrics import camdm_metrics, camdm_orientation_error
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.root_paths import named_path, read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton, facing_yaw
+from f3amd_lib.serving.artefact import read_manifest
 from f3amd_lib.training.checkpoints import describe, load_model, load_tree, save_tree
 from f3amd_lib.training.recipe import TrainingConfig
 
@@ -233,6 +237,59 @@ def test_descriptions_nested_deeper_than_python_reads_are_refused_by_name(tmp_pa
     save_tree(path, {"a": jnp.ones(2)}, {})
     refused("deep.safetensors", describe, path)
     refused("deep.safetensors", load_tree, path, {"a": jnp.ones(2)})
+
+
+# ------------------------------------------------------------------------- finds of the fuzz
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"[[run]]\nwindows = [", "Invalid value|Unclosed array"),
+        (b"[[run]]\nwindows = [1] # \xbc", "'utf-8' codec"),
+        (b"seeds = [" + b"[" * 3000, "recursion"),
+        (b"[[run]]\nwindows = [" + b"9" * 5000 + b"]", "5000 digits"),
+        (b"[[runs]]\nwindows = [1]", "has no 'run'"),
+        (b"[[run]]\nseeds = [1]", "run 1: has no 'windows'"),
+        (b"[[run]]\nwindow = 32\nwindowss = [1]\nwindows = [1]", "unknown key 'windowss'; did you mean 'windows'"),
+        (b"[[run]]\nwindows = 2e2", r"run 1: windows takes whole numbers of 1 or more, got 200\.0"),
+        (b"[[run]]\nwindows = [1]\nseeds = [-1]", "run 1: seeds takes whole numbers of 0 or more"),
+        (b"[[run]]\nwindows = [1]\nwindow = [32]", "run 1: window takes whole numbers of 2 or more"),
+        (b'[[run]]\nwindows = [1]\npresets = ["F3AMD-FNO-33"]', "unknown model 'F3AMD-FNO-33'"),
+        (b'run = 3', "garbles"),
+    ],
+)  # fmt: skip
+def test_a_broken_queue_is_refused_by_file_and_run(tmp_path, text, message):
+    path = tmp_path / "queue.toml"
+    path.write_bytes(text)
+    refused(rf"(?s)queue\.toml: .*({message})", queue, path)
+    path.write_text('[[run]]\npresets = ["F3AMD-FNO-32"]\nseeds = [0, 3]\nwindow = 64\nwindows = [2]\n')
+    assert queue(path) == [(Run("F3AMD-FNO-32", window=64, seed=seed), 2000) for seed in (0, 3)]
+
+
+def test_a_control_that_is_no_text_or_one_endless_cell_is_refused_by_line(tmp_path):
+    path = tmp_path / "control.csv"
+    path.write_bytes(b"frame,x,y,z\n0,0,1,\xd3\n")
+    refused(r"control\.csv: not a text file \(byte 18 is not UTF-8\)", read_control_csv, path, 40)
+    path.write_text("frame,x,y,z\n0,0,1," + "9" * 200_000 + "\n")  # more than Python's reader of CSV takes
+    refused(r"control\.csv: line 2: .{0,90} is not four finite numbers", read_control_csv, path, 40)
+    path.write_text('"frame","x","y","z"\n\n3,"0.5",1,2\n')
+    frames, points = read_control_csv(path, 40)
+    assert frames.tolist() == [3] and points.tolist() == [[0.5, 1.0, 2.0]]
+
+
+def test_a_manifest_nested_deeper_than_python_reads_is_refused_by_name(tmp_path):
+    (tmp_path / "manifest.json").write_text("[" * 100_000)
+    refused(r"manifest\.json: not readable as JSON", read_manifest, tmp_path)
+
+
+def test_an_array_of_a_crowd_with_a_damaged_head_is_refused_by_name(tmp_path):
+    """numpy hands the head to Python's tokenizer, whose errors are of a kind of their own."""
+    path = tmp_path / "root.npy"
+    np.save(path, np.zeros((3, 40, 3), "<f4"))
+    path.write_bytes(path.read_bytes().replace(b"(3, 40, 3), }", b"(3, 40, 3)(  "))
+    settings = {"num_characters": 3, "num_frames": 40, "joints": ["a"]}
+    refused(r"root\.npy: is not a whole array", _open_array, tmp_path, "root", settings)
 
 
 # ------------------------------------------------------------------------- CAMDM's own orientation

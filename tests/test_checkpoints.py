@@ -1,5 +1,6 @@
 """Files of weights: exact round trips, and a plain word about every broken file."""
 
+import dataclasses
 import json
 import shutil
 
@@ -7,9 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, evaluate, random_frames, refused, same_tree, tiny_trained
+from builders import (
+    CHANNELS,
+    HISTORY,
+    SKELETON,
+    WINDOW,
+    draw,
+    evaluate,
+    make_condition,
+    random_frames,
+    refused,
+    same_tree,
+    tiny_trained,
+)
 from safetensors.numpy import save_file
 
+from f3amd_lib.data.features import frame_positions
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.checkpoints import load_model, load_tree, save_model, save_tree
@@ -103,6 +117,24 @@ def test_model_can_be_kept_in_full_precision(trained, tmp_path):
     np.testing.assert_array_equal(
         evaluate(loaded.network(), frames, 2.0, condition), evaluate(trained.network(), frames, 2.0, condition)
     )
+
+
+def test_a_models_denoiser_has_its_weights_its_condition_and_its_level(trained):
+    x_noisy, condition = draw(2, WINDOW, CHANNELS), make_condition()
+    network, denoise = trained.network(), trained.denoiser(condition)
+    np.testing.assert_allclose(denoise(x_noisy, 3.0), evaluate(network, x_noisy, 3.0, condition), atol=1e-5)
+    unlike = lambda other: float(jnp.abs(other - denoise(x_noisy, 3.0)).max())
+    assert unlike(denoise(x_noisy, 0.3)) > 1e-3
+    assert unlike(trained.denoiser(condition._replace(path=condition.path + 1.0))(x_noisy, 3.0)) > 1e-4
+    doubled = dataclasses.replace(trained, params=jax.tree.map(lambda leaf: 2.0 * leaf, trained.params))
+    assert unlike(doubled.denoiser(condition)(x_noisy, 3.0)) > 1e-3
+
+
+def test_joints_of_network_units_are_in_metres(trained):
+    frames = random_frames((2, WINDOW))
+    joints = trained.joint_positions(trained.normaliser.normalise(frames))
+    np.testing.assert_allclose(joints, frame_positions(SKELETON, frames), atol=1e-4)
+    assert np.abs(joints - frame_positions(SKELETON, np.asarray(trained.normaliser.normalise(frames)))).max() > 0.1
 
 
 def test_half_precision_halves_the_file(trained, saved, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from f3amd_lib.benchmarking.timing import median_interval
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.ground import papers
-from f3amd_lib.ground.records import write_table
+from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
 from f3amd_lib.reports import claims, theory
@@ -1006,6 +1006,8 @@ def test_a_statement_names_its_kind_models_and_range():
         (STATEMENT | {"model": {"model": FNO, "step": 1}}, "unknown key 'step'; did you mean 'steps'"),
         (STATEMENT | {"within": [0, 1], "alike": 0.1}, "has the ranges within and alike; keep one"),
         (STATEMENT | {"within": [0, "miner"]}, "unknown threshold 'miner'; did you mean 'minor'"),
+        (STATEMENT | {"metric": "FD"}, "unknown metric 'FD'; did you mean 'FID'"),
+        (STATEMENT | {"kind": "ranked", "table": "qualty"}, "unknown table 'qualty'; did you mean 'quality'"),
         (STATEMENT | {"device": "GPU"}, "unexpected keyword argument 'device'; worse takes"),
         ({key: STATEMENT[key] for key in STATEMENT if key != "metric"}, "missing a required argument: 'metric'"),
         (SPREAD | {"models": {"family": "FN"}}, "unknown family 'FN'"),
@@ -1014,6 +1016,11 @@ def test_a_statement_names_its_kind_models_and_range():
 def test_a_broken_statement_is_an_error(statement, message):
     with pytest.raises(ValueError, match=f"f.toml, claim Q1, '{statement['says']}': .*{message}"):
         read(statement)
+
+
+def test_what_a_page_says_under_an_unknown_name_is_refused():
+    with pytest.raises(ValueError, match="f.toml, page: unknown key 'prefaces'; did you mean 'preface'"):
+        claims.read_claims(FILE | {"page": {"prefaces": "-"}, "claim": []}, "f3amd", "f.toml")
 
 
 def test_an_id_is_used_once_and_begins_with_a_group():
@@ -1188,6 +1195,17 @@ def test_the_committed_page_is_up_to_date(committed):
     assert page.read_text(encoding="utf-8") == claims.ledger_markdown(committed), (
         "paper_figures/claims.md is stale: run `python -m f3amd_lib.reports.claims`"
     )
+
+
+LEDGER_TABLES = sorted((claims.repository_root() / "paper_figures").glob("*/*/tables/08_claims.csv"))
+
+
+@pytest.mark.parametrize("path", LEDGER_TABLES, ids=lambda path: path.parts[-4])
+def test_the_ledger_among_a_data_sets_tables_is_the_accepted_one(path):
+    """Notebook 08 leaves it there, whatever data it was run on."""
+    table = read_table(path)[0].set_index("id")["verdict"]
+    accepted = {claim_id: entry["verdict"] for claim_id, entry in claims.accepted_verdicts().items()}
+    assert table.to_dict() == accepted, f"run notebook 08 again: f3amd figures --data {path.parts[-4]} --only 08"
 
 
 def test_the_ledger_has_all_claims(committed):

@@ -11,7 +11,9 @@ from f3amd_lib.benchmarking import measurements, synthesis
 from f3amd_lib.experiments import measure, protocol, sensitivity
 from f3amd_lib.experiments.recipes import RECIPES
 from f3amd_lib.experiments.sensitivity import FOOT_BANDS, STRENGTHS
+from f3amd_lib.experiments.text_tables import TABLES
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import write_table
 from f3amd_lib.measures.corruptions import CORRUPTIONS
@@ -151,6 +153,33 @@ def test_a_command_is_understood(run, monkeypatch):
         ((name, used, given, extra),) = called
         assert (name, used, status) == (what, window, 0)
         assert (given or []) + [PUBLISHED_CAMDM] * len(extra) == models
+
+
+OF_TEXT = [(paper, claim.id) for paper in ("acmdm", "motionpcm") for claim in claims.load_claims(paper)]
+
+
+def told(part, key: str) -> set[str]:
+    """Return all that a claim's entry has under a key, however deep."""
+    if isinstance(part, dict):
+        return {part[key]} if key in part else set().union(*(told(value, key) for value in part.values()))
+    return set().union(*(told(value, key) for value in part)) if isinstance(part, list) else set()
+
+
+@pytest.mark.parametrize(("paper", "claim_id"), OF_TEXT)
+def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, claim_id, monkeypatch):
+    """The tables that are measured for it, or the models that have a row there; nothing is done."""
+    asked: list[str] = []
+    monkeypatch.setattr("f3amd_lib.__main__._measure_text", lambda names, *rest: asked.extend(names) or 0)
+    monkeypatch.setattr(claims, "main", lambda *words: 0)
+    for run in claims.load_commands(paper)[claim_id]:
+        assert main(shlex.split(run, comments=True)[1:]) == 0
+    (entry,) = (entry for entry in load_paper_file("claims", paper)["claim"] if entry["id"] == claim_id)
+    tables_of_ours = told(entry["statement"], "table") & set(TABLES)
+    models = told(entry["statement"], "model") - set(load_paper_file("paper", paper)["others"])
+    measured = load_paper_file("experiments", paper)
+    reached = set(asked) | {row["model"] for name in asked for row in measured[name]["rows"]}
+    needed = tables_of_ours if paper == "acmdm" else models
+    assert needed <= reached and (needed or claim_id == "S4")
 
 
 def test_a_window_of_another_length_is_for_quality_alone(capsys, monkeypatch):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from builders import refused, tiny_camdm, tiny_config, tiny_trained, tiny_windows
+from builders import refused, tiny_camdm, tiny_trained, tiny_windows
 from scipy.stats import norm
 
 from f3amd_lib.diffusion import samplers
@@ -16,39 +16,13 @@ from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import denoising
 from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
-
-
-class Fake:
-    """A network that answers by a rule: `answer(x_noisy)`."""
-
-    config = tiny_config()
-
-    def __init__(self, answer):
-        self.answer = answer
-
-    def encode(self, condition):
-        return condition
-
-    def __call__(self, x_noisy, sigma, context):
-        return self.answer(x_noisy)
-
-
-@pytest.fixture
-def model_that(monkeypatch):
-    def make(answer):
-        monkeypatch.setattr(TrainedModel, "network", lambda self: Fake(answer))
-        return tiny_trained()
-
-    return make
-
 
 SIGMAS = (0.1, 1.0, 10.0)
 
 
 def test_a_network_that_returns_its_input_errs_by_the_noise(model_that):
-    trained = model_that(lambda x_noisy: x_noisy)
+    trained = model_that(lambda x_noisy, sigma: x_noisy)
     table = denoising.x0_error_by_sigma(trained, tiny_windows(), SIGMAS)
     np.testing.assert_allclose(table["x0_error"], SIGMAS, rtol=0.1)
     np.testing.assert_allclose(table["input_error"], SIGMAS)
@@ -58,7 +32,7 @@ def test_a_network_that_returns_its_input_errs_by_the_noise(model_that):
 
 @pytest.mark.slow
 def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
-    trained = model_that(lambda x_noisy: 0.0 * x_noisy)
+    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy)
     windows = tiny_windows()
     table = denoising.x0_error_by_sigma(trained, windows, SIGMAS)
     batch = denoising.held_out_batch(windows, trained)
@@ -91,7 +65,7 @@ def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
 
 @pytest.mark.slow
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
-    trained = model_that(lambda x_noisy: x_noisy)
+    trained = model_that(lambda x_noisy, sigma: x_noisy)
     generator = MotionGenerator(trained, 1)
     batch = denoising.held_out_batch(tiny_windows(), trained, 4)
     x0, _ = network_inputs(batch, trained.normaliser)
@@ -100,20 +74,20 @@ def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch
         # Only the root moves from seed to seed: relative to it nothing does.
         return x0.at[..., :3].add(jax.random.normal(key))
 
-    monkeypatch.setattr(generator, "sample_window", shifted)
+    monkeypatch.setattr(generator, "sample", shifted)
     spread = denoising.seed_spread(generator, tiny_windows(), num_conditions=4)
     assert spread == pytest.approx(0.0, abs=1e-3)
-    monkeypatch.setattr(generator, "sample_window", lambda key, c: x0 + 0.3 * jax.random.normal(key, x0.shape))
+    monkeypatch.setattr(generator, "sample", lambda key, c: x0 + 0.3 * jax.random.normal(key, x0.shape))
     assert denoising.seed_spread(generator, tiny_windows(), num_conditions=4) > 1.0
 
 
 def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch):
     windows = tiny_windows()
-    trained = model_that(lambda x_noisy: x_noisy)
+    trained = model_that(lambda x_noisy, sigma: x_noisy)
     generator = MotionGenerator(trained, 1)
     batch = denoising.held_out_batch(windows, trained)
     x0, _ = network_inputs(batch, trained.normaliser)
-    monkeypatch.setattr(generator, "sample_window", lambda key, condition: x0)
+    monkeypatch.setattr(generator, "sample", lambda key, condition: x0)
     quality = denoising.window_quality(generator, windows)
     assert quality["joint_error_cm"] == pytest.approx(0.0, abs=1e-3)
     for name in ("seam_cm", "joint_acceleration_cm"):
@@ -181,13 +155,8 @@ def test_variances_are_unbiased_in_few_seeds():
     ],
     ids=["constant", "level alone", "input"],
 )
-def test_use_of_inputs_is_told_on_held_out_windows(monkeypatch, answer, uses_x, uses_sigma):
-    class Answers(Fake):
-        def __call__(self, x_noisy, sigma, context):
-            return self.answer(x_noisy, sigma)
-
-    monkeypatch.setattr(TrainedModel, "network", lambda self: Answers(answer))
-    trained = tiny_trained()
+def test_use_of_inputs_is_told_on_held_out_windows(model_that, answer, uses_x, uses_sigma):
+    trained = model_that(answer)
     condition = denoising.held_out_condition(tiny_windows(), trained, 4)
     table = denoising.input_use(trained, condition, num_seeds=4)
     value = table.set_index("metric")["value"]

@@ -325,9 +325,8 @@ def second_paper(tmp_path, monkeypatch):
         '[[equation]]\nlabel = "Eq. 2"\nsection = "1"\nwhat = "sum"\n'
         '[[equation]]\nlabel = "Box 1"\nsection = "2"\nwhat = "update"\n'
     )
-    (tmp_path / "other/commands.toml").write_text('[[command]]\nrun = "f3amd measure"\nclaims = ["Q1"]\n')
     (tmp_path / "other/claims.toml").write_text(
-        '[groups]\nQ = "Quality"\n[thresholds]\n[page]\npreface = "-"\nintervals = "-"\nunjudged = "-"\n'
+        '[groups]\nQ = "Quality"\n[page]\npreface = "- what it says of {steps} steps"\n'
         '[[claim]]\nid = "Q1"\ntext = "better"\nwhere = "1"\n'
         'decided_by = "FID"\n[[claim.statement]]\nsays = "CAMDM is worse"\nkind = "worse"\nmodel = "CAMDM"\n'
         'against = "F3AMD-FNO-96"\nmetric = "FID"\n'
@@ -362,6 +361,12 @@ def test_a_second_paper_has_its_own_map_and_claims(second_paper, tmp_path):
     assert judgement.verdict == judgement.paper_verdict == "not measured"
     page = claims.ledger_markdown([judgement])
     assert "1 claims of the OTHER-2 paper" in page and "## Quality" in page and "f3amd measure quality" in page
+    assert re.search(r"^- what it says of \d+ steps$", page, re.M)  # its own words, and ours where it has none
+    assert "not judged** on a network that was trained with less than" in page and "{" not in page
+    (tmp_path / "third").mkdir()
+    (tmp_path / "third/paper.toml").write_text('name = "Third"\nsetting = "a paper"\n')
+    written = equations_markdown(root=tmp_path)
+    assert "## OTHER-2" in written and "Third" not in written  # it lists no equations yet
 
 
 def test_a_broken_folder_of_a_paper_is_refused(second_paper, tmp_path):

@@ -70,7 +70,7 @@ def test_every_model_step_style_and_treatment_has_its_row(table):
     rows, record = table
     made = rows[rows.model == "F3AMD-FNO-32"]
     assert set(made.steps) == {8, 1} and set(made.treatment) == set(measure.TREATMENTS)
-    assert len(made) == 2 * 4 * 2 and set(rows[rows.model == "real"].treatment) == {"as made"}
+    assert len(made) == 2 * 5 * 2 and set(rows[rows.model == "real"].treatment) == {"as made"}
     assert record["measurement"] == "feet" and set(record["weights_digests"]) == {"real", "F3AMD-FNO-32"}
 
 
@@ -82,6 +82,17 @@ def test_locked_feet_slide_less_and_blended_seams_kick_less(table):
     assert mean.slide_speed["blended"] > 0.7 * mean.slide_speed["as made"]  # blending holds no foot
     assert mean.seam_kick["blended"] < 0.7 * mean.seam_kick["as made"]
     assert mean.slide_speed["blended, feet locked"] < 0.3 * mean.slide_speed["as made"]
+
+
+def test_feet_held_without_a_look_ahead_slide_less_and_pop_no_more_than_blended_ones(table):
+    rows, _ = table
+    mean = rows[(rows.model == "F3AMD-FNO-32") & (rows.steps == 8)].groupby("treatment").mean(numeric_only=True)
+    online = mean.loc["blended, feet locked online"]
+    assert online.slide_speed < 0.3 * mean.slide_speed["blended"]
+    assert online.seam_kick < 0.7 * mean.seam_kick["as made"]
+    assert online.joint_acceleration < 2 * mean.joint_acceleration["blended"]
+    # It is another rule than the one that plans, and not that one under a second name.
+    assert (online != mean.loc["blended, feet locked"]).sum() >= 3
 
 
 def test_the_page_of_results_says_what_the_record_says():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from f3amd_lib.diffusion.flow import default_sampler, integrate, solve, told_time
+from f3amd_lib.diffusion.flow import default_sampler, integrate, network_time, solve
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.predictions import OBJECTIVES, clean_estimate, guided, guided_twice, prediction_target
 from f3amd_lib.diffusion.samplers import sample
@@ -94,10 +94,10 @@ def test_a_clean_estimate_undoes_a_target(schedule, objective):
 
 def test_a_network_is_told_the_time_or_the_number_of_a_level():
     t = straight().draw_times(jax.random.key(0), (4000,))
-    np.testing.assert_array_equal(told_time(straight(), t), t)
+    np.testing.assert_array_equal(network_time(straight(), t), t)
     np.testing.assert_allclose(np.quantile(t, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.03)
     np.testing.assert_allclose(BETAS.betas[[0, -1]], [0.002, 0.4])
-    told = np.asarray(told_time(BETAS, BETAS.draw_times(jax.random.key(1), (4000,))))
+    told = np.asarray(network_time(BETAS, BETAS.draw_times(jax.random.key(1), (4000,))))
     np.testing.assert_allclose(told, np.rint(told), atol=1e-4)
     number, count = np.unique(np.rint(told), return_counts=True)
     np.testing.assert_array_equal(number, np.arange(50))

@@ -10,8 +10,9 @@ from test_text_judge import OneVectorAWord
 
 from f3amd_lib.data.text_motions import text_motions
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
-from f3amd_lib.generation.latent_motion import decode_latent, sample_student
+from f3amd_lib.generation.latent_motion import decode_latent, latent_motions, reconstruction, sample_student, steps_of
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
@@ -41,7 +42,8 @@ TINY = {
         {"num_phases": 2, "num_frames": 40}, "ours", latent="tiny-VAE",
     ),
 }  # fmt: skip
-PROFILE = load_profile("smoke", "bandai", train_steps=2)
+PROFILE = load_profile("smoke", "bandai", train_steps=20)
+SPLITS = ("train", "test", "train", "validation")
 QUIET = {"progress": False, "batch_size": 2}
 
 
@@ -64,19 +66,24 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     for name in ("ACMDM-S-PS22-raw-n3", "MotionPCM-M1-small", "MotionPCM-VAE-small"):  # the newest comes last
         (tmp_path / "text" / f"{name}.safetensors").touch()
     assert text_models.find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
+    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
+    for asked in ("motionpcm", "MotionPCM-M1-small"):
+        assert latent_models.find_latent_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
+    with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
+        latent_models.find_latent_model("bandai", "MotionPCM-M4-small")
     assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
 
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):
-    """Three clips of the walker, two of them to train on, and the tiny presets."""
+    """Four clips of the walker, two of them to train on, and the tiny presets."""
     monkeypatch.setenv("F3AMD_CACHE_DIR", str(tmp_path / "cache"))
     for name, preset in TINY.items():
         monkeypatch.setitem(presets.PRESETS, name, preset)
     clips = []
-    for seed in range(3):
+    for seed in range(4):
         motion = resample(synthetic.synthesize(synthetic.STYLES[0], seconds=2.0, seed=seed), 20.0).slice(0, 40)
-        clips.append((f"clip_{seed}", motion, (f"a person walks {seed}",), ("train", "test", "train")[seed], str(seed)))
+        clips.append((f"clip_{seed}", motion, (f"a person walks {seed}",), SPLITS[seed], str(seed)))
     return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
 
 
@@ -91,6 +98,8 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
     monkeypatch.setattr(latent_models, "train_in_legs", loop)
+    watched = []
+    monkeypatch.setattr(latent_models, "held_out_clips", lambda clips, config: watched.append(clips.count.tolist()))
     student = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     teacher = load_latent_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
     ones, twos = (lambda tree, value=value: all((leaf == value).all() for leaf in jax.tree.leaves(tree))
@@ -103,6 +112,10 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         assert tasks[name].clips.count.tolist() == [1, 1]
         wanted = OneVectorAWord()(["a person walks 0", "a person walks 2"]).pooled
         np.testing.assert_allclose(tasks[name].clips.pooled, wanted, atol=1e-6)
+    # Losses are watched on the one validation clip; recipes' shares of the 20 steps arrive.
+    assert watched == [[1]] * 3
+    assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 8, 1]
+    assert student.words == ("a", "person", "walks")
     statistics = FrameStatistics.of(data)
     for kept in (student.statistics, teacher.statistics):
         np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
@@ -121,6 +134,10 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path):
             np.testing.assert_array_equal(found, wanted)
     assert (teacher.config.guidance_features, student.config.guidance_features) == (0, 256)
     assert student.record["identity"]["training"]["num_phases"] == 2
+    # Held-out losses of each stage lie in its history, the discriminator's among the student's.
+    for name, term in (("tiny-VAE", "joints"), ("tiny-teacher", "loss"), ("tiny-M2", "discriminator")):
+        history, _ = read_table(text_model_files(PROFILE, name, folder=tmp_path).history)
+        assert np.isfinite(history[f"held_out_{term}"].dropna()).all() and history[f"held_out_{term}"].notna().any()
     # Finished models are read, and other settings are refused by name.
     again = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))
@@ -132,3 +149,20 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path):
     latent = sample_student(network, made.schedule, text, noise, num_steps=2)
     vectors = decode_latent(coder, made.statistics, latent, np.ones((2, 12), bool))
     assert vectors.shape == (2, 12, 12 * data.skeleton.num_joints - 1) and np.isfinite(vectors).all()
+    # The same by the one door: captions and lengths in, metres out, zero in padding; the steps that each may take.
+    key, draw = jax.random.key(1), lambda model, **how: latent_motions(model, text, [12, 8], jax.random.key(1), **how)
+    first = draw(made)
+    assert first.shape == (2, 12, data.skeleton.num_joints, 3) and not first[1, 8:].any() and first[0].any()
+    np.testing.assert_array_equal(first, latent_motions(made, text, [12, 8], key, num_steps=2, guidance=14.0))
+    assert steps_of(teacher) == 50 and steps_of(teacher, 3) == 3
+    assert not np.array_equal(draw(teacher, num_steps=1), draw(teacher, num_steps=3))
+    with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
+        draw(made, num_steps=1)
+    with pytest.raises(ValueError, match="an autoencoder alone"):
+        draw(load_latent_model(files["tiny-VAE"]))
+    with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
+        latent_motions(made, text, 44, key)
+    # What a mean latent gives back is a motion of the same place and size, and not another clip's.
+    mask = np.ones((1, 40), bool)
+    again, positions = reconstruction(made, data.redundant_vectors()[None, :40], mask)
+    assert again.shape == (1, 40, 12 * data.skeleton.num_joints - 1) and np.isfinite(positions).all()

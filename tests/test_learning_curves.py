@@ -39,7 +39,7 @@ def small(monkeypatch):
 
 @pytest.mark.slow
 def test_a_learning_curve_starts_before_the_first_step(prepared):
-    curve = learning_curves.learning_curve(prepared, "F3AMD-FNO-32", **SHORT)
+    curve = learning_curves.learning_curve(prepared, "F3AMD-FNO-32", network={"depth": 1}, **SHORT)
     assert list(curve["step"]) == [0, 1, 2, 3, 4]
     assert math.isnan(curve["loss"][0]) and curve["loss"][1:].notna().all()
     assert curve["held_out_loss"].notna().all()
@@ -125,7 +125,7 @@ def leg(prepared, profile, folder, presets=("F3AMD-FNO-32",), **settings):
 
 @pytest.mark.slow
 def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
-    profile = load_profile("smoke", "synthetic", train_steps=4, batch_size=2, window=WINDOW)
+    profile = load_profile("smoke", "synthetic", train_steps=8, batch_size=2, window=WINDOW)
     # No time at all: nothing is begun.
     assert leg(prepared, profile, tmp_path, budget_s=0.0) == [("F3AMD-FNO-32", "unfinished")]
     assert not list(tmp_path.iterdir())
@@ -137,12 +137,12 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
     files = learning_curves.model_files(profile, "F3AMD-FNO-32", folder=tmp_path)
     assert files.state.exists() and not files.model.exists()
     done = int(checkpoints.load_tree(files.state, state_of(prepared, profile))[0].step)
-    assert 0 < done < 4
+    assert done == 4
     # A kill between the writing of the state and that of the history costs the rows, not the run.
     files.history.unlink()
     assert leg(prepared, profile, tmp_path) == [("F3AMD-FNO-32", "finished")]
     assert f"losses of the first {done} steps are lost" in caplog.text
-    assert list(read_table(files.history)[0]["step"]) == list(range(done + 1, 5))
+    assert list(read_table(files.history)[0]["step"]) == [8]
     before = files.model.read_bytes()
     assert leg(prepared, profile, tmp_path) == [("F3AMD-FNO-32", "finished before")]
     # Other data or other settings must not pass for the same model, nor cost the one that is there.
@@ -150,7 +150,7 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
     others = PreparedData(packed, WINDOW, HISTORY)
     with pytest.raises(ValueError, match=r"F3AMD-FNO-32.*\.safetensors: .* other .*fingerprint"):
         leg(others, profile, tmp_path)
-    longer = load_profile("smoke", "synthetic", train_steps=5, batch_size=2, window=WINDOW)
+    longer = load_profile("smoke", "synthetic", train_steps=9, batch_size=2, window=WINDOW)
     with pytest.raises(ValueError, match="other training settings .num_steps. lies there; move it away"):
         leg(prepared, longer, tmp_path)
     assert files.model.read_bytes() == before

@@ -76,10 +76,10 @@ def test_many_answers_are_numbers_that_are_checked():
 # Reading times: what a notebook's head says is what the plan's rule gives.
 
 
-def minutes_by_rule(notebook) -> float:
+def minutes_by_rule(cells) -> float:
     """180 words or 30 lines of code a minute, and 45 seconds for a displayed equation or a picture."""
-    prose = " ".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    prose = " ".join(cell.source for cell in cells if cell.cell_type == "markdown")
+    code = [cell for cell in cells if cell.cell_type == "code"]
     shown = prose.count("$$") // 2
     shown += sum("image/png" in output.get("data", {}) for cell in code for output in cell.outputs)
     words = len(re.findall(r"\w+", re.sub(r"\$\$.*?\$\$|\$[^$]*\$", " x ", prose, flags=re.S)))
@@ -95,26 +95,23 @@ def stated_minutes(notebook) -> tuple[int, int]:
     return int(found[1]), int(found[2] or 0)
 
 
-THEORY = [*(f"{name}.ipynb" for name in (
-    "02_sampler_theory", "10_printed_update", "11_one_step", "12_spectral_and_film", "13_exercise_solutions",
-    "standalone/sampler_theory_standalone",
-))]  # fmt: skip
-
-
-COURSE = [f"course/{path.name}" for path in sorted((PLAN.parents[1] / "notebooks/course").glob("*.ipynb"))]
+NOTEBOOKS = PLAN.parents[1] / "notebooks"
+BESIDE_THE_PAPER = [path.name for path in sorted([*NOTEBOOKS.glob("0*.ipynb"), *NOTEBOOKS.glob("1[0-5]*.ipynb")])]
+STANDALONE = ["standalone/sampler_theory_standalone.ipynb"]
+COURSE = [f"course/{path.name}" for path in sorted((NOTEBOOKS / "course").glob("*.ipynb"))]
 
 
 @pytest.mark.parametrize("name", COURSE)
 def test_a_notebook_of_the_course_takes_less_than_half_an_hour(name):
-    reading, exercises = stated_minutes(nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4))
+    reading, exercises = stated_minutes(nbformat.read(NOTEBOOKS / name, as_version=4))
     assert name.endswith("_solutions.ipynb") or (8 <= reading <= 25 and reading + exercises <= 35)
 
 
-@pytest.mark.parametrize("name", THEORY + COURSE)
+@pytest.mark.parametrize("name", BESIDE_THE_PAPER + STANDALONE + COURSE)
 def test_a_notebook_says_honestly_how_long_it_takes(name):
-    notebook = nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4)
+    notebook = nbformat.read(NOTEBOOKS / name, as_version=4)
     reading, exercises = stated_minutes(notebook)
-    assert reading == pytest.approx(minutes_by_rule(notebook), rel=0.2)
+    assert reading == pytest.approx(minutes_by_rule(notebook.cells), rel=0.2)
     count = sum("exercise" in cell.metadata.get("tags", []) for cell in notebook.cells)
     assert 3 * count <= exercises <= 5 * count
 
@@ -125,9 +122,30 @@ def test_the_plan_takes_as_long_over_a_notebook_as_its_head_says():
         name = Path(re.search(r"\((.*)\)", cells[2])[1]).name
         planned[name] = planned.get(name, 0) + int(cells[0])
     for name, minutes in planned.items():
-        total = sum(stated_minutes(nbformat.read(PLAN.parents[1] / "notebooks" / name, as_version=4)))
+        total = sum(stated_minutes(nbformat.read(NOTEBOOKS / name, as_version=4)))
         taught_whole = name.startswith("02")
         assert (0.9 * total if taught_whole else 0) <= minutes <= 1.1 * total, name
+
+
+def cells_of_section(notebook, heading: str):
+    """Yield the cells of a section; a cell that holds several sections is cut at their headings."""
+    inside = False
+    for cell in notebook.cells:
+        parts = re.split(r"^(?=## )", cell.source, flags=re.M) if cell.cell_type == "markdown" else [None]
+        for part in parts:
+            if part is not None and part.startswith("## "):
+                inside = part.splitlines()[0] == f"## {heading}"
+            if inside:
+                yield cell if part is None else nbformat.v4.new_markdown_cell(part)
+
+
+@pytest.mark.parametrize("session", SESSIONS, ids=lambda text: text.splitlines()[0])
+def test_no_row_is_shorter_than_reading_its_section_takes(session):
+    for cells in rows(session):
+        heading, path = re.fullmatch(r"\[(.*)\]\((.*)\)", cells[2]).groups()
+        section = list(cells_of_section(nbformat.read(PLAN.parent / path, as_version=4), heading))
+        assert len(section) >= 2  # prose and code, or the heading was not found
+        assert int(cells[0]) >= 0.9 * minutes_by_rule(section), heading
 
 
 def test_answers_are_folded_away_and_the_plan_is_linked():

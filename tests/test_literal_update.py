@@ -19,33 +19,10 @@ from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, Window
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw
-from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
 
 FEW = {"num_windows": 3, "num_seeds": 2}
-
-
-class Fake:
-    """A network that answers by a rule, `answer(x_noisy, sigma)`."""
-
-    def __init__(self, answer):
-        self.answer = answer
-
-    def encode(self, condition):
-        return condition
-
-    def __call__(self, x_noisy, sigma, context):
-        return self.answer(x_noisy, sigma)
-
-
-@pytest.fixture
-def model_that(monkeypatch):
-    def make(answer):
-        monkeypatch.setattr(TrainedModel, "network", lambda self: Fake(answer))
-        return tiny_trained()
-
-    return make
 
 
 def one(table, update, steps, metric):

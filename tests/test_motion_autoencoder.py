@@ -11,6 +11,7 @@ from f3amd_lib.networks.motion_autoencoder import (
     LOG_VARIANCE_RANGE,
     AutoencoderConfig,
     MotionAutoencoder,
+    TimeConvolution,
     smooth_l1,
     variational_loss,
 )
@@ -39,6 +40,16 @@ def test_sizes_are_those_of_the_released_file():
     assert count(model) == pytest.approx(17.08, abs=0.005)
     assert (count(model.encoder), count(model.decoder)) == pytest.approx((8.41, 8.67), abs=0.005)
     assert (config.frames_per_latent, config.latent_channels, config.dropout) == (4, 4, 0.2)
+
+
+@pytest.mark.parametrize("size, stride, dilation", [(3, 1, 9), (4, 2, 1), (1, 1, 1)])
+@pytest.mark.parametrize("causal", [True, False])
+def test_a_matrix_product_of_taps_is_the_convolution(size, stride, dilation, causal):
+    options = {"causal": causal, "stride": stride, "dilation": dilation}
+    ours = TimeConvolution(5, 7, size, **options, rngs=nnx.Rngs(0))
+    x = jax.random.normal(jax.random.key(1), (2, 16, 5))
+    padded = jnp.pad(x, ((0, 0), (ours.before, ours.after), (0, 0)))
+    np.testing.assert_allclose(ours(x), ours.layer(padded), atol=1e-5)
 
 
 @pytest.mark.parametrize("causal", [True, False])

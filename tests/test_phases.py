@@ -8,6 +8,7 @@ import pytest
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.phases import (
     LATENT_CONSISTENCY_TIMES,
+    consistency_answer,
     consistency_scales,
     cut_phases,
     ddim_times,
@@ -273,3 +274,26 @@ def test_latent_consistency_samples_with_fresh_noise():
     assert np.abs(draw(2, key) - draw(2, jax.random.key(1))).max() > 0.1
     # Told the conditional mean, one step returns to the middle, and four steps spread out again.
     assert draw(1, key).std() < draw(4, key).std()
+
+
+def test_a_perfect_target_answers_with_the_end_of_the_path_and_a_mean_does_not():
+    """Exploding state, exact teacher: neighbours on a path have its end, whatever the level; at 0 it is reached."""
+    mixture = GaussianMixture([-1.0, 0.6], 0.15, [0.4, 0.6])
+    denoise = lambda x, sigma: jnp.asarray(mixture.denoise(np.asarray(x), np.asarray(sigma)[:, None]))
+    end = lambda x, sigma: jnp.asarray(
+        np.stack(
+            [mixture.flow(np.asarray(one)[None], float(level), 0.0)[0] for one, level in zip(x, sigma, strict=True)]
+        )
+    )
+    sigma = jnp.array([3.0, 1.0, 0.3, 0.2])
+    x = jnp.array([[2.0], [-0.7], [0.5], [0.4]])
+    near = 0.98 * sigma
+    wanted = end(x, sigma)
+    np.testing.assert_allclose(consistency_answer(denoise, end, x, sigma, near), wanted, atol=0.01)
+    mean = consistency_answer(denoise, denoise, x, sigma, near)
+    assert jnp.abs(mean - wanted)[0] > 0.2
+    # The last step of the walk is the end itself, and the target is not heard.
+    nonsense = lambda x, sigma: jnp.full_like(x, 99.0)
+    last = consistency_answer(denoise, nonsense, x, sigma, jnp.zeros(4))
+    np.testing.assert_allclose(last, denoise(x, sigma), atol=1e-6)
+    assert (consistency_answer(denoise, nonsense, x, sigma, near) == 99.0).all()

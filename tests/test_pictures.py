@@ -98,6 +98,14 @@ def test_a_crowd_is_shown_whole():
     assert drawn[:, 0].max() - drawn[:, 0].min() > 0.8 * (right - left)  # and no room is wasted
 
 
+def test_a_long_note_makes_no_panel_narrower(tmp_path):
+    crowd = ([standing_at(x, z) for x, z in ((0.0, -9.0), (0.0, 9.0), (-9.0, 0.0), (9.0, 0.0))], ["#542788"] * 4)
+    figure = crowd_figure({f"{name}\n{'a long note ' * 9}\nand another": crowd for name in ("One", "Two")}, 10)
+    keep_figure(figure, tmp_path, "any", data="synthetic")
+    panel = figure.get_window_extent().width / 2
+    assert min(axis.get_window_extent().width for axis in figure.axes) > 0.9 * panel
+
+
 def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_slide():
     walk = synthesize("Neutral", seconds=3.0)
     glide = walk.root_position.copy()

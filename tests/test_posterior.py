@@ -25,7 +25,6 @@ from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn
-from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -135,35 +134,13 @@ def test_data_without_neighbours_are_refused():
 # ----------------------------------------------------------------------------- known answers
 
 
-class Fake:
-    """A network that answers by a rule."""
-
-    def __init__(self, answer):
-        self.answer = answer
-
-    def encode(self, condition):
-        return condition
-
-    def __call__(self, x_noisy, sigma, context):
-        return self.answer(x_noisy)
-
-
-@pytest.fixture
-def model_that(monkeypatch):
-    def make(answer, **changes):
-        monkeypatch.setattr(TrainedModel, "network", lambda self: Fake(answer))
-        return tiny_trained(**changes)
-
-    return make
-
-
 def poses(frames):
     positions = np.asarray(frame_positions(SKELETON, frames), np.float64)
     return positions - positions[..., :1, :]
 
 
 def test_a_blind_network_has_no_spread_and_one_error(model_that):
-    trained, windows = model_that(lambda x_noisy: 0.0 * x_noisy), tiny_windows()
+    trained, windows = model_that(lambda x_noisy, sigma: 0.0 * x_noisy), tiny_windows()
     table = posterior.answer_spread(trained, windows, (0.1, 100.0), num_windows=8, num_draws=3)
     by = table.set_index(["quantity", "sigma"])["value"]
     assert by["answer spread"].max() < 1e-3
@@ -177,7 +154,7 @@ def test_a_blind_network_has_no_spread_and_one_error(model_that):
 
 @pytest.mark.slow
 def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_that):
-    trained, windows = model_that(lambda x_noisy: x_noisy), tiny_windows()
+    trained, windows = model_that(lambda x_noisy, sigma: x_noisy), tiny_windows()
     draws = 6
     table = posterior.answer_spread(trained, windows, (0.05,), num_windows=8, num_draws=draws)
     by = table.set_index("quantity")
@@ -200,7 +177,7 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
 def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
     schedule = variance_preserving_cosine(4)
     config = tiny_camdm(noise_levels=tuple(schedule.levels.tolist()))
-    trained = model_that(lambda x_noisy: x_noisy, config=config, diffusion=schedule)
+    trained = model_that(lambda x_noisy, sigma: x_noisy, config=config, diffusion=schedule)
     for sigmas, expected in (((0.01, 3.0), schedule.levels[:3]), ((1e-3, 1e-2), [schedule.sigma_max])):
         table = posterior.answer_spread(trained, tiny_windows(), sigmas, num_windows=2, num_draws=2)
         np.testing.assert_allclose(sorted(set(table["sigma"])), expected, rtol=1e-6)
@@ -217,7 +194,7 @@ def test_one_draw_has_no_spread():
 @pytest.mark.slow
 def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeypatch, tmp_path):
     monkeypatch.setenv(RESULTS_DIR_VARIABLE, str(tmp_path))
-    trained = model_that(lambda x_noisy: 0.5 * x_noisy)
+    trained = model_that(lambda x_noisy, sigma: 0.5 * x_noisy)
     monkeypatch.setattr(posterior, "available_models", lambda profile: ["F3AMD-FNO-32"])
     monkeypatch.setattr(posterior, "obtain_model", lambda *a, **k: (trained, None, "shipped"))
     packed = dataclasses.replace(tiny_packed(), dataset="synthetic")

@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import runpy
 import string
 import sys
 import warnings
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -43,6 +46,16 @@ numbers = st.floats(-1e4, 1e4, width=32)
 def test_damaged_files_are_read_or_refused_by_name(tmp_path, name):
     for number, error, path, data in fuzz.attack(name, tmp_path, cases=60):
         assert error is None, f"case {number}, {path.name}, {data[:200]!r}: {error!r}"
+
+
+def test_every_reader_was_attacked_and_its_counts_are_kept(tmp_path):
+    with fuzz.COUNTS.open(encoding="utf-8") as file:
+        kept = {row["reader"]: row for row in csv.DictReader(file)}
+    assert list(kept) == list(fuzz.READERS)
+    assert all(int(row["files"]) > 1000 and int(row["other_errors"]) == 0 for row in kept.values())
+    for row in [{"reader": "path", "files": 1}, {"reader": "bvh", "files": 2}, {"reader": "path", "files": 3}]:
+        fuzz.keep(row, tmp_path / "fuzz.csv")
+    assert (tmp_path / "fuzz.csv").read_text() == "reader,files\nbvh,2\npath,3\n"
 
 
 @st.composite
@@ -159,3 +172,15 @@ def test_any_clips_go_through_a_folder_of_humanml3d(tmp_path_factory, lengths, s
         other = again.names.index(name)
         assert again.captions[other] == data.captions[number] and again.splits[other] == data.splits[number]
         np.testing.assert_array_equal(again.clip(other), data.clip(number)[:-1])
+
+
+@pytest.mark.parametrize("script", ["fuzz", "scaling", "side_by_side"])
+def test_scripts_use_the_library_beside_them(tmp_path, monkeypatch, script):
+    """And not one that is installed."""
+    (tmp_path / "f3amd_lib").mkdir()
+    installed = tmp_path / "f3amd_lib" / "__init__.py"
+    installed.touch()
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    assert Path(PathFinder.find_spec("f3amd_lib").origin) == installed
+    runpy.run_path(str(_FUZZ.with_name(f"{script}.py")), run_name="not called")
+    assert Path(PathFinder.find_spec("f3amd_lib").origin).parents[1] == _FUZZ.parents[1]

@@ -96,7 +96,8 @@ def measured(generator, packed, prepared, classifier):
     return measure_model(generator, packed, classifier, SMALL, prepared.windows("validation"))
 
 
-TEXT_METRICS = {metric.name for table in ("text", "control") for metric in SHOWN[table]} | {"sampling_seconds"}
+TEXT_TABLES = ("text", "control", "reconstruction")
+TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]} | {"sampling_seconds"}
 PROTOCOL_METRICS = (
     set(METRICS) - TEXT_METRICS - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
 )

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from builders import evaluate
+from builders import evaluate, refused
 from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf
@@ -156,6 +156,26 @@ def test_a_published_network_walks_on_the_data_it_knows(packed, tmp_path):
     with pytest.raises(ValueError, match="25 joints in 100 styles"):
         save_file(released(width=16, depth=1, hidden=32), tmp_path / "other.safetensors")
         published_model(tmp_path / "other.safetensors", packed)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_a_file_that_is_damaged_missing_or_holds_texts_is_refused_by_name(tmp_path, suffix):
+    path = tmp_path / f"arrays{suffix}"
+    refused(f"arrays{suffix}: not a whole file of arrays", published_arrays, path)
+    arrays = {"a": np.ones((3, 4), np.float32)}
+    np.savez(path, **arrays) if suffix == ".npz" else save_file(arrays, path)
+    np.testing.assert_array_equal(published_arrays(path)["a"], 1.0)
+    whole = path.read_bytes()
+    for damaged in (whole[:-7], whole[: len(whole) // 2], b"", whole.replace(b"a", b"b", 1)[:-3]):
+        path.write_bytes(damaged)
+        refused(f"arrays{suffix}: not a whole file of arrays", published_arrays, path)
+
+
+def test_texts_and_objects_are_no_weights(tmp_path):
+    np.savez(tmp_path / "texts.npz", a=np.array(["one"]))
+    refused("texts.npz: 'a' holds no real numbers", published_arrays, tmp_path / "texts.npz")
+    np.savez(tmp_path / "pickle.npz", a=np.array([{}], object))
+    refused("pickle.npz: not a whole file of arrays", published_arrays, tmp_path / "pickle.npz")
 
 
 def test_what_is_no_release_is_refused(tmp_path):

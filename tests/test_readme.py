@@ -1,4 +1,4 @@
-"""What README states in figures is what stands on record, and its links lead somewhere."""
+"""Figures in README and docs/results.md are those on record; links, and what CONTRIBUTING names, lead somewhere."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.reports.claims import load_claims
 from f3amd_lib.reports.model_cards import committed_quality
 from f3amd_lib.training.checkpoints import load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -18,45 +20,99 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR
 ROOT = repository_root()
 HERO = ROOT / "paper_figures/bandai/laptop/media/side_by_side.webp"
 README = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+LINES = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+RESULTS = " ".join(LINES.split())
+CHARACTERS = (1, 8, 32)
+FNO = "F3AMD-FNO-96"
 
 
-def stated(sentence: str) -> tuple[float, ...]:
-    """Figures of the one sentence of README that fits a pattern."""
-    found = re.findall(sentence, README)
+def stated(sentence: str, page: str = README) -> tuple[float, ...]:
+    """Figures of the one sentence of a page that fits a pattern."""
+    found = re.findall(sentence, page)
     assert len(found) == 1, sentence
     return tuple(float(figure) for figure in (found[0] if isinstance(found[0], tuple) else found))
 
 
 @pytest.fixture(scope="module")
-def milliseconds():
+def fastest():
+    """Rows of the fastest way, by model, steps, framework and characters."""
     times = pd.read_csv(ROOT / "paper_figures/synthetic/laptop/records/synthesis_time.csv")
-    ours = times[(times["characters"] == 32) & (times["framework"] == "jax")]
-    return ours.groupby(["model", "steps"])["value"].min()
+    keys = ["model", "steps", "framework", "characters"]
+    return times.loc[times.groupby(keys)["value"].idxmin()].set_index(keys).sort_index()
+
+
+@pytest.fixture(scope="module")
+def milliseconds(fastest):
+    return fastest["value"]
 
 
 def test_times(milliseconds):
     one, eight, baseline = stated(
         r"takes (\d+) ms for a window of 32 frames in 1 step, (\d+) ms in 8 steps; `CAMDM` takes (\d+) ms"
     )
-    measured = milliseconds[[("F3AMD-FNO-96", 1), ("F3AMD-FNO-96", 8), ("CAMDM", 8)]]
+    measured = milliseconds[[(FNO, 1, "jax", 32), (FNO, 8, "jax", 32), ("CAMDM", 8, "jax", 32)]]
     assert [one, eight, baseline] == [round(value) for value in measured]
 
 
+def test_the_table_of_times(milliseconds):
+    table = re.findall(r"^\| `([\w-]+)`, (\d) steps?(, PyTorch)? \|((?: [\d.]+ \|){3})$", LINES, re.M)
+    assert len(table) == 5
+    for model, steps, torch, cells in table:
+        row = (model, int(steps), "torch" if torch else "jax")
+        measured = [f"{milliseconds[(*row, count)]:.3g}" for count in CHARACTERS]
+        assert cells.split(" |")[:3] == [f" {figure}" for figure in measured], row
+
+
+def test_what_is_said_of_times(fastest, milliseconds):
+    ours = {steps: (FNO, steps, "jax", 32) for steps in (1, 8)}
+    camdm = ("CAMDM", 8, "jax", 32)
+    shares = stated(r"at (\d+) % \(8 steps\) and (\d+) % \(1 step\) of the speed .* CAMDM at (\d+) %", RESULTS)
+    assert list(shares) == [round(100 * fastest.loc[row, "share_of_peak"]) for row in (ours[8], ours[1], camdm)]
+    gains = stated(r"the gains, (\d+)-fold and (\d+)-fold", RESULTS)
+    assert list(gains) == [round(milliseconds[camdm] / milliseconds[ours[steps]]) for steps in (1, 8)]
+    operations = stated(r"quotients of operations, (\d+) and ([\d.]+)\.", RESULTS)
+    assert list(operations) == [float(f"{fastest.flops[camdm] / fastest.flops[ours[steps]]:.2g}") for steps in (1, 8)]
+
+
+def test_what_is_said_of_frameworks(milliseconds):
+    """Which compiler is meant decides whether the paper's figure is met."""
+    camdm = milliseconds["CAMDM", 8]
+    faster = camdm["jax"] / camdm["torch"]
+    low, high, few = stated(r"is ([\d.]+) to ([\d.]+) times as fast as ours in JAX by XLA for up to (\d) ", RESULTS)
+    assert [low, high] == [round(value, 1) for value in (faster.loc[:few].min(), faster.loc[:few].max())]
+    assert (faster.loc[few + 1 :] < 1.05).all() and len(faster) == 6
+    slower, count = stated(r"ours by IREE takes ([\d.]+) times as long as PyTorch's with (\d+) characters", RESULTS)
+    assert slower == round(camdm["iree", count] / camdm["torch", count], 1)
+
+
+@pytest.mark.parametrize("page", [README, RESULTS], ids=["README", "results"])
 @pytest.mark.parametrize(
     ("sentence", "model"),
     [
-        (r"real people moves at (\d+) cm/s", ("real", 0)),
-        (r"our recipe `-plus` moves at about (\d+),", ("F3AMD-FNO-96-plus", None)),
-        (r"that of `CAMDM` at about (\d+),", ("CAMDM", None)),
-        (r"trained this briefly, at about (\d+):", ("F3AMD-FNO-96", None)),
+        (r"real people moves at (\d+) cm/s", "real"),
+        (r"`-plus`(?: moves)? at about (\d+),", "F3AMD-FNO-96-plus"),
+        (r"that of `CAMDM` at about (\d+)[,.]", "CAMDM"),
+        (r"trained this briefly, (?:skates )?at about (\d+)[:,]", FNO),
     ],
 )
-def test_slide_of_the_feet(sentence, model):
+def test_slide_of_the_feet(page, sentence, model):
     """Both numbers of steps taken together, within what "about" may mean: a tenth."""
     quality = committed_quality("bandai").query("metric == 'slide_speed' and window_frames == 32")
-    rows = quality[quality["model"] == model[0]]
-    (figure,) = stated(sentence)
+    rows = quality[quality["model"] == model]
+    (figure,) = stated(sentence, page)
     assert len(rows) and figure == pytest.approx(rows["value"].mean(), rel=0.1)
+
+
+def test_number_of_claims():
+    assert stated(r"judges each of its (\d+) claims") == (len(load_claims()),)
+
+
+def test_models_of_the_papers_recipe_saw_less_than_a_hundredth_of_its_training():
+    assert README.count("models of the paper's recipe saw less than a hundredth of its training") == 1
+    trained = pd.read_csv(ROOT / "paper_figures/bandai/laptop/records/trained.csv").query("metric == 'windows'")
+    of_paper = trained[~trained["model"].str.endswith("-plus")]
+    whole = load_paper_file("paper")["training"]["windows"]["32"]
+    assert len(of_paper) >= 3 and of_paper["value"].max() < 0.01 * whole
 
 
 def test_links_lead_somewhere():

@@ -2,41 +2,20 @@
 
 import numpy as np
 import pytest
-from builders import packed_from, refused, straight_motion
+from builders import packed_from, refused, stiff_walk, walks_and_runs
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.experiments import real_clips
 from f3amd_lib.experiments.real_clips import path_statistics
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 
-TRAIN, VALIDATION, TEST = 0, 1, 2
+TRAIN = 0
 WINDOW = 8
-
-
-def walk(step, num_frames=60):
-    """A stiff figure at `step` metres a frame along +Z."""
-    return straight_motion(num_frames, (0.0, 0.0, step))
 
 
 @pytest.fixture
 def packed():
-    """Calm walks 1.2 m/s and has a run in the test split; of proud only fast test clips exist."""
-    made = packed_from(
-        [
-            (walk(0.04), 0, TRAIN),
-            (walk(0.04), 0, TRAIN),
-            (walk(0.12), 0, TRAIN),
-            (walk(0.03), 1, TRAIN),
-            (walk(0.042), 0, TEST),
-            (walk(0.12), 0, TEST),
-            (walk(0.09), 1, TEST),
-            (walk(0.15), 1, TEST),
-            (walk(0.04, 9), 0, TEST),
-            (walk(0.045), 0, VALIDATION),
-        ]
-    )
-    made.floor_shift[:] = np.linspace(0.01, 0.10, 10)
-    return made
+    return walks_and_runs()
 
 
 def test_pace_and_floor_come_from_training_clips(packed):
@@ -47,7 +26,7 @@ def test_pace_and_floor_come_from_training_clips(packed):
 
 
 def test_standing_frames_do_not_slow_the_pace():
-    clips = [(walk(0.04), 0, TRAIN), (walk(0.0, 200), 0, TRAIN), (walk(0.0), 1, TRAIN)]
+    clips = [(stiff_walk(0.04), 0, TRAIN), (stiff_walk(0.0, 200), 0, TRAIN), (stiff_walk(0.0), 1, TRAIN)]
     packed = packed_from(clips)
     assert real_clips.style_pace(packed, "calm") == pytest.approx(1.2, rel=1e-3)
     assert real_clips.style_pace(packed, "proud") == 0.1
@@ -85,7 +64,7 @@ def test_reference_clips_say_what_is_missing(packed):
 
 
 def test_own_path_keeps_a_line_and_loses_the_sway():
-    motion = walk(0.04, 90)
+    motion = stiff_walk(0.04, 90)
     line = path_from_motion(motion).position
     np.testing.assert_allclose(real_clips.own_path(motion).position, line, atol=1e-9)
     swayed = motion.root_position.copy()

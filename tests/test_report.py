@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import cut_off, refused
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -259,7 +260,7 @@ def test_paper_tables_are_copies_and_end_at_twelve():
     frame["value"] = 0.0
     frame.attrs["setting"] = "mine"
     again = papers.load_paper_table(3)
-    assert again["value"].abs().sum() > 0 and again.attrs["setting"] == papers.PAPER_SETTING
+    assert again["value"].abs().sum() > 0 and again.attrs["setting"] == papers.load_paper_file("paper")["setting"]
     refused("Tables 1 to 12, not 13", papers.load_paper_table, 13)
 
 
@@ -396,6 +397,30 @@ def test_film_strip_has_a_row_a_motion(tmp_path):
     with Image.open(path) as image:
         for side in ("left", "right", "middle"):
             assert count_near(image, stick_figures.LIMB_COLORS[side]) > 200
+
+
+def test_a_film_strip_shows_whole_limbs_on_one_scale():
+    """Arms that are held out before the last pose of a row need more room than other rows do."""
+    walk, forward = make_motion(), matrix_from_euler("X", np.array([-90.0]))
+    longer = dataclasses.replace(walk.skeleton, offsets=walk.skeleton.offsets * np.array([1.0, 1.8, 1.0]))
+    held = walk.rotations.copy()
+    held[:, [k for k, name in enumerate(longer.names) if "Shoulder" in name]] = forward
+    reaching = walk.replace(skeleton=longer, rotations=held)
+    axes = pictures.film_strip([walk, reaching]).axes[::2]
+    assert axes[0].get_xlim() == axes[1].get_xlim()
+    for axis in axes:
+        bodies = [part for part in axis.collections if isinstance(part, LineCollection)]
+        across = np.concatenate([np.concatenate(body.get_segments()) for body in bodies])[:, 0]
+        assert axis.get_xlim()[0] < across.min() and across.max() < axis.get_xlim()[1]
+
+
+def test_numbers_of_a_plan_do_not_lie_on_each_other():
+    """Somebody who stands has one number; somebody who walks has all."""
+    walk = make_motion()
+    for still, expected in ((False, 5), (True, 1)):
+        root = walk.root_position * ([0.01, 1.0, 0.01] if still else 1.0)
+        plan = pictures.film_strip(walk.replace(root_position=root), num_poses=5).axes[1]
+        assert len(plan.texts) == expected and plan.texts[0].get_text() == "1"
 
 
 def test_film_strip_is_written_in_one_call(tmp_path):

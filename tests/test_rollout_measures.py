@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders import SKELETON, packed_from, straight_motion
+from builders import SKELETON, stiff_walk, walks_and_runs
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.experiments import real_clips, rollout_measures
@@ -11,13 +11,7 @@ from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.motion.root_paths import RootPath, path_from_motion
 from f3amd_lib.reports import quality_tables
 
-TRAIN, VALIDATION, TEST = 0, 1, 2
 WINDOW = 8
-
-
-def walk(step, num_frames=60):
-    """A stiff figure at `step` metres a frame along +Z."""
-    return straight_motion(num_frames, (0.0, 0.0, step))
 
 
 def rollout_of(motions, paths=None, window=WINDOW):
@@ -30,23 +24,7 @@ def rollout_of(motions, paths=None, window=WINDOW):
 
 @pytest.fixture
 def packed():
-    """Calm walks 1.2 m/s and has a run in the test split; of proud only fast test clips exist."""
-    made = packed_from(
-        [
-            (walk(0.04), 0, TRAIN),
-            (walk(0.04), 0, TRAIN),
-            (walk(0.12), 0, TRAIN),
-            (walk(0.03), 1, TRAIN),
-            (walk(0.042), 0, TEST),
-            (walk(0.12), 0, TEST),
-            (walk(0.09), 1, TEST),
-            (walk(0.15), 1, TEST),
-            (walk(0.04, 9), 0, TEST),
-            (walk(0.045), 0, VALIDATION),
-        ]
-    )
-    made.floor_shift[:] = np.linspace(0.01, 0.10, 10)
-    return made
+    return walks_and_runs()
 
 
 def test_real_clips_and_rollouts_are_measured_alike(packed):
@@ -62,7 +40,7 @@ def test_real_clips_and_rollouts_are_measured_alike(packed):
 
 
 def test_rounds_show_where_the_path_is_lost():
-    motion = walk(0.04, 30)
+    motion = stiff_walk(0.04, 30)
     path = path_from_motion(motion)
     ramp = np.where(np.arange(30) < 16, 0.0, 0.5)[:, None] * np.array([1.0, 0.0])
     off = RootPath(path.position + ramp, path.yaw)

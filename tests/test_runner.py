@@ -19,7 +19,7 @@ def row(model, steps, weights="aa"):
 def run(tmp_path):
     """Measure rows into a folder; answers with the rows that were measured now."""
 
-    def measure(todo, *, again=(), seed=0, fails=()):
+    def measure(todo, *, again=(), seed=0, fails=(), folder=tmp_path, known=None):
         measured = []
 
         def one(wanted):
@@ -31,7 +31,8 @@ def run(tmp_path):
 
         record = run_record(profile="smoke", dataset="synthetic", seed=seed)
         total = {"summary": ("figures", lambda rows: rows.groupby(KEYS, sort=False, as_index=False)[["value"]].sum())}
-        records = Records(tmp_path, record, {"figures": KEYS, "rounds": KEYS}, again=again, summaries=total)
+        keys = {"figures": KEYS, "rounds": KEYS}
+        records = Records(folder, record, keys, again=again, known=known, summaries=total)
         records.measure(todo, one)
         return measured, records
 
@@ -72,3 +73,18 @@ def test_a_stopped_run_goes_on_and_other_settings_start_anew(run, tmp_path):
     assert run(todo)[0] == [("b", 8)]
     assert run(todo, seed=1)[0] == [("a", 8), ("b", 8)]
     assert (tmp_path / "figures.old1.csv").exists()
+
+
+def test_what_another_run_has_measured_alike_counts_and_stays_as_it_is(run, tmp_path):
+    run([row("a", 8), row("b", 8)])
+    theirs = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    here = {"folder": tmp_path / "here", "known": tmp_path}
+    measured, records = run([row("a", 8), row("a", 1), row("b", 8, "cc")], **here)
+    assert measured == [("a", 1), ("b", 8)]
+    assert set(read_table(records.path("figures"))[0]["model"]) == {"a", "b"}
+    assert run([row("b", 8)], **here)[0] == []  # theirs, beside one of our own with other weights
+    assert run([row("a", 8)], seed=1, **here)[0] == [("a", 8)]  # it asks for something else
+    (tmp_path / "figures.csv").write_text("half a ta")
+    assert run([row("a", 8)], folder=tmp_path / "there", known=tmp_path)[0] == [("a", 8)]
+    assert {path: path.read_bytes() for path in theirs} == theirs | {tmp_path / "figures.csv": b"half a ta"}
+    assert not list(tmp_path.glob("*.old*"))

@@ -47,6 +47,33 @@ def settings(monkeypatch) -> dict:
     return runpy.run_path(str(DOCS / "conf.py"))
 
 
+def launching(monkeypatch, address: str) -> dict:
+    """The theme's options about the repository, for an address of it."""
+    monkeypatch.setenv("F3AMD_REPOSITORY", address)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    options = runpy.run_path(str(DOCS / "conf.py"))["html_theme_options"]
+    return {name: value for name, value in options.items() if name.startswith(("repository", "launch"))}
+
+
+def test_notebooks_open_elsewhere_where_an_address_is_known_and_nowhere_else(monkeypatch):
+    assert launching(monkeypatch, "") == {}
+    options = launching(monkeypatch, "https://example.org/owner/name")
+    assert options["repository_url"] == "https://example.org/owner/name"
+    assert options["launch_buttons"]["binderhub_url"] == "https://mybinder.org"
+    assert "colab_url" not in options["launch_buttons"]  # which opens notebooks of GitHub alone
+    buttons = launching(monkeypatch, "https://github.com/owner/name")["launch_buttons"]
+    assert buttons["colab_url"] == "https://colab.research.google.com" and "binderhub_url" in buttons
+    assert "colab_url" not in launching(monkeypatch, "https://github.com.example.org/owner/name")["launch_buttons"]
+    refused("F3AMD_REPOSITORY must be an address", launching, monkeypatch, "owner/name")
+
+
+def test_binder_installs_the_library_as_the_environment_says():
+    command = "pip install --no-deps --no-build-isolation -e ."
+    assert command in (ROOT / "environment.yml").read_text(encoding="utf-8")
+    assert command in (ROOT / "postBuild").read_text(encoding="utf-8").splitlines()
+    assert "F3AMD_REPOSITORY" in WORKFLOW.read_text(encoding="utf-8")
+
+
 def toctree_entries(path: Path) -> list[str]:
     """What the tables of contents of a page name, as paths from the root of the repository."""
     entries = []

@@ -435,6 +435,18 @@ def test_data_dir_without_the_data_is_an_error_and_no_download(tmp_path, monkeyp
     refused("absent: there is no such file or folder", open_dataset, "bandai")
 
 
+def test_a_data_set_without_an_address_is_found_or_asked_for(tmp_path, monkeypatch, no_network):
+    """Licence and credit are all that a table of `data_sets.toml` must have."""
+    monkeypatch.setitem(sources._SETS, "mine", {"licence": "mine", "credit": "me"})
+    monkeypatch.delenv("F3AMD_DATA_DIR", raising=False)
+    with pytest.raises(ValueError, match="'mine' is downloaded from nowhere; set F3AMD_DATA_DIR"):
+        sources._find_archive("mine", None)
+    assert sources._find_archive("mine", tmp_path).path == str(tmp_path)
+    for name in ("mine.zip", "other.zip"):
+        zip_folder(tmp_path, tmp_path / name)
+    assert sources._find_archive("mine", tmp_path).path == str(tmp_path / "mine.zip")
+
+
 def test_downloads_are_pinned(small_bandai, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
     write_100style(tmp_path / "tree")

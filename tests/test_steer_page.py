@@ -16,15 +16,19 @@ import numpy as np
 import pytest
 from builders import refused
 
-from f3amd_lib.data.features import frame_positions, orthonormalise
+from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.generation.blending import blend_seams
+from f3amd_lib.generation.foot_locking import leg_chains
+from f3amd_lib.generation.online_feet import lock_frame, start_feet
 from f3amd_lib.generation.steering import Steering, Target, first_pose, move_target
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.serving import npm_packages, steer
 from f3amd_lib.serving.npm_packages import package_file
 from f3amd_lib.serving.onnx_export import model_card
 from f3amd_lib.serving.steer import WEB, steer_page, write_steer
+from f3amd_lib.training.checkpoints import describe_skeleton
 
 SIGMAS = variance_exploding().grid(3)
 BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};\n//# sourceMappingURL=x"
@@ -159,6 +163,37 @@ def test_rounds_under_way_are_alike_for_the_same_noise(tmp_path, trained):
 
 
 @pytest.mark.needs("node")
+def test_feet_are_held_alike(tmp_path):
+    """A walk that slides, with the switch turned off and on again on the way."""
+    motion = synthesize("Neutral", 6)
+    drift = np.arange(motion.num_frames)[:, None] * np.array([0.3 / motion.fps, -2e-4, 0.0])
+    frames = world_frames(motion.replace(root_position=motion.root_position + drift))
+    asked = [not 70 <= k < 90 for k in range(10, len(frames))]
+    feet, wanted = start_feet(SYNTHETIC_SKELETON, frames[:10]), []
+    for frame, locking in zip(frames[10:], asked, strict=True):
+        feet, settled = lock_frame(SYNTHETIC_SKELETON, feet, frame, locking=locking)
+        wanted.append(settled)
+    legs = leg_chains(SYNTHETIC_SKELETON).tolist()
+    found = in_node(
+        tmp_path,
+        "const walk = frames(given.frames), s = given.skeleton, settled = [];"
+        "let feet = m.startFeet(s, given.legs, walk.slice(0, 10));"
+        "walk.slice(10).forEach((frame, k) => {"
+        "  const one = m.lockFrame(s, given.legs, feet, frame, given.asked[k]);"
+        "  feet = one.feet; settled.push(one.frame); });"
+        "say([settled, feet.shown, feet.carries])",
+        skeleton=describe_skeleton(SYNTHETIC_SKELETON) | {"offsets": np.asarray(SYNTHETIC_SKELETON.offsets).tolist()},
+        legs=legs,
+        frames=frames.tolist(),
+        asked=asked,
+    )
+    np.testing.assert_allclose(found[0], wanted, atol=1e-4)
+    np.testing.assert_allclose(found[1], feet.shown, atol=1e-6)
+    assert found[2] == feet.carries.tolist()
+    assert np.abs(np.array(wanted) - frames[10:]).max() > 0.05  # something was held
+
+
+@pytest.mark.needs("node")
 def test_the_page_draws_standard_normal_numbers(tmp_path):
     drawn = in_node(tmp_path, "const draw = m.normalNumbers(5); say([draw(20000), m.normalNumbers(6)(5)])")
     numbers = np.array(drawn[0])
@@ -187,6 +222,7 @@ def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp
     poses = np.frombuffer(files["poses"], np.float32).reshape(2, builders.HISTORY, builders.CHANNELS)
     np.testing.assert_allclose(poses[:, -1, [0, 2]], 0.0, atol=1e-6)
     data = carried(page, "steer-data")
+    assert data["card"]["legs"] is None and 'id="feet" disabled' in page  # legs of these are no legs
     assert data["card"]["styles"] == ["calm", "proud"] and data["card"]["window"] == builders.WINDOW
     assert {name for name, _ in data["modules"]} | {"worker", "wasm", "program", "poses"} == set(files)
     head = page.split('<script type="application/json" id="steer-data">')[0]
@@ -202,6 +238,49 @@ def test_the_worker_is_one_script_without_modules(trained, packages):
     ).decode()
     assert "const ort=(()=>{var a=1" in worker and "return{InferenceSession:a,default:b}" in worker
     assert not re.search(r"^(import|export) |import\.meta", worker, re.M)
+
+
+def test_the_page_for_a_graphics_card_carries_the_runtime_for_both(trained, monkeypatch):
+    monkeypatch.setattr(steer, "package_file", lambda package, path: BUNDLE + path.encode())
+    for runtime, words in (("wasm", ("ort.wasm.", "threaded.wasm")), ("webgpu", ("ort.webgpu.", "asyncify.wasm"))):
+        page = steer_page(trained, program=b"", runtime=runtime)
+        files = {name: gzip.decompress(base64.b64decode(text)) for name, text in carried(page, "steer-files").items()}
+        found = files["wasm"].decode()
+        assert words[1] in found and carried(page, "steer-data")["card"]["webgpu"] is (runtime == "webgpu")
+        assert steer.RUNTIMES[runtime][0].startswith(f"dist/{words[0]}")
+    refused("unknown runtime 'webgl'", steer_page, trained, program=b"", runtime="webgl")
+
+
+@pytest.mark.needs("node")
+@pytest.mark.parametrize(
+    "wanted, card, works, runs",
+    [
+        (False, True, True, "wasm"),
+        (True, True, True, "webgpu"),
+        (True, False, True, "wasm"),
+        (True, True, False, "wasm"),
+    ],
+)
+def test_the_worker_takes_webgpu_only_where_it_is_wanted_and_works(tmp_path, wanted, card, works, runs):
+    worker = re.sub(r"^import .*\n", "", (WEB / "steer_worker.js").read_text(encoding="utf-8"), flags=re.M)
+    script = (
+        "const given = JSON.parse(process.argv[2]), normalNumbers = () => 0, asked = [];"
+        "const ort = {env: {wasm: {}}, InferenceSession: {create: async (program, {executionProviders: [name]}) => {"
+        "  asked.push(name); if (name === 'webgpu' && !given.works) throw new Error('no such device'); }}};"
+        "const gpu = {requestAdapter: async () => given.card ? {} : null};"
+        "const self = {navigator: {gpu}, postMessage: (m) => process.stdout.write(JSON.stringify({...m, asked}))};"
+        f"{worker}\nself.onmessage({{data: {{id: 1, kind: 'open', card: {{webgpu: given.wanted, channels: 1,"
+        " num_history: 1}, poses: new Float32Array(1)}});"
+    )
+    (tmp_path / "worker.cjs").write_text(script)
+    given = json.dumps({"wanted": wanted, "card": card, "works": works})
+    done = subprocess.run(["node", "worker.cjs", given], cwd=tmp_path, capture_output=True, text=True, check=False)
+    answer = json.loads(done.stdout)
+    assert answer["runs"] == runs == answer["asked"][-1]
+    why = {(False, True): "lends no graphics card", (True, False): "no such device"}.get((card, works))
+    assert (why in answer["instead"]) if wanted and why else "instead" not in answer
+    if not wanted:
+        assert answer["asked"] == ["wasm"]
 
 
 def test_another_bundle_or_sampler_is_refused(trained, monkeypatch):

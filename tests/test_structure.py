@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,15 @@ def test_networks_and_samplers_know_no_data(room, may_know):
     for name, known in import_graph().items():
         if name.startswith(f"f3amd_lib.{room}."):
             assert {other.split(".")[1] for other in known} <= may_know | {room}, name
+
+
+def roads(text: str) -> dict[str, list[str]]:
+    """What each road of docs/house.md leads from, and the files on it."""
+    lines = text.split("## Four roads\n")[1].split("\n## ")[0].split("\n- ")[1:]
+    return {line.split(":**")[0]: re.findall(r"`([\w/]+\.\w+)`", line) for line in lines}
+
+
+def test_the_four_roads_are_short_and_lead_through_files_that_exist():
+    found = roads((LIBRARY.parent / "docs" / "house.md").read_text(encoding="utf-8"))
+    assert len(found) == 4 and all(2 <= len(files) <= 4 for files in found.values())
+    assert [file for files in found.values() for file in files if not (LIBRARY / file).is_file()] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -19,10 +20,10 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from builders import HISTORY, WINDOW, refused, same_tree, tiny_packed
+from builders import HISTORY, WINDOW, refused, same_tree, tiny_packed, tiny_trained
 
 from f3amd_lib import __main__ as command_line
-from f3amd_lib.experiments import campaign, sweep
+from f3amd_lib.experiments import campaign, measure, sweep
 from f3amd_lib.experiments.campaign import Run, run_campaign
 from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.experiments.runner import Records
@@ -217,9 +218,9 @@ def test_what_the_campaign_has_measured_is_not_trained_anew(work, monkeypatch):
     known = Records(work.records(work.results), record, table)
     known.put("campaign", {"run": QUEUE[0][0].name, "windows": 1000}, pd.DataFrame({"value": [1.0], "weights": ["a"]}))
 
-    def measured(*arguments, snapshots, **settings):
+    def measured(*arguments, snapshots, known, **settings):
         run, windows = snapshots[0]
-        records = Records(results_dir("synthetic", "smoke") / "records", record, table)
+        records = Records(results_dir("synthetic", "smoke") / "records", record, table, known=known)
         if records.has("campaign", key := {"run": run.name, "windows": windows}):
             yield run.name, windows, "measured before"
             return
@@ -232,7 +233,30 @@ def test_what_the_campaign_has_measured_is_not_trained_anew(work, monkeypatch):
     rows, record = read_table(where(work, "campaign"))
     assert list(zip(rows["run"], rows["windows"], strict=True)) == [(run.name, windows) for run, windows in QUEUE]
     assert rows["value"].tolist() == [1.0, 2.0, 2.0, 2.0]
+    assert not list(work.place(plan(["campaign"], [], PROFILE, QUEUE)[0]).rglob("campaign.*"))
     assert record["weights_digests"][QUEUE[0][0].name] == ["a", "b"]
+
+
+@pytest.mark.slow
+def test_a_real_measurement_leaves_the_table_of_one_process(tmp_path, monkeypatch):
+    """`walking` itself, of two small networks: what it draws depends on no model that was measured before."""
+    prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
+    models = {A: tiny_trained(), B: tiny_trained(latent_width=12)}
+    obtain = lambda *arguments, preset, **settings: (models[preset], None, "shipped")
+    for module in (sweep, measure):
+        monkeypatch.setattr(module, "obtain_model", obtain)
+    monkeypatch.setattr(sweep, "_opened", lambda profile, source: prepared)
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "one process"))
+    profile = dataclasses.replace(PROFILE, window=WINDOW)
+    here = measure.measure_walking(prepared, profile, [A, B])
+    work = Work(profile, None, tmp_path / "results", tmp_path / "folder")
+    legs, told = plan(["walking"], [A, B], profile, []), {}
+    for leg in sorted(legs, key=lambda leg: leg.preset, reverse=True):  # the other one first
+        told[leg.name] = run_leg(work, leg, told.get(leg.after))
+    gather(work, legs)
+    assert contents(where(work)) == contents(here)
+    table = read_table(here)[0]
+    assert list(dict.fromkeys(table["model"])) == ["real", A, B] and set(table["steps"]) == {0, 1, 8}
 
 
 # ------------------------------------------------------------------------------------ the engine

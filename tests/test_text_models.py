@@ -7,17 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import captioned_walks
 from test_text_judge import OneVectorAWord
 
 from f3amd_lib.__main__ import main
 from f3amd_lib.data import text_encoders
-from f3amd_lib.data.text_motions import text_motions
 from f3amd_lib.diffusion.schedules import straight
-from f3amd_lib.generation import told_motion
+from f3amd_lib.generation import captioned_motion
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import read_bvh
-from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.training import text_models
@@ -51,13 +50,7 @@ ENCODER = OneVectorAWord()
 
 @pytest.fixture(scope="module")
 def data():
-    clips = []
-    for style in STYLES:
-        for seed in range(6):
-            motion = resample(synthetic.synthesize(style, seconds=3.2, seed=seed), 20.0).slice(0, 64)
-            split = ("test", "validation", "train")[min(seed, 2)]
-            clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
-    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+    return captioned_walks(STYLES, ("test", "validation", "train"), num_frames=64)
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +155,24 @@ def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_pa
             assert any(np.allclose(motion, clip[s : s + len(motion)], atol=1e-5) for clip in known for s in starts)
 
 
+def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path, monkeypatch):
+    """Clips begin at the origin; pieces from the middle would not."""
+    given = {}
+
+    def loop(task, files, record, **_):
+        given.update(task=task, record=record)
+        return types.SimpleNamespace(step=0), []
+
+    monkeypatch.setattr(text_models, "train_in_legs", loop)
+    monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
+    assert train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, window=32, **QUIET) is None
+    cut, task = data.cut(32), given["task"]
+    assert task.model_config.window == 32 and np.asarray(task.clips.length).tolist() == [32] * 8
+    first = cut.normaliser().normalise(data.clip(data.members("train")[0])[:32])
+    np.testing.assert_allclose(task.clips.frames[:32], first, atol=1e-5)
+    assert given["record"]["dataset_fingerprint"] == cut.fingerprint != data.fingerprint
+
+
 def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(folder, data, tmp_path):
     train = lambda **leg: train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, **QUIET, **leg)
     assert train(stop_at=0.0) is None
@@ -217,10 +228,10 @@ def test_only_data_with_captions_open():
 
 def test_lengths_and_seeds(folder):
     trained, pooled = load(folder, "tiny"), np.ones((2, 8), np.float32)
-    made = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
+    made = captioned_motion.draw_motions(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
     assert made.shape == (2, 32, 23, 3) and not made[0, 24:].any() and made[1, 31].any()
-    again = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
-    other = told_motion.motions_told(trained, pooled, [24, 32], jax.random.key(1), num_steps=2)
+    again = captioned_motion.draw_motions(trained, pooled, [24, 32], jax.random.key(0), num_steps=2)
+    other = captioned_motion.draw_motions(trained, pooled, [24, 32], jax.random.key(1), num_steps=2)
     np.testing.assert_array_equal(made, again)
     assert np.abs(made - other).max() > 0.01
 
@@ -232,12 +243,12 @@ def test_the_model_is_told_the_caption_and_the_control_in_its_own_units(folder, 
         seen.update(condition=condition, control=control, told=told)
         return control.positions
 
-    monkeypatch.setattr(told_motion, "sample_control", sample)
+    monkeypatch.setattr(captioned_motion, "sample_control", sample)
     points = np.array([[0.1, 1.2, 0.3], [0.4, 0.9, 0.6]])
     wrist = controlled_joints(trained.skeleton)["left_wrist"]
-    control = told_motion.control_of(trained, wrist, [3, 20], points, 24)
+    control = captioned_motion.control_of(trained, wrist, [3, 20], points, 24)
     pooled = np.arange(8, dtype=np.float32)[None]
-    made = told_motion.motions_told(
+    made = captioned_motion.draw_motions(
         trained, pooled, 24, jax.random.key(0), guidance=2.0, num_steps=5, control=control
     )  # fmt: skip
     np.testing.assert_allclose(made[0, [3, 20], wrist], points, atol=1e-5)  # metres in, metres out
@@ -261,11 +272,11 @@ def test_a_stream_goes_straight_on_wherever_it_walks(folder, name, monkeypatch):
         steps = 1.0 + jnp.arange(network.config.window - prefix.shape[1])[:, None, None]
         yield prefix[:, -1:] + steps * (prefix[:, -1:] - prefix[:, -2:-1])
 
-    monkeypatch.setattr(told_motion, "continue_prefix", go_on)
+    monkeypatch.setattr(captioned_motion, "continue_prefix", go_on)
     pooled = np.eye(8, dtype=np.float32)[:2]
-    positions = told_motion.stream_told(trained, pooled, [1, 2], jax.random.key(0))
+    positions = captioned_motion.stream_motions(trained, pooled, [1, 2], jax.random.key(0))
     first = 12
-    assert len(positions) == first + 3 * told_motion.window_frames(trained)
+    assert len(positions) == first + 3 * captioned_motion.window_frames(trained)
     if name == "raw":
         step = np.diff(positions[:, 0], axis=0)
         np.testing.assert_allclose(step, np.tile(step[0], (len(step), 1)), atol=1e-4)
@@ -279,12 +290,12 @@ def test_a_stream_begins_near_its_first_caption(folder):
     near = dataclasses.replace(trained, starts={**trained.starts, **many})
     starts = np.concatenate([starts, -np.ones((9, 8), np.float32)])
     for seed in range(3):
-        made = told_motion.stream_told(near, starts[:1], [0], jax.random.key(seed), starts=starts[:, :])
+        made = captioned_motion.stream_motions(near, starts[:1], [0], jax.random.key(seed), starts=starts[:, :])
         assert len(made) == 12
     with pytest.raises(ValueError, match="a stream needs the prefix form: --model ACMDM-n4-PS22-prefix"):
-        told_motion.stream_told(load(folder, "tiny"), starts[:1], [1], jax.random.key(0))
+        captioned_motion.stream_motions(load(folder, "tiny"), starts[:1], [1], jax.random.key(0))
     with pytest.raises(ValueError, match="goes on from earlier frames"):
-        told_motion.motions_told(trained, starts[:1], 24, jax.random.key(0))
+        captioned_motion.draw_motions(trained, starts[:1], 24, jax.random.key(0))
 
 
 # --------------------------------------------------------------------------------------------------------- command line

@@ -138,6 +138,18 @@ def test_clips_are_chosen_with_all_that_is_theirs():
         toy.members("validation")
 
 
+def test_cut_clips_keep_their_first_frames_and_all_that_is_theirs():
+    toy = data()
+    cut = toy.cut(40)
+    assert cut.lengths.tolist() == [24, 40, 40] and cut.names == toy.names and cut.captions == toy.captions
+    for number in range(3):
+        assert np.array_equal(cut.clip(number), toy.clip(number)[:40])
+    assert cut.fingerprint != toy.fingerprint == toy.cut(60).fingerprint
+    for frames in (20, 42):
+        with pytest.raises(ValueError, match=f"a multiple of 4 from 24 on, got {frames}"):
+            toy.cut(frames)
+
+
 def test_normalisation_is_by_axis_and_of_training_clips():
     toy = data()
     train = np.concatenate([toy.clip(0), toy.clip(1)])

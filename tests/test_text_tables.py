@@ -4,16 +4,15 @@ import time
 
 import numpy as np
 import pytest
+from builders import captioned_walks
 from test_text_models import ENCODER, PROFILE, TINY
 
-from f3amd_lib.data.text_motions import text_motions
 from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import TABLES, asked_frames, measure_text_table
+from f3amd_lib.experiments.text_tables import PAPERS, asked_frames, measure_text_table
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.text_metrics import control_errors
 from f3amd_lib.motion import synthetic
-from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
 from f3amd_lib.reports import claims
 from f3amd_lib.reports.evidence import SCHEMAS
@@ -35,13 +34,7 @@ ROWS = {
 
 @pytest.fixture(scope="module")
 def data():
-    clips = []
-    for style in synthetic.STYLES[:2]:
-        for seed in range(6):
-            motion = resample(synthetic.synthesize(style, seconds=2.0, seed=seed), 20.0).slice(0, 40)
-            split = ("test", "test", "validation", "train")[min(seed, 3)]
-            clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
-    return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
+    return captioned_walks(synthetic.STYLES[:2], ("test", "test", "validation", "train"), num_frames=40)
 
 
 @pytest.fixture(scope="module")
@@ -121,13 +114,13 @@ def test_true_motion_has_no_control_error_and_a_moved_one_has_it(data):
 
 def test_the_files_rows_name_presets_columns_and_commands():
     about = load_paper_file("experiments", "acmdm")
-    assert set(TABLES) == {name for name in about if name != "settings"} == set(ROWS)
+    assert set(PAPERS["acmdm"]) == {name for name in about if name != "settings"} == set(ROWS)
     typed = " ".join(run for runs in claims.load_commands("acmdm").values() for run in runs)
-    for name in TABLES:
+    for name in PAPERS["acmdm"]:
         assert f"f3amd measure {name} " in typed
         for row in about[name]["rows"]:
             assert text_models.is_text_preset(row["trained"]) and presets.find_preset(row["model"])
             assert {*row} - {"trained", "first"} == set(SCHEMAS[name]) - {"metric", "joint"}
     # One autoencoder size and one number of blocks within a table, but where blocks are what is compared.
     depths = {presets.find_preset(row["trained"]).network["depth"] for row in about["text_table1"]["rows"]}
-    assert depths == {3}
+    assert depths == {2}

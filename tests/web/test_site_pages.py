@@ -13,9 +13,11 @@ pytestmark = pytest.mark.skipif(
 
 PHONE = (390, 844)
 
+LEDGERS = [f"paper_figures/{path.stem}.html" for path in sorted((ROOT / "paper_figures").glob("claims*.md"))]
+
 PAGES = [
     *sorted(path.relative_to(SITE).as_posix() for path in (SITE / "docs").rglob("*.html")),
-    "paper_figures/claims.html",
+    *LEDGERS,
     "search.html",
 ]
 
@@ -114,22 +116,23 @@ def test_every_notebook_is_whole_on_a_phone(browser):
 def test_no_table_is_cut_off_on_a_small_laptop(browser):
     browser.resize(1280, 800)
     tables = 0
-    for name in [*notebooks(), "paper_figures/claims.html"]:
+    for name in [*notebooks(), *LEDGERS]:
         page = browser.open(SITE / name)
         tables += page.script("return document.querySelectorAll('.bd-article table').length")
         assert page.script(CUT_OFF) == [], name
     assert tables > 50
 
 
-def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots):
+@pytest.mark.parametrize("name", LEDGERS)
+def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots, name):
     browser.resize(*PHONE, phone=True)
-    page = browser.open(SITE / "paper_figures/claims.html")
+    page = browser.open(SITE / name)
     cell = "const td = document.querySelector('#claims-ledger table:has(th:nth-child(8)) td:nth-child(4)');"
     assert page.script(cell + "return getComputedStyle(td).display") == "block"
     assert page.script(cell + "return getComputedStyle(td, '::before').content") == '"ours: "'
-    page.screenshot(screenshots / "site_claims_phone.png")
+    page.screenshot(screenshots / f"site_{Path(name).stem}_phone.png")
     browser.resize(1280, 800)
-    page = browser.open(SITE / "paper_figures/claims.html")
+    page = browser.open(SITE / name)
     assert page.script(cell + "return getComputedStyle(td).display") == "table-cell"
 
 

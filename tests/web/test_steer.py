@@ -9,7 +9,7 @@ import pytest
 from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.generation.steering import FPS, Steering, first_pose
-from f3amd_lib.measures.walking import seam_kick
+from f3amd_lib.measures.walking import seam_kick, slide_speed
 from f3amd_lib.serving.onnx_export import denoiser_program
 from f3amd_lib.serving.steer import write_steer
 from f3amd_lib.training.checkpoints import load_model
@@ -25,8 +25,12 @@ def trained():
 
 
 @pytest.fixture(scope="module")
-def page(trained, tmp_path_factory):
-    program = denoiser_program(trained.network(), weights="int8")
+def program(trained):
+    return denoiser_program(trained.network(), weights="int8")
+
+
+@pytest.fixture(scope="module")
+def page(trained, program, tmp_path_factory):
     return write_steer(tmp_path_factory.mktemp("steer") / "steer.html", trained, program=program)
 
 
@@ -85,6 +89,18 @@ def test_rounds_are_pythons_for_the_same_noise(browser, page, trained):
             ),
         )
         np.testing.assert_allclose(found, wanted, atol=1e-4)
+    assert browser.errors() == [] and browser.requests() == []
+
+
+def test_a_page_for_webgpu_says_what_runs_and_walks_without_it(browser, trained, program, page, tmp_path):
+    """This browser has no graphics card: WebAssembly takes over, of the runtime that would do both."""
+    opened(browser, page)
+    assert browser.find("#where").text == "in WebAssembly on one thread"
+    opened(browser, write_steer(tmp_path / "gpu.html", trained, program=program, runtime="webgpu"))
+    runs = browser.script("return steer.state().runs")
+    words = {"wasm": "in WebAssembly on one thread (not by WebGPU: ", "webgpu": "on the graphics card, by WebGPU"}
+    assert browser.find("#where").text.startswith(words[runs])
+    browser.wait("return steer.state().rounds > 1", 120)
     assert browser.errors() == [] and browser.requests() == []
 
 
@@ -151,6 +167,29 @@ def test_what_a_round_costs_at_1_8_and_32_characters(browser, page, screenshots,
     browser.screenshot(screenshots / "steer_32.png")
     with capsys.disabled():
         print("", *lines, sep="\n")
+    assert browser.errors() == [] and browser.requests() == []
+
+
+def test_feet_stand_while_the_tick_is_there(browser, page, trained, screenshots, capsys):
+    """The lower toe of one who walks straight on, with the tick and without."""
+    opened(browser, page)
+    choose(browser, "steps", 1)
+    assert browser.script("return document.getElementById('feet').checked")
+    key(browser, "keydown", "ArrowUp")
+    slides = []
+    for held in (True, False):
+        browser.wait("return steer.state().rounds > 3 && steer.state().timed >= 3", 60)
+        browser.script("steer.forget()")
+        browser.wait("return steer.record().length >= 120", 90)
+        points = np.reshape([row["points"] for row in browser.script("return steer.record()")[:120]], (120, -1, 3))
+        slides.append(float(slide_speed(points[:, : trained.skeleton.num_joints], trained.skeleton)))
+        if held:
+            browser.screenshot(screenshots / "steer_feet.png")
+            browser.find("#feet").click()
+            browser.wait(f"return steer.state().newest >= {browser.script('return steer.state().newest') + 60}", 60)
+    with capsys.disabled():
+        print(f"\nthe lower toe slides at {slides[0]:.1f} cm/s held, {slides[1]:.1f} cm/s as the network moves it")
+    assert slides[0] < 0.5 * slides[1]
     assert browser.errors() == [] and browser.requests() == []
 
 

@@ -1,0 +1,185 @@
+"""ACMDM and MotionPCM as ONNX: the card's times and a few lines of NumPy give the motion that JAX gives."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import refused, tiny_trained
+from flax import nnx
+
+from f3amd_lib.__main__ import main
+from f3amd_lib.data.text_motions import AxisNormaliser
+from f3amd_lib.diffusion.flow import solve
+from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
+from f3amd_lib.generation.latent_motion import sample_student, sample_teacher
+from f3amd_lib.generation.text_to_motion import text_prediction
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
+from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
+from f3amd_lib.serving.onnx_export import CARD, PROGRAM, OnnxProgram
+from f3amd_lib.serving.onnx_text import (
+    export_text_onnx,
+    load_text_or_latent,
+    seeded_text_inputs,
+    text_inputs,
+    text_program,
+)
+from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
+from f3amd_lib.training.latent_models import LatentModel, save_latent_model
+from f3amd_lib.training.latent_motion import FrameStatistics
+from f3amd_lib.training.motion_codec import MotionCodec
+from f3amd_lib.training.text_models import TextModel, save_text_model
+
+needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
+ABOUT = {"skeleton": SYNTHETIC_SKELETON, "fps": 20.0, "text_encoder": "tiny-8"}
+RECORD = {"dataset": "tiny", "dataset_licence": "CC BY 4.0", "dataset_credit": "nobody"}
+SIZES = {
+    "window": 4,
+    "channels": 3,
+    "latent_width": 16,
+    "depth": 3,
+    "num_heads": 2,
+    "hidden_width": 16,
+}
+
+
+def weights_of(network):
+    """Weights of a network, away from the zeros that some begin with."""
+    draw = np.random.default_rng(0)
+    return jax.tree.map(
+        lambda leaf: leaf + 0.1 * jnp.asarray(draw.normal(size=leaf.shape), leaf.dtype), nnx.state(network)
+    )
+
+
+def acmdm(**changes) -> TextModel:
+    config = ACMDMConfig(
+        **{"num_joints": 5, "channels": 3, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 8}
+        | changes
+    )
+    axes = AxisNormaliser(np.arange(3, dtype=np.float32), np.full(3, 2.0, np.float32))
+    params = weights_of(ACMDM(config, rngs=nnx.Rngs(0)))
+    return TextModel(
+        "tiny-ACMDM", MotionCodec(axes), record=RECORD, config=config, params=params, schedule=straight(), **ABOUT
+    )
+
+
+def motionpcm(guidance_features: int) -> LatentModel:
+    config = LatentDenoiserConfig(**SIZES, text_width=8, time_features=8, guidance_features=guidance_features)
+    autoencoder = LatentAutoencoderConfig(**SIZES, features=7)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), weights_shapes(autoencoder))
+    record = RECORD | {"identity": {"training": {"num_phases": 2, "skip": 50}}}
+    return LatentModel(
+        "tiny-PCM", autoencoder, zeros, FrameStatistics(jnp.zeros(7), jnp.ones(7)), record=record, config=config,
+        params=weights_of(LatentDenoiser(config, rngs=nnx.Rngs(0))), schedule=variance_preserving_betas(), **ABOUT,
+    )  # fmt: skip
+
+
+MODELS = {
+    "ACMDM": acmdm,
+    "ACMDM-concatenation-x0": lambda: acmdm(conditioning="concatenation", objective="x0", patch="pair"),
+    "ACMDM-blocks": lambda: acmdm(block_frames=2),
+    "teacher": lambda: motionpcm(0),
+    "student": lambda: motionpcm(8),
+}
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def exported(request, tmp_path_factory):
+    """A model, and the folder that its file was exported to by the command."""
+    trained, folder = MODELS[request.param](), tmp_path_factory.mktemp("told")
+    save = save_text_model if isinstance(trained, TextModel) else save_latent_model
+    save(folder / "tiny.safetensors", trained, jnp.float32)
+    words = ["export", "--target", "onnx", "--weights", str(folder / "tiny.safetensors"), "--steps", "4"]
+    assert main([*words, "--out", str(folder / "out")]) == 0
+    assert main([*words, "--out", str(folder / "out")]) == 2  # nothing is replaced unasked
+    return trained, folder / "out"
+
+
+def by_the_card(folder, inputs, count: str) -> np.ndarray:
+    """Walk as the card says, with NumPy and ONNX Runtime alone."""
+    card, run = json.loads((folder / CARD).read_text(encoding="utf-8")), OnnxProgram((folder / PROGRAM).read_bytes())
+    steps, state = card["steps"][count], inputs["state"]
+    for k in range(len(steps["time"]) - 1):
+        (alpha, sigma), (alpha_next, sigma_next) = ((steps["alpha"][i], steps["sigma"][i]) for i in (k, k + 1))
+        told = inputs | {"state": state, "time": np.full(len(state), steps["time"][k])}
+        answer = run(**told)
+        if card["predicts"] == "eps":
+            x0, eps = (state - sigma * answer) / alpha, answer
+        elif card["predicts"] == "x0":
+            x0, eps = answer, (state - alpha * answer) / sigma
+        else:  # v = x0 - eps on the straight path
+            x0, eps = state + sigma * answer, state - alpha * answer
+        state = alpha_next * x0 + sigma_next * eps
+    return state
+
+
+def by_jax(trained, inputs, count: int) -> np.ndarray:
+    """The same by the library's own samplers."""
+    network, text = network_with(trained.config, trained.params), inputs["text"]
+    if isinstance(trained, TextModel):
+        predict = text_prediction(network, TextCondition(text, inputs["mask"] > 0.5))
+        return solve(
+            predict, trained.config.objective, trained.schedule, inputs["state"], sampler="ddim", num_steps=count
+        )
+    how = {"num_steps": count}
+    if trained.config.guidance_features:
+        return sample_student(
+            network, trained.schedule, text, inputs["state"], skip=50, guidance=inputs["guidance"], **how
+        )
+    return sample_teacher(network, trained.schedule, text, np.zeros(8), inputs["state"], guidance=0.0, **how)
+
+
+@needs_onnx
+@pytest.mark.parametrize("batch", [1, 3])
+def test_a_walk_by_the_card_ends_where_jax_ends(exported, batch):
+    trained, folder = exported
+    inputs = seeded_text_inputs(network_with(trained.config, trained.params), batch)
+    counts = json.loads((folder / CARD).read_text(encoding="utf-8"))["steps"]
+    assert list(counts) == (["2"] if "guidance" in inputs else ["1", "4"])
+    motion = inputs["mask"] > 0.5 if "mask" in inputs else np.s_[:]
+    for count in counts:
+        found, wanted = by_the_card(folder, inputs, count), np.asarray(by_jax(trained, inputs, int(count)))
+        np.testing.assert_allclose(found[motion], wanted[motion], atol=1e-4 * max(1, np.abs(wanted).max()))
+
+
+@needs_onnx
+def test_every_input_is_heard(exported):
+    trained, folder = exported
+    run = OnnxProgram((folder / PROGRAM).read_bytes())
+    inputs = seeded_text_inputs(network_with(trained.config, trained.params), 2)
+    inputs["time"] = np.array([0.2, 0.9]) if "mask" in inputs else np.array([100.0, 900.0])
+    said = run(**inputs)
+    # Frames of early blocks see no later ones, and only those are masked here.
+    heard = set(inputs) - ({"mask"} if getattr(trained.config, "block_frames", 0) else set())
+    for name in sorted(heard):
+        value = inputs[name]
+        assert np.abs(run(**inputs | {name: value[::-1]})[:, :4] - said[:, :4]).max() > 1e-4, name
+
+
+@needs_onnx
+def test_the_card_says_what_the_model_is(exported):
+    trained, folder = exported
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    assert (card["model"], card["terms"], card["batch"]) == (trained.name, "CC BY 4.0", "any")
+    assert card["text_encoder"] == "tiny-8" and card["frames_per_second"] == 20
+    assert 0 < card["largest_error"] < 1e-3
+    assert set(card["about"]) - {"normaliser"} == set(card["inputs"])
+    latent = isinstance(trained, LatentModel)
+    assert ("not exported" in card["decoder"]) if latent else card["normaliser"]["deviation"] == [2.0] * 3
+    assert card["predicts"] == trained.config.objective
+
+
+def test_what_is_no_model_of_text_is_left_to_others_or_refused(tmp_path, monkeypatch):
+    walker = tiny_trained()
+    save_model(tmp_path / "walker.safetensors", walker)
+    assert load_text_or_latent(tmp_path / "walker.safetensors") is None
+    refused("other.safetensors", load_text_or_latent, tmp_path / "other.safetensors")
+    refused("only ACMDM", text_inputs, walker.network(), 2)
+    alone = dataclasses.replace(motionpcm(0), config=None, params=None)
+    refused("autoencoder alone", export_text_onnx, alone, tmp_path / "out")
+    network = network_with(acmdm().config, acmdm().params)
+    refused("at least 1", text_program, network, batch=0)
+    refused("unknown weights", text_program, network, weights="int4")

@@ -1,0 +1,128 @@
+"""A figure with a slider: every frame is in the output, at the right place, and nothing is asked of anybody."""
+
+import html.parser
+import json
+import re
+
+import nbformat
+import numpy as np
+import pytest
+from builders import refused
+from helpers.sliders import slide
+
+from f3amd_lib.drawing.style import new_figure
+from f3amd_lib.ground.profiles import repository_root
+
+NOTEBOOKS = {"02_sampler_theory": (17, 10), "12_spectral_and_film": (17,)}
+"""Notebooks with sliders -> how many places each slider has."""
+
+
+class Elements(html.parser.HTMLParser):
+    """Attributes of the elements of a page, by name of the element."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.texts = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.found.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.found if name == tag]
+
+
+def points(path: str) -> list[np.ndarray]:
+    """Points of a path, one array a stroke, in the units of its picture."""
+    strokes = []
+    for part in path.split("M")[1:]:
+        first, rest = part.split("l")
+        places = [[int(number) for number in re.findall(r"-?\d+", text)] for text in (first, rest)]
+        strokes.append(np.cumsum([places[0], *np.reshape(places[1], (-1, 2))], axis=0))
+    return strokes
+
+
+@pytest.fixture
+def drawn():
+    """A figure with one line that moves, and where its line is at each of three places."""
+    figure, axis = new_figure(4, 3)
+    axis.set(xlim=(0, 10), ylim=(-1, 1), xlabel="x")
+    (line,) = axis.plot([], [], "o-")
+    x = np.linspace(0, 10, 5)
+    frames = {f"<{k}> & 'so'": [np.stack([x, np.sin(k * x)], -1)] for k in range(3)}
+    return figure, line, frames
+
+
+def test_every_frame_is_there_and_lies_where_matplotlib_would_draw_it(drawn):
+    figure, line, frames = drawn
+    page = Elements(slide(figure, [line], frames, label="k <3", start=1, alt="A 'sine'").data)
+    (setter,), (picture,), (path,) = page.all("input"), page.all("svg"), page.all("path")
+    moved = json.loads(setter["data-frames"])
+    assert [name for name, _ in moved] == list(frames)
+    assert (setter["type"], setter["min"], setter["max"], setter["value"]) == ("range", "0", "2", "1")
+    assert setter["aria-valuetext"] == "<1> & 'so'" and path["d"] == moved[1][1][0]
+    assert "k <3 " in page.texts and page.all("img")[0]["alt"] == "A 'sine'"
+    height = float(picture["viewbox"].split()[3])
+    fine = height / figure.bbox.height
+    for (_, paths), (expected,) in zip(moved, frames.values(), strict=True):
+        (stroke,) = points(paths[0])
+        places = line.axes.transData.transform(expected)
+        places[:, 1] = figure.bbox.height - places[:, 1]
+        np.testing.assert_allclose(stroke[1:], fine * places, atol=0.51)  # the first stands twice
+
+
+def test_a_row_of_nan_lifts_the_pen(drawn):
+    figure, line, _ = drawn
+    frames = {"one": [np.array([[0, 0], [1, 1], [np.nan, np.nan], [2, 0], [3, 1]])]}
+    page = Elements(slide(figure, [line], frames, label="k", alt="").data)
+    assert [len(stroke) for stroke in points(page.all("path")[0]["d"])] == [3, 3]
+
+
+def test_the_label_belongs_to_the_slider_and_what_moves_is_not_in_the_picture_below(drawn):
+    figure, line, frames = drawn
+    text = slide(figure, [line], frames, label="k", alt="").data
+    inside = text[text.index("<label") : text.index("</label>")]
+    assert "<input" in inside and "<output" in inside
+    assert not line.get_visible()
+
+
+def test_frames_that_do_not_fit_are_refused(drawn):
+    figure, line, frames = drawn
+    refused("'short'", slide, figure, [line], frames | {"short": []}, label="k", alt="")
+    refused("[n, 2]", slide, figure, [line], {"flat": [np.zeros(4)]}, label="k", alt="")
+    refused("start", slide, figure, [line], frames, label="k", alt="", start=3)
+
+
+def sliders(name: str) -> list[str]:
+    """The sliders in the committed outputs of a notebook."""
+    notebook = nbformat.read(repository_root() / "notebooks" / f"{name}.ipynb", as_version=4)
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    shown = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
+    return [text for text in shown if "class='slider'" in text]
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_committed_sliders_have_all_their_frames_and_no_address(name):
+    found = sliders(name)
+    for text, places in zip(found, NOTEBOOKS[name], strict=True):
+        page = Elements(text)
+        (setter,) = page.all("input")
+        moved = json.loads(setter["data-frames"])
+        assert len(moved) == places == int(setter["max"]) + 1
+        assert len({json.dumps(paths) for _, paths in moved}) == places  # no two are alike
+        assert all(len(paths) == len(page.all("path")) and all(map(points, paths)) for _, paths in moved)
+        assert addresses(text) == [] and page.all("script") == []
+        assert page.all("img")[0]["alt"]
+
+
+def addresses(text: str) -> list[str]:
+    """What a page would fetch from elsewhere."""
+    return re.findall(r"(?:https?:|//)[\w.]+\.\w+|(?:src|href)='(?!data:)[^']*'|url\((?!#)[^)]*\)", text)
+
+
+def test_an_address_is_found():
+    assert addresses("<img src='https://a.example/b.png'>") and addresses("<script src='b.js'></script>")
+    assert addresses("url(font.woff)") and not addresses("<img src='data:image/png;base64,//ab'>")
