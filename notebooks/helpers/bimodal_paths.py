@@ -267,6 +267,12 @@ def _initial_weights(config, keys):
     return jax.vmap(lambda key: nnx.state(build_from_config(config, key)))(keys)
 
 
+def optimiser_by_seed(config: TrainingConfig) -> optax.GradientTransformation:
+    """Return a recipe's optimiser for each seed on its own: one seed's large gradient clips no other's."""
+    one = make_optimiser(config)
+    return optax.GradientTransformation(jax.vmap(one.init), jax.vmap(one.update))
+
+
 @functools.partial(jax.jit, static_argnames="data")
 @functools.partial(jax.vmap, in_axes=(None, 0, 0))
 def _draw_batches(data: BimodalPaths, sigmas, key):
@@ -299,9 +305,8 @@ class PathTask:
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
-        """The recipe's, for each seed on its own: one seed's large gradient clips no other's."""
-        one = make_optimiser(self.config)
-        return optax.GradientTransformation(jax.vmap(one.init), jax.vmap(one.update))
+        """The recipe's, for each seed on its own."""
+        return optimiser_by_seed(self.config)
 
     def identity(self) -> dict:
         """Return the recipe; no state of this toy is kept in a file."""
