@@ -19,7 +19,7 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools \
+.PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web coverage web-tools \
   lint lab clean site site-tools onnx-tools sweep-tools
 
 help: ## Show this list
@@ -88,6 +88,12 @@ test-all: test test-slow test-long test-extras site test-web ## All tests there 
 test-extras: bench-tools onnx-tools sweep-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime, Dask or Sphinx
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
 
+coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, the slow tests among them (long)
+	$(PYTHON) -m coverage erase
+	$(PYTEST:pytest=coverage run -m pytest) tests $(SIDE_BY_SIDE) -m "not long" --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTHON) -m coverage combine --quiet
+	$(PYTHON) -m coverage report
+
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
 web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if it is missing
 	@bash scripts/browser.sh
@@ -117,6 +123,6 @@ lab: $(INSTALLED) ## Open the notebooks in JupyterLab
 	$(PYTHON) -m jupyterlab --notebook-dir=notebooks $(LAB_OPTIONS)
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
-	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage ./*.egg-info
+	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage* ./*.egg-info
 	find . \( -path ./.venv -o -path ./$(VENV) -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
 	  -prune -o -type d \( -name __pycache__ -o -name .pytest_cache \) -exec rm -rf {} +

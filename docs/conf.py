@@ -16,6 +16,8 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # autodoc imports the library; it computes nothing
 
+from pages import launch_options  # noqa: E402 (the line above is what finds it)
+
 project = "F3AMD companion"
 author = copyright = "The F3AMD companion authors"
 release = version = importlib.metadata.version("f3amd_lib")
@@ -101,6 +103,7 @@ html_theme_options = {
     "use_download_button": True,
     "use_fullscreen_button": False,
     "back_to_top_button": True,
+    **launch_options(os.environ.get("F3AMD_REPOSITORY", "")),
     # The ledger's tables need the width.
     "secondary_sidebar_items": {
         "**": ["page-toc.html"],

@@ -270,6 +270,26 @@ def readme_markdown(argument: str = "") -> str:
     return re.sub(r"\]\((?!#|/|[a-z]+:)", "](/", text)
 
 
+def launch_options(address: str) -> dict:
+    """Return the theme's options for buttons on each notebook that open it on Binder, and on Colab.
+
+    Args:
+      address: where everybody reaches the repository; "" gives no options, and no button. Colab opens notebooks of
+        GitHub alone, so that another address gives the button for Binder only.
+
+    Raises:
+      ValueError: for anything else than an address of a repository.
+    """
+    if not address:
+        return {}
+    if not re.fullmatch(r"https://[\w.-]+(/[\w.-]+){2,}", address):
+        raise ValueError(f"F3AMD_REPOSITORY must be an address such as https://github.com/owner/name, got {address!r}")
+    buttons = {"binderhub_url": "https://mybinder.org", "notebook_interface": "jupyterlab"}
+    if address.startswith("https://github.com/"):
+        buttons["colab_url"] = "https://colab.research.google.com"
+    return {"repository_url": address, "repository_branch": "main", "launch_buttons": buttons}
+
+
 # Players ------------------------------------------------------------------------------------------
 
 
