@@ -738,7 +738,7 @@ def campaign(
     Args:
       minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
       batch_size: windows a step; the paper's is 512.
-      only: this preset of the queue; repeatable.
+      only: this preset, recipe or run of the queue; repeatable.
       packed: the data set as its packed cache file, instead of its source.
       out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
     """

@@ -26,7 +26,7 @@ addEventListener("DOMContentLoaded", () => {
   for (const table of document.querySelectorAll(".bd-article table")) {
     const names = [...table.querySelectorAll("thead th")].map((cell) => cell.textContent.trim());
     for (const cell of table.querySelectorAll("th, td")) {
-      if (cell.matches("#claims-ledger td") && names[cell.cellIndex]) {
+      if (cell.matches("[id^=\"claims-of-\"] td") && names[cell.cellIndex]) {
         cell.dataset.label = names[cell.cellIndex];
         if (["", "–"].includes(cell.textContent.trim())) cell.dataset.empty = "";
       }

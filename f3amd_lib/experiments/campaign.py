@@ -69,6 +69,11 @@ class Run:
         parts += ["" if self.window == 32 else f"{self.window}frames", f"seed{self.seed}"]
         return "-".join(filter(None, parts))
 
+    @property
+    def names(self) -> set[str]:
+        """What `only` may call it: its preset, its recipe, or this run alone."""
+        return {self.preset, self.recipe, self.name}
+
     def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
         """Return the training config of `EPOCHS` epochs over so many windows."""
         steps = EPOCHS * num_windows // batch_size
@@ -117,7 +122,7 @@ def run_campaign(
       classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
       folder: where training states and weights lie, a folder a run.
       batch_size: windows a step (the paper's is 512, for a GPU).
-      only: names of presets; all by default.
+      only: names of presets, of recipes or of single runs; all by default.
       budget_s: seconds; the run under way stops with a checkpoint when they are over.
       snapshots: see `queue`, which is the default.
       known: folder of another run's records, whose snapshots count as measured.
@@ -127,11 +132,11 @@ def run_campaign(
       (run, windows, state) for each snapshot: "measured before", "measured", or "unfinished", which is the last.
 
     Raises:
-      ValueError: if `only` names no preset of the queue.
+      ValueError: if `only` names nothing of the queue.
     """
     snapshots, only = queue() if snapshots is None else snapshots, list(only)
     for name in only:
-        if name not in (queued := {run.preset for run, _ in snapshots}):
+        if name not in (queued := {name for run, _ in snapshots for name in run.names}):
             raise ValueError(f"the queue has no {name!r}{nearest_hint(name, queued)}")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     stop_at = None if budget_s is None else time.monotonic() + budget_s
@@ -144,7 +149,7 @@ def run_campaign(
     records = Records(folder_of_records, record, keys, known=known)
     for run, windows in snapshots:
         key = {"run": run.name, "windows": windows}
-        if only and run.preset not in only:
+        if only and run.names.isdisjoint(only):
             continue
         if records.has("campaign", key):
             yield run.name, windows, "measured before"
