@@ -127,7 +127,7 @@ def test_no_table_is_cut_off_on_a_small_laptop(browser):
 def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots, name):
     browser.resize(*PHONE, phone=True)
     page = browser.open(SITE / name)
-    cell = "const td = document.querySelector('[id^="claims-of-"] table:has(th:nth-child(8)) td:nth-child(4)');"
+    cell = "const td = document.querySelector('[id^=claims-of-] table:has(th:nth-child(8)) td:nth-child(4)');"
     assert page.script(cell + "return getComputedStyle(td).display") == "block"
     assert page.script(cell + "return getComputedStyle(td, '::before').content") == '"ours: "'
     page.screenshot(screenshots / f"site_{Path(name).stem}_phone.png")
