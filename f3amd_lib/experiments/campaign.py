@@ -3,7 +3,8 @@
 The queue stands in `papers/f3amd/campaign.toml`. Every run follows the paper's text, whose learning
 rate hardly falls, so that each snapshot of a long run is a fair row at its length. Snapshots are
 kept as weights, measured by the protocol of `experiments.protocol` with one seed, and gathered in
-one table, `records/campaign.csv`.
+one table, `records/campaign.csv`. A queue may take months and machines: each row names the style
+classifier that it was seen through, and FID and EMD are compared between rows of one classifier.
 """
 
 from __future__ import annotations
@@ -142,8 +143,7 @@ def run_campaign(
     stop_at = None if budget_s is None else time.monotonic() + budget_s
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement="campaign",
-        batch_size=batch_size,
-        protocol=dataclasses.asdict(protocol), classifier_weights=weights_digest(classifier.params),
+        batch_size=batch_size, protocol=dataclasses.asdict(protocol),
     )  # fmt: skip
     folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {"campaign": ["run", "windows"]}
     records = Records(folder_of_records, record, keys, known=known)
@@ -190,6 +190,7 @@ def _measured(
     columns = {
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
+        "classifier": weights_digest(classifier.params),
         "device": jax.devices()[0].device_kind,
     }  # fmt: skip
     return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**columns)
