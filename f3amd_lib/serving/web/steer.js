@@ -270,8 +270,13 @@ export async function start(data, files, workerUrl) {
   });
 
   const poses = new Float32Array(files.poses.buffer);
-  const { runs, instead } = await network.ask("open", { card, wasm: files.wasm.buffer, program: files.program, poses });
-  $("where").textContent = { webgpu: "on the graphics card, by WebGPU", wasm: "in WebAssembly on one thread" }[runs];
+  const { runs, instead } = await network.ask("open", {
+    card, wasm: files.wasm.buffer, program: files.program, poses,
+    software: location.hash === "#software-webgpu", // slower than WebAssembly: for tests
+  });
+  $("where").textContent = {
+    webgpu: "on the graphics card, by WebGPU", software: "by WebGPU in software", wasm: "in WebAssembly on one thread",
+  }[runs];
   if (instead) $("where").textContent += ` (not by WebGPU: ${instead})`;
 
   const ownStyle = (k) => (k === 0 ? styleOf($("first").value) : (styleOf($("first").value) + 37 * k) % card.styles.length);
@@ -362,7 +367,7 @@ export async function start(data, files, workerUrl) {
   let before = performance.now();
   function loop(now) {
     requestAnimationFrame(loop);
-    if (!tapes.length) return;
+    if (!tapes.length || timing) return;
     const passed = Math.min(0.1, (now - before) / 1000), wanted = clock + passed * FPS;
     before = now;
     if (wanted > newest) waits++;
@@ -392,7 +397,11 @@ export async function start(data, files, workerUrl) {
     $("rate").textContent = rate().toFixed(0);
   }
 
-  let frozen = false;
+  let frozen = false, timing = false;
+  async function freeze() {
+    frozen = true;
+    while (pending) await new Promise((done) => setTimeout(done, 10));
+  }
   function fail(error) {
     frozen = true;
     $("message").textContent = `The network does not run in this browser: ${error.message}`;
@@ -431,10 +440,22 @@ export async function start(data, files, workerUrl) {
     }),
     record: () => record,
     forget: () => { record = []; waits = 0; },
+    // Milliseconds that the worker takes for one round as the game asks for it, with game and picture stopped: for those who
+    // measure.
+    async time(count, steps) {
+      timing = true;
+      await freeze();
+      const places = Array.from({ length: count }, (_, k) => ({ x: 2 * k, z: 0, yaw: 0, style: ownStyle(k) }));
+      await network.ask("characters", { places, keep: true });
+      const wish = { speed: pace(), direction: 0 };
+      return (await network.ask("round", {
+        wishes: places.map(() => wish), styles: places.map((_, k) => weights(k)), sigmas: card.sigmas[steps],
+        hop: HOP, blend: BLEND, locking: options.locking,
+      })).ms;
+    },
     // One round of given numbers from a fresh start, with the game stopped: for tests.
     async rehearse({ places, wishes: given, styles, noise, sigmas, hop, blend, locking }) {
-      frozen = true;
-      while (pending) await new Promise((done) => setTimeout(done, 10));
+      await freeze();
       await network.ask("characters", { places, keep: false });
       const made = [];
       for (const one of noise)

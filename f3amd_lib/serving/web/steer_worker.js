@@ -29,9 +29,12 @@ const answers = {
     const create = (provider) => ort.InferenceSession.create(message.program, { executionProviders: [provider] });
     if (card.webgpu) {
       try {
-        if (!(await self.navigator.gpu?.requestAdapter())) throw new Error("this browser lends no graphics card");
+        const adapter = await self.navigator.gpu?.requestAdapter();
+        if (!adapter) throw new Error("this browser lends no graphics card");
+        const software = adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter ?? false;
+        if (software && !message.software) throw new Error("this browser only plays a graphics card, in software");
         session = await create("webgpu");
-        return { runs: "webgpu" };
+        return { runs: software ? "software" : "webgpu" };
       } catch (error) {
         session = await create("wasm");
         return { runs: "wasm", instead: String(error?.message ?? error) };
