@@ -137,6 +137,27 @@ def test_a_page_for_webgpu_says_why_it_walks_without_a_card(
     assert browser.errors() == [] and browser.requests() == []
 
 
+@pytest.mark.parametrize("slow", [True, False])
+def test_a_slow_picture_gets_fewer_pixels_and_the_page_says_so(browser, page, slow):
+    """The browser's clock of pictures is made up: 100 ms apart, or 10."""
+    step = 100 if slow else 10
+    clock = (
+        f"let now = 0; const ask = requestAnimationFrame; requestAnimationFrame = (f) => ask(() => f(now += {step}));"
+    )
+    added = browser.command("Page.addScriptToEvaluateOnNewDocument", source=clock)
+    try:
+        opened(browser, page)
+        browser.wait("return steer.state().rounds > 2 && steer.state().rate > 0", 120)
+        browser.wait(f"return steer.state().sharpness {'< 0.6' if slow else '=== 1'}", 120)
+        browser.wait(
+            f"return document.getElementById('coarse').textContent === '{' (fewer pixels, to be quicker)' * slow}'"
+        )
+        canvas = browser.script("const c = document.getElementById('view'); return c.width / c.clientWidth")
+        assert canvas == pytest.approx(0.5 if slow else 1.0, abs=0.01)
+    finally:
+        browser.command("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+
 def test_the_usual_page_asks_for_no_card(browser, page):
     opened(browser, page)
     assert browser.find("#where").text == "in WebAssembly on one thread"

@@ -80,7 +80,8 @@ class Picture {
   constructor(canvas, data) {
     this.data = data;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.sharpness = Math.min(devicePixelRatio, 2);
+    this.renderer.setPixelRatio(this.sharpness);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.1, 80);
     this.around = Math.PI; // behind somebody who faces +Z
@@ -145,6 +146,15 @@ class Picture {
     // Beside the panel, or above it.
     this.camera.setViewOffset(width, height, width > 600 ? -0.1 * width : 0, width > 600 ? 0 : 0.22 * height, width, height);
     this.camera.updateProjectionMatrix();
+  }
+
+  // Fewer pixels, for whoever draws without a graphics card; false if there are few already.
+  coarser() {
+    if (this.sharpness <= 0.5) return false;
+    this.sharpness = Math.max(0.5, this.sharpness / 1.5);
+    this.renderer.setPixelRatio(this.sharpness);
+    this.width = undefined; // so that `resize` sets the canvas anew
+    return true;
   }
 
   look(x, z, count, quick) {
@@ -381,6 +391,7 @@ export async function start(data, files, workerUrl) {
     picture.look(middle(0), middle(2), tapes.length, rounds < 2 ? 1 : 1 - Math.exp(-5 * passed));
     draw();
     drawn = [...drawn, now].slice(-60);
+    if (drawn.length === 12 && median(drawn.slice(1).map((at, k) => at - drawn[k])) > 50 && picture.coarser()) drawn = [];
     if (rounds && drawn.length % 10 === 0) report(ms);
   }
 
@@ -394,7 +405,8 @@ export async function start(data, files, workerUrl) {
     reported = performance.now();
     $("ms").textContent = ms < 10 ? ms.toFixed(1) : ms.toFixed(0);
     $("hop").textContent = options.hop;
-    $("rate").textContent = rate().toFixed(0);
+    $("rate").textContent = rate() < 10 ? rate().toFixed(1) : rate().toFixed(0);
+    $("coarse").textContent = picture.sharpness < Math.min(devicePixelRatio, 2) ? " (fewer pixels, to be quicker)" : "";
   }
 
   let frozen = false, timing = false;
@@ -436,7 +448,7 @@ export async function start(data, files, workerUrl) {
   return {
     state: () => ({
       clock, newest, rounds, waits, hop: options.hop, ms: times.length ? median(times) : null, timed: times.length, rate: rate(),
-      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs,
+      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs, sharpness: picture.sharpness,
     }),
     record: () => record,
     forget: () => { record = []; waits = 0; },
