@@ -57,7 +57,7 @@ def time_rounds(driver, page: Path) -> list[dict]:
         seconds[0] += float(driver.execute_async_script(TIME, count, str(steps))) / 1000  # or the page's words
 
     calls = {key: partial(one, *key) for key in ROUNDS}
-    timings = take_turns(calls, min_rounds=30, min_seconds=5.0, warmup=2, clock=lambda: seconds[0])
+    timings = take_turns(calls, min_rounds=20, min_seconds=4.0, warmup=2, clock=lambda: seconds[0])
     return [
         {"steps": steps, "characters": count, **timing.columns("ms", 1e3), "rounds": timing.rounds}
         for (steps, count), timing in timings.items()
