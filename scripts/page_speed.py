@@ -9,7 +9,6 @@ whose people walk, with sticks and with bodies by turns. Each run opens the page
 from __future__ import annotations
 
 import argparse
-import re
 import shutil
 import sys
 import tempfile
@@ -26,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 from f3amd_lib.benchmarking.machine import describe_machine
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.records import read_table, run_record, write_table
-from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.ground.tables import fill_tables, markdown_table
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.serving.player import Scene, write_player
 from f3amd_lib.serving.steer import write_steer
@@ -64,7 +63,7 @@ def time_rounds(driver, page: Path) -> list[dict]:
     ]
 
 
-def count_pictures(driver, page: Path, count: int, turns: int = 3) -> list[dict]:
+def count_pictures(driver, page: Path, count: int, turns: int = 2) -> list[dict]:
     """Count the pictures a second of a player page, sticks and bodies by turns, two seconds each."""
     open_page(driver, page)
     rates = {"sticks": [], "bodies": []}
@@ -96,24 +95,26 @@ def measure(runs: int, beside: str) -> None:
     for option in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1280,800"):
         options.add_argument(option)
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which("chromedriver")))
-    rows, walks = {"page_rounds": [], "page_pictures": []}, [synthesize("Neutral", 8.0, seed=seed) for seed in range(4)]
+    record = run_record(
+        profile="laptop", dataset="synthetic", seed=0, model=trained.name, runs=runs, beside=beside,
+        browser=f"Chromium {driver.capabilities['browserVersion']}, headless", machine=describe_machine(),
+    )  # fmt: skip
+    walks = [synthesize("Neutral", 8.0, seed=seed) for seed in range(4)]
     with tempfile.TemporaryDirectory() as folder:
-        steer, crowds = write_steer(Path(folder) / "steer.html", trained), {}
+        calls = {"page_rounds": [partial(time_rounds, driver, write_steer(Path(folder) / "steer.html", trained))]}
+        calls["page_pictures"] = []
         for count in CROWDS:
             places = [np.array([1.5 * (k % 10), 0.0, 1.5 * (k // 10)]) for k in range(count)]
             moved = [walks[k % 4].replace(root_position=walks[k % 4].root_position + at) for k, at in enumerate(places)]
-            crowds[count] = write_player(Path(folder) / f"{count}.html", Scene(moved), strip=False)
-        for run in tqdm(range(runs), unit="run"):
-            about = {"run": run, "load": describe_machine()["load"]}
-            rows["page_rounds"] += [about | row for row in time_rounds(driver, steer)]
-            for count, page in crowds.items():
-                rows["page_pictures"] += [about | row for row in count_pictures(driver, page, count)]
-    browser = f"Chromium {driver.capabilities['browserVersion']}, headless"
+            page = write_player(Path(folder) / f"{count}.html", Scene(moved), strip=False)
+            calls["page_pictures"].append(partial(count_pictures, driver, page, count))
+        for name, made in calls.items():
+            rows = []
+            for run in tqdm(range(runs), unit="run", desc=name):
+                load = describe_machine()["load"]
+                rows += [{"run": run, "load": load} | row for call in made for row in call()]
+            write_table(RECORDS / f"{name}.csv", pd.DataFrame(rows), record | {"measurement": name})
     driver.quit()
-    for name, made in rows.items():
-        record = run_record(profile="laptop", dataset="synthetic", seed=0, measurement=name, model=trained.name,
-                            runs=runs, browser=browser, beside=beside, machine=describe_machine())  # fmt: skip
-        write_table(RECORDS / f"{name}.csv", pd.DataFrame(made), record)
 
 
 def tables() -> dict[str, str]:
@@ -127,19 +128,9 @@ def tables() -> dict[str, str]:
     return made
 
 
-def written(page: str) -> str:
-    """Return a page with its tables made anew; ValueError if one has no place in it."""
-    for name, table in tables().items():
-        place = rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)"
-        page, count = re.subn(place, rf"\1\n{table}\n\2", page, flags=re.S)
-        if count != 1:
-            raise ValueError(f"{PAGE.name}: no `<!-- {name}: begin -->` and `end` around a table")
-    return page
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=3, help="how often all is measured")
     parser.add_argument("--beside", required=True, help="what else the machine did meanwhile, for the record")
     measure(**vars(parser.parse_args()))
-    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    PAGE.write_text(fill_tables(PAGE.read_text(encoding="utf-8"), tables(), PAGE.name), encoding="utf-8")

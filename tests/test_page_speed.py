@@ -5,10 +5,9 @@ import sys
 from pathlib import Path
 
 import pandas as pd
-import pytest
-from builders import refused
 
 from f3amd_lib.ground.records import read_table, run_record, write_table
+from f3amd_lib.ground.tables import fill_tables
 
 ROOT = Path(__file__).resolve().parents[1]
 _spec = importlib.util.spec_from_file_location("page_speed", ROOT / "scripts" / "page_speed.py")
@@ -18,7 +17,7 @@ _spec.loader.exec_module(page_speed)
 
 def test_the_page_has_the_tables_of_the_records():
     page = page_speed.PAGE.read_text(encoding="utf-8")
-    assert page_speed.written(page) == page, "measure again: python scripts/page_speed.py"
+    assert fill_tables(page, page_speed.tables(), "commands.md") == page, "measure again: python scripts/page_speed.py"
 
 
 def test_records_have_every_row_in_every_run_and_say_what_ran_beside():
@@ -39,10 +38,3 @@ def test_a_table_is_the_middle_of_the_runs(tmp_path, monkeypatch):
     for name in ("page_rounds", "page_pictures"):
         write_table(tmp_path / f"{name}.csv", runs, record)
     assert "12 (10 to 30)" in page_speed.tables()["page_rounds"]
-    refused("no `<!-- page_rounds: begin -->`", page_speed.written, "a page without a place")
-
-
-@pytest.mark.parametrize("broken", ["page_rounds", "page_pictures"])
-def test_a_place_that_is_there_twice_is_refused(broken):
-    page = page_speed.PAGE.read_text(encoding="utf-8")
-    refused(broken, page_speed.written, page + f"<!-- {broken}: begin -->\n<!-- {broken}: end -->")
