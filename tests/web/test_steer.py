@@ -274,3 +274,28 @@ def test_the_style_slider_and_the_finger_are_heard(browser, page, screenshots):
     assert wide <= 0 and panel["x"] >= 0 and panel["x"] + panel["width"] <= PHONE[0]
     assert panel["y"] > 0.45 * PHONE[1]  # the picture has the upper half
     assert browser.errors() == []
+
+
+def test_mouse_and_gamepad_are_heard(browser, page):
+    """The picture's right is -X: the camera stands behind one who faces +Z. A wish is looked at a round later."""
+    opened(browser, page)
+    choose(browser, "steps", 1)
+
+    def wish():
+        browser.script("steer.forget()")
+        browser.wait("return steer.record().length > 8", 60)
+        return browser.script("return steer.record().at(-1).wish")
+
+    for x, side in ((1240, -1), (420, 1)):
+        where = {"x": x, "y": 600, "button": "left", "clickCount": 1}
+        browser.command("Input.dispatchMouseEvent", type="mousePressed", **where)
+        wanted = wish()
+        browser.command("Input.dispatchMouseEvent", type="mouseReleased", **where)
+        assert wanted["speed"] > 0.3 and side * wanted["direction"] > 0.2
+    assert wish()["speed"] == 0
+    browser.script("navigator.getGamepads = () => [{connected: true, axes: [1, 0, 0, 0], buttons: []}]")
+    wanted = wish()
+    assert wanted["speed"] > 0.3 and abs(wanted["direction"] + np.pi / 2) < 1e-3
+    browser.script("navigator.getGamepads = () => []")
+    assert wish()["speed"] == 0
+    assert browser.errors() == []
