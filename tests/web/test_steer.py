@@ -282,8 +282,8 @@ def test_mouse_and_gamepad_are_heard(browser, page):
     choose(browser, "steps", 1)
 
     def wish():
-        browser.script("steer.forget()")
-        browser.wait("return steer.record().length > 8", 60)
+        rounds = browser.script("return steer.state().rounds")
+        browser.wait(f"return steer.state().rounds > {rounds + 1}", 60)
         return browser.script("return steer.record().at(-1).wish")
 
     for x, side in ((1240, -1), (420, 1)):
