@@ -1,9 +1,8 @@
-"""Measure the pages in headless Chromium: milliseconds a round of the steer page, pictures a second of a crowd.
+"""Measure in headless Chromium how many milliseconds a round of the steer page takes, at 1, 8 and 32 characters.
 
-    python scripts/page_speed.py --beside "nothing"    # writes records and docs/commands.md; make web-tools onnx-tools
+    python scripts/page_speed.py --beside "nothing"    # record, table of docs/commands.md; make web-tools onnx-tools
 
-Rounds are timed in the page's worker, by turns, with game and picture stopped. Pictures are those of a player page
-whose people walk, with sticks and with bodies by turns. Each run opens the pages anew.
+Rounds are timed in the page's worker, by turns, with game and picture stopped. Each run opens the page anew.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
@@ -26,18 +24,16 @@ from f3amd_lib.benchmarking.machine import describe_machine
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.tables import fill_tables, markdown_table
-from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.serving.player import Scene, write_player
 from f3amd_lib.serving.steer import write_steer
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import find_model
 
 ROOT = Path(__file__).resolve().parents[1]
-RECORDS, PAGE = ROOT / "paper_figures/synthetic/laptop/records", ROOT / "docs/commands.md"
-ROUNDS, CROWDS = [(steps, count) for steps in (8, 1) for count in (1, 8, 32)], (1, 32, 100)
-READY = "return !!(window.steer || window.player) && document.documentElement.dataset.ready === 'yes'"
+RECORD = ROOT / "paper_figures/synthetic/laptop/records/page_rounds.csv"
+PAGE = ROOT / "docs/commands.md"
+ROUNDS = [(steps, count) for steps in (8, 1) for count in (1, 8, 32)]
+READY = "return !!window.steer && document.documentElement.dataset.ready === 'yes'"
 TIME = "const done = arguments[2]; steer.time(arguments[0], arguments[1]).then(done, (error) => done(String(error)))"
-DRAWN = "player.setBody(arguments[0]); player.setPlaying(true); return [player.state().draws, performance.now()]"
 
 
 def open_page(driver, page: Path) -> None:
@@ -63,30 +59,8 @@ def time_rounds(driver, page: Path) -> list[dict]:
     ]
 
 
-def count_pictures(driver, page: Path, count: int, turns: int = 2) -> list[dict]:
-    """Count the pictures a second of a player page, sticks and bodies by turns, two seconds each."""
-    open_page(driver, page)
-    rates = {"sticks": [], "bodies": []}
-    for drawn in list(rates) * turns:
-        first, began = driver.execute_script(DRAWN, drawn == "bodies")
-        time.sleep(2.0)
-        last, ended = driver.execute_script(DRAWN, drawn == "bodies")
-        rates[drawn].append(1000 * (last - first) / (ended - began))
-    return [
-        {
-            "drawn": drawn,
-            "characters": count,
-            "unit": "1/s",
-            "value": np.median(seen),
-            "low": min(seen),
-            "high": max(seen),
-        }
-        for drawn, seen in rates.items()
-    ]
-
-
 def measure(runs: int, beside: str) -> None:
-    """Measure everything so many times, and write both tables with their records."""
+    """Time everything so many times, and write the table with its record."""
     from selenium import webdriver
 
     trained = load_model(find_model("synthetic"))
@@ -97,35 +71,25 @@ def measure(runs: int, beside: str) -> None:
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which("chromedriver")))
     record = run_record(
         profile="laptop", dataset="synthetic", seed=0, model=trained.name, runs=runs, beside=beside,
+        measurement=RECORD.stem,
         browser=f"Chromium {driver.capabilities['browserVersion']}, headless", machine=describe_machine(),
     )  # fmt: skip
-    walks = [synthesize("Neutral", 8.0, seed=seed) for seed in range(4)]
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        calls = {"page_rounds": [partial(time_rounds, driver, write_steer(Path(folder) / "steer.html", trained))]}
-        calls["page_pictures"] = []
-        for count in CROWDS:
-            places = [np.array([1.5 * (k % 10), 0.0, 1.5 * (k // 10)]) for k in range(count)]
-            moved = [walks[k % 4].replace(root_position=walks[k % 4].root_position + at) for k, at in enumerate(places)]
-            page = write_player(Path(folder) / f"{count}.html", Scene(moved), strip=False)
-            calls["page_pictures"].append(partial(count_pictures, driver, page, count))
-        for name, made in calls.items():
-            rows = []
-            for run in tqdm(range(runs), unit="run", desc=name):
-                load = describe_machine()["load"]
-                rows += [{"run": run, "load": load} | row for call in made for row in call()]
-            write_table(RECORDS / f"{name}.csv", pd.DataFrame(rows), record | {"measurement": name})
+        page = write_steer(Path(folder) / "steer.html", trained)
+        for run in tqdm(range(runs), unit="run"):
+            load = describe_machine()["load"]
+            rows += [{"run": run, "load": load} | row for row in time_rounds(driver, page)]
     driver.quit()
+    write_table(RECORD, pd.DataFrame(rows), record)
 
 
 def tables() -> dict[str, str]:
-    """Return the page's tables, name -> Markdown: the middle of the runs' medians, with the lowest and the highest."""
-    made = {}
-    for name, down in (("page_rounds", "steps"), ("page_pictures", "drawn")):
-        rows, _ = read_table(RECORDS / f"{name}.csv")
-        cells = rows.groupby([down, "characters"], sort=False)["value"].agg(["median", "min", "max"])
-        text = cells.apply(lambda row: "{:.3g} ({:.3g} to {:.3g})".format(*row), axis=1).unstack("characters")
-        made[name] = markdown_table(text.loc[rows[down].unique()].rename_axis(None, axis=1).reset_index())
-    return made
+    """Return the page's table by its name, Markdown: the middle one of the runs' medians, the lowest and the highest."""
+    rows, _ = read_table(RECORD)
+    cells = rows.groupby(["steps", "characters"], sort=False)["value"].agg(["median", "min", "max"])
+    text = cells.apply(lambda row: "{:.3g} ({:.3g} to {:.3g})".format(*row), axis=1).unstack("characters")
+    return {RECORD.stem: markdown_table(text.loc[rows["steps"].unique()].rename_axis(None, axis=1).reset_index())}
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def test_the_page_has_the_tables_of_the_records():
 
 
 def test_records_have_every_row_in_every_run_and_say_what_ran_beside():
-    rounds, record = read_table(page_speed.RECORDS / "page_rounds.csv")
+    rounds, record = read_table(page_speed.RECORD)
     wanted = pd.MultiIndex.from_product([range(record["runs"]), (8, 1), (1, 8, 32)])
     assert set(rounds.set_index(["run", "steps", "characters"]).index) == set(wanted) and len(rounds) == len(wanted)
     assert (rounds["low"] <= rounds["value"]).all() and (rounds["value"] <= rounds["high"]).all()
@@ -32,9 +32,7 @@ def test_records_have_every_row_in_every_run_and_say_what_ran_beside():
 
 
 def test_a_table_is_the_middle_of_the_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr(page_speed, "RECORDS", tmp_path)
-    record = run_record(profile="laptop", dataset="synthetic", seed=0)
-    runs = pd.DataFrame({"value": [10.0, 30.0, 12.0]}).assign(characters=1, steps=8, drawn="sticks")
-    for name in ("page_rounds", "page_pictures"):
-        write_table(tmp_path / f"{name}.csv", runs, record)
+    monkeypatch.setattr(page_speed, "RECORD", tmp_path / "page_rounds.csv")
+    runs = pd.DataFrame({"value": [10.0, 30.0, 12.0]}).assign(characters=1, steps=8)
+    write_table(page_speed.RECORD, runs, run_record(profile="laptop", dataset="synthetic", seed=0))
     assert "12 (10 to 30)" in page_speed.tables()["page_rounds"]
