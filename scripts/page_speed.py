@@ -85,10 +85,11 @@ def measure(runs: int, beside: str) -> None:
 
 
 def tables() -> dict[str, str]:
-    """Return the page's table by its name, Markdown: the middle one of the runs' medians, the lowest and the highest."""
+    """Return the page's table by its name, Markdown: middle, lowest and highest of the runs' medians."""
     rows, _ = read_table(RECORD)
     cells = rows.groupby(["steps", "characters"], sort=False)["value"].agg(["median", "min", "max"])
-    text = cells.apply(lambda row: "{:.3g} ({:.3g} to {:.3g})".format(*row), axis=1).unstack("characters")
+    cells = cells.map(lambda value: f"{value:.3g}" if value < 1000 else f"{value:.0f}")
+    text = cells.apply(lambda row: "{} ({} to {})".format(*row), axis=1).unstack("characters")
     return {RECORD.stem: markdown_table(text.loc[rows["steps"].unique()].rename_axis(None, axis=1).reset_index())}
 
 
