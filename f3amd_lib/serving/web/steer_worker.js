@@ -26,7 +26,9 @@ const answers = {
     ({ card } = message);
     poses = frameList(message.poses, card.num_history * card.channels).map((pose) => frameList(pose, card.channels));
     Object.assign(ort.env.wasm, { wasmBinary: message.wasm, numThreads: 1, proxy: false });
-    const create = (provider) => ort.InferenceSession.create(message.program, { executionProviders: [provider] });
+    const create = (provider) => ort.InferenceSession.create(message.program, {
+      executionProviders: [provider], logSeverityLevel: 3, // that some nodes stay on the processor is no fault
+    });
     if (card.webgpu) {
       try {
         const adapter = await self.navigator.gpu?.requestAdapter();
