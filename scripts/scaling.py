@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import heapq
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from f3amd_lib.experiments.campaign import STEPS_MEASURED, queue
 from f3amd_lib.experiments.sweep import CAMPAIGN, Leg, plan
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.ground.tables import fill_tables, markdown_table
 from f3amd_lib.networks import presets
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -155,12 +154,7 @@ def written(page: str) -> str:
     Raises:
       ValueError: if a table has no place in it.
     """
-    for name, table in tables().items():
-        pattern = rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)"
-        page, count = re.subn(pattern, lambda found, table=table: f"{found[1]}\n{table}\n{found[2]}", page, flags=re.S)
-        if count != 1:
-            raise ValueError(f"{PAGE.name}: no `<!-- {name}: begin -->` and `end` around a table")
-    return page
+    return fill_tables(page, tables(), PAGE.name)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ A tidy table has one number a row: columns that say what it is about (model, ste
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
@@ -15,6 +16,25 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 
 ARROWS = {"down": " ↓", "up": " ↑"}
+
+
+def fill_tables(page: str, tables: Mapping[str, str], where: str) -> str:
+    """Return a page with tables made anew, each between `<!-- NAME: begin -->` and `<!-- NAME: end -->`.
+
+    Args:
+      page: its text.
+      tables: name -> Markdown.
+      where: the page's name, for messages.
+
+    Raises:
+      ValueError: if a table has no place in it, or two.
+    """
+    for name, table in tables.items():
+        place = rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)"
+        page, count = re.subn(place, lambda found, table=table: f"{found[1]}\n{table}\n{found[2]}", page, flags=re.S)
+        if count != 1:
+            raise ValueError(f"{where}: no `<!-- {name}: begin -->` and `end` around a table, or two of them")
+    return page
 
 
 def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:

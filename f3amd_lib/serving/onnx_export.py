@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import logging
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -54,14 +55,10 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
       ImportError: if jax2onnx is not installed, saying how to install it.
       ValueError: for another family, less than one character, or unknown `weights`.
     """
-    config = network.config
-    if not isinstance(config, ConditionedConfig):
-        raise ValueError(f"only networks of history, path and style are exported here, got {type(config).__name__}")
-
     def denoise(network, x_noisy, sigma, history, path, style):
         return network(x_noisy, sigma, network.encode(Condition(history, path, style)))
 
-    return onnx_program(network, denoise, input_shapes(config, check_batch(batch)), "x0_hat", weights=weights)
+    return onnx_program(network, denoise, input_shapes(network.config, check_batch(batch)), "x0_hat", weights=weights)
 
 
 def check_batch(batch: int | None) -> int | str:
@@ -106,7 +103,9 @@ def onnx_program(network, evaluate, shapes: dict[str, tuple], output: str, *, we
 
 
 def input_shapes(config: ConditionedConfig, batch) -> dict[str, tuple]:
-    """Return the shapes of `INPUTS`, in the order of a call; `batch` may be a name."""
+    """Return the shapes of `INPUTS`, in the order of a call; `batch` may be a name. ValueError for another family."""
+    if not isinstance(config, ConditionedConfig):
+        raise ValueError(f"only networks of history, path and style are exported here, got {type(config).__name__}")
     frames = (batch, config.window, config.channels)
     history = (batch, config.num_history, config.channels)
     shapes = frames, (batch,), history, (batch, config.window, 8), (batch, config.num_styles)
@@ -268,29 +267,52 @@ def export_onnx(
     Raises:
       ImportError, ValueError: as `denoiser_program`; or if a file is there and `overwrite` is false.
     """
-    folder = free_folder(folder, overwrite)
     network = trained.network()
-    program = denoiser_program(network, batch=batch, weights=weights)
-    error = largest_difference(program, network, trained.diffusion.grid(num_steps)[:-1])
-    card = model_card(trained, num_steps)
-    card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
-    examples = {path.stem: path.read_bytes() for path in sorted(EXAMPLES.glob("*.txt"))}  # they run beside a card
-    return write_export(folder, program, card, examples)
+    levels = trained.diffusion.grid(num_steps)[:-1]
+    return write_export(
+        folder,
+        model_card(trained, num_steps),
+        partial(denoiser_program, network),
+        lambda program: largest_difference(program, network, levels),
+        batch=batch,
+        weights=weights,
+        overwrite=overwrite,
+        examples=True,
+    )
 
 
-def free_folder(folder, overwrite: bool) -> Path:
-    """Return a folder as a path; ValueError if an export is in it that may not be replaced."""
-    if not overwrite and (Path(folder) / PROGRAM).exists():
-        raise ValueError(f"{Path(folder) / PROGRAM}: exists already; pass --overwrite or another --out")
-    return Path(folder)
+def write_export(
+    folder, card: dict, make, error_of, *, batch: int | None, weights: str, overwrite: bool, examples: bool = False
+) -> Path:
+    """Make a program, measure it, and write it with its card, each file whole or not at all.
 
+    Args:
+      folder: is made, if need be.
+      card: what whoever runs the program has to know; batch, weights, size and error are added.
+      make: `make(batch=, weights=)`, the program.
+      error_of: `error_of(program)`, how far it is from JAX.
+      batch, weights: as for `denoiser_program`.
+      overwrite: replace an earlier export.
+      examples: write the worked examples beside it.
 
-def write_export(folder: Path, program: bytes, card: dict, beside: dict[str, bytes] | None = None) -> Path:
-    """Write a program, its card and what lies beside them, each file whole or not at all; return the folder."""
+    Returns:
+      The folder.
+
+    Raises:
+      ValueError: if an export is there that may not be replaced; said before anything is made.
+    """
+    folder = Path(folder)
+    if not overwrite and (folder / PROGRAM).exists():
+        raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
+    program = make(batch=batch, weights=weights)
+    card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error_of(program)}
     folder.mkdir(parents=True, exist_ok=True)
-    for path in EXAMPLES.glob("*.txt"):  # those of an export that is replaced would not fit the new card
-        (folder / path.stem).unlink(missing_ok=True)
-    files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()} | (beside or {})
+    files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()}
+    for path in EXAMPLES.glob("*.txt"):
+        if examples:
+            files[path.stem] = path.read_bytes()
+        else:  # those of an export that is replaced would not fit the new card
+            (folder / path.stem).unlink(missing_ok=True)
     for name, content in files.items():
         with whole_file(folder / name, overwrite=True) as temporary:
             Path(temporary).write_bytes(content)

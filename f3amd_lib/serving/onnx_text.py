@@ -15,6 +15,7 @@ What an autoencoder makes of a latent is not exported, nor is the text encoder: 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.phases import cut_phases, ddim_times, shares
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.networks.motionpcm import LatentDenoiser
-from f3amd_lib.serving.onnx_export import OnnxProgram, check_batch, free_folder, onnx_program, write_export
+from f3amd_lib.serving.onnx_export import OnnxProgram, check_batch, onnx_program, write_export
 from f3amd_lib.training.checkpoints import describe_skeleton, file_kind, network_with
 from f3amd_lib.training.latent_models import LatentModel, load_latent_model
 from f3amd_lib.training.text_models import TextModel, load_text_model
@@ -195,12 +196,17 @@ def export_text_onnx(
     Raises:
       ImportError, ValueError: as `text_program`; if the file holds an autoencoder alone, or an export is there.
     """
-    folder = free_folder(folder, overwrite)
     if trained.config is None:
         raise ValueError(f"{trained.name} is an autoencoder alone: export a model that denoises")
     network = network_with(trained.config, trained.params)
     card = text_card(trained, network, num_steps)
-    program = text_program(network, batch=batch, weights=weights)
-    error = text_difference(program, network, list(card["steps"].values())[-1]["time"][:-1])
-    card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
-    return write_export(folder, program, card)
+    times = list(card["steps"].values())[-1]["time"][:-1]
+    return write_export(
+        folder,
+        card,
+        partial(text_program, network),
+        lambda program: text_difference(program, network, times),
+        batch=batch,
+        weights=weights,
+        overwrite=overwrite,
+    )

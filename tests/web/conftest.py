@@ -164,8 +164,8 @@ class Browser:
         return np.asarray(image)
 
 
-@pytest.fixture(scope="session")
-def _driver():
+def _start(*options_besides: str):
+    """Start a browser; the test is skipped, with the reason, where selenium, Chromium or its driver is missing."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium: see `make test-web`")
     binary = next(filter(None, map(shutil.which, _BROWSERS)), None)
     helper = shutil.which("chromedriver")
@@ -174,10 +174,15 @@ def _driver():
         pytest.skip(f"no {missing} on this machine (Debian: apt install chromium chromium-driver)")
     options = webdriver.ChromeOptions()
     options.binary_location = binary
-    for option in _BROWSER_OPTIONS:
+    for option in (*_BROWSER_OPTIONS, *options_besides):
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(helper))
+    return webdriver.Chrome(options=options, service=webdriver.ChromeService(helper))
+
+
+@pytest.fixture(scope="session")
+def _driver():
+    driver = _start()
     yield driver
     driver.quit()
 
@@ -188,6 +193,27 @@ def browser(_driver) -> Browser:
     tab = Browser(_driver)
     tab.reset()
     return tab
+
+
+@pytest.fixture
+def webgpu_browser(tmp_path) -> Browser:
+    """An empty tab of a browser that computes WebGPU in software; skipped where it has no such adapter."""
+    driver = _start(
+        "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan"
+    )  # fmt: skip
+    tab = Browser(driver)
+    tab.reset()
+    (tmp_path / "empty.html").write_text("<title>empty</title>", encoding="utf-8")
+    tab.open(tmp_path / "empty.html")
+    found = driver.execute_async_script(
+        "const done = arguments[0], tell = (adapter) => done(!!adapter);"
+        "Promise.resolve(navigator.gpu?.requestAdapter()).then(tell, () => tell(null))"
+    )
+    if found:
+        yield tab
+    driver.quit()
+    if not found:
+        pytest.skip("this Chromium has no WebGPU adapter, in software neither")
 
 
 @pytest.fixture

@@ -538,18 +538,105 @@ def test_damaged_data_are_told_of(browser, tmp_path):
     assert "cannot be shown" in browser.find("#message").text
 
 
+def crowd_of(count):
+    """People in rows, who walk in place of each other."""
+    base = [synthesize("Neutral", 2.0, seed=seed) for seed in range(4)]
+    return [
+        base[k % 4].replace(root_position=base[k % 4].root_position + np.array([1.5 * (k % 10), 0.0, 1.5 * (k // 10)]))
+        for k in range(count)
+    ]
+
+
+CARD = "A graphics card"
+PRETENDED = """
+const ask = WebGL2RenderingContext.prototype.getParameter;
+WebGL2RenderingContext.prototype.getParameter = function (name) {{
+  return [37446, 7937].includes(name) ? "{card}" : ask.call(this, name);
+}};
+const now = performance.now.bind(performance);
+performance.now = () => {speed} * now();
+"""
+"""What draws, and a clock that goes so many times as fast: drawing seems to take as long as a case wants."""
+
+
+@pytest.mark.parametrize(
+    ("count", "card", "speed", "says"),
+    [
+        (
+            100,
+            "SwiftShader",
+            1e-6,
+            "Drawn as sticks: this browser draws without a graphics card, too slowly for 100 bodies.",
+        ),
+        (16, CARD, 1e4, "Drawn as sticks: a picture with bodies takes "),
+        (16, CARD, 1e-6, ""),
+        (1, "SwiftShader", 1e4, "Drawn as sticks: a picture with bodies takes "),
+        (1, "SwiftShader", 1e-6, ""),
+    ],
+    ids=["crowd in software", "crowd, slow", "crowd, quick", "one, slow", "one, quick"],
+)
+def test_who_draws_too_slowly_gets_sticks_is_told_and_may_have_bodies(browser, tmp_path, count, card, speed, says):
+    path = write_player(tmp_path / "crowd.html", Scene(crowd_of(count)), strip=False, autoplay=False)
+    source = PRETENDED.format(card=card, speed=speed)
+    added = browser.command("Page.addScriptToEvaluateOnNewDocument", source=source)
+    try:
+        browser.open(path)
+        browser.wait("return document.documentElement.dataset.ready === 'yes'", 120)
+        said = browser.find("#notice").text
+        assert said.startswith(says) if says else said == ""
+        assert said.count(". ") == bool(says) and said.endswith("The button Sticks brings bodies back." * bool(says))
+        assert state(browser)["body"] is not bool(says)
+        assert browser.find("#sticks").get_attribute("aria-pressed") == str(bool(says)).lower()
+        browser.find("#sticks").click()  # overridden, either way
+        assert state(browser)["body"] is bool(says) and browser.find("#notice").text == ""
+    finally:
+        browser.command("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+    assert browser.errors() == []
+
+
+def test_bodies_of_a_crowd_take_as_many_draws_as_one(browser, tmp_path):
+    """Whatever the number of people: bodies are instances of one, limb by limb."""
+    draws = []
+    for count in (20, 40):
+        opened(browser, write_player(tmp_path / f"{count}.html", Scene(crowd_of(count)), strip=False, autoplay=False))
+        calls = []
+        for body in (True, False):
+            browser.script("player.setBody(arguments[0]); player.stage.castShadows(false)", body)
+            settled(browser)
+            calls.append(browser.script("return player.stage.renderer.info.render.calls"))
+        draws.append(calls[0] - calls[1])  # bodies instead of sticks, trails apart
+    limbs = browser.script("return player.characters[0].figure.skeleton.capsules.length")
+    assert draws == [limbs - 2, limbs - 2]  # sticks and heads are two
+
+
+def test_instanced_bodies_are_where_skinned_ones_are(browser, tmp_path):
+    """The same picture of a crowd, drawn together and one by one."""
+    opened(browser, write_player(tmp_path / "many.html", Scene(crowd_of(16)), strip=False, autoplay=False))
+    browser.script("player.setBody(true); player.stage.castShadows(false); player.seek(7)")
+    settled(browser)
+    together = pixels(browser)
+    browser.script(
+        "const { scene } = player.stage.views[0]; scene.remove(...scene.children.filter((one) => one.isGroup));"
+        "player.characters.forEach(({ figure, panel }) => panel.view.scene.add(figure.mesh)); player.seek(7)"
+    )
+    settled(browser)
+    apart = pixels(browser)
+    browser.script(
+        "player.characters.forEach(({ figure, panel }) => panel.view.scene.remove(figure.mesh)); player.seek(7)"
+    )
+    settled(browser)
+    nobody = pixels(browser)
+    difference = np.abs(together.astype(int) - apart).max(axis=-1) > 40
+    people = np.abs(apart.astype(int) - nobody).max(axis=-1) > 40
+    assert people.sum() > 2000 and difference.sum() < 0.02 * people.sum()
+
+
 def test_slow_machines_get_sticks_and_are_told(browser, tmp_path, screenshots, capsys):
     """Bodies of a crowd stay where a picture takes 17 ms at most; times are printed, for whoever wants them."""
-    base = [synthesize("Neutral", 2.0, seed=seed) for seed in range(4)]
     lines = []
     for count in (1, 100):
-        crowd = [
-            base[k % 4].replace(
-                root_position=base[k % 4].root_position + np.array([1.5 * (k % 10), 0.0, 1.5 * (k // 10)])
-            )
-            for k in range(count)
-        ]
-        path = write_player(tmp_path / f"{count}.html", Scene(crowd, title="Crowd"), strip=False, autoplay=False)
+        scene = Scene(crowd_of(count), title="Crowd")
+        path = write_player(tmp_path / f"{count}.html", scene, strip=False, autoplay=False)
         opened(browser, path)
         now, said = state(browser), browser.script("return document.getElementById('notice').textContent")
         software = browser.script("return player.stage.software")

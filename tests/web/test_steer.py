@@ -10,6 +10,7 @@ from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.generation.steering import FPS, Steering, first_pose
 from f3amd_lib.measures.walking import seam_kick, slide_speed
+from f3amd_lib.serving import steer
 from f3amd_lib.serving.onnx_export import denoiser_program
 from f3amd_lib.serving.steer import write_steer
 from f3amd_lib.training.checkpoints import load_model
@@ -53,55 +54,113 @@ def choose(browser, name: str, value) -> None:
     browser.script(f"document.querySelector('input[name={name}][value=\"{value}\"]').click()")
 
 
+def pythons_rounds(trained, page_paces, num_steps, rounds):
+    """What Python makes of two characters, and what a page needs to be asked for the same."""
+    config, rng = trained.config, np.random.default_rng(0)
+    noise = rng.standard_normal((rounds, 2, config.window, config.channels)).astype(np.float32)
+    names, paces, yaws = ("Neutral", "Old"), (1.22, 0.58), (0.3, -1.0)
+    numbers = [trained.style_index(name) for name in names]
+    style = np.eye(len(trained.styles))[numbers]
+    style[1] = 0.5 * style[0] + 0.5 * style[1]
+    poses = [
+        first_pose(trained, name, (k, 2.0 * k), yaws[k], page_paces[number])
+        for k, (name, number) in enumerate(zip(names, numbers, strict=True))
+    ]
+    steering = Steering(MotionGenerator(trained, num_steps), np.stack(poses), yaws)
+    asked = {
+        "places": [{"x": k, "z": 2.0 * k, "yaw": yaws[k], "style": number} for k, number in enumerate(numbers)],
+        "wishes": [{"speed": paces[k], "direction": (1.0, -1.0)[k]} for k in range(2)],
+        "styles": style.tolist(),
+        "noise": noise.reshape(rounds, -1).tolist(),
+        "sigmas": variance_exploding(**dict(trained.diffusion.settings)).grid(num_steps).tolist(),
+        "hop": steering.hop,
+        "blend": steering.blend_frames,
+    }
+    return [steering.advance(paces, (1.0, -1.0), style, one) for one in noise], asked
+
+
+def same_as_python(browser, trained, num_steps, rounds):
+    page_paces = browser.script("return JSON.parse(document.getElementById('steer-data').textContent).paces")
+    wanted, asked = pythons_rounds(trained, page_paces, num_steps, rounds)
+    browser.driver.set_script_timeout(240)
+    found = browser.driver.execute_async_script(
+        "const done = arguments[1]; steer.rehearse(JSON.parse(arguments[0])).then(done, (e) => done(String(e)))",
+        json.dumps(asked),
+    )
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
 def test_rounds_are_pythons_for_the_same_noise(browser, page, trained):
     """The whole way: history, condition, the network in WebAssembly with the page's weights, sampler, blending."""
     opened(browser, page)
-    config, rng = trained.config, np.random.default_rng(0)
-    noise = rng.standard_normal((2, 2, config.window, config.channels)).astype(np.float32)
-    names, paces, yaws = ("Neutral", "Old"), (1.22, 0.58), (0.3, -1.0)
-    style = np.eye(len(trained.styles))[[trained.style_index(name) for name in names]]
-    style[1] = 0.5 * style[0] + 0.5 * style[1]
-    page_paces = browser.script("return JSON.parse(document.getElementById('steer-data').textContent).paces")
     for num_steps in (8, 1):
-        generator = MotionGenerator(trained, num_steps)
-        poses = [
-            first_pose(trained, name, (k, 2.0 * k), yaws[k], page_paces[trained.style_index(name)])
-            for k, name in enumerate(names)
-        ]
-        steering = Steering(generator, np.stack(poses), yaws)
-        wanted = [steering.advance(paces, (1.0, -1.0), style, one) for one in noise]
-        browser.driver.set_script_timeout(120)
-        found = browser.driver.execute_async_script(
-            "const done = arguments[1]; steer.rehearse(JSON.parse(arguments[0])).then(done, (e) => done(String(e)))",
-            json.dumps(
-                {
-                    "places": [
-                        {"x": k, "z": 2.0 * k, "yaw": yaws[k], "style": trained.style_index(name)}
-                        for k, name in enumerate(names)
-                    ],
-                    "wishes": [{"speed": paces[k], "direction": (1.0, -1.0)[k]} for k in range(2)],
-                    "styles": style.tolist(),
-                    "noise": noise.reshape(2, -1).tolist(),
-                    "sigmas": variance_exploding(**dict(trained.diffusion.settings)).grid(num_steps).tolist(),
-                    "hop": steering.hop,
-                    "blend": steering.blend_frames,
-                }
-            ),
-        )
-        np.testing.assert_allclose(found, wanted, atol=1e-4)
+        same_as_python(browser, trained, num_steps, rounds=2)
     assert browser.errors() == [] and browser.requests() == []
 
 
-def test_a_page_for_webgpu_says_what_runs_and_walks_without_it(browser, trained, program, page, tmp_path):
-    """This browser has no graphics card: WebAssembly takes over, of the runtime that would do both."""
-    opened(browser, page)
-    assert browser.find("#where").text == "in WebAssembly on one thread"
+@pytest.fixture(scope="module")
+def webgpu_page(trained, program, tmp_path_factory):
+    return write_steer(tmp_path_factory.mktemp("gpu") / "gpu.html", trained, program=program, runtime="webgpu")
+
+
+def test_rounds_by_webgpu_are_pythons(webgpu_browser, webgpu_page, trained):
+    """The graphics card is played in software, slowly; its shaders are those that a card would run."""
+    opened(webgpu_browser, webgpu_page.as_uri() + "#software-webgpu")
+    assert webgpu_browser.find("#where").text == "by WebGPU in software"
+    for num_steps in (2, 1):
+        same_as_python(webgpu_browser, trained, num_steps, rounds=1)
+    assert webgpu_browser.script("return steer.state().runs") == "software"
+    assert webgpu_browser.errors() == [] and webgpu_browser.requests() == []
+
+
+NO_CARD = {
+    "this browser lends no graphics card": "undefined",
+    "this browser only plays a graphics card, in software": "{requestAdapter: async () => "
+    "({info: {isFallbackAdapter: true}})}",
+    "the card is gone": "{requestAdapter: async () => { throw new Error('the card is gone'); }}",
+}
+"""What a page for WebGPU says -> what its worker finds as `navigator.gpu`."""
+
+
+@pytest.mark.parametrize("reason", NO_CARD)
+def test_a_page_for_webgpu_says_why_it_walks_without_a_card(
+    browser, trained, program, page, tmp_path, monkeypatch, reason
+):
+    """WebAssembly takes over, of the runtime that would do both."""
+    made = steer._worker
+    hidden = f"Object.defineProperty(self.navigator, 'gpu', {{value: {NO_CARD[reason]}}});\n"
+    monkeypatch.setattr(steer, "_worker", lambda script: hidden + made(script))
     opened(browser, write_steer(tmp_path / "gpu.html", trained, program=program, runtime="webgpu"))
-    runs = browser.script("return steer.state().runs")
-    words = {"wasm": "in WebAssembly on one thread (not by WebGPU: ", "webgpu": "on the graphics card, by WebGPU"}
-    assert browser.find("#where").text.startswith(words[runs])
+    assert browser.find("#where").text == f"in WebAssembly on one thread (not by WebGPU: {reason})"
+    assert browser.script("return steer.state().runs") == "wasm"
     browser.wait("return steer.state().rounds > 1", 120)
     assert browser.errors() == [] and browser.requests() == []
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_a_slow_picture_gets_fewer_pixels_and_the_page_says_so(browser, page, slow):
+    """The browser's clock of pictures is made up: 100 ms apart, or 10."""
+    step = 100 if slow else 10
+    clock = (
+        f"let now = 0; const ask = requestAnimationFrame; requestAnimationFrame = (f) => ask(() => f(now += {step}));"
+    )
+    added = browser.command("Page.addScriptToEvaluateOnNewDocument", source=clock)
+    try:
+        opened(browser, page)
+        browser.wait("return steer.state().rounds > 2 && steer.state().rate > 0", 120)
+        browser.wait(f"return steer.state().sharpness {'< 0.6' if slow else '=== 1'}", 120)
+        browser.wait(
+            f"return document.getElementById('coarse').textContent === '{' (fewer pixels, to be quicker)' * slow}'"
+        )
+        canvas = browser.script("const c = document.getElementById('view'); return c.width / c.clientWidth")
+        assert canvas == pytest.approx(0.5 if slow else 1.0, abs=0.01)
+    finally:
+        browser.command("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+
+def test_the_usual_page_asks_for_no_card(browser, page):
+    opened(browser, page)
+    assert browser.find("#where").text == "in WebAssembly on one thread"
 
 
 def test_a_square_driven_by_keys(browser, page, trained, screenshots, capsys):
@@ -214,4 +273,29 @@ def test_the_style_slider_and_the_finger_are_heard(browser, page, screenshots):
     panel = browser.find("#panel").rect
     assert wide <= 0 and panel["x"] >= 0 and panel["x"] + panel["width"] <= PHONE[0]
     assert panel["y"] > 0.45 * PHONE[1]  # the picture has the upper half
+    assert browser.errors() == []
+
+
+def test_mouse_and_gamepad_are_heard(browser, page):
+    """The picture's right is -X: the camera stands behind one who faces +Z. A wish is looked at a round later."""
+    opened(browser, page)
+    choose(browser, "steps", 1)
+
+    def wish():
+        rounds = browser.script("return steer.state().rounds")
+        browser.wait(f"return steer.state().rounds > {rounds + 1}", 60)
+        return browser.script("return steer.record().at(-1).wish")
+
+    for x, side in ((1240, -1), (420, 1)):
+        where = {"x": x, "y": 600, "button": "left", "clickCount": 1}
+        browser.command("Input.dispatchMouseEvent", type="mousePressed", **where)
+        wanted = wish()
+        browser.command("Input.dispatchMouseEvent", type="mouseReleased", **where)
+        assert wanted["speed"] > 0.3 and side * wanted["direction"] > 0.2
+    assert wish()["speed"] == 0
+    browser.script("navigator.getGamepads = () => [{connected: true, axes: [1, 0, 0, 0], buttons: []}]")
+    wanted = wish()
+    assert wanted["speed"] > 0.3 and abs(wanted["direction"] + np.pi / 2) < 1e-3
+    browser.script("navigator.getGamepads = () => []")
+    assert wish()["speed"] == 0
     assert browser.errors() == []

@@ -3,7 +3,7 @@
 // A skeleton is { names, parents, offsets: [[x, y, z]], capsules: [[joint, start, end, radii, wide]],
 // bones: [[joint, [x, y, z], side]], head, toes }, in metres; the sides are "left", "right", "middle".
 import {
-  Bone, BufferAttribute, BufferGeometry, Color, CylinderGeometry, InstancedMesh, Matrix4, MeshBasicMaterial, MeshLambertMaterial,
+  Bone, BufferAttribute, BufferGeometry, Color, CylinderGeometry, Group, InstancedMesh, Matrix4, MeshBasicMaterial, MeshLambertMaterial,
   Quaternion, Skeleton, SkinnedMesh, SphereGeometry, Vector3,
 } from "three";
 
@@ -106,12 +106,16 @@ function sideOf({ bones, sides }, [joint, , end]) {
   return along ? along[2] : sides[joint];
 }
 
-// Vertex colours: trunk and limbs, or one colour for all.
+// Colours of trunk and limbs, or one for all.
+function partColors(colors, one) {
+  const soft = new Color(colors.flesh);
+  return Object.fromEntries(["left", "right", "middle"].map((side) =>
+    [side, one ? new Color(one) : side === "middle" ? soft : new Color(colors[side]).lerp(soft, 0.3)]));
+}
+
 export function paintBody(geometry, colors, one) {
   const { sides } = geometry.userData;
-  const soft = new Color(colors.flesh);
-  const parts = Object.fromEntries(["left", "right", "middle"].map((side) =>
-    [side, one ? new Color(one) : side === "middle" ? soft : new Color(colors[side]).lerp(soft, 0.3)]));
+  const parts = partColors(colors, one);
   const values = new Float32Array(3 * sides.length);
   sides.forEach((side, k) => parts[side].toArray(values, 3 * k));
   geometry.setAttribute("color", new BufferAttribute(values, 3));
@@ -150,6 +154,42 @@ export class Figure {
 
 export function bodyMaterial(options = {}) {
   return new MeshLambertMaterial({ vertexColors: true, ...options });
+}
+
+// Bodies of many characters, a draw for each capsule of a skeleton: it goes rigidly with its joint. Bones have to be posed
+// before `update`.
+export class Bodies {
+  constructor(figures) {
+    const material = bodyMaterial({ vertexColors: false });
+    this.parts = [...new Set(figures.map(({ skeleton }) => skeleton))].flatMap((skeleton) => {
+      const alike = figures.filter((figure) => figure.skeleton === skeleton);
+      const rest = restPositions(skeleton);
+      return skeleton.capsules.map((capsule) => {
+        const [joint] = capsule;
+        const geometry = bodyGeometry({ ...skeleton, capsules: [capsule] }).translate(...rest[joint].map((value) => -value));
+        const mesh = new InstancedMesh(geometry, material, alike.length);
+        mesh.frustumCulled = false;
+        mesh.castShadow = true;
+        return { mesh, joint, figures: alike };
+      });
+    });
+    this.group = new Group().add(...this.parts.map(({ mesh }) => mesh));
+  }
+
+  paint(colors) {
+    for (const { mesh, figures } of this.parts) {
+      const [side] = mesh.geometry.userData.sides;
+      figures.forEach(({ color }, k) => mesh.setColorAt(k, partColors(colors, color)[side]));
+      mesh.instanceColor.needsUpdate = true;
+    }
+  }
+
+  update() {
+    for (const { mesh, joint, figures } of this.parts) {
+      figures.forEach(({ bones }, k) => mesh.setMatrixAt(k, bones[joint].matrixWorld));
+      mesh.instanceMatrix.needsUpdate = true;
+    }
+  }
 }
 
 // Sticks and heads of many characters in two draws. Bones have to be posed before `update`.

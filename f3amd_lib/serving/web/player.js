@@ -4,7 +4,7 @@ import {
   Mesh, MeshBasicMaterial, OrbitControls, PerspectiveCamera, Quaternion, QuaternionKeyframeTrack, RingGeometry, Spherical,
   Vector3, VectorKeyframeTrack,
 } from "three";
-import { Figure, Sticks, bodyGeometry, bodyMaterial, paintBody, plainCapsules } from "body";
+import { Bodies, Figure, Sticks, bodyGeometry, bodyMaterial, paintBody, plainCapsules } from "body";
 import { Stage } from "scene";
 
 const data = JSON.parse(document.getElementById("player-data").textContent);
@@ -141,7 +141,7 @@ function enter(character, panel) {
   character.figure = Object.assign(new Figure(skeleton, geometry, material), { color: character.color });
   character.panel = panel;
   const { scene } = panel.view;
-  scene.add(character.figure.mesh);
+  if (character.ghost || !panel.many) scene.add(character.figure.mesh); // those of a crowd are drawn together
   if (character.ghost) {
     character.figure.mesh.castShadow = false;
     return;
@@ -167,10 +167,13 @@ const ghostMaterial = bodyMaterial({ transparent: true, opacity: 0.32, depthWrit
 
 const real = (panel) => panel.scene.characters.filter((one) => !one.ghost);
 
-// Sticks and contact marks of a panel, made anew when somebody enters.
+// Sticks and contact marks of a panel, and the bodies of a crowd, made anew when somebody enters.
 function gather(panel) {
   const { scene } = panel.view;
   if (panel.sticks) scene.remove(panel.sticks.rods, panel.sticks.heads, panel.marks);
+  if (panel.bodies) scene.remove(panel.bodies.group);
+  panel.bodies = panel.many ? new Bodies(real(panel).map(({ figure }) => figure)) : null;
+  if (panel.bodies) scene.add(panel.bodies.group);
   panel.sticks = new Sticks(real(panel).map(({ figure }) => figure), panel.many ? 0.03 : 0.022, panel.many);
   panel.marks = new InstancedMesh(new CircleGeometry(0.085, panel.many ? 8 : 24).rotateX(-Math.PI / 2), overFloor(3), 2 * real(panel).length);
   panel.marks.frustumCulled = false;
@@ -206,6 +209,7 @@ function readColors() {
   for (const panel of panels) {
     panel.view.paint(colors);
     panel.sticks.paint(colors);
+    panel.bodies?.paint(colors);
     panel.marks.material.color.set(colors.contact);
     for (const { trail, asked, goal, color } of panel.scene.characters) {
       if (trail) trail.material.color.set(color || colors.trail);
@@ -377,6 +381,10 @@ function draw() {
     }
     panel.sticks.rods.visible = panel.sticks.heads.visible = !show.body;
     if (!show.body) panel.sticks.update();
+    if (panel.bodies) {
+      panel.bodies.group.visible = show.body;
+      if (show.body) panel.bodies.update();
+    }
     markContacts(panel, frame);
     lookAt(panel, frame, share);
     panel.view.scene.updateMatrixWorld();

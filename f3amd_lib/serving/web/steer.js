@@ -80,7 +80,8 @@ class Picture {
   constructor(canvas, data) {
     this.data = data;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.sharpness = Math.min(devicePixelRatio, 2);
+    this.renderer.setPixelRatio(this.sharpness);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.1, 80);
     this.around = Math.PI; // behind somebody who faces +Z
@@ -145,6 +146,15 @@ class Picture {
     // Beside the panel, or above it.
     this.camera.setViewOffset(width, height, width > 600 ? -0.1 * width : 0, width > 600 ? 0 : 0.22 * height, width, height);
     this.camera.updateProjectionMatrix();
+  }
+
+  // Fewer pixels, for whoever draws without a graphics card; false if there are few already.
+  coarser() {
+    if (this.sharpness <= 0.5) return false;
+    this.sharpness = Math.max(0.5, this.sharpness / 1.5);
+    this.renderer.setPixelRatio(this.sharpness);
+    this.width = undefined; // so that `resize` sets the canvas anew
+    return true;
   }
 
   look(x, z, count, quick) {
@@ -270,8 +280,13 @@ export async function start(data, files, workerUrl) {
   });
 
   const poses = new Float32Array(files.poses.buffer);
-  const { runs, instead } = await network.ask("open", { card, wasm: files.wasm.buffer, program: files.program, poses });
-  $("where").textContent = { webgpu: "on the graphics card, by WebGPU", wasm: "in WebAssembly on one thread" }[runs];
+  const { runs, instead } = await network.ask("open", {
+    card, wasm: files.wasm.buffer, program: files.program, poses,
+    software: location.hash === "#software-webgpu", // slower than WebAssembly: for tests
+  });
+  $("where").textContent = {
+    webgpu: "on the graphics card, by WebGPU", software: "by WebGPU in software", wasm: "in WebAssembly on one thread",
+  }[runs];
   if (instead) $("where").textContent += ` (not by WebGPU: ${instead})`;
 
   const ownStyle = (k) => (k === 0 ? styleOf($("first").value) : (styleOf($("first").value) + 37 * k) % card.styles.length);
@@ -362,7 +377,7 @@ export async function start(data, files, workerUrl) {
   let before = performance.now();
   function loop(now) {
     requestAnimationFrame(loop);
-    if (!tapes.length) return;
+    if (!tapes.length || timing) return;
     const passed = Math.min(0.1, (now - before) / 1000), wanted = clock + passed * FPS;
     before = now;
     if (wanted > newest) waits++;
@@ -376,6 +391,7 @@ export async function start(data, files, workerUrl) {
     picture.look(middle(0), middle(2), tapes.length, rounds < 2 ? 1 : 1 - Math.exp(-5 * passed));
     draw();
     drawn = [...drawn, now].slice(-60);
+    if (drawn.length === 12 && median(drawn.slice(1).map((at, k) => at - drawn[k])) > 50 && picture.coarser()) drawn = [];
     if (rounds && drawn.length % 10 === 0) report(ms);
   }
 
@@ -389,10 +405,15 @@ export async function start(data, files, workerUrl) {
     reported = performance.now();
     $("ms").textContent = ms < 10 ? ms.toFixed(1) : ms.toFixed(0);
     $("hop").textContent = options.hop;
-    $("rate").textContent = rate().toFixed(0);
+    $("rate").textContent = rate() < 10 ? rate().toFixed(1) : rate().toFixed(0);
+    $("coarse").textContent = picture.sharpness < Math.min(devicePixelRatio, 2) ? " (fewer pixels, to be quicker)" : "";
   }
 
-  let frozen = false;
+  let frozen = false, timing = false;
+  async function freeze() {
+    frozen = true;
+    while (pending) await new Promise((done) => setTimeout(done, 10));
+  }
   function fail(error) {
     frozen = true;
     $("message").textContent = `The network does not run in this browser: ${error.message}`;
@@ -427,14 +448,26 @@ export async function start(data, files, workerUrl) {
   return {
     state: () => ({
       clock, newest, rounds, waits, hop: options.hop, ms: times.length ? median(times) : null, timed: times.length, rate: rate(),
-      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs,
+      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs, sharpness: picture.sharpness,
     }),
     record: () => record,
     forget: () => { record = []; waits = 0; },
+    // Milliseconds that the worker takes for one round as the game asks for it, with game and picture stopped: for those who
+    // measure.
+    async time(count, steps) {
+      timing = true;
+      await freeze();
+      const places = Array.from({ length: count }, (_, k) => ({ x: 2 * k, z: 0, yaw: 0, style: ownStyle(k) }));
+      await network.ask("characters", { places, keep: true });
+      const wish = { speed: pace(), direction: 0 };
+      return (await network.ask("round", {
+        wishes: places.map(() => wish), styles: places.map((_, k) => weights(k)), sigmas: card.sigmas[steps],
+        hop: HOP, blend: BLEND, locking: options.locking,
+      })).ms;
+    },
     // One round of given numbers from a fresh start, with the game stopped: for tests.
     async rehearse({ places, wishes: given, styles, noise, sigmas, hop, blend, locking }) {
-      frozen = true;
-      while (pending) await new Promise((done) => setTimeout(done, 10));
+      await freeze();
       await network.ask("characters", { places, keep: false });
       const made = [];
       for (const one of noise)

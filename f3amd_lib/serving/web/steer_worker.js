@@ -26,12 +26,17 @@ const answers = {
     ({ card } = message);
     poses = frameList(message.poses, card.num_history * card.channels).map((pose) => frameList(pose, card.channels));
     Object.assign(ort.env.wasm, { wasmBinary: message.wasm, numThreads: 1, proxy: false });
-    const create = (provider) => ort.InferenceSession.create(message.program, { executionProviders: [provider] });
+    const create = (provider) => ort.InferenceSession.create(message.program, {
+      executionProviders: [provider], logSeverityLevel: 3, // that some nodes stay on the processor is no fault
+    });
     if (card.webgpu) {
       try {
-        if (!(await self.navigator.gpu?.requestAdapter())) throw new Error("this browser lends no graphics card");
+        const adapter = await self.navigator.gpu?.requestAdapter();
+        if (!adapter) throw new Error("this browser lends no graphics card");
+        const software = adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter ?? false;
+        if (software && !message.software) throw new Error("this browser only plays a graphics card, in software");
         session = await create("webgpu");
-        return { runs: "webgpu" };
+        return { runs: software ? "software" : "webgpu" };
       } catch (error) {
         session = await create("wasm");
         return { runs: "wasm", instead: String(error?.message ?? error) };
