@@ -64,8 +64,11 @@ def trained(models, *, windows=2e8, fall=0.01, **walk):
             for metric, value in figures.items()
         ],
         "walking": [
-            {"model": model, "steps": steps, "seed": seed, "style": "walk"} | WALKS | changed
-            for model, steps, changed in [("real", 0, {}), *((name, 8, walk) for name in dict(models))]
+            {"model": model, "window_frames": window, "steps": steps, "seed": seed, "style": "walk"} | WALKS | changed
+            for model, window, steps, changed in [
+                *(("real", window, 0, {}) for window in dict.fromkeys(window for _, window in models)),
+                *((name, window, 8, walk) for name, window in models),
+            ]
             for seed in (0, 1)
         ],
     }

@@ -363,8 +363,8 @@ def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] =
     """
     keys = list(SCHEMAS[name])
     table = table.rename(columns={_VALUES.get(name, "value"): "value"})
-    if name == "walking" and "metric" not in table:  # a row per style and seed, its figures side by side
-        means = table.groupby(["model", "steps"])[[check for check in CHECKS if check in table]].mean()
+    if name == "walking" and set(keys) - set(table) == {"metric"}:  # a row per style and seed, its figures side by side
+        means = table.groupby(keys[:-1])[[check for check in CHECKS if check in table]].mean()
         table = means.melt(var_name="metric", ignore_index=False).reset_index()
     if name in ("synthesis_time", "training_time"):
         table = _with_interval_of_median(table)
