@@ -605,6 +605,12 @@ def test_the_remark_on_q5_tells_use_of_the_input_from_use_of_the_level(tmp_path,
     assert remarks == [expected]
 
 
+def test_a_metric_that_is_better_is_not_called_worse(tmp_path):
+    tables = qualities(*(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1.0), (4, 0.6), (2, 1.6), (1, 3.0))))
+    texts = [s.figure for s in judge(keep(tmp_path, tables), "Q6").ours if s.verdict != REMARK]
+    assert [text.split(",")[0] for text in texts] == ["FID 40 % better", "FID 60 % worse", "FID 3x worse"]
+
+
 @pytest.mark.parametrize("claim_id", RECORDED)
 def test_each_rule_says_why_nothing_was_measured(tmp_path, claim_id):
     judgement = judge(tmp_path, claim_id)

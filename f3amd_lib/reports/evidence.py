@@ -329,7 +329,8 @@ def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
     if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
-        return f"CPU, {record.get('cores')} cores"
+        cores = record.get("cores")
+        return f"CPU, {cores} core" + "s" * (cores != 1)
     kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
 
