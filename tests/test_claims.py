@@ -802,6 +802,18 @@ def test_the_gate_asks_what_a_claim_needs(tmp_path):
     assert judge(keep(tmp_path / "time", CASES["E2"][0]), "E2").verdict == HOLDS
 
 
+@pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])
+def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, skates, verdict):
+    """Q4 says that CAMDM fails with 64 frames, and so that one need not walk."""
+    walking = trained([(name, window) for name in (FNO, CAMDM) for window in (32, 64)])["walking"]
+    walking = [
+        row | {"slide_speed": 90.0} if (row["model"], row["window_frames"]) == skates else row for row in walking
+    ]
+    statements = [s for s in judge(keep(tmp_path, CASES["Q4"][0] | {"walking": walking}), "Q4").ours if s.verdict]
+    about = statements[skates[0] == CAMDM]
+    assert about.verdict == verdict and (skates[0] in about.reasons.get("does not walk", ())) == (verdict == UNJUDGED)
+
+
 def test_a_judged_data_set_decides_before_one_that_only_has_figures(tmp_path):
     keep(tmp_path, SOUND | trained(PAIR, windows=192_000), dataset="bandai")
     keep(tmp_path, SOUND, dataset="synthetic")
