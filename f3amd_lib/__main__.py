@@ -697,8 +697,11 @@ def measure(
     models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
     other_window = profile.window != load_profile(profile.name, profile.dataset).window
-    if (other_window or published) and set(names) != {"quality"}:
-        raise ValueError("--window and --published are for quality alone: measure it by name")
+    of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
+    if (other_window or published) and not (names and set(names) <= of_windows):
+        raise ValueError(
+            "--window is for quality, trained and walking, --published for quality alone: measure them by name"
+        )
     extra = {"published": published} if published else {}
     records = results_dir(profile.dataset, profile.name) / "records"
     for name in names or MEASUREMENTS:
@@ -801,7 +804,7 @@ def sweep(
 
     profile = load_profile(motion.profile, motion.data)
     if motion.window not in (None, profile.window):
-        raise ValueError("--window is for f3amd measure quality alone")
+        raise ValueError("--window is for f3amd measure alone")
     folder = (out or runs_dir(profile.dataset, profile.name)).resolve()
     results = results_dir(profile.dataset, profile.name).resolve()
     work = engine.Work(profile, motion.source, results.parents[1], folder, batch_size)

@@ -64,8 +64,11 @@ def trained(models, *, windows=2e8, fall=0.01, **walk):
             for metric, value in figures.items()
         ],
         "walking": [
-            {"model": model, "steps": steps, "seed": seed, "style": "walk"} | WALKS | changed
-            for model, steps, changed in [("real", 0, {}), *((name, 8, walk) for name in dict(models))]
+            {"model": model, "window_frames": window, "steps": steps, "seed": seed, "style": "walk"} | WALKS | changed
+            for model, window, steps, changed in [
+                *(("real", window, 0, {}) for window in dict.fromkeys(window for _, window in models)),
+                *((name, window, 8, walk) for name, window in models),
+            ]
             for seed in (0, 1)
         ],
     }
@@ -602,6 +605,12 @@ def test_the_remark_on_q5_tells_use_of_the_input_from_use_of_the_level(tmp_path,
     assert remarks == [expected]
 
 
+def test_a_metric_that_is_better_is_not_called_worse(tmp_path):
+    tables = qualities(*(quality(CAMDM, steps=n, harm=h) for n, h in ((8, 1.0), (4, 0.6), (2, 1.6), (1, 3.0))))
+    texts = [s.figure for s in judge(keep(tmp_path, tables), "Q6").ours if s.verdict != REMARK]
+    assert [text.split(",")[0] for text in texts] == ["FID 40 % better", "FID 60 % worse", "FID 3x worse"]
+
+
 @pytest.mark.parametrize("claim_id", RECORDED)
 def test_each_rule_says_why_nothing_was_measured(tmp_path, claim_id):
     judgement = judge(tmp_path, claim_id)
@@ -791,6 +800,18 @@ def test_the_gate_asks_what_a_claim_needs(tmp_path):
     assert judge(keep(tmp_path / "short", CASES["Q12"][0] | short), "Q12").verdict == UNJUDGED
     assert claims.find_claim("Q12").judge(paper_evidence())[0].verdict == HOLDS
     assert judge(keep(tmp_path / "time", CASES["E2"][0]), "E2").verdict == HOLDS
+
+
+@pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])
+def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, skates, verdict):
+    """Q4 says that CAMDM fails with 64 frames, and so that one need not walk."""
+    walking = trained([(name, window) for name in (FNO, CAMDM) for window in (32, 64)])["walking"]
+    walking = [
+        row | {"slide_speed": 90.0} if (row["model"], row["window_frames"]) == skates else row for row in walking
+    ]
+    statements = [s for s in judge(keep(tmp_path, CASES["Q4"][0] | {"walking": walking}), "Q4").ours if s.verdict]
+    about = statements[skates[0] == CAMDM]
+    assert about.verdict == verdict and (skates[0] in about.reasons.get("does not walk", ())) == (verdict == UNJUDGED)
 
 
 def test_a_judged_data_set_decides_before_one_that_only_has_figures(tmp_path):

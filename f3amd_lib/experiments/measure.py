@@ -72,9 +72,10 @@ from f3amd_lib.training.recipe import profile_recipe
 log = logging.getLogger("f3amd")
 
 STEPS = (8, 4, 2, 1)
+"""Numbers of denoising steps that the paper compares (Table 5)."""
+
 LEADING = ", leading"
 """Added to the name of a network of K levels in rows whose fewer steps count from the least noisy one."""
-"""Numbers of denoising steps that the paper compares (Table 5)."""
 
 SPACINGS = ("endpoints", "uniform")
 """Both readings of where N steps lie, ours first (see `NoiseSchedule.times`)."""
@@ -247,8 +248,8 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
     held-out clips for captured data.
 
     Returns:
-      The table, `records/walking.csv`: a row per model, steps, seed and style, with the digest of
-      the weights.
+      The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
+      of the weights.
     """
     packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
     styles = _styles(prepared, profile)
@@ -281,10 +282,13 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
         ]
         return {"walking": pd.DataFrame(rows)}
 
-    digests = _digests(trained)
-    todo = [{"model": "real", "steps": 0, "weights": ""}]
-    todo += [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (8, 1)]
-    records = Records(_records_dir(profile), record, {"walking": ["model", "steps"]}, again=asked)
+    rows = [("real", 0, "")]
+    rows += [(name, steps, digest) for name, digest in _digests(trained).items() for steps in (8, 1)]
+    todo = [
+        {"model": name, "window_frames": profile.window, "steps": steps, "weights": digest}
+        for name, steps, digest in rows
+    ]
+    records = Records(_records_dir(profile), record, {"walking": ["model", "window_frames", "steps"]}, again=asked)
     return records.measure(todo, walk)
 
 

@@ -284,6 +284,10 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
+_OF_MEASURES = ("corruptions", "settling")
+"""Tables that ask FID and EMD themselves: of a classifier's own, which they name, and compared with no model's."""
+
+
 def stale_reason(name: str, record: dict, reference: dict) -> str:
     """Say why a table does not belong with the quality table of its folder.
 
@@ -306,6 +310,8 @@ def stale_reason(name: str, record: dict, reference: dict) -> str:
             earlier, later = (", ".join(sorted(of[model])) for of in (there, now))
             return f"was measured with other weights of {model} ({earlier}, now {later})"
     seen, by = (of.get("classifier_weights") for of in (record, reference))
+    if name in _OF_MEASURES:
+        return "" if seen else "does not say which style classifier it was seen through"
     if name in THROUGH_CLASSIFIER and by and seen != by:
         return f"was seen through another style classifier ({seen}, now {by})"
     return ""

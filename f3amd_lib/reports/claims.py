@@ -84,7 +84,7 @@ class Statement:
     sources: tuple[Source, ...] = ()
     no_table: bool = False
 
-    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor: Sequence[str] = ()) -> Statement:
+    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor=()) -> Statement:
         """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
         evidence.sources.clear()
         evidence.trained.clear()
@@ -113,7 +113,7 @@ class Claim:
       statements: what it stands for, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
-      poor: models that it says do badly; they need not walk to be judged.
+      poor: (model, window) of networks that it says do badly; they need not walk to be judged.
     """
 
     paper: str
@@ -125,7 +125,7 @@ class Claim:
     statements: tuple[Statement, ...]
     paper_says: str = ""
     computed: bool = False
-    poor: tuple[str, ...] = ()
+    poor: tuple[tuple[str, int], ...] = ()
 
     def judge(self, evidence: Evidence) -> list[Statement]:
         """Return its statements as this evidence has them."""
@@ -208,9 +208,8 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
         check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed", "poor"))
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
             raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
-        fields = {key: tuple(value) if key == "poor" else value for key, value in entry.items() if key != "statement"}
-        for model in fields.get("poor", ()):
-            check_model(model, here)
+        fields = {key: value for key, value in entry.items() if key != "statement"}
+        fields["poor"] = tuple((one.model, one.window) for one in _read_models(entry.get("poor", []), {}, here))
         statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
         claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
     return list(claims.values())

@@ -329,7 +329,8 @@ def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
     if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
-        return f"CPU, {record.get('cores')} cores"
+        cores = record.get("cores")
+        return f"CPU, {cores} core" + "s" * (cores != 1)
     kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
 
@@ -363,8 +364,8 @@ def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] =
     """
     keys = list(SCHEMAS[name])
     table = table.rename(columns={_VALUES.get(name, "value"): "value"})
-    if name == "walking" and "metric" not in table:  # a row per style and seed, its figures side by side
-        means = table.groupby(["model", "steps"])[[check for check in CHECKS if check in table]].mean()
+    if name == "walking" and set(keys) - set(table) == {"metric"}:  # a row per style and seed, its figures side by side
+        means = table.groupby(keys[:-1])[[check for check in CHECKS if check in table]].mean()
         table = means.melt(var_name="metric", ignore_index=False).reset_index()
     if name in ("synthesis_time", "training_time"):
         table = _with_interval_of_median(table)

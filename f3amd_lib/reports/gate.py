@@ -44,7 +44,7 @@ def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | No
     try:
         figures = {
             check: [
-                evidence.figure("walking", model=name, steps=steps, metric=check).value
+                evidence.figure("walking", model=name, window_frames=window, steps=steps, metric=check).value
                 for name, steps in ((model, GATE_STEPS), ("real", 0))
             ]
             for check in CHECKS
@@ -57,19 +57,19 @@ def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | No
 
 
 def why_not_judged(
-    evidence: Evidence, paper_windows: Mapping[str, int], poor: Collection[str] = ()
+    evidence: Evidence, paper_windows: Mapping[str, int], poor: Collection[tuple[str, int]] = ()
 ) -> dict[str, list[str]]:
     """Return why the networks that were looked up last decide nothing: reason -> models; none where they may.
 
     Args:
       evidence: records, after a rule has looked into them; a paper's own tables may always be judged.
       paper_windows: frames of a window, as text -> windows that the paper trained with.
-      poor: models that the claim calls poor.
+      poor: (model, window) of networks that the claim calls poor.
     """
     lacking: dict[str, list[str]] = {}
     networks = [] if evidence.printed else dict.fromkeys(evidence.trained)
     for model, window in networks:
-        for fault in _faults(evidence, model, window, paper_windows.get(str(window)), model not in poor):
+        for fault in _faults(evidence, model, window, paper_windows.get(str(window)), (model, window) not in poor):
             lacking.setdefault(fault, []).append(model)
     for model, (trained, windows) in evidence.told.items():
         if trained != model:

@@ -249,6 +249,10 @@ def _change_text(figure: Figure) -> str:
     return f"{100.0 * (figure.value - 1.0):+.3g} %"
 
 
+def _harm_text(harm: Figure) -> str:
+    return f"{_change_text(harm).lstrip('+-')} {'worse' if harm.value >= 1.0 else 'better'}"
+
+
 def _in_percent(figure: Figure) -> Figure:
     return figure.map(lambda bound: 100.0 * (bound - 1.0))
 
@@ -524,7 +528,8 @@ def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) ->
     """Judge whether each, or any, of some metrics is worse by a factor in a range."""
     harms = {metric: _harm(evidence, model, against, metric) for metric in metrics}
     verdict = {"each": every, "any": any_of}[quantifier](within(harm, bounds) for harm in harms.values())
-    return verdict, ", ".join(f"{metric} {_change_text(harm)} worse" for metric, harm in harms.items())
+    texts = (f"{metric} {_harm_text(harm)}" for metric, harm in harms.items())
+    return verdict, ", ".join(texts)
 
 
 def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:

@@ -247,14 +247,14 @@ def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     rows = []
     figures = [metric.name for metric in SHOWN["card"] if metric.name in walking]
     figures.remove("joint_acceleration")  # the protocol has its own
-    columns = ["model", "steps", "weights"]
+    columns = ["model", "window_frames", "steps", "weights"]
     for key, part in walking.fillna({"weights": ""}).groupby(columns, sort=False):
         means = part.groupby("seed")[figures].mean()
         half = 1.96 * means.std(ddof=1) / len(means) ** 0.5  # NaN for one seed
         for name, value in means.mean().items():
             interval = {"low": value - half[name], "high": value + half[name]}
             rows.append({"metric": name, "value": value, **interval, **dict(zip(columns, key, strict=True))})
-    return pd.DataFrame(rows).assign(window_frames=32)
+    return pd.DataFrame(rows)
 
 
 def committed_hands(dataset: str) -> pd.DataFrame | None:
