@@ -84,6 +84,18 @@ def test_news_tell_what_was_written_and_how_long_the_rest_takes(tmp_path):
     assert line.split() == "05_rollout 1.7 min wrote 2 figures; about 30 s left".split()
 
 
+def test_a_notebook_that_the_last_whole_run_lacked_counts_as_an_average_one(checkout, monkeypatch):
+    monkeypatch.setattr(reproduce, "_execute", lambda *args: None)
+    for name in ("00_long", "01_short", "02_new"):
+        write_notebook(checkout / "notebooks", name, PARAMETERS)
+    last = {"00_long.ipynb": 300.0, "01_short.ipynb": 100.0}
+    monkeypatch.setattr(reproduce, "_usual_seconds", lambda results: last)
+    news = []
+    reproduce.reproduce("bandai", "smoke", say=news.append)
+    # Nothing takes time here: 60 s at the usual pace stand against what would have taken 360 s, and then 460 s.
+    assert [line.partition("; ")[2] for line in news] == ["about 50 s left", "about 26 s left", ""]
+
+
 def test_only_files_that_are_there_are_worth_opening(checkout):
     results = checkout / "results"
     assert reproduce.what_to_open(results) == []
