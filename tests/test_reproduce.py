@@ -139,6 +139,21 @@ def test_a_killed_kernel_is_told_with_its_cell(checkout):
     assert "Kernel died" in str(caught.value)
 
 
+def test_a_kernel_that_is_interrupted_at_its_end_says_nothing(checkout, capfd):
+    still_busy_after_its_last_answer = """
+import time
+handlers = get_ipython().kernel.shell_handlers
+answer = handlers["kernel_info_request"]
+async def answer_and_go_on(*message):
+    await answer(*message)
+    time.sleep(1.0)
+handlers["kernel_info_request"] = answer_and_go_on
+"""
+    write_notebook(checkout / "notebooks", "00_busy", PARAMETERS, still_busy_after_its_last_answer)
+    reproduce.reproduce("bandai", "smoke")
+    assert "KeyboardInterrupt" not in capfd.readouterr().err
+
+
 def test_one_notebook_alone_leaves_the_whole_runs_summary(checkout):
     folder = checkout / "notebooks"
     write_notebook(folder, "00_first", PARAMETERS, "raise RuntimeError('not asked for')")
