@@ -188,6 +188,7 @@ def reproduce(
     executed_folder.mkdir(parents=True, exist_ok=True)
     rows, failure = [], None
     usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
+    typical = sum(usual.values()) / len(usual) if usual else 0.0  # for a notebook that the last whole run did not have
     # Bars are for people: a log file gets the lines of `say` instead.
     for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
         began, start = time.time(), time.monotonic()
@@ -202,7 +203,7 @@ def reproduce(
             break
         if path.name in usual:
             took, usually = took + seconds, usually + usual[path.name]
-        rest = sum(usual.get(later.name, 0.0) for later in selected[number + 1 :])
+        rest = sum(usual.get(later.name, typical) for later in selected[number + 1 :])
         say(_news(path, seconds, written_since(results, began), rest * took / usually))
 
     summary = pd.DataFrame(rows)
@@ -255,8 +256,9 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
             parameters=dict(parameters),
             kernel_name=KERNEL,
             cwd=str(path.parent),  # as in JupyterLab and nbval
-            # A kernel warns of its own connection to this process, which no reader can act on.
-            extra_arguments=["--log-level=ERROR"],
+            # A kernel warns of its own connection to this process, and reports as an error the interrupt that it gets before
+            # its shutdown, if that finds it busy with papermill's last question. No reader can act on either.
+            extra_arguments=["--log-level=CRITICAL"],
             progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
         )
     except PapermillExecutionError as error:

@@ -67,20 +67,24 @@ def timed_as(preset: str, timed: Sequence[str]) -> str:
     )
 
 
+def _config(preset: str):
+    """Return a preset's config on `bandai`, with windows of 32 frames."""
+    return presets.build_config(preset, channels=129, num_styles=22, window=32)
+
+
 def costs() -> pd.DataFrame:
     """Return the measured costs: model, s_per_window, s_per_snapshot (its measurement with one seed), parameters."""
     steps, _ = read_table(RECORDS / "synthetic/laptop/records/training_time.csv")
     rows, record = read_table(RECORDS / "bandai/laptop/records/quality_by_seed.csv")
     seconds = rows[rows["steps"].isin(STEPS_MEASURED)].groupby(["model", "steps"])["seconds"].first()
     measured = seconds.groupby("model").sum() / record["protocol"]["num_seeds"]
-    sizes = presets.table(channels=129, num_styles=22).query("window == 32").set_index("model")
     table = pd.DataFrame(
         {
             "model": steps["model"],
             "s_per_window": steps["value"] / steps["batch_size"],
             "s_per_step": steps["value"],
             "s_per_snapshot": [measured[timed_as(model, measured.index)] for model in steps["model"]],
-            "parameters": [sizes["parameters"][model] for model in steps["model"]],
+            "parameters": [presets.count_parameters(_config(model)) for model in steps["model"]],
         }
     )
     return table.set_index("model")
@@ -90,12 +94,11 @@ def queue_legs(measured: pd.DataFrame) -> tuple[list[Leg], dict[str, float]]:
     """Return the legs of the queue and what each takes: the windows since the snapshot before, and a measurement."""
     legs = plan([CAMPAIGN], [], load_profile("laptop", "bandai"), queue())
     before = {leg.name: leg.windows for leg in legs}
-    operations = presets.table(channels=129, num_styles=22).query("window == 32").set_index("model")
+    operations = functools.cache(lambda preset: presets.count_model_flops(_config(preset))[1])
     seconds = {}
     for leg in legs:
         stands = timed_as(leg.preset, measured.index)
-        of = operations["mflop_per_evaluation"]
-        share = of[leg.preset] / of[stands] * leg.run.window / 32
+        share = operations(leg.preset) / operations(stands) * leg.run.window / 32
         windows = leg.windows - before.get(leg.after, 0)
         seconds[leg.name] = share * windows * measured["s_per_window"][stands] + measured["s_per_snapshot"][stands]
     return legs, seconds

@@ -99,12 +99,12 @@ def hashes(folder: Path) -> dict[str, str]:
 
 
 def elsewhere(folder: Path, cores: int | None = None) -> Path:
-    """Make all in another process, of so many cores; its programs are compiled anew where the cores differ."""
+    """Make all in another process, of so many cores; its programs are compiled anew."""
     folder.mkdir()
     pin = "" if cores is None else f"import os; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}]); "
     script = f"{pin}import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
     script += f"import test_determinism; test_determinism.make(pathlib.Path({str(folder)!r}))"
-    environment = os.environ | ({} if cores is None else {"JAX_ENABLE_COMPILATION_CACHE": "false"})
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     subprocess.run([sys.executable, "-c", script], check=True, env=environment)
     return folder
 

@@ -84,6 +84,18 @@ def test_news_tell_what_was_written_and_how_long_the_rest_takes(tmp_path):
     assert line.split() == "05_rollout 1.7 min wrote 2 figures; about 30 s left".split()
 
 
+def test_a_notebook_that_the_last_whole_run_lacked_counts_as_an_average_one(checkout, monkeypatch):
+    monkeypatch.setattr(reproduce, "_execute", lambda *args: None)
+    for name in ("00_long", "01_short", "02_new"):
+        write_notebook(checkout / "notebooks", name, PARAMETERS)
+    last = {"00_long.ipynb": 300.0, "01_short.ipynb": 100.0}
+    monkeypatch.setattr(reproduce, "_usual_seconds", lambda results: last)
+    news = []
+    reproduce.reproduce("bandai", "smoke", say=news.append)
+    # Nothing takes time here: 60 s at the usual pace stand against what would have taken 360 s, and then 460 s.
+    assert [line.partition("; ")[2] for line in news] == ["about 50 s left", "about 26 s left", ""]
+
+
 def test_only_files_that_are_there_are_worth_opening(checkout):
     results = checkout / "results"
     assert reproduce.what_to_open(results) == []
@@ -125,6 +137,21 @@ def test_a_killed_kernel_is_told_with_its_cell(checkout):
     with pytest.raises(reproduce.NotebookFailed, match=r"cell In \[3\], 'import os'") as caught:
         reproduce.reproduce("synthetic", "smoke")
     assert "Kernel died" in str(caught.value)
+
+
+def test_a_kernel_that_is_interrupted_at_its_end_says_nothing(checkout, capfd):
+    still_busy_after_its_last_answer = """
+import time
+handlers = get_ipython().kernel.shell_handlers
+answer = handlers["kernel_info_request"]
+async def answer_and_go_on(*message):
+    await answer(*message)
+    time.sleep(1.0)
+handlers["kernel_info_request"] = answer_and_go_on
+"""
+    write_notebook(checkout / "notebooks", "00_busy", PARAMETERS, still_busy_after_its_last_answer)
+    reproduce.reproduce("bandai", "smoke")
+    assert "KeyboardInterrupt" not in capfd.readouterr().err
 
 
 def test_one_notebook_alone_leaves_the_whole_runs_summary(checkout):

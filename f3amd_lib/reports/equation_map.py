@@ -129,11 +129,11 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
         module = path.relative_to(root / "f3amd_lib").with_suffix("").as_posix()
         if module.startswith("reports/"):  # what draws and lists implements nothing
             continue
-        for name, text in _documented(path):
+        for name, text in _documented(path.read_text(encoding="utf-8")):
             for label in mentioned_equations(text, paper):
                 places[label]["functions"].append(f"{module}: {name}")
     for path in sorted((root / "tests").glob("test_*.py")):
-        for name, labels in _tests(path, paper):
+        for name, labels in _tests(path.read_text(encoding="utf-8"), paper):
             for label in labels:
                 places[label]["tests"].append(f"{path.stem}: {name}")
     folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
@@ -157,8 +157,10 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
     )
 
 
-def _documented(path: Path):
-    """Yield (qualified name, docstring) of the classes, functions and methods of a file."""
+# Papers have sources in common: a file is parsed once for all of them.
+@functools.cache
+def _documented(source: str) -> list[tuple[str, str]]:
+    """Return (qualified name, docstring) of the classes, functions and methods of a file."""
 
     def visit(body, above: str):
         for node in body:
@@ -168,21 +170,21 @@ def _documented(path: Path):
                 yield above + node.name, re.sub(r"Attributes:.*?(\n\n|\Z)", "", text, flags=re.S)
                 yield from visit(node.body, f"{above}{node.name}.")
 
-    yield from visit(ast.parse(path.read_text(encoding="utf-8")).body, "")
+    return list(visit(ast.parse(source).body, ""))
 
 
-def _tests(path: Path, paper: str):
+def _tests(source: str, paper: str):
     """Yield (name, labels) of tests that carry an equation in their name or docstring."""
     _, pattern, _, marks = _patterns(paper)
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-            labels = mentioned_equations(ast.get_docstring(node) or "", paper)
-            named = pattern.match(node.name)
+    for name, text in _documented(source):
+        if name.startswith("test_") and "." not in name:
+            labels = mentioned_equations(text, paper)
+            named = pattern.match(name)
             if named and (named[1] or _DEFAULT) == paper:
                 first, last = named[2], named[3] or named[2]
                 numbers = range(int(first), int(last) + 1) if first else ()
                 labels |= {marks[named[4]]} if named[4] else {f"Eq. {number}" for number in numbers}
-            yield node.name, labels & set(equation_labels(paper))
+            yield name, labels & set(equation_labels(paper))
 
 
 @dataclass(frozen=True)
@@ -245,6 +247,7 @@ def _displayed(texts: list[str], paper: str) -> set[str]:
     return found & set(equation_labels(paper)) if paper == _DEFAULT else set()
 
 
+@functools.cache
 def _kept_figures(source: str) -> list[str]:
     """Return the names under which a code cell keeps figures: `keep_figure(..., "02_paths")`."""
     names = []

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(
     not (SITE / "docs" / "index.html").is_file(), reason="the site is not built: `make site`"
 )
 
-PHONE = (390, 844)
+PHONE, DESKTOP = (390, 844), (1280, 800)
 
 LEDGERS = [f"paper_figures/{path.stem}.html" for path in sorted((ROOT / "paper_figures").glob("claims*.md"))]
 
@@ -97,11 +97,11 @@ def test_the_first_screen_says_what_this_is_shows_a_walk_and_leads_on(browser, s
     page.screenshot(screenshots / "site_first_page_phone.png")
 
 
-def test_every_notebook_is_whole_on_a_phone(browser):
-    """Equations drawn, nothing wider than the screen, no errors, nothing asked of the outside."""
-    browser.resize(*PHONE, phone=True)
-    equations = 0
+def test_every_notebook_is_whole_on_a_phone_and_on_a_small_laptop(browser):
+    """Equations drawn, nothing wider than the screen, no table cut off, no errors, nothing asked of the outside."""
+    equations = tables = 0
     for name in notebooks():
+        browser.resize(*PHONE, phone=True)
         page = open_with_equations(browser, name)
         asked = page.script("return document.querySelectorAll('.math').length")
         drawn = page.script("return document.querySelectorAll('.math mjx-container svg').length")
@@ -110,17 +110,10 @@ def test_every_notebook_is_whole_on_a_phone(browser):
         assert page.script(f"return document.querySelectorAll('{NOT_UNDERSTOOD}').length") == 0, name
         assert page.script(SIDEWAYS) == "", name
         assert page.errors() == [] and page.outside() == [], name
-    assert equations > 100
-
-
-def test_no_table_is_cut_off_on_a_small_laptop(browser):
-    browser.resize(1280, 800)
-    tables = 0
-    for name in [*notebooks(), *LEDGERS]:
-        page = browser.open(SITE / name)
+        browser.resize(*DESKTOP)
         tables += page.script("return document.querySelectorAll('.bd-article table').length")
         assert page.script(CUT_OFF) == [], name
-    assert tables > 50
+    assert equations > 100 and tables > 50
 
 
 @pytest.mark.parametrize("name", LEDGERS)
@@ -131,9 +124,9 @@ def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots
     assert page.script(cell + "return getComputedStyle(td).display") == "block"
     assert page.script(cell + "return getComputedStyle(td, '::before').content") == '"ours: "'
     page.screenshot(screenshots / f"site_{Path(name).stem}_phone.png")
-    browser.resize(1280, 800)
-    page = browser.open(SITE / name)
+    browser.resize(*DESKTOP)
     assert page.script(cell + "return getComputedStyle(td).display") == "table-cell"
+    assert page.script(CUT_OFF) == []
 
 
 def test_a_notebook_opens_with_its_question_and_folded_imports(browser):
