@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import ast
 import collections
+import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import nbformat
@@ -28,6 +29,7 @@ from f3amd_lib.benchmarking.machine import describe_machine
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE
 from f3amd_lib.ground import profiles
+from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
@@ -173,7 +175,8 @@ def reproduce(
       One row per notebook: notebook, seconds (wall time), cells, finished.
 
     Raises:
-      ValueError: for a name that does not exist: data set, profile, notebook or parameter.
+      ValueError: for a name that does not exist (data set, profile, notebook, parameter), or a notebook that
+        another process runs with this data set and profile.
       NotebookFailed: if a notebook stops.
     """
     defaults = load_profile(profile, dataset)  # refuses unknown names before anything starts
@@ -190,7 +193,8 @@ def reproduce(
     usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
     typical = sum(usual.values()) / len(usual) if usual else 0.0  # for a notebook that the last whole run did not have
     # Bars are for people: a log file gets the lines of `say` instead.
-    for number, path in enumerate(tqdm(selected, desc="notebooks", disable=None)):
+    alone = _alone_with(selected, executed_folder)
+    for number, path in enumerate(tqdm(alone, total=len(selected), desc="notebooks", disable=None)):
         began, start = time.time(), time.monotonic()
         try:
             _execute(path, executed_folder / path.name, parameters)
@@ -218,6 +222,14 @@ def reproduce(
     if failure:
         raise failure
     return summary
+
+
+def _alone_with(notebooks: list[Path], folder: Path) -> Iterator[Path]:
+    """Yield notebooks while none of them is run into the same folder by another process."""
+    with contextlib.ExitStack() as held:
+        for path in notebooks:
+            held.enter_context(locked(folder / f".{path.stem}.lock", f"running {path.name}"))
+        yield from notebooks
 
 
 def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda line: None) -> list[Path]:

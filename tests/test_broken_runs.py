@@ -99,6 +99,23 @@ def test_a_broken_record_of_a_measurement_is_set_aside_too(tmp_path, caplog):
     write_table(path, pd.DataFrame({"model": ["b"], "value": [2.0]}), RECORD)
 
 
+def test_a_run_killed_between_a_table_and_its_record_keeps_the_rows_that_the_record_describes(tmp_path, caplog):
+    path, rows = tmp_path / "quality.csv", pd.DataFrame({"model": ["a", "b"], "value": [0.1, 2.0]})
+    write_table(path, rows, RECORD)
+    record = path.with_suffix(".json").read_bytes()
+    more = pd.concat([rows, pd.DataFrame({"model": ["c"], "value": [3.0]})])
+    write_table(path, more, RECORD)
+    path.with_suffix(".json").write_bytes(record)  # killed before this file was put in its place
+    with caplog.at_level(logging.WARNING, "f3amd"):
+        pd.testing.assert_frame_equal(kept_rows(path, RECORD), rows)
+    assert "a run died while writing" in caplog.text
+    assert len((tmp_path / "quality.old1.csv").read_text().splitlines()) == 4  # a row that somebody added is not lost
+    pd.testing.assert_frame_equal(read_table(path)[0], rows)
+    # A table of other rows is none of them.
+    path.write_text(path.read_text().replace("0.1", "0.2") + "c,3.0\n")
+    assert kept_rows(path, RECORD) is None
+
+
 @pytest.mark.parametrize(
     "text", ["[" * 20_000, "[]", "3", '{"table": [1]}', '{"table": null}', '{"weights_digests": 4}', "\udc80"]
 )
@@ -178,7 +195,7 @@ def test_a_picture_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "figure.png"
     path.write_bytes(b"the old one")
     monkeypatch.setattr(style, "_png", cut)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="figure.png: cannot be written .*No space"):
         style.save_figure(None, path)
     assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
 

@@ -1,11 +1,15 @@
 """The long queue: what it holds, that each run is trained as its row says, and that a stopped leg loses nothing."""
 
+from types import SimpleNamespace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 from builders import packed_from, refused
 
+from f3amd_lib.experiments import campaign
 from f3amd_lib.experiments.campaign import Run, queue, run_campaign
 from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground.profiles import load_profile
@@ -126,6 +130,32 @@ def test_windows_of_64_frames_and_only_one_preset(packed, judges, small, tmp_pat
     assert table["device"].unique().tolist() == [jax.devices()[0].device_kind]
 
 
-def test_a_preset_that_is_not_in_the_queue_is_refused(packed, judges, tmp_path, monkeypatch):
-    call = lambda: run(packed, judges, tmp_path, [(Run("F3AMD-FNO-32"), 4)], monkeypatch, only=["F3AMD-FNO-23"])
-    refused("F3AMD-FNO-32", call)
+MIXED, SEEDED = Run("F3AMD-FNO-32", "mixed-noise"), Run("F3AMD-FNO-32", seed=1)
+
+
+@pytest.mark.parametrize(
+    ("only", "wanted"),
+    [
+        (["F3AMD-FNO-32"], [MIXED, SEEDED]),  # a preset, whatever it is trained by
+        (["mixed-noise"], [MIXED]),  # a recipe
+        (["paper"], [SEEDED, Run("CAMDM")]),  # the paper's text, as a recipe
+        ([SEEDED.name], [SEEDED]),  # a single run
+        (["CAMDM", "mixed-noise"], [MIXED, Run("CAMDM")]),  # in the order of the queue
+        ([], [MIXED, SEEDED, Run("CAMDM")]),
+    ],
+)
+def test_what_is_named_is_trained_and_nothing_else(packed, tmp_path, monkeypatch, only, wanted):
+    asked, judges = [], (SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(STYLES))
+    monkeypatch.setattr(campaign, "_measured", lambda *given: asked.append(given[3]) or pd.DataFrame({"value": [1.0]}))
+    snapshots = [(MIXED, 4), (SEEDED, 4), (Run("CAMDM"), 4)]
+    states, _ = run(packed, judges, tmp_path, snapshots, monkeypatch, only=only)
+    assert asked == wanted and [name for name, *_ in states] == [each.name for each in wanted]
+
+
+@pytest.mark.parametrize(
+    ("only", "nearest"),
+    [("F3AMD-FNO-23", "F3AMD-FNO-32"), ("mixed-nose", "mixed-noise"), ("F3AMD-FNO-32-seed2", "F3AMD-FNO-32-seed1")],
+)
+def test_a_name_that_is_not_in_the_queue_is_refused(packed, tmp_path, monkeypatch, only, nearest):
+    call = lambda: run(packed, (None, None), tmp_path, [(MIXED, 4), (SEEDED, 4)], monkeypatch, only=["paper", only])
+    refused(f"the queue has no '{only}'; did you mean '{nearest}'", call)

@@ -1,8 +1,12 @@
 """Files appear whole or not at all."""
 
+import os
+import time
+
 import pytest
 
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground import files
+from f3amd_lib.ground.files import whole_file, whole_folder
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -46,3 +50,33 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     with whole_file(path, overwrite=True) as temporary:
         temporary.write_text("new")
     assert path.read_text() == "new"
+
+
+def test_a_folder_appears_when_it_is_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "set"
+    with pytest.raises(RuntimeError, match="power cut"):
+        with whole_folder(path) as temporary:
+            (temporary / "half").touch()
+            raise RuntimeError("power cut")
+    assert not list(path.parent.iterdir())
+    path.mkdir()  # an empty one is as good as none
+    with whole_folder(path) as temporary:
+        (temporary / "all").touch()
+        assert not list(path.iterdir())
+    assert [item.name for item in path.iterdir()] == ["all"]
+    with pytest.raises(OSError), whole_folder(path) as temporary:  # somebody was faster
+        (temporary / "other").touch()
+    assert [item.name for item in path.rglob("*")] == ["all"]
+
+
+def test_a_folder_that_a_killed_process_left_goes_an_hour_after_its_last_file(tmp_path):
+    for name, age in ((".old.1.part", 7200), (".young.2.part", 60)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "half").touch()
+        for path in (tmp_path / name / "half", tmp_path / name):
+            os.utime(path, (time.time() - age,) * 2)
+    os.utime(tmp_path / ".young.2.part", (0, 0))  # begun long ago, and still written to
+    files._cleared.clear()
+    with whole_file(tmp_path / "a.csv") as temporary:
+        temporary.touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".young.2.part", "a.csv"]

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
 from f3amd_lib.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, UNIT, TextMotions, text_motions
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
@@ -256,9 +256,14 @@ def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = N
     data.members("train")
     if len(set(data.names)) != data.num_clips:
         raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
+    with whole_folder(folder) as temporary:
+        _write_clips(temporary, data, {} if contact_step is None else {"contact_step": contact_step})
+    return folder
+
+
+def _write_clips(folder: Path, data: TextMotions, options: dict) -> None:
     for part in ("new_joints", "new_joint_vecs", "texts"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    options = {} if contact_step is None else {"contact_step": contact_step}
     training = []
     for number, name in enumerate(data.names):
         clip = data.clip(number)
@@ -283,7 +288,6 @@ def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = N
     described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
     described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
     _write(folder / "skeleton.json", [json.dumps(described, indent=1)])
-    return folder
 
 
 def _write(path: Path, lines) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import time
 import tomllib
 import uuid
@@ -54,11 +55,49 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         temporary.touch()
         permissions = temporary.stat().st_mode
-        yield temporary
+        with _named(path):
+            yield temporary
         temporary.chmod(permissions)  # safetensors makes a new file that the owner alone may read
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say which file could not be written, where the system's own error, such as that of a full disk, does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and str(path) not in str(error):
+            raise OSError(f"{path}: cannot be written ({error})") from error
+        raise
+
+
+@contextlib.contextmanager
+def whole_folder(path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`, which becomes `path` at the end; if the block fails, it is removed.
+
+    Args:
+      path: the folder wanted, which must be empty or not there; missing folders above it are made.
+
+    Yields:
+      The folder to write into.
+
+    Raises:
+      OSError: if something has appeared at `path` meanwhile.
+    """
+    path = Path(path).resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _clear_leftovers(path.parent)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        temporary.mkdir()
+        with _named(path):
+            yield temporary
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _clear_leftovers(folder: Path) -> None:
@@ -69,8 +108,8 @@ def _clear_leftovers(folder: Path) -> None:
     _cleared.add(folder)
     for item in folder.glob(".*.part"):
         with contextlib.suppress(OSError):  # another process may be faster
-            if time.time() - item.stat().st_mtime > _LEFTOVER_S:
-                item.unlink()
+            if time.time() - max(part.stat().st_mtime for part in (item, *item.rglob("*"))) > _LEFTOVER_S:
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
 
 
 @contextlib.contextmanager

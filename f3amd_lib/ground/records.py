@@ -340,6 +340,8 @@ def set_aside_table(path) -> Path:
 def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
     """Read a table that a run wants to go on from; a broken one is renamed with a warning, so that the run can.
 
+    Where a run died between a table and its record, the rows that the record describes count.
+
     Args:
       path: of the CSV.
 
@@ -352,8 +354,30 @@ def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
     try:
         return read_table(path)
     except (ValueError, FileNotFoundError) as error:
+        if (found := _described_rows(path)) is not None:
+            return found
         log.warning("%s; kept as %s", error, set_aside_table(path).name)
         return None
+
+
+def _described_rows(path: Path) -> tuple[pd.DataFrame, dict] | None:
+    """Go back to the rows that a table's record describes, where it has more: the run died before it wrote the record.
+
+    The table with all rows is kept under another name; None where its beginning is not what the record describes.
+    """
+    try:
+        record = _read_record(path, path.with_suffix(".json"))
+        rows, digest = record["table"]["rows"], record["table"]["sha256"]
+        text = "".join(f"{line}\n" for line in path.read_text(encoding="utf-8").split("\n")[: rows + 1])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if _text_hash(text) != digest:
+        return None
+    kept = set_aside([path], path.stem)
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+    log.warning("%s: a run died while writing; its last rows lie in %s.csv and are made again", path, kept)
+    return read_table(path)
 
 
 def kept_rows(path, record: dict) -> pd.DataFrame | None:

@@ -81,7 +81,7 @@ def _read(path: Path) -> tuple[dict, dict]:
             f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, delete it or restore a copy"
         ) from None
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: not written by this project (format {header.get('format')!r})")
+        raise ValueError(f"{path}: not written by this project (format {repr(header.get('format'))[:60]})")
     if header.get("sha256") != _checksum(arrays, header.get("description", "")):
         raise ValueError(f"{path}: content does not match its checksum; restore a whole copy")
     with errors_name(path):

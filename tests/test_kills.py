@@ -1,0 +1,338 @@
+"""Commands that are killed, find no room, may not write, or run twice: nothing whole is lost, and the next call works.
+
+Each phase is its command with small networks and few clips, in a process of its own. The sweep's are in
+`test_sweep.py`, those of a crowd in `test_crowd.py`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import io
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+import tqdm
+from builders import HISTORY, WINDOW, captioned_walks, tiny_packed, tiny_trained
+from safetensors.numpy import load_file
+from test_reproduce import PARAMETERS, write_notebook
+from test_text_judge import OneVectorAWord
+from test_text_models import STYLES, TINY
+
+from f3amd_lib import __main__ as command_line
+from f3amd_lib.data import sources, text_encoders
+from f3amd_lib.data.packed import packed_dataset
+from f3amd_lib.experiments import campaign, measure
+from f3amd_lib.experiments.campaign import Run
+from f3amd_lib.experiments.protocol import Protocol
+from f3amd_lib.ground import profiles
+from f3amd_lib.ground.files import locked
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.motion.bvh import write_bvh
+from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.networks import presets
+from f3amd_lib.training import text_models
+from f3amd_lib.training.pipeline import PreparedData
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="kills, limits and rights as Linux has them"),
+]
+
+MODEL = "F3AMD-FNO-32"
+SMOKE = ["--profile", "smoke"]
+
+# ------------------------------------------------------------------------------------ phases, in a process of their own
+
+
+def data(folder: Path) -> list[str]:
+    """Pack a data set: the cache."""
+    opened = sources.open_dataset
+    sources.open_dataset = lambda name, **settings: opened(name, seconds_per_style=13.0, num_styles=1)
+    command_line.Data.open = lambda self: (
+        SimpleNamespace(packed=packed_dataset(sources.open_dataset(self.data), progress=False)),
+        None,
+    )
+    return ["data"]
+
+
+def dataset(folder: Path) -> list[str]:
+    """Write captioned motions in HumanML3D's layout."""
+    place = folder.with_name(f"{folder.name} source")
+    place.mkdir(exist_ok=True)
+    for seed in range(3):
+        write_bvh(place / f"walk{seed}.bvh", synthesize("Neutral", 4.0, seed), overwrite=True)
+    captions = place / "captions.csv"
+    captions.write_text("file,caption\n" + "".join(f"walk{seed},a person walks\n" for seed in range(3)))
+    return ["dataset", "--captions", str(captions), "--source", str(place), "--out", str(folder / "set")]
+
+
+def _small_networks() -> None:
+    """Narrow networks, few clips."""
+    build, prepared = presets.build_config, PreparedData(tiny_packed(), WINDOW, HISTORY)
+    presets.build_config = lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8})
+    profiles.load_profile = lambda *a, **k: dataclasses.replace(load_profile(*a, **k), window=WINDOW)
+    given = lambda values: {name: value for name, value in values.items() if value is not None}
+    command_line.Data.open = lambda self, **values: (
+        prepared,
+        profiles.load_profile(self.profile, self.data, **given(values)),
+    )
+
+
+def train(folder: Path) -> list[str]:
+    """Train a model of locomotion."""
+    _small_networks()
+    return ["train", "--preset", MODEL, "--steps", "6", "--batch-size", "4", *SMOKE, "--out", str(folder)]
+
+
+def train_text(folder: Path) -> list[str]:
+    """Train a model of text to motion."""
+    walks = captioned_walks(STYLES, ("test", "validation", "train"), num_frames=64)
+    presets.PRESETS["ACMDM-tiny"] = dataclasses.replace(TINY["tiny"], name="ACMDM-tiny")
+    text_models.open_text_motions = lambda *a: walks
+    text_encoders.load_text_encoder = OneVectorAWord
+    words = ["train", "--preset", "ACMDM-tiny", "--steps", "6", "--batch-size", "2", "--data", "bandai"]
+    return [*words, *SMOKE, "--out", str(folder)]
+
+
+def measure_walking(folder: Path) -> list[str]:
+    """Measure a model."""
+    _small_networks()
+    measure.available_models = lambda profile: [MODEL]
+    measure.obtain_model = lambda *a, **k: (tiny_trained(), None, "shipped")
+    return ["measure", "walking", *SMOKE]
+
+
+def run_campaign(folder: Path) -> list[str]:
+    """Train and measure two snapshots of the queue."""
+    _small_networks()
+
+    def figures(generator, *arguments):
+        value = sum(float(jnp.abs(leaf).sum()) for leaf in generator.trained.params.flat_state().leaves)
+        rows = [{"steps": generator.num_steps, "metric": "weights", "unit": "m", "value": value / 3}]
+        return pd.DataFrame(rows), None
+
+    judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(("calm", "proud")), None
+    campaign.measure_model, measure.protocol_of = figures, lambda *a: judges
+    run = Run(MODEL, window=WINDOW)
+    campaign.queue = lambda: [(run, 8), (run, 16)]
+    return ["campaign", *SMOKE, "--batch-size", "4", "--out", str(folder / "runs")]
+
+
+def figures(folder: Path) -> list[str]:
+    """Run notebooks; the second one kills the command while it runs, once."""
+    profiles.repository_root = lambda: folder
+    write = "from f3amd_lib.ground.profiles import results_dir\n"
+    write += "(results_dir(data, profile) / 'tables' / '{}').write_text('{}')"
+    kill = f"import os, pathlib\nmark = pathlib.Path({str(folder)!r}) / 'killed'\nif not mark.exists():\n"
+    kill += "    mark.touch()\n    os.kill(os.getppid(), 9)"
+    write_notebook(folder / "notebooks", "00_first", PARAMETERS, write.format("first.txt", "first"))
+    write_notebook(folder / "notebooks", "01_second", PARAMETERS, kill, write.format("second.txt", "second"))
+    return ["figures", *SMOKE]
+
+
+PHASES = {phase.__name__: phase for phase in (data, dataset, train, train_text, measure_walking, run_campaign)}
+
+# ------------------------------------------------------------------------------------ what goes wrong
+
+
+def count(folder: Path, at: int, then: Callable[[], None]) -> None:
+    """Do something before the file with this number is put in its place, its content written."""
+    replace, put = os.replace, []
+
+    def counted(source, target):
+        put.extend([target] * Path(target).is_relative_to(folder))
+        if len(put) == at:
+            then()
+        replace(source, target)
+
+    os.replace = counted
+
+
+def kill(folder: Path, at: int) -> None:
+    count(folder, at, lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def stop(folder: Path, at: int) -> None:
+    """Until somebody lets it go on."""
+    count(folder, at, lambda: os.kill(os.getpid(), signal.SIGSTOP))
+
+
+def full_disk(folder: Path, at: int) -> None:
+    """No file can have more bytes."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (at, at))
+
+
+def read_only(folder: Path, at: int) -> None:
+    """The folder takes nothing, from the superuser either."""
+    folder.chmod(0o555)
+    libc, header = ctypes.CDLL(None, use_errno=True), (ctypes.c_uint32 * 2)(0x20080522, 0)
+    rights = (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, rights) == 0
+    rights[0] &= ~0b110  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+    assert libc.capset(header, rights) == 0
+
+
+def command(phase: str, folder: Path, fault: str | None, at: int, answer) -> None:
+    """Run a command that goes wrong; send its exit status and what it told the user."""
+    sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
+    tqdm.tqdm.status_printer = staticmethod(lambda file: lambda bar: None)
+    os.environ |= {"F3AMD_RESULTS_DIR": str(folder / "results"), "F3AMD_CACHE_DIR": str(folder / "cache")}
+    try:
+        words = {"figures": figures, **PHASES}[phase](folder)
+        if fault:
+            globals()[fault](folder, at)
+        answer.send((command_line.main(words), sys.stderr.getvalue().strip()))
+    except BaseException:  # what no command may end with
+        answer.send((1, traceback.format_exc()))
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """Start a command; for all of them modules are imported once, and programs compiled once."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+
+    def start(phase: str, folder: Path, fault: str | None = None, at: int = 0):
+        folder.mkdir(exist_ok=True)
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=command, args=(phase, folder, fault, at, theirs))
+        process.start()
+        theirs.close()
+        return process, ours
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(
+            "PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(Path(command_line.__file__).parents[1])])
+        )
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("programs")))
+        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        yield start
+
+
+def ended(started) -> tuple[int | None, str]:
+    """Exit status and message of a command; None of one that was killed."""
+    process, answer = started
+    try:
+        status = answer.recv()
+    except EOFError:
+        status = None, ""
+    process.join()
+    assert process.exitcode == (-signal.SIGKILL if status[0] is None else 0)
+    return status
+
+
+def left(folder: Path) -> dict[str, object]:
+    """What lies in a folder, but for dates, commits, and what is unfinished or set aside."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if not path.is_file() or ".part" in name or path.suffix == ".lock" or ".old" in name:
+            continue
+        if path.suffix == ".json":
+            circumstances = ("date_utc", "git_commit", "git_dirty")
+            found[name] = {
+                key: value for key, value in json.loads(path.read_text()).items() if key not in circumstances
+            }
+        elif path.suffix == ".safetensors":
+            found[name] = {key: array.tobytes() for key, array in load_file(path).items()}
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(start, tmp_path_factory):
+    """What a phase leaves that nothing disturbs."""
+    known = {}
+
+    def whole(phase: str) -> dict:
+        if phase not in known:
+            folder = tmp_path_factory.mktemp("whole")
+            assert ended(start(phase, folder)) == (0, "")
+            known[phase] = left(folder)
+            assert known[phase]
+        return known[phase]
+
+    return whole
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_killed_at_each_file_it_ends_as_if_it_had_not_been(phase, start, whole, tmp_path):
+    """Killed before its first file, then before its second, and so on, until no file is left to be killed at."""
+    expected, kills = whole(phase), 0
+    while (told := ended(start(phase, tmp_path / "run", "kill", kills + 1)))[0] is None:
+        kills += 1
+        assert kills < 20
+    assert told == (0, "") and kills > 0
+    assert left(tmp_path / "run") == expected
+
+
+def test_notebooks_that_another_process_runs_are_refused(start, tmp_path):
+    with locked(tmp_path / "runs/synthetic/smoke/notebooks/.01_second.lock", "running 01_second.ipynb"):
+        status, told = ended(start("figures", tmp_path))
+    assert status == 2 and "another process is running 01_second.ipynb there" in told and "\n" not in told
+    assert not list(tmp_path.rglob("*.txt"))  # before the first of them ran
+
+
+def test_notebooks_killed_while_one_runs_run_again(start, tmp_path):
+    assert ended(start("figures", tmp_path))[0] is None
+    results = tmp_path / "results/synthetic/smoke/tables"
+    assert [path.name for path in results.iterdir()] == ["first.txt"]
+    assert ended(start("figures", tmp_path)) == (0, "")
+    assert {path.name for path in results.iterdir()} >= {"first.txt", "second.txt", "run_summary.csv"}
+
+
+@pytest.mark.parametrize("fault", ["full_disk", "read_only"])
+@pytest.mark.parametrize("phase", PHASES)
+def test_without_room_or_right_it_says_so_in_one_line_and_the_next_call_works(phase, fault, start, whole, tmp_path):
+    folder = tmp_path / "run"
+    status, told = ended(start(phase, folder, fault, 100))
+    folder.chmod(0o755)
+    assert status == 2 and len(told.strip().splitlines()) == 1, told
+    assert told.startswith(f"f3amd {phase.split('_')[-1 if phase == 'run_campaign' else 0]}: ") and str(folder) in told
+    assert ended(start(phase, folder)) == (0, "")
+    assert left(folder) == whole(phase)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_two_at_once_leave_what_one_leaves(phase, start, whole, tmp_path):
+    """The second is refused while the first works, or does the same beside it."""
+    folder = tmp_path / "run"
+    first = start(phase, folder, "stop", 2 if phase == "train_text" else 1)  # its first is the captions' cache
+    status = Path(f"/proc/{first[0].pid}/stat")
+    while status.read_text().rsplit(")")[-1].split()[0] != "T":
+        time.sleep(0.05)
+        assert first[0].is_alive()
+    second = ended(start(phase, folder))
+    os.kill(first[0].pid, signal.SIGCONT)
+    one = ended(first)
+    if phase in ("data", "dataset"):  # no lock: each writes a file or folder of its own, whole
+        assert second == (0, "")
+        assert one[0] == (0 if phase == "data" else 2) and len(one[1].splitlines()) == one[0] // 2
+    else:
+        assert one == (0, "")
+        assert second[0] == 2 and "another process" in second[1] and len(second[1].splitlines()) == 1
+    assert left(folder) == whole(phase)
+
+
+def test_a_lost_byte_is_noticed(whole, start, tmp_path):
+    """So that equal folders say something."""
+    assert ended(start("dataset", tmp_path)) == (0, "")
+    assert left(tmp_path) == whole("dataset")
+    vectors = tmp_path / "set/Mean.npy"
+    np.save(vectors, np.load(vectors) + 1e-6)
+    assert left(tmp_path) != whole("dataset")
