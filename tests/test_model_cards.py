@@ -1,13 +1,22 @@
 """Cards of shipped models say what the weights file and the committed results say."""
 
+import dataclasses
 import hashlib
+import json
 import re
+import shlex
 
 import pandas as pd
 import pytest
+from builders import captioned_walks
 
+from f3amd_lib.__main__ import main
+from f3amd_lib.data import text_encoders
 from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.motion import synthetic
+from f3amd_lib.networks import presets
 from f3amd_lib.reports import model_cards
+from f3amd_lib.training import text_models
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -24,6 +33,32 @@ def test_every_shipped_model_of_text_has_its_card(path):
     recipe = record["identity"]["training"]  # of the last leg, where there were several
     assert f"({record.get('motions_seen', recipe['num_steps'] * recipe['batch_size']):,} motions" in card
     assert record.get("schedule_note", "") in card
+
+
+class Asked(Exception):
+    """Raised where a training would begin."""
+
+
+def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(monkeypatch):
+    def begin(data, split, encoder, preset, config, codec, window=None):
+        raise Asked(preset, config, window)
+
+    monkeypatch.setattr(text_models, "denoiser_task", begin)
+    walks = captioned_walks(synthetic.STYLES[:1], ("train",), num_frames=40)
+    monkeypatch.setattr(text_models, "open_text_motions", lambda *asked: walks)
+    monkeypatch.setattr(text_encoders, "load_text_encoder", lambda: None)
+    path = PRETRAINED_DIR / "bandai" / "text" / "ACMDM-S-PS22-raw-n3.safetensors"
+    command = re.search(r"^f3amd (train .*)$", path.with_suffix(".md").read_text(encoding="utf-8"), re.MULTILINE)[1]
+    with pytest.raises(Asked) as asked:
+        main(shlex.split(command))
+    name, config, window = asked.value.args
+    record = describe(path)["record"]
+    told, network = record["identity"]["training"], record["identity"]["model"]["denoiser"]
+    assert config.num_steps * config.batch_size == record["motions_seen"]
+    # The record is of the last of two goes.
+    assert json.loads(json.dumps(dataclasses.asdict(config))) == told | {"num_steps": config.num_steps}
+    sizes = {"num_joints": network["num_joints"], "text_width": network["text_width"], "window": window}
+    assert presets.build_config(name, **sizes).to_dict() == network
 
 
 @pytest.mark.parametrize("path", WALKERS, ids=lambda path: path.stem)

@@ -73,7 +73,7 @@ def test_every_table_has_the_columns_that_the_ledger_reads(tables):
         assert set(keys) <= set(table) and not table.duplicated(keys).any()
         assert {"trained", "windows", "weights"} <= set(table)
         # 3 steps of the recipe's batch.
-        assert set(table["windows"]) == {3 * 64}
+        assert set(table["windows"]) == {3 * 32}
         assert np.isfinite(table["value"]).all()
 
 

@@ -141,6 +141,10 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
             counts = own.fillna({"wording": "clips"}).groupby(["model", "wording"], sort=False)[columns].sum()
             counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
             measured = f"Which hand goes up where the caption says left or right:\n\n{markdown_table(counts)}"
+    command = (
+        f"f3amd train --preset {trained.name} --data {record['dataset']} --window {trained.most_frames} "
+        f"--steps {steps} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
+    )
     template = Path(__file__).with_name("text_model_card.template").read_text(encoding="utf-8")
     return template.format(
         trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
@@ -155,6 +159,7 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
         loss=history["held_out_loss"].dropna().iloc[-1], measured=measured, words=len(trained.words),
+        command=command,
     )  # fmt: skip
 
 
