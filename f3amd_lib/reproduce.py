@@ -268,8 +268,8 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
             parameters=dict(parameters),
             kernel_name=KERNEL,
             cwd=str(path.parent),  # as in JupyterLab and nbval
-            # A kernel warns of its own connection to this process, and reports as an error the interrupt that it gets before
-            # its shutdown, if that finds it busy with papermill's last question. No reader can act on either.
+            # A kernel warns of its own connection to this process, and reports the interrupt that comes before its
+            # shutdown as an error, if that finds it busy with papermill's last question. No reader can act on either.
             extra_arguments=["--log-level=CRITICAL"],
             progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
         )

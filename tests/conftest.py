@@ -11,9 +11,9 @@ from pathlib import Path
 os.environ["JAX_PLATFORMS"] = "cpu"
 # Tests compile much and run little.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-# Fusions by way of MLIR take XLA a third of what it needs for such programs.
+# Fusions by way of MLIR are a third of the time that XLA needs for such programs.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
-# What one test, worker or run compiled, the next ones read: networks of the tests are few, and compiled again and again.
+# What one test, worker or run compiled, the next ones read: few networks are compiled again and again.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["MPLBACKEND"] = "Agg"

@@ -1,5 +1,7 @@
 """The motion autoencoder: sizes, causality, joints apart, padding."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,7 @@ from f3amd_lib.networks.motion_autoencoder import (
 POSITIONS = jax.random.normal(jax.random.key(0), (2, 32, 3, 3))
 
 
+@functools.cache
 def tiny(**settings):
     return MotionAutoencoder(AutoencoderConfig(width=8, dilations=(3, 1), **settings), rngs=nnx.Rngs(0))
 
@@ -31,6 +34,11 @@ def there_and_back(model, positions, mask=None):
 @nnx.jit
 def latent(model, positions, mask=None):
     return model.latent_of(positions, mask)
+
+
+@nnx.jit
+def encode(model, positions):
+    return model.encode(positions)
 
 
 def test_sizes_are_those_of_the_released_file():
@@ -56,7 +64,7 @@ def test_a_matrix_product_of_taps_is_the_convolution(size, stride, dilation, cau
 @pytest.mark.parametrize("variational", [True, False])
 def test_each_form_has_the_shapes_of_its_latent(causal, variational):
     model = tiny(causal=causal, variational=variational)
-    encoded = model.encode(POSITIONS)
+    encoded = encode(model, POSITIONS)
     assert encoded.shape == (2, 8, 3, 8 if variational else 4)
     assert latent(model, POSITIONS).shape == (2, 8, 3, 4)
     assert there_and_back(model, POSITIONS).shape == POSITIONS.shape
