@@ -55,6 +55,7 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
       ImportError: if jax2onnx is not installed, saying how to install it.
       ValueError: for another family, less than one character, or unknown `weights`.
     """
+
     def denoise(network, x_noisy, sigma, history, path, style):
         return network(x_noisy, sigma, network.encode(Condition(history, path, style)))
 

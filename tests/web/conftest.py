@@ -87,8 +87,9 @@ class Browser:
         """Open a file or an address, and forget what an earlier page asked for."""
         self._listen()
         self._asked, self._errors = [], []
-        self._page = page.resolve().as_uri() if isinstance(page, Path) else str(page)
-        self.driver.get(self._page)
+        address = page.resolve().as_uri() if isinstance(page, Path) else str(page)
+        self._page = address.partition("#")[0]  # as it is asked for
+        self.driver.get(address)
         return self
 
     def _listen(self) -> None:

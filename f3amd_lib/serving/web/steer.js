@@ -448,7 +448,7 @@ export async function start(data, files, workerUrl) {
   return {
     state: () => ({
       clock, newest, rounds, waits, hop: options.hop, ms: times.length ? median(times) : null, timed: times.length, rate: rate(),
-      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs, sharpness: picture.sharpness,
+      count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs, sharpness: picture.sharpness, pictures: drawn.length,
     }),
     record: () => record,
     forget: () => { record = []; waits = 0; },
