@@ -5,8 +5,6 @@ import shlex
 
 import pandas as pd
 import pytest
-from safetensors.numpy import save_file
-from test_published import released
 
 from f3amd_lib.__main__ import main
 from f3amd_lib.benchmarking import measurements, synthesis
@@ -19,7 +17,6 @@ from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import write_table
 from f3amd_lib.measures.corruptions import CORRUPTIONS
-from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.networks import presets
 from f3amd_lib.reports import claims
 from f3amd_lib.reports.evidence import NINE_METRICS, PUBLISHED_CAMDM, recorded_evidence
@@ -238,21 +235,6 @@ def test_a_command_runs_at_smoke_size(words, table, tmp_path_factory, monkeypatc
     assert main([*words, "--profile", "smoke"]) == 0
     rows = pd.read_csv(folder / "synthetic" / "smoke" / "records" / f"{table}.csv")
     assert len(rows) and rows.drop_duplicates().shape == rows.shape
-
-
-@pytest.mark.long
-def test_published_weights_are_measured_at_smoke_size(tmp_path, monkeypatch):
-    """Random numbers in the released shape, of the walker's joints and styles."""
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    monkeypatch.setattr(protocol, "require_telling_styles", lambda classifier: None)
-    styles = load_profile("smoke", "synthetic").num_styles
-    weights = released(SYNTHETIC_SKELETON.num_joints, styles, width=16, depth=1, hidden=32)
-    save_file(weights, tmp_path / "camdm.safetensors")
-    words = ["measure", "quality", "--window", "45", "--published", str(tmp_path / "camdm.safetensors")]
-    assert main([*words, "--profile", "smoke"]) == 0
-    rows = pd.read_csv(tmp_path / "synthetic" / "smoke" / "records" / "quality.csv")
-    made = rows[rows["model"] == PUBLISHED_CAMDM]
-    assert set(made["steps"]) == {4, 2, 1} and set(made["window_frames"]) == {45}
 
 
 def test_another_claims_command_leaves_gaps(tmp_path):
