@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import shlex
+import shutil
 
 import pandas as pd
 import pytest
@@ -132,3 +133,27 @@ def test_figures_of_other_weights_are_not_shown():
     weights = weights_digest(load_model(path).params)
     card = model_cards.model_card(path, quality(weights, FID=12.345))
     assert re.search(r"\| FID +\| +12\.35 +\| +10\.00? +\|", card) or "12.35" in card
+
+
+def test_all_cards_and_the_page_are_written_anew(tmp_path, monkeypatch):
+    pages, weights = tmp_path / "docs", tmp_path / "pretrained" / "synthetic"
+    shutil.copytree(PRETRAINED_DIR / "synthetic", weights)
+    pages.mkdir()
+    shutil.copy(repository_root() / "docs/results.md", pages)
+    expected = {path.name: path.read_text(encoding="utf-8") for path in weights.rglob("*.md")}
+    for path in weights.rglob("*.md"):
+        path.unlink()
+    page = (pages / "results.md").read_text(encoding="utf-8")
+    head, tail = page.split("<!-- measured: begin -->")[0], page.split("<!-- measured: end -->")[1]
+    (pages / "results.md").write_text(f"{head}<!-- measured: begin -->\nold\n<!-- measured: end -->{tail}")
+    write, quality = model_cards.write_cards, model_cards.committed_quality("bandai")
+    monkeypatch.setattr(model_cards, "write_cards", lambda: write(weights.parent))
+    monkeypatch.setattr(model_cards, "committed_quality", lambda name: quality)
+    monkeypatch.setattr(model_cards, "card_of", lambda path: expected[path.with_suffix(".md").name])
+    monkeypatch.setattr(model_cards, "repository_root", lambda: tmp_path)
+    assert model_cards.main() == 0
+    assert {path.name: path.read_text(encoding="utf-8") for path in weights.rglob("*.md")} == expected
+    assert (pages / "results.md").read_text(encoding="utf-8") == page
+    sums = (weights.parent / "checksums.txt").read_text().splitlines()
+    digests = {hashlib.sha256(path.read_bytes()).hexdigest() for path in weights.rglob("*.safetensors")}
+    assert digests and digests <= {line.split()[0] for line in sums}

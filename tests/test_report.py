@@ -285,6 +285,16 @@ def test_numbers_show_four_digits(value, text):
     assert f" {text} |" in tables.markdown_table(pd.DataFrame({"a": [value]}))
 
 
+def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "repository_root", lambda: tmp_path)
+    assert "No stored `02_any` of `laptop` on `synthetic` yet" in tables.stored_result("synthetic", "02_any")
+    told, path = record(), tmp_path / "paper_figures/synthetic/laptop/tables/02_any.csv"
+    records.write_table(path, pd.DataFrame({"model": ["a"], "value": [1.23456]}), told)
+    shown = tables.stored_result("synthetic", "02_any")
+    assert f"data {told['dataset']}, {told['cores']} cores" in shown and told["date_utc"][:10] in shown
+    assert "| a     |  1.23 |" in shown
+
+
 # ------------------------------------------------------------------------------------- figures
 
 
@@ -311,6 +321,14 @@ def test_model_styles_follow_the_family():
     sizes = [style(f"F3AMD-FNO-{width}") for width in (32, 48, 64, 96, 128)]
     assert len({s.color for s in sizes}) == len({s.marker for s in sizes}) == 5
     assert style("CAMDM-code").color == style("CAMDM").color != style("F3AMD-FNO-96").color
+
+
+def test_one_step_is_drawn_otherwise_than_eight_and_curves_in_an_order_grow_lighter():
+    eight, one = (figures.system_line(f"F3AMD-FNO-96, {steps}") for steps in ("8 steps", "1 step"))
+    assert eight == figures.model_style("F3AMD-FNO-96").line
+    assert (one["linestyle"], one["markerfacecolor"], one["color"]) == (":", "white", eight["color"])
+    lights = [luminance(color[:3]) for color in figures.shades(5)]
+    assert len(set(lights)) == 5 and lights == sorted(lights)
 
 
 def test_style_is_used_and_given_back():

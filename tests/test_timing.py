@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from builders import refused
 
+from f3amd_lib.benchmarking import machine
 from f3amd_lib.benchmarking.machine import describe_machine, fast_xla_flags, matmul_precision, matmul_probe
 from f3amd_lib.benchmarking.timing import take_turns
 
@@ -86,6 +88,18 @@ def test_machine_is_described_for_a_record():
     assert json.loads(json.dumps(machine)) == machine
     assert machine["cores"] >= 1 and machine["memory_gib"] > 0
     assert machine["processor"]
+
+
+def test_what_the_system_does_not_tell_is_left_out_and_what_a_tool_tells_is_kept(tmp_path, monkeypatch):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 'A card, 100 MHz, 200 MHz'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert machine._graphics_clocks() == "A card, 100 MHz, 200 MHz"
+    tool.write_text("#!/bin/sh\nexit 9\n")  # a driver that does not answer
+    assert machine._graphics_clocks() is None
+    monkeypatch.setattr(machine, "Path", lambda name: tmp_path / "none")
+    assert machine._processor() == (platform.processor() or platform.machine())
 
 
 def test_matmul_probe_counts_its_operations_and_multiplies():
