@@ -128,6 +128,17 @@ def test_an_autoencoder_rehearses_and_hears_of_joints():
     assert row["loss"] == pytest.approx(row["features"] + row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.5])
+def test_joints_count_in_the_loss_as_much_as_is_said(weight):
+    config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=23, num_positions=40)
+    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    task = LatentAutoencoderTask(config, recipe(joints_weight=weight), None, statistics)
+    clips = normal(4, 2, 8, 23), jnp.ones((2, 8), bool)
+    terms = task.held_out_terms(task.init(jax.random.key(0))[0], None, clips, None)
+    assert terms["joints"] > 0.01
+    assert terms["loss"] == pytest.approx(terms["features"] + weight * terms["joints"] + 1e-4 * terms["divergence"])
+
+
 # ------------------------------------------------------------------------------------------------------------- teacher
 
 
