@@ -128,6 +128,42 @@ def test_an_autoencoder_rehearses_and_hears_of_joints():
     assert row["loss"] == pytest.approx(row["features"] + row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
 
 
+@pytest.mark.long
+def test_with_spans_a_short_training_keeps_movement():
+    # Clips stand somewhere and swing about it; by attention alone the same steps find out where they stand.
+    frames, count, width = 32, 64, 23
+    swing = jnp.sin(jnp.linspace(0.0, 4.0 * jnp.pi, frames) + 6.0 * normal(1, count, 1))
+    clips = normal(2, count, 1, width) + swing[..., None] * normal(3, count, 1, width)
+    table = ClipTable(
+        clips.reshape(-1, width), jnp.arange(count) * frames, jnp.full(count, frames), jnp.arange(count),
+        jnp.ones(count, jnp.int32),
+    )  # fmt: skip
+    kept = {}
+    for path in ("attention", "spans"):
+        config = LatentAutoencoderConfig(
+            **SMALL | {"latent_width": 32}, window=8, channels=16, features=width, num_positions=64, path=path,
+            position_start="waves",
+        )  # fmt: skip
+        settings = recipe(num_frames=frames, learning_rate=3e-3, num_steps=200, batch_size=16, joints_weight=0.0)
+        task = LatentAutoencoderTask(config, settings, table, FrameStatistics(jnp.zeros(width), jnp.ones(width)))
+        state, _ = optimise(task, chunk=200, progress=False)
+        model, mask = network_with(config, state.params), jnp.ones((count, frames), bool)
+        made = model.decode(model.encode(clips, mask)[0], mask)
+        kept[path] = float(made.var(axis=1).sum() / clips.var(axis=1).sum())
+    assert kept["spans"] > 0.3 > 0.05 > kept["attention"]
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5])
+def test_joints_count_in_the_loss_as_much_as_is_said(weight):
+    config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=23, num_positions=40)
+    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    task = LatentAutoencoderTask(config, recipe(joints_weight=weight), None, statistics)
+    clips = normal(4, 2, 8, 23), jnp.ones((2, 8), bool)
+    terms = task.held_out_terms(task.init(jax.random.key(0))[0], None, clips, None)
+    assert terms["joints"] > 0.01
+    assert terms["loss"] == pytest.approx(terms["features"] + weight * terms["joints"] + 1e-4 * terms["divergence"])
+
+
 # ------------------------------------------------------------------------------------------------------------- teacher
 
 

@@ -19,6 +19,7 @@ from f3amd_lib.networks.motionpcm import (
     LatentDenoiserConfig,
     SkipTransformer,
     SkipTransformerConfig,
+    span_shares,
     student_of,
     waves,
 )
@@ -26,7 +27,11 @@ from f3amd_lib.networks.motionpcm import (
 SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32}
 RNGS = nnx.Rngs(0)
 TEACHER = Compiled(LatentDenoiser(LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=RNGS))
-CODER = Compiled(LatentAutoencoder(LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), rngs=RNGS))
+CODER = LatentAutoencoderConfig(**SMALL, features=7, num_positions=40)
+CODERS = {
+    path: Compiled(LatentAutoencoder(dataclasses.replace(CODER, path=path), rngs=RNGS))
+    for path in ("attention", "spans")
+}
 
 
 def normal(seed, *shape):
@@ -73,22 +78,45 @@ def test_presets_name_every_row_of_the_paper_and_survive_json():
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
-def test_a_latent_has_one_size_and_padding_changes_nothing():
+@pytest.mark.parametrize("coder", CODERS.values(), ids=CODERS)
+def test_a_latent_has_one_size_and_padding_changes_nothing(coder):
     clip, mask = normal(0, 2, 12, 7), jnp.arange(12) < jnp.asarray([[12], [8]])
-    mean, log_variance = CODER.encode(clip, mask)
+    mean, log_variance = coder.encode(clip, mask)
     assert mean.shape == log_variance.shape == (2, 4, 3)
     spoilt = jnp.where(mask[..., None], clip, 1e3)
-    np.testing.assert_allclose(CODER.encode(spoilt, mask)[0], mean, atol=1e-5)
-    np.testing.assert_allclose(CODER.encode(clip[1:, :8], mask[1:, :8])[0], mean[1:], atol=1e-5)
-    assert np.abs(CODER.encode(clip.at[1, 7].add(1.0), mask)[0] - mean)[1].max() > 1e-4
-    made = CODER.decode(mean, mask)
+    np.testing.assert_allclose(coder.encode(spoilt, mask)[0], mean, atol=1e-5)
+    np.testing.assert_allclose(coder.encode(clip[1:, :8], mask[1:, :8])[0], mean[1:], atol=1e-5)
+    assert np.abs(coder.encode(clip.at[1, 7].add(1.0), mask)[0] - mean)[1].max() > 1e-4
+    made = coder.decode(mean, mask)
     assert made.shape == clip.shape and not made[1, 8:].any() and made[1, :8].all()
-    np.testing.assert_allclose(CODER.decode(mean[1:], mask[1:, :8]), made[1:, :8], atol=1e-5)
+    np.testing.assert_allclose(coder.decode(mean[1:], mask[1:, :8]), made[1:, :8], atol=1e-5)
     # Every frame hears the latent, and is a frame of its own.
-    assert np.abs(CODER.decode(mean + 1.0, mask) - made)[0].max(axis=-1).min() > 1e-3
+    assert np.abs(coder.decode(mean + 1.0, mask) - made)[0].max(axis=-1).min() > 1e-3
     assert np.abs(np.diff(made[0], axis=0)).max(axis=-1).min() > 1e-3
     with pytest.raises(ValueError, match="at most 32, 7"):
-        CODER.encode(normal(0, 1, 33, 7), jnp.ones((1, 33), bool))
+        coder.encode(normal(0, 1, 33, 7), jnp.ones((1, 33), bool))
+
+
+def test_a_frame_belongs_to_the_spans_about_it():
+    shares = np.asarray(span_shares(jnp.arange(6) < jnp.asarray([[6], [4]]), 2))
+    # Middles of the spans are at frames 1 and 4 of six, at 0.5 and 2.5 of four.
+    np.testing.assert_allclose(shares[0, :, 1], [0, 0, 1 / 3, 2 / 3, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(shares[1, :, 1], [0, 0.25, 0.75, 1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(shares.sum(axis=-1), [[1] * 6, [1] * 4 + [0] * 2], atol=1e-6)
+
+
+def test_with_spans_each_token_begins_with_its_own_frames():
+    clip, mask, began = normal(0, 1, 12, 7), jnp.ones((1, 12), bool), {}
+    for path, coder in CODERS.items():
+        mean, log_variance = coder.encode(clip, mask)
+        heard = np.abs(coder.encode(clip.at[0, 0].add(1.0), mask)[0] - mean)[0].max(axis=-1)
+        made = coder.decode(mean, mask)
+        moved = np.abs(coder.decode(mean.at[0, 0].add(1.0), mask) - made)[0].max(axis=-1)
+        began[path] = heard, moved, np.exp(0.5 * log_variance).mean()
+    heard, moved, noise = began["spans"]
+    assert heard[0] > 1e-2 and not heard[1:].any() and (moved[:4] > 1e-2).all() and not moved[5:].any() and noise < 0.2
+    heard, moved, noise = began["attention"]  # all tokens and all frames hear of everything
+    assert (heard[1:] > 1e-3).all() and (moved[5:] > 1e-3).all() and noise > 0.5
 
 
 def test_the_second_half_is_handed_the_first_in_reverse():

@@ -109,11 +109,44 @@ class LatentAutoencoderConfig(SkipTransformerConfig):
 
     Attributes:
       features: numbers of a frame of motion: 263 of HumanML3D, 251 of KIT-ML, 12 J - 1.
+      path: how movement gets to a token: "attention" alone (MotionLCM V2), or "spans" (ours): a token begins with the
+        mean of its span of the clip's frames, and a frame with its span's token. Blocks then begin as the identity,
+        and latents with little noise, so that a short training meets movement in its first steps.
     """
 
     family: ClassVar[str] = "latent autoencoder"
+    choices: ClassVar[dict[str, tuple[str, ...]]] = SkipTransformerConfig.choices | {"path": ("attention", "spans")}
 
     features: int = 263
+    path: str = "attention"
+
+
+SPAN_LOG_VARIANCE = -5.0
+"""What a fresh autoencoder of path "spans" adds to its latents' log variance (ours)."""
+
+
+def span_shares(mask, window: int):
+    """Return how much of each frame belongs to each of `window` even spans of its clip, [B, L, window].
+
+    A frame between the middles of two spans belongs to both; a frame's shares sum to 1, to 0 in padding.
+
+    Args:
+      mask: frames that are motion, [B, L].
+      window: spans.
+    """
+    length = jnp.sum(mask, axis=1, keepdims=True)
+    place = jnp.clip((jnp.arange(mask.shape[1]) + 0.5) * window / length - 0.5, 0, window - 1)
+    return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(window))) * mask[..., None]
+
+
+def _begin_as_identity(body: SkipTransformer) -> None:
+    """Let each part of each block add nothing yet, and joins pass on what comes from the block before."""
+    for block in body.blocks:
+        parts = [block, block.attention] + ([block.crossing] if hasattr(block, "crossing") else [])
+        for part in parts:
+            part.output.kernel[...] = jnp.zeros_like(part.output.kernel[...])
+    for join in body.joins:
+        join.kernel[...] = jnp.eye(*join.kernel.shape)
 
 
 class LatentAutoencoder(nnx.Module):
@@ -130,6 +163,9 @@ class LatentAutoencoder(nnx.Module):
         self.decoder_positions = position_table(config, rngs)
         self.decoder = SkipTransformer(config, crossing=True, rngs=rngs)
         self.output = nnx.Linear(width, config.features, rngs=rngs)
+        if config.path == "spans":
+            for body in (self.encoder, self.decoder):
+                _begin_as_identity(body)
 
     def encode(self, features, mask, key=None):
         """Return (mean, log variance) of the latent, [B, window, channels] each.
@@ -147,17 +183,28 @@ class LatentAutoencoder(nnx.Module):
             wanted = f"[B, at most {config.num_positions - 2 * config.window}, {config.features}]"
             raise ValueError(f"features must be {wanted}, got {features.shape}")
         tokens = jnp.broadcast_to(self.tokens[...], (len(features), *self.tokens.shape))
-        z = jnp.concatenate([tokens, self.frames(features)], axis=1)
+        frames = self.frames(features)
+        if config.path == "spans":
+            share = span_shares(mask, config.window)
+            share = share / jnp.maximum(jnp.sum(share, axis=1, keepdims=True), 1e-6)
+            # What stands in the padding may be infinite, and 0 times that is no number.
+            mean = jnp.einsum("blw,bld->bwd", share, jnp.where(mask[..., None], frames, 0.0))
+            tokens = tokens + jnp.tile(mean, (1, 2, 1))
+        z = jnp.concatenate([tokens, frames], axis=1)
         seen = jnp.concatenate([jnp.ones(tokens.shape[:2], bool), mask], axis=1)
         z = self.encoder(z + self.encoder_positions[...][: z.shape[1]], seen, key=key)
-        return jnp.split(self.to_latent(z[:, : 2 * config.window]), 2, axis=1)
+        mean, log_variance = jnp.split(self.to_latent(z[:, : 2 * config.window]), 2, axis=1)
+        return mean, log_variance + (SPAN_LOG_VARIANCE if config.path == "spans" else 0.0)
 
     def decode(self, latent, mask, key=None):
         """Return features [B, L, features], zero in padding, of a latent [B, window, channels]; arguments as above."""
         queries = jnp.broadcast_to(
             self.decoder_positions[...][: mask.shape[1]], (*mask.shape, self.config.latent_width)
         )
-        z = self.decoder(queries, mask, self.from_latent(latent), key)
+        memory = self.from_latent(latent)
+        if self.config.path == "spans":
+            queries = queries + span_shares(mask, self.config.window) @ memory
+        z = self.decoder(queries, mask, memory, key)
         return self.output(z) * mask[..., None]
 
 

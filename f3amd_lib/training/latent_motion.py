@@ -59,6 +59,8 @@ class LatentMotionTraining:
       ema_decay: moving average of the weights, None for none; of a student it is mu, and the average is the target.
       text_dropout: share of samples whose caption is replaced by the empty one (teacher).
       kl_weight: of the autoencoder's divergence.
+      joints_weight: of the autoencoder's error of joints in the world, into which each frame's turn and step go for all
+        frames after it: in small batches its gradient drowns that of the features.
       consistency: "phased", or "latent": MotionLCM's, all the way to the data.
       skip: levels that a step of the teacher's solver passes, k.
       num_phases: M.
@@ -82,6 +84,7 @@ class LatentMotionTraining:
     ema_decay: float | None = None
     text_dropout: float = 0.1
     kl_weight: float = 1e-4
+    joints_weight: float = 1.0
     consistency: str = "phased"
     skip: int = 100
     num_phases: int = 1
@@ -102,8 +105,9 @@ class LatentMotionTraining:
                 "consistency 'latent' has no phases and no discriminator: num_phases 1, adversarial_weight 0"
             )
         whole = ("num_steps", "batch_size", "skip", "num_phases", "num_frames")
+        free = ("warmup_steps", "kl_weight", "joints_weight", "adversarial_weight")
         positive = ("learning_rate", "gradient_clip", "huber_width", "discriminator_rate")
-        for names, low in ((whole, 1), (positive, 1e-12), (("warmup_steps", "kl_weight", "adversarial_weight"), 0)):
+        for names, low in ((whole, 1), (positive, 1e-12), (free, 0)):
             for name in names:
                 if not low <= getattr(self, name) < float("inf"):
                     raise ValueError(f"{name} must be at least {low:g} and finite, got {getattr(self, name)!r}")
@@ -239,7 +243,7 @@ class LatentAutoencoderTask:
         return (batch.motion, batch.mask), key_loss
 
     def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)): smooth L1 of features and of joints, and 1e-4 of the divergence."""
+        """Return (loss, (terms, statistics)): smooth L1 of features and of joints, and the divergence."""
         terms = self._terms(params, batch, jax.random.split(key, 3))
         return terms["loss"], (terms, statistics)
 
@@ -249,7 +253,8 @@ class LatentAutoencoderTask:
 
     def _terms(self, params, batch, keys) -> dict:
         terms = reconstruction_terms(network_with(self.model_config, params), self.statistics, *batch, keys)
-        loss = terms["features"] + terms["joints"] + self.config.kl_weight * terms["divergence"]
+        config = self.config
+        loss = terms["features"] + config.joints_weight * terms["joints"] + config.kl_weight * terms["divergence"]
         return {"loss": loss, **terms}
 
 
