@@ -36,14 +36,7 @@ from f3amd_lib.training.text_models import TextModel, save_text_model
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
 ABOUT = {"skeleton": SYNTHETIC_SKELETON, "fps": 20.0, "text_encoder": "tiny-8"}
 RECORD = {"dataset": "tiny", "dataset_licence": "CC BY 4.0", "dataset_credit": "nobody"}
-SIZES = {
-    "window": 4,
-    "channels": 3,
-    "latent_width": 16,
-    "depth": 3,
-    "num_heads": 2,
-    "hidden_width": 16,
-}
+SIZES = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}
 
 
 def weights_of(network):
