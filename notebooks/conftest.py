@@ -13,7 +13,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 QUICKLY = f"{XLA_FLAGS} --xla_cpu_use_fusion_emitters=false".strip()  # see tests/conftest.py
 
-LONG_TRAININGS = ("10_printed_update", "11_one_step")
+LONG_TRAININGS = ("10_printed_update", "10_rounds", "11_one_step")
 """Notebooks that run longer than they compile."""
 
 
