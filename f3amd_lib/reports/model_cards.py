@@ -61,6 +61,19 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     return limits
 
 
+def _filled(name: str, path: Path, trained, params, **fields) -> str:
+    """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
+    record, history = trained.record, read_table(path.with_name(f"{path.stem}.history.csv"))[0]
+    return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
+        trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
+        count=sum(leaf.size for leaf in jax.tree.leaves(params)),
+        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record), date=record["date_utc"][:10],
+        commit=(record["git_commit"] or "unknown")[:10],
+        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        loss=history["held_out_loss"].dropna().iloc[-1], **fields,
+    )  # fmt: skip
+
+
 def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     """Write the card of one weights file.
 
@@ -81,7 +94,6 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     windows = record.get("windows_seen", recipe["num_steps"] * recipe["batch_size"])
     steps, legs = windows // recipe["batch_size"], record.get("schedule_note")
     passes = windows / record["num_train_windows"]
-    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
     figures, limits = "Not measured by the protocol yet.", []
     if quality is not None:
         weights = weights_digest(trained.params)
@@ -97,17 +109,9 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     if passes < 20:
         limits.append("It was trained far shorter than the paper's models.")
-    template = Path(__file__).with_name("model_card.template").read_text(encoding="utf-8")
-    return template.format(
-        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
-        count=sum(leaf.size for leaf in jax.tree.leaves(trained.params)),
-        weights_type=describe(path).get("weights", "bfloat16"),
-        terms=_terms(record),
-        styles=", ".join(trained.styles), steps=steps, legs=f" ({legs})" if legs else "",
-        windows=windows, passes=passes, date=record["date_utc"][:10],
-        commit=(record["git_commit"] or "unknown")[:10],
-        state=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        loss=history["held_out_loss"].dropna().iloc[-1], measured=figures,
+    return _filled(
+        "model_card", path, trained, trained.params, recipe=recipe, styles=", ".join(trained.styles), steps=steps,
+        legs=f" ({legs})" if legs else "", windows=windows, passes=passes, measured=figures,
         limits="\n".join(f"- {limit}" for limit in limits),
     )  # fmt: skip
 
@@ -132,7 +136,6 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     motions = record.get("motions_seen", recipe["num_steps"] * recipe["batch_size"])
     steps, legs = motions // recipe["batch_size"], record.get("schedule_note")
     paper = load_paper_file("paper", "acmdm")["training"]
-    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
     measured = "Not measured yet."
     if hands is not None:
         own = hands[(hands["weights"] == weights_digest(trained.params)) | hands["model"].isin(["real clips"])]
@@ -145,20 +148,15 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
         f"f3amd train --preset {trained.name} --data {record['dataset']} --window {trained.most_frames} "
         f"--steps {steps} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
     )
-    template = Path(__file__).with_name("text_model_card.template").read_text(encoding="utf-8")
-    return template.format(
-        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
-        count=sum(leaf.size for leaf in jax.tree.leaves((trained.params, trained.codec.params))),
-        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record),
+    return _filled(
+        "text_model_card", path, trained, (trained.params, trained.codec.params), recipe=recipe,
         state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
         if trained.codec.autoencoder else "positions of joints",
         seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
         paper=paper["says"], steps=steps, legs=f" ({legs})" if legs else "",
         guidance=f"{record['guidance']:g}" if "guidance" in record else "the paper's 3",
-        passes=motions / record["num_train_clips"], date=record["date_utc"][:10],
-        commit=(record["git_commit"] or "unknown")[:10],
-        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        loss=history["held_out_loss"].dropna().iloc[-1], measured=measured, words=len(trained.words),
+        passes=motions / record["num_train_clips"],
+        measured=measured, words=len(trained.words),
         command=command,
     )  # fmt: skip
 
@@ -181,7 +179,6 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     record, recipe = trained.record, trained.training
     motions = recipe["num_steps"] * recipe["batch_size"]
     paper = load_paper_file("paper", "motionpcm")["training"]
-    history, _ = read_table(path.with_name(f"{path.stem}.history.csv"))
     shown = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance", "sampling_seconds"]
     rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
             for name, table in tables.items() if "steps" in table]  # fmt: skip
@@ -199,19 +196,14 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     if (table := tables.get("text_pcm3")) is not None:
         kept = table.set_index("metric")["value"].get("kept_movement", float("nan"))
         movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
-    template = Path(__file__).with_name("latent_model_card.template").read_text(encoding="utf-8")
     is_student = bool(trained.config.guidance_features)
-    return template.format(
-        trained=trained, record=record, recipe=recipe, file=path.name, megabytes=path.stat().st_size / 1e6,
-        count=sum(leaf.size for leaf in jax.tree.leaves((trained.params, trained.autoencoder_params))),
-        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record),
+    return _filled(
+        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params), recipe=recipe,
         what=f"student of {recipe['num_phases']} step{'s' * (recipe['num_phases'] > 1)}" if is_student
         else "teacher, sampled by DDIM",
         seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
-        paper=paper["says"], passes=motions / record["num_train_clips"], date=record["date_utc"][:10],
-        commit=(record["git_commit"] or "unknown")[:10],
-        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        loss=history["held_out_loss"].dropna().iloc[-1], measured=measured, words=len(trained.words),
+        paper=paper["says"], passes=motions / record["num_train_clips"],
+        measured=measured, words=len(trained.words),
         latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}", movement=movement,
     )  # fmt: skip
 
