@@ -104,6 +104,20 @@ def test_steps_are_seen_from_the_root():
     assert np.allclose(steps[:, 0], 0.05 * np.array([np.sin(yaw), 0.0, np.cos(yaw)]))
 
 
+def test_joint_features_are_steps_in_the_world_and_the_vectors_own_rotations_and_contacts():
+    skeleton, positions = turning_figure()
+    for shown in (positions, np.repeat(positions[:1], 9, axis=0)):
+        features, vectors = (
+            made(skeleton, shown) for made in (redundant.joint_features, redundant.redundant_from_positions)
+        )
+        parts = {name: vectors[:, part] for name, part in redundant.vector_parts(8).items()}
+        np.testing.assert_allclose(features[..., :3], np.diff(shown, axis=0))
+        np.testing.assert_allclose(features[:, 1:, 3:9].reshape(len(features), -1), parts["rotations"])
+        feet = [joint for toe in skeleton.toes for joint in (skeleton.parents[toe], toe)]
+        np.testing.assert_array_equal(features[:, feet, 9], parts["contacts"])
+        assert not features[:, 0, 3:9].any() and not np.delete(features[..., 9], feet, axis=1).any()
+
+
 def test_rotations_carry_the_rest_pose_down_each_chain():
     """Turning the rest bones by the stored rotations gives the bones back, in direction."""
     motion = MOTIONS[23]

@@ -36,6 +36,7 @@ SIZES = {"latent_width": 16, "depth": 1, "num_heads": 2, "channels": 3, "window"
 LATENT = {**SIZES, "channels": 4, "window": 8}
 TINY = {
     "tiny": Preset("tiny", "acmdm", "ACMDM", straight(), SIZES, {}, "ours"),
+    "tiny-redundant": Preset("tiny-redundant", "acmdm", "ACMDM", straight(), SIZES | {"channels": 13}, {}, "ours"),
     "tiny-AE": Preset(
         "tiny-AE", "acmdm", "motion autoencoder", straight(), {"width": 8, "dilations": (1,)}, {}, "ours"
     ),
@@ -61,7 +62,7 @@ def folder(data, tmp_path_factory):
         patch.setenv("F3AMD_CACHE_DIR", str(folder / "cache"))
         for name, preset in TINY.items():
             patch.setitem(presets.PRESETS, name, preset)
-        for name in ("tiny+control", "tiny-prefix"):
+        for name in ("tiny+control", "tiny-redundant", "tiny-prefix"):
             assert train_text_model(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
         yield folder / "models"
 
@@ -98,7 +99,7 @@ def test_a_name_trains_what_it_stands_on_and_files_are_whole(folder, data):
 
 
 def test_models_come_back_from_their_files(folder, tmp_path):
-    for name in ("tiny+control", "tiny-prefix", "tiny-AE"):
+    for name in ("tiny+control", "tiny-prefix", "tiny-redundant", "tiny-AE"):
         trained = load(folder, name)
         save_text_model(tmp_path / "exact", trained, jnp.float32)
         again = load_text_model(tmp_path / "exact")
@@ -200,10 +201,30 @@ def test_a_branch_stands_beside_a_finished_model_of_any_settings_but_of_the_same
 
 
 def test_positions_do_not_train_a_preset_of_other_channels(folder, data, monkeypatch):
-    wrong = dataclasses.replace(TINY["tiny"], name="wrong", network=SIZES | {"channels": 13})
+    wrong = dataclasses.replace(TINY["tiny"], name="wrong", network=SIZES | {"channels": 12})
     monkeypatch.setitem(presets.PRESETS, "wrong", wrong)
-    with pytest.raises(ValueError, match="wrong models 13 numbers a joint; positions have 3"):
+    with pytest.raises(ValueError, match="wrong models 12 numbers a joint; positions have 3"):
         train_text_model(data, ENCODER, PROFILE, "wrong", folder=folder, **QUIET)
+
+
+def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, data):
+    plain, trained = load(folder, "tiny"), load(folder, "tiny-redundant")
+    states = text_models.encoded_clips(trained.codec, data)
+    np.testing.assert_array_equal(states[..., :3], text_models.encoded_clips(plain.codec, data))
+    part = np.repeat([split == "train" for split in data.splits], data.lengths)
+    np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)
+    np.testing.assert_allclose(states[part, :, 3:].std(axis=(0, 1)), 1.0, atol=1e-3)
+    # A step is that to the next frame's position.
+    step = trained.codec.redundancy.restore(states[..., 3:])[..., :3]
+    np.testing.assert_allclose(step[: data.start[1] - 1], np.diff(data.clip(0), axis=0), atol=1e-5)
+    made = captioned_motion.draw_motions(
+        trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0), num_steps=2
+    )
+    assert made.shape == (2, 40, 23, 3) and np.isfinite(made).all() and not made[0, 24:].any()
+    seen = np.arange(2 * 4 * 23 * 13, dtype=np.float32).reshape(2, 4, 23, 13)
+    np.testing.assert_array_equal(trained.codec.decode(seen, np.ones((2, 4), bool)), seen[..., :3])
+    with pytest.raises(ValueError, match="redundant features cannot be made of positions alone"):
+        trained.codec.encode(seen[..., :3], np.ones((2, 4), bool))
 
 
 def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):

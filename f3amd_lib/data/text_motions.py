@@ -21,7 +21,7 @@ from f3amd_lib.data.captions import CAPTIONED, compose_captions, other_side, pla
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.motion.redundant import canonical_start, essential_features, redundant_from_positions
+from f3amd_lib.motion.redundant import canonical_start, essential_features, joint_features, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
 FPS = 20.0
@@ -172,6 +172,10 @@ class TextMotions:
     def essential_features(self) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
         return self._of_each(essential_features)
+
+    def joint_features(self) -> np.ndarray:
+        """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
+        return self._of_each(joint_features)
 
     def _of_each(self, features) -> np.ndarray:
         clips = (self.clip(number) for number in range(self.num_clips))

@@ -45,6 +45,10 @@ CONTACT_STEP = 0.002
 """A foot whose squared step is smaller is in contact, square metres a frame at 20 fps."""
 
 
+NUM_JOINT_FEATURES = 10
+"""Numbers that InterGen's representation has of each joint beside its position."""
+
+
 def vector_parts(num_joints: int) -> dict[str, slice]:
     """Return where each part of the vector lies, by its name in the table above."""
     others = num_joints - 1
@@ -143,14 +147,43 @@ def redundant_from_positions(
     """
     first, turned = _first_parts(skeleton, positions, smoothing)
     step = np.diff(np.asarray(positions, np.float64), axis=0)
-    feet = [joint for toe in skeleton.toes for joint in (skeleton.parents[toe], toe)]
     parts = [
         first,
         rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1])),
         step @ turned[:-1],
-        np.sum(step[:, feet] ** 2, axis=-1) < contact_step,
+        np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < contact_step,
     ]
     return np.concatenate([part.reshape(len(step), -1) for part in parts], axis=-1)
+
+
+def joint_features(skeleton: Skeleton, positions) -> np.ndarray:
+    """Return what InterGen's representation adds to each joint's position.
+
+    Args:
+      skeleton, positions: as in `redundant_from_positions`.
+
+    Returns:
+      [L - 1, J, 10], float64: step to the next frame in the world, metres; 6D rotation of the bone that leads to the
+      joint, as in the redundant vector; contact, 0 or 1. What a joint lacks is 0: the root's bone, contact but of feet.
+
+    Raises:
+      ValueError: as `redundant_from_positions`.
+
+    Source: ACMDM section 4.2; Liang et al. 2024 (InterGen), its non-canonical representation.
+    """
+    _, turned = _first_parts(skeleton, positions, FACING_SMOOTHING)
+    step = np.diff(np.asarray(positions, np.float64), axis=0)
+    features = np.zeros((*step.shape[:2], NUM_JOINT_FEATURES))
+    features[..., :3] = step
+    features[:, 1:, 3:9] = rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1]))
+    feet = _feet(skeleton)
+    features[:, feet, 9] = np.sum(step[:, feet] ** 2, axis=-1) < CONTACT_STEP
+    return features
+
+
+def _feet(skeleton: Skeleton) -> list[int]:
+    """Return left ankle and toe, then the right ones."""
+    return [joint for toe in skeleton.toes for joint in (skeleton.parents[toe], toe)]
 
 
 def _bone_rotations(skeleton: Skeleton, positions, turned) -> np.ndarray:

@@ -151,7 +151,8 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     return _filled(
         "text_model_card", path, trained, (trained.params, trained.codec.params), recipe=recipe,
         state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
-        if trained.codec.autoencoder else "positions of joints",
+        if trained.codec.autoencoder
+        else "positions of joints" + (" and redundant features" if trained.codec.redundancy else ""),
         seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
         paper=paper["says"], steps=steps, legs=f" ({legs})" if legs else "",
         guidance=f"{record['guidance']:g}" if "guidance" in record else "the paper's 3",

@@ -167,7 +167,9 @@ def text_card(trained: TextModel | LatentModel, network, num_steps: int) -> dict
     else:
         axes = {name: np.asarray(value, float).tolist() for name, value in trained.codec.axes._asdict().items()}
         card |= {"decoder": None, "normaliser": axes}
-        card["about"]["normaliser"] = "joint positions in metres are state * deviation + mean, by axis"
+        card["about"]["normaliser"] = (
+            "joint positions in metres: the state's first three numbers a joint * deviation + mean"
+        )
     return card
 
 

@@ -1,4 +1,4 @@
-"""Between motion and what a denoiser is trained on: positions as they are, or the latent of an autoencoder."""
+"""Between motion and what a denoiser is trained on: positions, with redundant features or without, or a latent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from f3amd_lib.training.checkpoints import network_with
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("axes", "params", "latent"), meta_fields=("autoencoder",)
+    jax.tree_util.register_dataclass,
+    data_fields=("axes", "params", "latent", "redundancy"),
+    meta_fields=("autoencoder",),
 )
 @dataclass(frozen=True, eq=False)
 class MotionCodec:
@@ -26,12 +28,14 @@ class MotionCodec:
       autoencoder: config of the autoencoder, None where the state is positions.
       params: its weights.
       latent: of its latent's channels.
+      redundancy: of the features that a state has beside positions (`joint_features`), None where it has none.
     """
 
     axes: AxisNormaliser
     autoencoder: AutoencoderConfig | None = None
     params: Any = None
     latent: AxisNormaliser | None = None
+    redundancy: AxisNormaliser | None = None
 
     @property
     def frames_per_state(self) -> int:
@@ -51,7 +55,12 @@ class MotionCodec:
 
         Returns:
           [B, l, J, C].
+
+        Raises:
+          ValueError: for a state with redundant features, which are of a whole clip (`TextMotions.joint_features`).
         """
+        if self.redundancy is not None:
+            raise ValueError("a state with redundant features cannot be made of positions alone")
         state = normalised
         if self.autoencoder is not None:
             state = self.latent.normalise(network_with(self.autoencoder, self.params).latent_of(normalised, mask))
@@ -60,7 +69,7 @@ class MotionCodec:
     def decode(self, state, mask):
         """Return normalised positions [B, L, J, 3] of a state [B, l, J, C]; mask [B, L]."""
         if self.autoencoder is None:
-            return state
+            return state[..., : len(self.axes.mean)]
         return network_with(self.autoencoder, self.params).decode(self.latent.restore(state), self.state_mask(mask))
 
 

@@ -28,6 +28,7 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.motion.redundant import NUM_JOINT_FEATURES
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
@@ -127,6 +128,8 @@ def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
     arrays = {"axes": codec.axes._asdict()}
     if codec.autoencoder is not None:
         arrays["latent"] = codec.latent._asdict()
+    if codec.redundancy is not None:
+        arrays["redundancy"] = codec.redundancy._asdict()
     arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
     extra = {
         "controlled": trained.branch is not None,
@@ -146,10 +149,10 @@ def load_text_model(path: Path) -> TextModel:
     """
     with errors_name(path):
         common, autoencoder, tree, metadata = load_captioned_model(path, _KIND, _shapes)
-        axes, latent = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
-                        for what in ("axes", "latent"))  # fmt: skip
+        axes, latent, redundancy = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
+                                    for what in ("axes", "latent", "redundancy"))  # fmt: skip
         return TextModel(
-            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent),
+            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy),
             starts={caption: np.asarray(state) for caption, state in tree["starts"].items()},
             branch=tree.get("branch"),
             **common,
@@ -163,6 +166,8 @@ def _shapes(metadata: dict, config: ACMDMConfig | None, autoencoder: Autoencoder
     weights, arrays = {}, {"axes": numbers(3)}
     if autoencoder is not None:
         arrays["latent"] = numbers(autoencoder.latent_channels)
+    elif config.channels > 3:
+        arrays["redundancy"] = numbers(NUM_JOINT_FEATURES)
     if metadata["controlled"]:
         frames = 1 if autoencoder is None else autoencoder.frames_per_latent
         weights["branch"] = nnx.state(nnx.eval_shape(lambda: ControlBranch(config, frames, rngs=nnx.Rngs(0))))
@@ -204,6 +209,8 @@ def _whole_states(codec: MotionCodec, data: TextMotions) -> list[np.ndarray]:
 def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
     """Return all clips as states, one after the other, [N / frames of a state, J, C]."""
     frames, clips = codec.frames_per_state, _whole_states(codec, data)
+    if codec.redundancy is not None:
+        return np.concatenate([np.concatenate(clips), codec.redundancy.normalise(data.joint_features())], axis=-1)
     if codec.autoencoder is None:
         return np.concatenate(clips)
     encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
@@ -341,7 +348,7 @@ def train_text_model(
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
     part = "autoencoder" if preset.family == AutoencoderConfig.family else "denoiser"
     part = "control" if name.endswith(CONTROL) else part
-    codec = MotionCodec(data.normaliser()) if before is None else before.codec
+    codec = _codec_of_positions(data, preset) if before is None else before.codec
     settings = {"seed": profile.seed, "unit": max(1, UNIT // codec.frames_per_state)}
     settings |= {} if batch_size is None else {"batch_size": batch_size}
     recipe = part if profile.name == "gpu" else f"short-{part}"
@@ -380,6 +387,14 @@ def train_text_model(
         )  # fmt: skip
     save_text_model(files.model, made)
     return load_text_model(files.model)
+
+
+def _codec_of_positions(data: TextMotions, preset: presets.Preset) -> MotionCodec:
+    """Return the codec of positions, and of redundant features beside them where a preset has channels for those."""
+    redundancy = None
+    if preset.network.get("channels") == 3 + NUM_JOINT_FEATURES:
+        redundancy = AxisNormaliser.of(data.select(data.members("train")).joint_features())
+    return MotionCodec(data.normaliser(), redundancy=redundancy)
 
 
 def _codec_of(task: AutoencoderTask, codec: MotionCodec, params, data: TextMotions) -> MotionCodec:
