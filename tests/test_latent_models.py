@@ -54,7 +54,7 @@ def test_a_preset_knows_what_it_stands_on():
         chain[name] = stage_of(preset), stands_on(preset)
     assert chain == {
         "MotionPCM-VAE": ("autoencoder", ""),
-        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small"),
+        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small-spans"),
         "MotionPCM-M4": ("student", "MotionPCM-teacher"),
         "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
     }
