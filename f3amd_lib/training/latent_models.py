@@ -237,8 +237,7 @@ def train_latent_model(
             return None
     settings = {"seed": profile.seed} | ({} if batch_size is None else {"batch_size": batch_size})
     recipe = stage if profile.name == "gpu" else f"short-{stage}"
-    said = load_paper_file("recipes", "motionpcm")[recipe]
-    share = said.get("share_of", {}).get(preset.name, said.get("share", 1.0))
+    share = load_paper_file("recipes", "motionpcm")[recipe].get("share", 1.0)
     config = latent_motion_recipe(recipe, max(1, round(share * profile.train_steps)), preset.name, **settings)
     # A finished model is only read, and its clips need not be encoded for that.
     task = _task(preset, config, data, encoder, before)
