@@ -54,7 +54,7 @@ def test_a_preset_knows_what_it_stands_on():
         chain[name] = stage_of(preset), stands_on(preset)
     assert chain == {
         "MotionPCM-VAE": ("autoencoder", ""),
-        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small"),
+        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small-spans"),
         "MotionPCM-M4": ("student", "MotionPCM-teacher"),
         "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
     }
@@ -114,7 +114,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         np.testing.assert_allclose(tasks[name].clips.pooled, wanted, atol=1e-6)
     # Losses are watched on the one validation clip; recipes' shares of the 20 steps arrive.
     assert watched == [[1]] * 3
-    assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 8, 1]
+    assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 20, 3]
     assert student.words == ("a", "person", "walks")
     statistics = FrameStatistics.of(data)
     for kept in (student.statistics, teacher.statistics):

@@ -48,10 +48,10 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
         how = f"`make measure MEASURE={measurement} DATA=bandai`"
         return None, f"Not measured yet: `{name}`. {how} measures it."
     table, record = found
-    table.attrs["dataset"] = record["dataset"]
+    table.attrs["dataset"], cores = record["dataset"], record["cores"]
     sentence = (
         f"Stored result `{name}`: data {record['dataset']}, profile {record['profile']}, "
-        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}. "
+        f"{cores} core{'s' * (cores != 1)} ({record['device_platform']}), {record['date_utc'][:10]}. "
         f"{record['dataset_credit'] or ''}"
     )
     if table.attrs["stale"]:

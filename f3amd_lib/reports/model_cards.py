@@ -24,6 +24,7 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import METRICS, SHOWN
+from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.reports.quality_tables import figure_text, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.latent_models import is_latent_preset, load_latent_model
@@ -195,7 +196,8 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
         )
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
     if (table := tables.get("text_pcm3")) is not None:
-        kept = table.set_index("metric")["value"].get("kept_movement", float("nan"))
+        values = table.set_index(["trained", "metric"])["value"]
+        kept = values.get((find_preset(trained.name).latent, "kept_movement"), float("nan"))
         movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
     is_student = bool(trained.config.guidance_features)
     return _filled(
