@@ -101,7 +101,7 @@ web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if 
 	  -q --require-hashes --no-deps -r requirements-web.txt
 
 test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
-	$(PYTEST) tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
 
 site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \

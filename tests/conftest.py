@@ -5,14 +5,18 @@ import importlib.util
 import os
 import shutil
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 # Before anything imports JAX or matplotlib.
 os.environ["JAX_PLATFORMS"] = "cpu"
 # Tests compile much and run little.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-# Fusions by way of MLIR are a third of the time that XLA needs for such programs.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+# Fusions by way of MLIR are half of the time that XLA needs for such programs, cutting them up for more threads a
+# tenth. XLA ends a process that names a flag it does not know: only versions of the lock are known to have these.
+if f"jaxlib=={version('jaxlib')} " in (Path(__file__).resolve().parents[1] / "requirements.lock").read_text():
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
 # What one test, worker or run compiled, the next ones read: few networks are compiled again and again.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

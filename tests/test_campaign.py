@@ -99,6 +99,15 @@ def test_a_queue_with_a_misspelt_row_is_refused(tmp_path):
 def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing_twice(
     packed, judges, small, tmp_path, monkeypatch
 ):
+    """What a measurement says of real networks is the next test's; here it is a number of their weights."""
+    measured = []
+
+    def weigh(generator, *_):
+        value = sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(generator.trained.params))
+        measured.append(value)
+        return pd.DataFrame([{"steps": generator.num_steps, "metric": "size", "unit": "", "value": value}]), None
+
+    monkeypatch.setattr(campaign, "measure_model", weigh)
     snapshots = [(Run("F3AMD-FNO-32"), 8), (Run("F3AMD-FNO-32"), 16), (Run("F3AMD-FNO-32", "mixed-noise", seed=1), 8)]
     whole, (table, record) = run(packed, judges, tmp_path / "whole", snapshots, monkeypatch)
     assert [state for *_, state in whole] == ["measured"] * 3
@@ -108,6 +117,8 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     for each, windows in snapshots:
         kept = checkpoints.load_model(tmp_path / "whole" / "runs" / each.name / f"{windows}.safetensors")
         assert kept.record["training"]["seed"] == each.seed
+    once = measured.copy()
+    assert len(once) == 2 * len(snapshots) and len(set(once)) == len(snapshots)
     # Stopped at once, then after the first snapshot, then to the end.
     legs = tmp_path / "legs"
     stopped, nothing = run(packed, judges, legs, snapshots, monkeypatch, budget_s=0.0)
@@ -116,6 +127,7 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     rest, (again, _) = run(packed, judges, legs, snapshots, monkeypatch)
     assert [state for *_, state in rest] == ["measured before", "measured", "measured"]
     pd.testing.assert_frame_equal(table, again)
+    assert measured == 2 * once
     # A nonsense must show: another seed gives other weights.
     _, (other, _) = run(packed, judges, tmp_path / "other", [(Run("F3AMD-FNO-32", seed=5), 8)], monkeypatch)
     assert other["weights"][0] not in set(table["weights"])

@@ -56,25 +56,29 @@ def recipe(**settings):
     return LatentMotionTraining(**{"num_steps": 4, "batch_size": 8, "warmup_steps": 0, "seed": 0, **settings})
 
 
-TEACHER_WEIGHTS = nnx.state(build_from_config(TEACHER, jax.random.key(5)))
+@functools.cache
+def teacher_weights():
+    return nnx.state(build_from_config(TEACHER, jax.random.key(5)))
 
 
 def distillation(**settings):
     config = recipe(**{"ema_decay": 0.95, "num_phases": 2, **settings})
-    return DistillationTask(TEACHER, TEACHER_WEIGHTS, config, SCHEDULE, latents())
+    return DistillationTask(TEACHER, teacher_weights(), config, SCHEDULE, latents())
 
 
-TASK = distillation()
+@functools.cache
+def usual_task():
+    return distillation()
 
 
 @pytest.fixture(scope="module")
 def start():
-    return initial_state(TASK)
+    return initial_state(usual_task())
 
 
 @pytest.fixture(scope="module")
 def batch(start):
-    return jax.jit(lambda state: TASK.draw(state, jax.random.key(3)))(start)[0]
+    return jax.jit(lambda state: usual_task().draw(state, jax.random.key(3)))(start)[0]
 
 
 # ------------------------------------------------------------------------------------------------------------- recipes
@@ -99,7 +103,7 @@ def test_recipes_are_the_papers_and_the_presets():
         with pytest.raises(ValueError, match=message):
             recipe(**settings)
     with pytest.raises(ValueError, match="set ema_decay"):
-        DistillationTask(TEACHER, TEACHER_WEIGHTS, recipe(), SCHEDULE, latents())
+        DistillationTask(TEACHER, teacher_weights(), recipe(), SCHEDULE, latents())
 
 
 # --------------------------------------------------------------------------------------------------------- autoencoder
@@ -246,8 +250,8 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
 
 
 def test_a_student_begins_as_its_teacher(start):
-    teacher = network_with(TEACHER, TEACHER_WEIGHTS)
-    student = network_with(TASK.student_config, start.params["student"])
+    teacher = network_with(TEACHER, teacher_weights())
+    student = network_with(usual_task().student_config, start.params["student"])
     state, text, time = normal(1, 3, 2, 3), normal(2, 3, 4), jnp.asarray([999, 499, 99])
     told = student(state, time, student.encode(text), jnp.asarray([5.0, 10.0, 15.0]))
     np.testing.assert_allclose(told, teacher(state, time, teacher.encode(text)), atol=1e-6)
@@ -256,7 +260,7 @@ def test_a_student_begins_as_its_teacher(start):
 def test_the_target_is_the_moving_average(start):
     """Other weights of the student change nothing of what it is asked; another average changes the target."""
     moved = jax.tree.map(lambda leaf: 1.1 * leaf, start.params)
-    draw = jax.jit(lambda state: TASK.draw(state, jax.random.key(3))[0].target)
+    draw = jax.jit(lambda state: usual_task().draw(state, jax.random.key(3))[0].target)
     target = draw(start)
     np.testing.assert_array_equal(draw(start._replace(params=moved)), target)
     assert np.abs(draw(start._replace(ema=moved)) - target).max() > 1e-3
@@ -279,10 +283,10 @@ def test_each_sample_is_told_its_own_guidance_and_jumps_to_its_own_edge(batch, m
 
 
 def test_what_is_asked_lies_in_its_phase(batch, start):
-    drawn = jax.jit(lambda key: TASK.questions(start.ema["student"], *TASK.clips.draw(key, 256), key))(
+    drawn = jax.jit(lambda key: usual_task().questions(start.ema["student"], *usual_task().clips.draw(key, 256), key))(
         jax.random.key(1)
     )
-    phases, edge = TASK.phases, np.asarray(drawn.edge)
+    phases, edge = usual_task().phases, np.asarray(drawn.edge)
     assert set(np.asarray(drawn.time)) == set(phases.times) and set(edge) == {0, 499}
     end = np.where(edge == 0, 499, 999)
     for time in (drawn.time, drawn.critic_time):
@@ -290,7 +294,7 @@ def test_what_is_asked_lies_in_its_phase(batch, start):
     assert (5 <= drawn.guidance).all() and (drawn.guidance <= 15).all() and drawn.guidance.std() > 2
     # Data come to the discriminator with noise of their own: at s they fit the marginal, and not the student's noise.
     alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, drawn.time))
-    clean = TASK.clips.draw(jax.random.key(1), 256)[0]
+    clean = usual_task().clips.draw(jax.random.key(1), 256)[0]
     noise = (drawn.state - alpha * clean) / sigma
     alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, drawn.critic_time))
     critics = np.asarray((drawn.real - alpha * clean) / sigma)
@@ -302,14 +306,14 @@ def test_what_is_asked_lies_in_its_phase(batch, start):
 def test_a_target_is_the_guided_teachers_step_and_then_the_targets_jump(start):
     """Algorithm 1, lines 9 and 10, worked out again point by point, with another target than the student."""
     target = jax.tree.map(lambda leaf: 1.1 * leaf, start.params["student"])
-    latent, text = TASK.clips.draw(jax.random.key(1), 6)
-    drawn = jax.jit(TASK.questions)(target, latent, text, jax.random.key(4))
-    teacher = Compiled(network_with(TEACHER, TEACHER_WEIGHTS))
-    follower = Compiled(network_with(TASK.student_config, target))
+    latent, text = usual_task().clips.draw(jax.random.key(1), 6)
+    drawn = jax.jit(usual_task().questions)(target, latent, text, jax.random.key(4))
+    teacher = Compiled(network_with(TEACHER, teacher_weights()))
+    follower = Compiled(network_with(usual_task().student_config, target))
     for row in range(6):
         one = functools.partial(jax.lax.dynamic_slice_in_dim, start_index=row, slice_size=1)
         state, time, w = one(drawn.state), int(drawn.time[row]), float(drawn.guidance[row])
-        told, free = (teacher(state, time, teacher.encode(t)) for t in (one(text), TASK.clips.empty[None]))
+        told, free = (teacher(state, time, teacher.encode(t)) for t in (one(text), usual_task().clips.empty[None]))
         before = max(time - 100, 0)
         solved = jump(SCHEDULE, state, (1 + w) * told - w * free, time, before)
         answer = follower(solved, before, follower.encode(one(text)), jnp.asarray([w]))
@@ -326,7 +330,7 @@ def test_each_player_learns_from_its_own_loss_alone(batch, start):
     params = start.params
 
     def losses(params):
-        loss, (terms, _) = TASK.loss(params, None, batch, None)
+        loss, (terms, _) = usual_task().loss(params, None, batch, None)
         return {**terms, "sum": loss}
 
     # One backward pass for all four.
@@ -353,7 +357,7 @@ def test_each_player_learns_from_its_own_loss_alone(batch, start):
 def test_the_loop_keeps_the_target_and_trains_both_and_resumes(start, tmp_path):
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (start.params, start.ema)), strict=True))
     keep = jax.tree.map(jnp.copy, start)
-    state, terms = advance(TASK, jax.tree.map(jnp.copy, start), 1)
+    state, terms = advance(usual_task(), jax.tree.map(jnp.copy, start), 1)
     follow_up = jax.tree.map(lambda old, new: 0.95 * old + 0.05 * new, keep.ema, state.params)
     for found, wanted in zip(jax.tree.leaves(state.ema), jax.tree.leaves(follow_up), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-7)
@@ -361,8 +365,8 @@ def test_the_loop_keeps_the_target_and_trains_both_and_resumes(start, tmp_path):
         changed = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), state.params[branch], keep.params[branch])
         assert max(jax.tree.leaves(changed)) > 1e-5, branch
     assert set(terms) == {"loss", "consistency", "adversarial", "discriminator"}
-    save_state(tmp_path / "student", TASK, state)
-    again = restore_state(tmp_path / "student", TASK)
+    save_state(tmp_path / "student", usual_task(), state)
+    again = restore_state(tmp_path / "student", usual_task())
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, state.params)), strict=True))
     with pytest.raises(ValueError, match=r"training settings \(skip\)"):
         restore_state(tmp_path / "student", distillation(skip=50))
@@ -464,7 +468,7 @@ def test_students_learn_where_the_flow_goes(toys):
 
 @pytest.mark.slow
 def test_samples_are_calls_of_the_network_at_the_papers_times():
-    student = student_of(network_with(TEACHER, TEACHER_WEIGHTS), jax.random.key(0))
+    student = student_of(network_with(TEACHER, teacher_weights()), jax.random.key(0))
     student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
     student = Compiled(student)
     text, noise, empty = normal(1, 3, 4), normal(2, 3, 2, 3), normal(4, 4)
@@ -475,7 +479,7 @@ def test_samples_are_calls_of_the_network_at_the_papers_times():
     made = sample_student(student, SCHEDULE, text, noise, num_steps=2)
     np.testing.assert_allclose(made, state, atol=1e-4)
     assert np.abs(sample_student(student, SCHEDULE, text, noise, num_steps=2, guidance=5.0) - made).max() > 1e-3
-    teacher = Compiled(network_with(TEACHER, TEACHER_WEIGHTS))
+    teacher = Compiled(network_with(TEACHER, teacher_weights()))
     ask = lambda text: teacher(noise, 999, teacher.encode(text))
     wanted = jump(SCHEDULE, noise, 7.5 * ask(text) - 6.5 * ask(jnp.stack([empty] * 3)), 999, 0)
     np.testing.assert_allclose(

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
@@ -115,6 +114,8 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
     Returns:
       The path, [T].
     """
+    from scipy.signal import savgol_filter  # here: half a second that few callers need
+
     path = path_from_motion(motion)
     span = min(frames, path.num_frames)
     span -= 1 - span % 2  # the filter wants an odd number

@@ -28,7 +28,6 @@ import dataclasses
 import numpy as np
 from scipy import sparse
 from scipy.ndimage import maximum_filter1d, median_filter, percentile_filter, uniform_filter1d
-from scipy.signal import find_peaks, peak_widths
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
@@ -126,6 +125,8 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
     other = unrest[:, ::-1]
     sure = (unrest < 0.8) | ((unrest < 0.6 * other) & (above < 0.06))
     likely = (unrest < 1.5) | ((unrest < 0.8 * other) & (above < 0.08))
+    from scipy.signal import find_peaks, peak_widths  # here: half a second that few callers need
+
     for foot in range(2):
         smooth = uniform_filter1d(height[:, foot], frames(0.1), mode="nearest")
         peaks = find_peaks(smooth, prominence=STEP_PROMINENCE)[0]

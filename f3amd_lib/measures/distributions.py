@@ -14,10 +14,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import ot
 import pandas as pd
 from scipy.spatial.distance import cdist
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 _MOST_PIVOTS = 10_000_000  # of the network simplex; POT's own 100,000 stops short of 2,000 windows
 
@@ -150,6 +149,8 @@ def earth_movers_distance(features, reference) -> float:
     the classifier's features as for FID, Euclidean ground distance, equal weights and equal counts,
     and the exact solution, by POT's network simplex. Like FID it falls with the number of windows.
     """
+    import ot  # here: it brings every array library there is, up to seconds that few callers need
+
     features, reference = _two_clouds(features, reference)
     if len(features) != len(reference):
         raise ValueError(
@@ -298,7 +299,7 @@ def mean_and_interval(values) -> dict:
     mean = float(values.mean()) if count else float("nan")
     half = float("nan")
     if count > 1:
-        half = float(student_t.ppf(0.975, count - 1)) * float(values.std(ddof=1)) / np.sqrt(count)
+        half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(count)
     return {"value": mean, "low": mean - half, "high": mean + half, "repeats": count}
 
 

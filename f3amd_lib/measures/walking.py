@@ -13,7 +13,6 @@ from itertools import groupby
 import numpy as np
 import pandas as pd
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import find_peaks
 
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.measures.metrics import foot_sliding, joint_acceleration
@@ -46,6 +45,8 @@ def stepping_rate(positions, skeleton: Skeleton, fps: float = 30.0):
     that foot's last one; heights are averaged over 0.1 s first, so that shaking is no step. A foot
     that skates while its leg swings counts here: `slide_speed` is what sees it.
     """
+    from scipy.signal import find_peaks  # here: half a second that few callers need
+
     height = toe_positions(positions, skeleton)[..., 1]
     height = uniform_filter1d(height, max(1, round(0.1 * fps)), axis=-2, mode="nearest")
     series = np.moveaxis(height, -1, -2).reshape(-1, height.shape[-2])

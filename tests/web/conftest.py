@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+HERE = Path(__file__).parent
 SCREENSHOTS_VARIABLE = "F3AMD_SCREENSHOTS"
 DESKTOP = (1280, 800)
 PHONE = (390, 844)
@@ -179,6 +180,14 @@ def _start(*options_besides: str):
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     return webdriver.Chrome(options=options, service=webdriver.ChromeService(helper))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """With `--dist loadgroup`, tests of a file keep their process and its pages; those of the built site need none."""
+    for item in items:
+        if item.path.parent == HERE and item.path.stem != "test_site_pages":
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.fixture(scope="session")
