@@ -220,9 +220,8 @@ def test_acmdms_tables_are_whole_and_its_own_rows_have_presets(number):
     assert len(frame) == ACMDM_ROWS[number] and "HumanML3D" in frame.attrs["setting"]
     assert set(frame["better"]) <= {"up", "down", "real"}
     assert (frame["value"].isna() == (frame["printed"] == "")).all()
-    if number != "4":  # meshes: no network of theirs is here yet
-        own = {name for name in frame["model"] if name.startswith("ACMDM")}
-        assert own and all(find_preset(name).paper == "acmdm" for name in own)
+    own = {name for name in frame["model"] if name.startswith("ACMDM")}
+    assert own and all(find_preset(name).paper == "acmdm" for name in own)
 
 
 def test_acmdms_headline_row_is_the_same_in_every_table():

@@ -15,7 +15,7 @@ from f3amd_lib.data import text_encoders
 from f3amd_lib.diffusion.schedules import straight
 from f3amd_lib.generation import captioned_motion
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.motion import synthetic
+from f3amd_lib.motion import body, synthetic
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
@@ -40,10 +40,19 @@ TINY = {
     "tiny-AE": Preset(
         "tiny-AE", "acmdm", "motion autoencoder", straight(), {"width": 8, "dilations": (1,)}, {}, "ours"
     ),
+    "tiny-mesh-AE": Preset(
+        "tiny-mesh-AE", "acmdm", "mesh autoencoder", straight(),
+        {"coarse_levels": (40, 12), "channels": (4, 6), "latent_channels": 5, "num_bases": 2, "around": (5, 4),
+         "down": (40, 8), "up": (3, 2)}, {}, "ours",
+    ),
+    "tiny-mesh": Preset(
+        "tiny-mesh", "acmdm", "ACMDM", straight(), SIZES | {"num_joints": 12, "channels": 5}, {}, "ours",
+        latent="tiny-mesh-AE",
+    ),
     "tiny-prefix": Preset(
         "tiny-prefix", "acmdm", "ACMDM", straight(), LATENT, {"prefix_frames": 3}, "ours", latent="tiny-AE"
     ),
-}
+}  # fmt: skip
 QUIET = {"progress": False, "batch_size": 2}
 PROFILE = load_profile("smoke", "bandai", train_steps=3)
 ENCODER = OneVectorAWord()
@@ -62,7 +71,7 @@ def folder(data, tmp_path_factory):
         patch.setenv("F3AMD_CACHE_DIR", str(folder / "cache"))
         for name, preset in TINY.items():
             patch.setitem(presets.PRESETS, name, preset)
-        for name in ("tiny+control", "tiny-redundant", "tiny-prefix"):
+        for name in ("tiny+control", "tiny-redundant", "tiny-mesh", "tiny-prefix"):
             assert train_text_model(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
         yield folder / "models"
 
@@ -225,6 +234,52 @@ def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, da
     np.testing.assert_array_equal(trained.codec.decode(seen, np.ones((2, 4), bool)), seen[..., :3])
     with pytest.raises(ValueError, match="redundant features cannot be made of positions alone"):
         trained.codec.encode(seen[..., :3], np.ones((2, 4), bool))
+
+
+def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, tmp_path):
+    trained = load(folder, "tiny-mesh")
+    codec, mesh = trained.codec, trained.codec.mesh
+    count = len(mesh.body.vertices)
+    assert (trained.config.num_joints, trained.config.channels, codec.frames_per_state) == (12, 5, 1)
+    assert codec.autoencoder.levels == (count, 40, 12) and trained.most_frames == 40
+    # What the codec encodes is the body of the clip, at its places in metres.
+    clip = codec.axes.normalise(data.clip(0)[None])
+    vertices = codec.axes.restore(codec.vertices_of(clip[0]))
+    np.testing.assert_allclose(mesh.joints(vertices), data.clip(0), atol=2e-3)
+    states = text_models.encoded_clips(codec, data)
+    assert states.shape == (len(data.positions), 12, 5)
+    one = np.asarray(codec.encode(clip, np.ones(clip.shape[:2], bool)))[0]
+    np.testing.assert_allclose(one, states[: len(one)], atol=1e-4)
+    # Joints are those of the vertices, by either door.
+    made = codec.decode_vertices(one[None])
+    assert made.shape == (1, 64, count, 3)
+    np.testing.assert_allclose(codec.decode(one[None], np.ones((1, 64), bool)), mesh.joints(made), atol=1e-5)
+    draw = lambda **how: captioned_motion.draw_motions(
+        trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0), num_steps=2, **how
+    )
+    joints, meshes = draw(), draw(mesh=True)
+    assert meshes.shape == (2, 40, count, 3) and not meshes[0, 24:].any()
+    np.testing.assert_allclose(mesh.joints(meshes), joints, atol=1e-4)
+    with pytest.raises(ValueError, match="tiny makes joints, no mesh"):
+        captioned_motion.draw_motions(load(folder, "tiny"), np.zeros((1, 8)), 24, jax.random.key(0), mesh=True)
+    with pytest.raises(ValueError, match="tiny-mesh has no control branch"):
+        train_text_model(data, ENCODER, PROFILE, "tiny-mesh+control", folder=folder, **QUIET)
+
+
+def test_a_model_of_another_body_is_refused(folder, tmp_path, monkeypatch):
+    trained = load(folder, "tiny-mesh-AE")
+    save_text_model(tmp_path / "exact", trained, jnp.float32)
+    again = load_text_model(tmp_path / "exact").codec
+    assert same(again.params, trained.codec.params) and same(again.mesh.lists, trained.codec.mesh.lists)
+    np.testing.assert_array_equal(again.mesh.skeleton.offsets, trained.codec.mesh.skeleton.offsets)
+    monkeypatch.setitem(body._TABLE, "head", {"start": 0.2, "end": 0.2, "wide": 1.0, "tip": 0.0})
+    with pytest.raises(ValueError, match="exact: was trained on a body with other neighbours"):
+        load_text_model(tmp_path / "exact")
+
+
+def test_a_network_for_a_larger_mesh_is_refused(data, tmp_path):
+    with pytest.raises(ValueError, match=r"levels must have fewer and fewer vertices, got .\d+, 1925"):
+        train_text_model(data, ENCODER, PROFILE, "ACMDM-S-PS28", folder=tmp_path, **QUIET)
 
 
 def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):

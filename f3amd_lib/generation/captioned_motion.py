@@ -166,7 +166,7 @@ def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) ->
 
 def draw_motions(
     trained: TextModel | LatentModel, pooled, num_frames, key, *,
-    guidance: float | None = None, num_steps: int | None = None, control: Control | None = None,
+    guidance: float | None = None, num_steps: int | None = None, control: Control | None = None, mesh: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """Draw a motion for each caption, whole at once, or block by block or masked, as the model is made for.
 
@@ -179,13 +179,16 @@ def draw_motions(
       guidance: w; by default what the model's record says (`guidance`), else the form's own.
       num_steps: of Euler's method; by default the model's own sampler. Of MotionPCM as `latent_motion.steps_of`.
       control: where joints should be, normalised, [B, L, J, 3].
+      mesh: return the vertices of a model of meshes, [B, L, V, 3], whose `codec.mesh` has joints and faces of them.
 
     Returns:
       Positions, [B, L, J, 3], metres, starting near the origin facing +Z; L the longest; 0 in the padding.
 
     Raises:
-      ValueError: for a model of the prefix form, or a control and no branch.
+      ValueError: for a model of the prefix form, a control and no branch, or a mesh of a model that makes joints.
     """
+    if mesh and (isinstance(trained, LatentModel) or trained.codec.mesh is None):
+        raise ValueError(f"{trained.name} makes joints, no mesh; a model that makes one: ACMDM-S-PS28-n2")
     if isinstance(trained, LatentModel):
         if control is not None:
             raise ValueError(f"{trained.name} has no control branch: leave --control out, or name a model of ACMDM")
@@ -215,7 +218,7 @@ def draw_motions(
         else:
             sample = sample_blocks if config.block_frames else sample_text
             state = sample(network, schedule, condition, noise, key=key, **asked)
-        return codec.decode(state, mask)
+        return codec.decode_vertices(state) if mesh else codec.decode(state, mask)
 
     made = np.asarray(draw(jax.random.normal(key_noise, shape), key_solver))
     return codec.axes.restore(made) * np.asarray(mask)[..., None, None]

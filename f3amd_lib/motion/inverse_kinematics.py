@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from f3amd_lib.ground.arrays import array_module
 from f3amd_lib.motion.rotations import shortest_turn
-from f3amd_lib.motion.skeleton import Motion, Skeleton, forward_kinematics
+from f3amd_lib.motion.skeleton import Motion, Skeleton, compose, forward_kinematics
 
 _NO_LENGTH = 1e-9
 """Metres under which a bone has no direction."""
@@ -17,7 +18,7 @@ _PULL = 1e-9
 """Weight, m^2, by which a joint whose children leave its twist open follows its parent."""
 
 
-def fit_rotations(skeleton: Skeleton, positions) -> tuple[np.ndarray, np.ndarray]:
+def fit_rotations(skeleton: Skeleton, positions):
     """Return (root positions [T, 3], local rotations [T, J, 3, 3]) that bring joints near positions.
 
     A joint aims its bones from where it came to stand at where its children should be: several bones by the rotation of
@@ -27,36 +28,39 @@ def fit_rotations(skeleton: Skeleton, positions) -> tuple[np.ndarray, np.ndarray
 
     Args:
       skeleton: J joints.
-      positions: [T, J, 3], metres; bones may have any lengths.
+      positions: [T, J, 3], metres; bones may have any lengths. JAX in, JAX out; all else is reckoned in numpy, float64.
     """
-    positions = np.asarray(positions, np.float64)
-    frames, joints = positions.shape[:2]
-    turned = np.broadcast_to(np.eye(3), (frames, joints, 3, 3)).copy()
-    local, placed = turned.copy(), positions.copy()
+    xp = array_module(positions)
+    positions = xp.asarray(positions, np.float64 if xp is np else None)
+    start = xp.broadcast_to(xp.eye(3, dtype=positions.dtype), (len(positions), 3, 3))
+    turned, local, placed = [], [], []
     for joint, parent in enumerate(skeleton.parents):
-        above = np.broadcast_to(np.eye(3), (frames, 3, 3))
-        if parent >= 0:
-            above = turned[:, parent]
-            placed[:, joint] = placed[:, parent] + above @ skeleton.offsets[joint]
+        above = start if parent < 0 else turned[parent]
+        offset = skeleton.offsets[joint].astype(positions.dtype)
+        placed.append(positions[:, 0] if parent < 0 else placed[parent] + xp.sum(above * offset, axis=-1))
         children = [child for child, its in enumerate(skeleton.parents) if its == joint]
-        bones = [child for child in children if np.linalg.norm(skeleton.offsets[child]) > _NO_LENGTH]
-        wanted = positions[:, bones] - placed[:, joint, None]
-        local[:, joint] = _aimed(skeleton.offsets[bones], wanted @ above)
-        turned[:, joint] = above @ local[:, joint]
-    left = np.mean(positions - forward_kinematics(skeleton, positions[:, 0], local), axis=1)
+        bones = np.array([child for child in children if np.linalg.norm(skeleton.offsets[child]) > _NO_LENGTH], int)
+        wanted = positions[:, bones] - placed[joint][:, None]
+        wanted = xp.sum(wanted[..., None] * above[:, None], axis=-2)  # in the parent's frame
+        local.append(_aimed(skeleton.offsets[bones].astype(positions.dtype), wanted) if len(bones) else start)
+        turned.append(compose(above, local[joint]))
+    local = xp.stack(local, axis=1)
+    left = xp.mean(positions - forward_kinematics(skeleton, positions[:, 0], local), axis=1)
     return positions[:, 0] + left, local
 
 
-def _aimed(offsets: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _aimed(offsets: np.ndarray, wanted):
     """Return rotations [T, 3, 3] that turn offsets [K, 3] towards wanted [T, K, 3], both in the parent's frame."""
+    xp = array_module(wanted)
     if len(offsets) == 1:
         direction = wanted[:, 0]
-        nowhere = np.linalg.norm(direction, axis=-1, keepdims=True) < _NO_LENGTH
-        return shortest_turn(offsets, np.where(nowhere, offsets, direction))
-    # For no bone at all the sum is the pull alone: no turn.
-    left, _, right = np.linalg.svd(np.einsum("tki,kj->tij", wanted, offsets) + _PULL * np.eye(3))
-    left[..., -1] *= np.linalg.det(left @ right)[:, None]
-    return left @ right
+        nowhere = xp.linalg.norm(direction, axis=-1, keepdims=True) < _NO_LENGTH
+        return shortest_turn(offsets, xp.where(nowhere, offsets, direction))
+    spread = xp.sum(wanted[..., :, None] * offsets[:, None, :], axis=1)
+    left, _, right = xp.linalg.svd(spread + _PULL * np.eye(3, dtype=offsets.dtype))
+    sign = xp.linalg.det(left) * xp.linalg.det(right)
+    left = left * xp.stack([xp.ones_like(sign), xp.ones_like(sign), sign], axis=-1)[:, None]
+    return compose(left, right)
 
 
 def fitted(motion: Motion) -> tuple[Motion, np.ndarray]:

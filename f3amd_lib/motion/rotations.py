@@ -145,8 +145,8 @@ def euler_from_matrix(order: str, matrix: np.ndarray) -> np.ndarray:
     return rotation.as_euler(order, degrees=True).reshape(*matrix.shape[:-2], 3)
 
 
-def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that carries one direction to another (numpy only).
+def shortest_turn(start, end):
+    """Return the smallest rotation that carries one direction to another.
 
     Args:
       start, end: directions of any length but 0, [..., 3].
@@ -154,19 +154,20 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     Returns:
       Rotation matrices, [..., 3, 3]. Of opposite directions one of the many half turns.
     """
-    start, end = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
-    start, end = np.broadcast_arrays(start, end)
+    xp = array_module(start, end)
+    start, end = (vector / xp.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
+    start, end = xp.broadcast_arrays(start, end)
     # A half turn about the middle direction, after one about the start, is the turn from start to end.
     middle = start + end
-    opposite = np.linalg.norm(middle, axis=-1) < 1e-9
-    across = np.cross(start, np.eye(3)[np.argmin(np.abs(start), axis=-1)])
-    middle = np.where(opposite[..., None], across, middle)
-    middle = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
-
-    def half_turn(axis):
-        return 2.0 * axis[..., :, None] * axis[..., None, :] - np.eye(3)
-
-    return half_turn(middle) @ half_turn(start)
+    opposite = xp.linalg.norm(middle, axis=-1) < 1e-9
+    across = xp.cross(start, xp.eye(3, dtype=start.dtype)[xp.argmin(xp.abs(start), axis=-1)])
+    middle = xp.where(opposite[..., None], across, middle)
+    middle = middle / xp.linalg.norm(middle, axis=-1, keepdims=True)
+    # Two half turns H(m) H(s), H(a) = 2 a a' - 1, multiplied out.
+    along = xp.sum(middle * start, axis=-1)[..., None, None]
+    outer = lambda one, other: one[..., :, None] * other[..., None, :]
+    turn = 4.0 * along * outer(middle, start) - 2.0 * outer(middle, middle) - 2.0 * outer(start, start)
+    return turn + xp.eye(3, dtype=start.dtype)
 
 
 def slerp_matrices(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -255,8 +255,8 @@ class Motion:
 _ARRAYS = ("root_position", "rotations", "joint_positions")
 
 
-def _compose(first, second):
-    """Multiply stacks of 3 x 3 matrices.
+def compose(first, second):
+    """Multiply stacks of 3 x 3 matrices [..., 3, 3].
 
     In JAX as a sum of three outer products, which fuses with its neighbours; XLA's batched product
     of such small matrices is slower on a CPU, and jax 0.10 refuses some of them inside a scan.
@@ -278,7 +278,7 @@ def walk_tree(skeleton: Skeleton, root_position, rotations):
         above = level_rotations[-1][..., slot, :, :]
         bones = sum(above[..., k] * offsets[joints, k, None] for k in range(3))
         level_positions.append(level_positions[-1][..., slot, :] + bones)
-        level_rotations.append(_compose(above, rotations[..., joints, :, :]))
+        level_rotations.append(compose(above, rotations[..., joints, :, :]))
     order = np.argsort(np.array([joint for level in skeleton.levels for joint in level]))
     positions = xp.concatenate(level_positions, axis=-2)[..., order, :]
     turned = xp.concatenate(level_rotations, axis=-3)[..., order, :, :]

@@ -29,6 +29,7 @@ from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
+from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
 from f3amd_lib.networks.motionpcm import (
     Discriminator,
@@ -43,7 +44,8 @@ FAMILIES = {
     config.family: (config, network)
     for config, network in (
         (F3AMDConfig, F3AMD), (CAMDMConfig, CAMDM), (ACMDMConfig, ACMDM), (MaskedACMDMConfig, MaskedACMDM),
-        (AutoencoderConfig, MotionAutoencoder), (LatentAutoencoderConfig, LatentAutoencoder),
+        (AutoencoderConfig, MotionAutoencoder), (MeshAutoencoderConfig, MeshAutoencoder),
+        (LatentAutoencoderConfig, LatentAutoencoder),
         (LatentDenoiserConfig, LatentDenoiser), (DiscriminatorConfig, Discriminator),
     )
 }  # fmt: skip
@@ -274,7 +276,8 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
         family = FAMILIES[preset.family][0]
         if not hasattr(family, "state_shape"):  # an autoencoder denoises nothing
             continue
-        of_data = {name: settings[name] for name in family.from_data if name in settings}
+        # A latent of meshes has the vertices that it has, whatever the data.
+        of_data = {name: settings[name] for name in family.from_data if name in settings.keys() - preset.network.keys()}
         for window in preset.windows:
             config = build_config(preset.name, **of_data, window=window)
             mflop = round(count_model_flops(config)[1] / 1e6, 2)

@@ -152,7 +152,9 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     return _filled(
         "text_model_card", path, trained, (trained.params, trained.codec.params), recipe=recipe,
         state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
-        if trained.codec.autoencoder
+        if trained.codec.frames_per_state > 1
+        else f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
+        if trained.codec.mesh
         else "positions of joints" + (" and redundant features" if trained.codec.redundancy else ""),
         seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
         paper=paper["says"], steps=steps, legs=f" ({legs})" if legs else "",

@@ -1,7 +1,11 @@
-"""Between motion and what a denoiser is trained on: positions, with redundant features or without, or a latent."""
+"""Between motion and what a denoiser is trained on: positions, with redundant features or without, or a latent.
+
+A latent is of positions or, by a mesh autoencoder, of the body's vertices.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +13,8 @@ from typing import Any
 import jax
 
 from f3amd_lib.data.text_motions import AxisNormaliser
+from f3amd_lib.motion.body_mesh import BodyMesh
+from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.checkpoints import network_with
 
@@ -16,7 +22,7 @@ from f3amd_lib.training.checkpoints import network_with
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("axes", "params", "latent", "redundancy"),
-    meta_fields=("autoencoder",),
+    meta_fields=("autoencoder", "mesh"),
 )
 @dataclass(frozen=True, eq=False)
 class MotionCodec:
@@ -29,13 +35,15 @@ class MotionCodec:
       params: its weights.
       latent: of its latent's channels.
       redundancy: of the features that a state has beside positions (`joint_features`), None where it has none.
+      mesh: the body whose vertices a mesh autoencoder sees, None for all others.
     """
 
     axes: AxisNormaliser
-    autoencoder: AutoencoderConfig | None = None
+    autoencoder: AutoencoderConfig | MeshAutoencoderConfig | None = None
     params: Any = None
     latent: AxisNormaliser | None = None
     redundancy: AxisNormaliser | None = None
+    mesh: BodyMesh | None = None
 
     @property
     def frames_per_state(self) -> int:
@@ -63,14 +71,46 @@ class MotionCodec:
             raise ValueError("a state with redundant features cannot be made of positions alone")
         state = normalised
         if self.autoencoder is not None:
-            state = self.latent.normalise(network_with(self.autoencoder, self.params).latent_of(normalised, mask))
+            state = self.latent.normalise(self.latent_of(normalised, mask))
         return state * self.state_mask(mask)[..., None, None]
 
     def decode(self, state, mask):
         """Return normalised positions [B, L, J, 3] of a state [B, l, J, C]; mask [B, L]."""
         if self.autoencoder is None:
             return state[..., : len(self.axes.mean)]
+        if self.mesh is not None:
+            return _frame_by_frame(lambda frames: self.mesh.joints(self._vertices(frames)), state)
         return network_with(self.autoencoder, self.params).decode(self.latent.restore(state), self.state_mask(mask))
+
+    def decode_vertices(self, state):
+        """Return normalised vertices [B, L, V, 3] of a mesh autoencoder's state [B, L, n, C]."""
+        return _frame_by_frame(self._vertices, state)
+
+    def _vertices(self, frames):
+        network = network_with(self.autoencoder, self.params)
+        return network.decode(self.latent.restore(frames), self.mesh.lists)
+
+    def vertices_of(self, frames):
+        """Return the body's normalised vertices [N, V, 3] of normalised positions [N, J, 3]."""
+        return self.axes.normalise(self.mesh.vertices(self.axes.restore(frames)))
+
+    def latent_of(self, normalised, mask):
+        """Return the autoencoder's own latent [B, l, J, C] of normalised positions; arguments as of `encode`."""
+        network = network_with(self.autoencoder, self.params)
+        if self.mesh is None:
+            return network.latent_of(normalised, mask)
+        return _frame_by_frame(lambda frames: network.encode(self.vertices_of(frames), self.mesh.lists), normalised)
+
+
+_FRAMES_AT_ONCE = 128
+"""Of meshes: all vertices of many clips at once would not fit into memory."""
+
+
+def _frame_by_frame(function, clips):
+    """Apply a function of frames [N, ...] to clips [B, L, ...]."""
+    frames = clips.reshape(-1, *clips.shape[2:])
+    made = jax.lax.map(lambda frame: function(frame[None])[0], frames, batch_size=_FRAMES_AT_ONCE)
+    return made.reshape(*clips.shape[:2], *made.shape[1:])
 
 
 def with_latent(codec: MotionCodec, config: AutoencoderConfig, params, normalised, mask) -> MotionCodec:
@@ -81,5 +121,6 @@ def with_latent(codec: MotionCodec, config: AutoencoderConfig, params, normalise
       config, params: of the trained autoencoder.
       normalised, mask: motion to take the statistics from, [B, L, J, 3] and [B, L].
     """
-    latent = network_with(config, params).latent_of(normalised, mask)[mask[:, :: config.frames_per_latent]]
-    return MotionCodec(codec.axes, config, params, AxisNormaliser.of(latent))
+    codec = dataclasses.replace(codec, autoencoder=config, params=params)
+    latent = codec.latent_of(normalised, mask)[codec.state_mask(mask)]
+    return dataclasses.replace(codec, latent=AxisNormaliser.of(latent))

@@ -28,12 +28,15 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.motion.body import make_body
+from f3amd_lib.motion.body_mesh import BodyMesh, standing
 from f3amd_lib.motion.redundant import NUM_JOINT_FEATURES
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.acmdm_control import ControlBranch
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
+from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.captioned_models import load_captioned_model, save_captioned_model
 from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
@@ -43,6 +46,7 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles, alone_with, 
 from f3amd_lib.training.text_motion import (
     AutoencoderTask,
     ControlTask,
+    MeshAutoencoderTask,
     TextMotionTask,
     TextMotionTraining,
     branch_with,
@@ -130,10 +134,13 @@ def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
         arrays["latent"] = codec.latent._asdict()
     if codec.redundancy is not None:
         arrays["redundancy"] = codec.redundancy._asdict()
+    if codec.mesh is not None:
+        arrays["rest"] = jnp.asarray(codec.mesh.skeleton.offsets, jnp.float32)
     arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
     extra = {
         "controlled": trained.branch is not None,
         "start_shapes": {caption: list(np.shape(state)) for caption, state in trained.starts.items()},
+        "neighbours": None if codec.mesh is None else weights_digest(codec.mesh.lists),
     }
     weights = {"autoencoder": codec.params, "branch": trained.branch}
     save_captioned_model(
@@ -151,8 +158,14 @@ def load_text_model(path: Path) -> TextModel:
         common, autoencoder, tree, metadata = load_captioned_model(path, _KIND, _shapes)
         axes, latent, redundancy = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
                                     for what in ("axes", "latent", "redundancy"))  # fmt: skip
+        mesh = None
+        if "rest" in tree:
+            rest = dataclasses.replace(common["skeleton"], offsets=np.asarray(tree["rest"]))
+            mesh = BodyMesh.of(rest, autoencoder.levels, **autoencoder.neighbours)
+            if weights_digest(mesh.lists) != metadata["neighbours"]:
+                raise ValueError("was trained on a body with other neighbours than this version's; train it anew")
         return TextModel(
-            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy),
+            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy, mesh),
             starts={caption: np.asarray(state) for caption, state in tree["starts"].items()},
             branch=tree.get("branch"),
             **common,
@@ -164,6 +177,8 @@ def _shapes(metadata: dict, config: ACMDMConfig | None, autoencoder: Autoencoder
     single = jax.ShapeDtypeStruct
     numbers = lambda width: {what: single((width,), jnp.float32) for what in AxisNormaliser._fields}
     weights, arrays = {}, {"axes": numbers(3)}
+    if isinstance(autoencoder, MeshAutoencoderConfig):
+        arrays["rest"] = single((len(metadata["joints"]), 3), jnp.float32)
     if autoencoder is not None:
         arrays["latent"] = numbers(autoencoder.latent_channels)
     elif config.channels > 3:
@@ -237,11 +252,19 @@ def pooled_captions(captions: Sequence[str], encoder: TextEncoder) -> jax.Array:
 # ---------------------------------------------------------------------------------------------------------------- tasks
 
 
-def autoencoder_task(data: TextMotions, split: str, preset: str, config: TextMotionTraining) -> AutoencoderTask:
+def autoencoder_task(
+    data: TextMotions, split: str, preset: str, config: TextMotionTraining
+) -> AutoencoderTask | MeshAutoencoderTask:
     """Return the training of a preset's autoencoder on the clips of a split."""
     axes, part = data.normaliser(), data.select(data.members(split))
     table, _ = clip_table(part, axes.normalise(part.positions))
-    return AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+    if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
+        return AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+    # The body stands as people do when clips begin: those of training, whatever the split.
+    rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
+    model = presets.build_config(preset, num_vertices=len(make_body(rest).vertices))
+    codec = MotionCodec(axes, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
+    return MeshAutoencoderTask(model, config, table, data.fingerprint, codec)
 
 
 def denoiser_task(
@@ -258,7 +281,7 @@ def denoiser_task(
       window: most frames of motion in a state, instead of the preset's.
     """
     table, pooled = _captioned_states(codec, data.select(data.members(split)), encoder)
-    sizes = {"num_joints": data.skeleton.num_joints, "text_width": pooled.shape[-1]}
+    sizes = {"num_joints": table.frames.shape[1], "text_width": pooled.shape[-1]}
     if window:
         sizes["window"] = window // codec.frames_per_state
     model = presets.build_config(preset, **sizes)
@@ -301,9 +324,18 @@ def of_this_training(found, task: Task, files: ModelFiles):
     return found
 
 
+_AUTOENCODERS = {AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.family: "mesh-autoencoder"}
+"""Recipe of each family of autoencoders."""
+
+
+def _of_meshes(preset: presets.Preset) -> bool:
+    """Say whether a preset's states are of vertices."""
+    return bool(preset.latent) and presets.find_preset(preset.latent).family == MeshAutoencoderConfig.family
+
+
 def is_text_preset(name: str) -> bool:
     """Say whether a preset, with or without "+control", is one that this file trains."""
-    families = (ACMDMConfig.family, MaskedACMDMConfig.family, AutoencoderConfig.family)
+    families = (ACMDMConfig.family, MaskedACMDMConfig.family, *_AUTOENCODERS)
     return presets.find_preset(name.removesuffix(CONTROL)).family in families
 
 
@@ -334,6 +366,8 @@ def train_text_model(
       TrainingDiverged: if the loss stops being a number.
     """
     preset = presets.find_preset(name.removesuffix(CONTROL))
+    if name.endswith(CONTROL) and _of_meshes(preset):
+        raise ValueError(f"{preset.name} has no control branch: its states are of vertices, not of joints")
     name = preset.name + (CONTROL if name.endswith(CONTROL) else "")
     data = data.cut(window) if window and window < data.lengths.max() else data
     earlier = preset.name if name.endswith(CONTROL) else preset.latent
@@ -346,7 +380,7 @@ def train_text_model(
             return None
         if before.record["dataset_fingerprint"] != data.fingerprint:
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
-    part = "autoencoder" if preset.family == AutoencoderConfig.family else "denoiser"
+    part = _AUTOENCODERS.get(preset.family, "denoiser")
     part = "control" if name.endswith(CONTROL) else part
     codec = _codec_of_positions(data, preset) if before is None else before.codec
     settings = {"seed": profile.seed, "unit": max(1, UNIT // codec.frames_per_state)}
@@ -363,7 +397,7 @@ def train_text_model(
     if files.model.exists():
         return of_this_training(load_text_model(files.model), task, files)
     held_out = task_of("validation").draw(None, jax.random.key(0))[0]
-    if part == "autoencoder":
+    if preset.family in _AUTOENCODERS:
         held_out = (held_out, jnp.ones(held_out.shape[:2], bool))
     record = run_record(
         profile=profile, dataset=data, seed=config.seed, model=name, identity=task.identity(),
@@ -374,7 +408,7 @@ def train_text_model(
     if int(state.step) < config.num_steps:
         return None
     about = {"skeleton": data.skeleton, "fps": data.fps, "record": record, "name": name}
-    if part == "autoencoder":
+    if preset.family in _AUTOENCODERS:
         made = TextModel(codec=_codec_of(task, codec, state.averaged, data), **about)
     elif part == "control":
         made = dataclasses.replace(before, branch=state.averaged, name=name, record=record)
@@ -402,6 +436,7 @@ def _codec_of(task: AutoencoderTask, codec: MotionCodec, params, data: TextMotio
     part = data.members("train")
     part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]
     frames = task.model_config.frames_per_latent
+    codec = getattr(task, "codec", codec)
     clips = [codec.axes.normalise(data.clip(number)) for number in part]
     padded = pad_motions(clips, max(map(len, clips)) // frames * frames)
     return with_latent(codec, task.model_config, params, padded.motion, padded.mask)

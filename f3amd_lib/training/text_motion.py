@@ -27,6 +27,7 @@ from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
+from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, smooth_l1, variational_loss
 from f3amd_lib.networks.presets import build_from_config, find_preset
 from f3amd_lib.training.checkpoints import network_with
@@ -56,7 +57,7 @@ class TextMotionTraining:
       control_weight: of the distance from the control points, m^2, in the control branch's loss.
       prefix_frames: frames of the state that are given clean (prefix autoregression); 0: none.
       unit: lengths are multiples of so many frames of the state: 1 of the latent, 4 of motion (released code).
-      window: frames of a training window of the autoencoder.
+      window: frames of a training window of the autoencoder; 1 for meshes.
       seed: of initial weights and batches.
 
     Raises:
@@ -222,6 +223,35 @@ class AutoencoderTask:
         positions_hat = model.decode(model.latent_of(positions, mask), mask[:, :: self.model_config.frames_per_latent])
         loss = smooth_l1(positions_hat, positions, mask)
         return {"loss": loss, "smooth_l1": loss}
+
+
+@task_tree(("clips", "codec"), ("model_config",))
+@dataclass(frozen=True, eq=False)
+class MeshAutoencoderTask(AutoencoderTask):
+    """A mesh autoencoder to train on frames, one of each clip that is drawn (a `training.optimise.Task`).
+
+    Attributes:
+      codec: of positions, with the mesh whose vertices they move.
+    """
+
+    name: ClassVar[str] = "mesh autoencoder"
+
+    model_config: MeshAutoencoderConfig
+    codec: MotionCodec | None = None
+
+    def loss(self, params, statistics, batch, key):
+        """Return (loss, (terms, statistics)): L1, summed over a frame, mean over frames (ACMDM's released code)."""
+        loss = self._distance(params, batch)
+        return loss, ({"loss": loss}, statistics)
+
+    def held_out_terms(self, params, statistics, held_out, key) -> dict:
+        """Return the error on held-out frames, (positions [B, 1, J, 3], mask)."""
+        return {"loss": self._distance(params, held_out[0])}
+
+    def _distance(self, params, clips):
+        model, lists = network_with(self.model_config, params), self.codec.mesh.lists
+        vertices = self.codec.vertices_of(clips[:, 0])
+        return jnp.sum(jnp.abs(model.decode(model.encode(vertices, lists), lists) - vertices)) / len(clips)
 
 
 # ------------------------------------------------------------------------------------------------------------ denoiser

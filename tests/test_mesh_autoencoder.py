@@ -1,0 +1,108 @@
+"""The mesh autoencoder: the paper's size by hand, each layer against a loop, and learning."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from builders import SKELETON, wandering_motion
+from flax import nnx
+
+from f3amd_lib.motion.body_mesh import BodyMesh
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.mesh_autoencoder import (
+    MeshAutoencoder,
+    MeshAutoencoderConfig,
+    MeshConvolution,
+    MeshPooling,
+)
+
+SIZES = {"coarse_levels": (24, 8), "channels": (6, 8), "latent_channels": 5, "num_bases": 3,
+         "around": (5, 4), "down": (16, 8), "up": (3, 2)}  # fmt: skip
+CONFIG = MeshAutoencoderConfig(num_vertices=42 * 6, **SIZES)
+MESH = BodyMesh.of(SKELETON, CONFIG.levels, **CONFIG.neighbours)
+VERTICES = jnp.asarray(MESH.vertices(wandering_motion(8).positions), jnp.float32)
+GENERATOR = np.random.default_rng(0)
+
+
+def test_the_papers_network_has_the_parameters_counted_by_hand():
+    """Released sizes: vertices x neighbours x 9 coefficients, 9 matrices and a bias; pooling weights, linear maps."""
+    wide, levels = (3, 64, 128, 256, 512), (6890, 1925, 400, 54)
+    count = 12 * 512 * 2  # into the latent and out of it
+    for level, around in enumerate((10, 21, 26, 19)):
+        one, other = wide[level], wide[level + 1]
+        count += 2 * (levels[level] * around * 9 + 9 * one * other) + one + other
+    count += 1925 * 32 + 400 * 56 + 54 * 66 + 28 * 33 + 6890 * 11 + 1925 * 14 + 400 * 11 + 54 * 1
+    assert presets.count_parameters(presets.build_config("ACMDM-mesh-AE")) == count
+    for size in ("S", "B", "L", "XL"):
+        config = presets.build_config(f"ACMDM-{size}-PS28", text_width=512)
+        assert config.state_shape(2) == (2, 196, 28, 12) and config.num_patches == 1
+
+
+def test_a_convolution_is_the_sum_over_edges():
+    neighbours = GENERATOR.integers(0, 7, (4, 3))
+    layer = MeshConvolution(4, 3, 2, 5, 6, rngs=nnx.Rngs(0))
+    layer.bias[...] = jnp.arange(6.0)
+    x = GENERATOR.normal(size=(7, 2, 5)).astype(np.float32)
+    bases, own = np.asarray(layer.bases[...]).reshape(2, 5, 6), np.asarray(layer.coefficients[...])
+    wanted = np.zeros((4, 2, 6)) + np.arange(6.0)
+    for i in range(4):
+        for j in range(3):
+            wanted[i] += x[neighbours[i, j]] @ sum(own[i, k, j] * bases[k] for k in range(2))
+    np.testing.assert_allclose(layer(jnp.asarray(x), neighbours), wanted, atol=1e-5)
+
+
+def test_pooling_is_a_mean_by_the_sizes_of_its_weights():
+    layer = MeshPooling(2, 2, 3, 3, rngs=nnx.Rngs(0))
+    layer.weights[...] = jnp.array([[1.0, -3.0], [0.0, 2.0]])
+    x = jnp.arange(12.0).reshape(4, 1, 3)
+    pooled = layer(x, np.array([[0, 1], [2, 3]]))
+    np.testing.assert_allclose(pooled[:, 0], [0.25 * x[0, 0] + 0.75 * x[1, 0], x[3, 0]])
+    wide = MeshPooling(2, 2, 3, 7, rngs=nnx.Rngs(0))
+    assert wide(x, np.array([[0, 1], [2, 3]])).shape == (2, 1, 7) and layer.linear is None
+
+
+def test_a_mesh_goes_to_its_latent_and_back_and_every_parameter_learns():
+    network = MeshAutoencoder(CONFIG, rngs=nnx.Rngs(0))
+    graph, params = nnx.split(network)
+    encode = nnx.jit(lambda network, vertices: network.encode(vertices, MESH.lists))
+    latent = encode(network, VERTICES)
+    assert latent.shape == (8, 8, 5)
+    # Frames do not mix.
+    np.testing.assert_allclose(encode(network, VERTICES[::-1]), latent[::-1], atol=1e-5)
+
+    @jax.jit
+    def step(params, state):
+        def loss(params):
+            model = nnx.merge(graph, params)
+            return jnp.mean(jnp.abs(model.decode(model.encode(VERTICES, MESH.lists), MESH.lists) - VERTICES))
+
+        value, slope = jax.value_and_grad(loss)(params)
+        update, state = adam.update(slope, state)
+        return optax.apply_updates(params, update), state, value, slope
+
+    adam, losses = optax.adam(1e-2), []
+    state = adam.init(params)
+    for number in range(40):
+        params, state, value, slope = step(params, state)
+        if not number:
+            assert all(bool(jnp.any(leaf != 0)) for leaf in jax.tree.leaves(slope))
+        losses.append(value)
+    assert losses[-1] < 0.3 * losses[0]
+
+
+def test_what_makes_no_sense_is_refused():
+    for changes, words in (
+        ({"coarse_levels": (300, 8)}, "levels must have fewer and fewer vertices, got .252, 300, 8.: .* too large"),
+        ({"channels": (6,)}, "must be as many whole numbers"),
+        ({"around": (5, 0)}, "must be as many whole numbers"),
+        ({"up": (3, 9)}, "up asks for more neighbours"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            MeshAutoencoderConfig(num_vertices=252, **(SIZES | changes))
+    network = MeshAutoencoder(CONFIG, rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match=r"vertices must be \[N, 252, 3\]"):
+        network.encode(VERTICES[:, 1:], MESH.lists)
+    with pytest.raises(ValueError, match=r"latent must be \[N, 8, 5\]"):
+        network.decode(jnp.zeros((2, 8, 4)), MESH.lists)
+    assert MeshAutoencoderConfig.from_dict(CONFIG.to_dict()) == CONFIG
