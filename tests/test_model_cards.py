@@ -157,3 +157,14 @@ def test_all_cards_and_the_page_are_written_anew(tmp_path, monkeypatch):
     sums = (weights.parent / "checksums.txt").read_text().splitlines()
     digests = {hashlib.sha256(path.read_bytes()).hexdigest() for path in weights.rglob("*.safetensors")}
     assert digests and digests <= {line.split()[0] for line in sums}
+
+
+def test_a_card_names_the_movement_that_its_own_autoencoder_keeps():
+    path = PRETRAINED_DIR / "bandai" / "text" / "MotionPCM-M1-small.safetensors"
+    both = pd.DataFrame(
+        [("MotionPCM-VAE-small", 0.25), ("MotionPCM-VAE-small-spans", 0.75)], columns=["trained", "value"]
+    )
+    table = both.assign(metric="kept_movement")
+    assert "Its autoencoder keeps 75.0 % of the movement" in model_cards.latent_model_card(path, {"text_pcm3": table})
+    other = model_cards.latent_model_card(path, {"text_pcm3": table.iloc[:1]})
+    assert "75.0 %" not in other and "25.0 %" not in other

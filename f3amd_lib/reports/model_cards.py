@@ -71,6 +71,7 @@ def _filled(name: str, path: Path, trained, params, **fields) -> str:
         weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record), date=record["date_utc"][:10],
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        cores=f"{record['cores']} core{'s' * (record['cores'] != 1)}",
         loss=history["held_out_loss"].dropna().iloc[-1], **fields,
     )  # fmt: skip
 
@@ -197,9 +198,11 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
             "Figures of one judge compare with each other alone."
         )
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
+    kept = None
     if (table := tables.get("text_pcm3")) is not None:
         values = table.set_index(["trained", "metric"])["value"]
-        kept = values.get((find_preset(trained.name).latent, "kept_movement"), float("nan"))
+        kept = values.get((find_preset(trained.name).latent, "kept_movement"))
+    if kept is not None:
         movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
     is_student = bool(trained.config.guidance_features)
     return _filled(
