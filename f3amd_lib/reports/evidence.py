@@ -223,6 +223,9 @@ class Evidence:
         self.trained: list[tuple[str, int]] = []
         self.told: dict[str, tuple[str, int]] = {}
         self._load = functools.cache(load)
+        # A ledger asks for thousands of figures, by few devices and values.
+        self._of_device = functools.cache(self._of_device)
+        self._holding = functools.cache(self._holding)
 
     @property
     def printed(self) -> bool:
@@ -244,22 +247,28 @@ class Evidence:
           NotMeasured: if there is no such table, or none with rows of that device.
           ValueError: if the table is broken or not what its folder says.
         """
-        table, record, path = self._load(name)
-        if device is not None:
-            table = table[table["device"] == device]
-            if table.empty:
-                raise NotMeasured(f"{self.called(name)} no rows of a {device}")
+        _, record, path = self._load(name)
+        table = self._of_device(name, device)
+        if device is not None and table.empty:
+            raise NotMeasured(f"{self.called(name)} no rows of a {device}")
         sha256 = record.get("table", {}).get("sha256", "")[:12]
         self.sources.append(Source(path, sha256, _hardware(record, device)))
         return table
 
+    def _of_device(self, name: str, device: str | None) -> pd.DataFrame:
+        table, _, _ = self._load(name)
+        return table if device is None else table[table["device"] == device]
+
+    def _holding(self, name: str, device: str | None, column: str, value) -> np.ndarray:
+        return (self._of_device(name, device)[column] == value).to_numpy()
+
     def rows(self, name: str, device: str | None = None, **row) -> pd.DataFrame:
         """Return those rows of a table that have these values in these columns; maybe none."""
         table = self.table(name, device)
-        for column, wanted in row.items():
-            # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
-            if column != "dataset" or self.printed:
-                table = table[table[column] == wanted]
+        # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
+        wanted = [(column, value) for column, value in row.items() if column != "dataset" or self.printed]
+        if wanted:
+            table = table[np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])]
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
             network = row["model"].split(",")[0]  # "CAMDM, leading" is CAMDM, sampled in another way
             self.trained.append((network, row.get("window_frames", 32)))
@@ -284,7 +293,7 @@ class Evidence:
             found = found[found[value].notna()]
         if len(found) and value in found:
             bounds = ["value", "low", "high"] if value == "value" else [value]
-            return Figure.of(*found.iloc[0][bounds])
+            return Figure.of(*(found[bound].iat[0] for bound in bounds))
         what = "" if value == "value" else f"{value} of "
         where = f", {device}" if device else ""
         raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")

@@ -183,9 +183,9 @@ def _start(*options_besides: str):
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """With `--dist loadgroup`, tests of a file keep their process and its pages; those of the built site need none."""
-    for item in items:
+    for item in items if config.pluginmanager.hasplugin("xdist") else ():
         if item.path.parent == HERE and item.path.stem != "test_site_pages":
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
