@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from f3amd_lib.data.text_motions import AxisNormaliser
 from f3amd_lib.motion.body_mesh import BodyMesh
@@ -108,9 +109,12 @@ _FRAMES_AT_ONCE = 128
 
 def _frame_by_frame(function, clips):
     """Apply a function of frames [N, ...] to clips [B, L, ...]."""
-    frames = clips.reshape(-1, *clips.shape[2:])
-    made = jax.lax.map(lambda frame: function(frame[None])[0], frames, batch_size=_FRAMES_AT_ONCE)
-    return made.reshape(*clips.shape[:2], *made.shape[1:])
+    count = clips.shape[0] * clips.shape[1]
+    size = min(_FRAMES_AT_ONCE, count)
+    frames = jnp.asarray(clips).reshape(count, *clips.shape[2:])
+    frames = jnp.pad(frames, ((0, -count % size), *[(0, 0)] * (frames.ndim - 1)), mode="edge")
+    made = jax.lax.map(function, frames.reshape(-1, size, *frames.shape[1:]))
+    return made.reshape(-1, *made.shape[2:])[:count].reshape(*clips.shape[:2], *made.shape[2:])
 
 
 def with_latent(codec: MotionCodec, config: AutoencoderConfig, params, normalised, mask) -> MotionCodec:

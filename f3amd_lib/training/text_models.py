@@ -229,6 +229,9 @@ def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
     if codec.autoencoder is None:
         return np.concatenate(clips)
     encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
+    if codec.mesh is not None:  # frames do not see each other: nothing is padded
+        whole = np.concatenate(clips)[None]
+        return np.asarray(encode(codec, whole, np.ones(whole.shape[:2], bool)))[0]
     for first in range(0, len(clips), _ENCODED_AT_ONCE):
         part = clips[first : first + _ENCODED_AT_ONCE]
         padded = pad_motions([*part, *[part[0]] * (_ENCODED_AT_ONCE - len(part))], longest)
