@@ -34,8 +34,7 @@ def test_a_fault_whose_place_has_gone_is_refused(listed):
     refused("occurs 0 times", listed[0].planted, "another text")
     refused("occurs 2 times", listed[0].planted, 2 * listed[0].old)
     gone = [fault.name for fault in listed if (ROOT / fault.file).read_text(encoding="utf-8").count(fault.old) != 1]
-    # The script refuses to run until they are mended; one in twenty may wait for that.
-    assert len(gone) <= 0.05 * len(listed), gone
+    assert not gone  # the script refuses to run until they are mended
 
 
 def test_nineteen_of_twenty_faults_are_caught(listed):
