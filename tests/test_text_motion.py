@@ -11,6 +11,7 @@ from flax import nnx
 
 from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
+from f3amd_lib.generation.text_to_motion import sample_control
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch
@@ -349,6 +350,42 @@ def test_a_control_branch_trains_beside_a_frozen_base():
     assert not any("output_modulation" in name for name in moved)  # the base's last layer is not the branch's
     dropped = dataclasses.replace(task, config=recipe(control_dropout=1.0)).draw(None, jax.random.key(8))[0][3]
     assert not np.any(dropped.kept) and control.kept.all()
+
+
+@pytest.mark.slow
+def test_a_trained_branch_takes_a_joint_where_it_is_asked_to_be():
+    """Clips that stand still anywhere: one point asked for says where the whole clip has to be."""
+    number, frames, joints = 512, 8, 2
+    places = np.random.default_rng(0).standard_normal((number, 1, 1, 3)).astype(np.float32)
+    still = np.broadcast_to(places, (number, frames, joints, 3))
+    rows, each = jnp.asarray(still.reshape(-1, joints, 3)), jnp.arange(number)
+    clips = ClipTable(rows, each * frames, jnp.full(number, frames), each, jnp.ones(number, int))
+    codec = MotionCodec(AxisNormaliser(np.zeros(3, np.float32), np.ones(3, np.float32)))
+    size = {"num_joints": joints, "latent_width": 32, "depth": 2, "num_heads": 2, "text_width": 4}
+    config = ACMDMConfig(**size, channels=3, window=frames)
+    short = {"batch_size": 64, "learning_rate": 4e-3, "schedule": "warmup_cosine", "warmup_steps": 30}
+    training = TextMotionTraining(num_steps=200, **short, ema_decay=0.97, gradient_clip=1.0, seed=0)
+    nothing_said = jnp.zeros((number, 4))
+    state, _ = optimise(TextMotionTask(config, training, straight(), clips, nothing_said), progress=False)
+    base, both = state.averaged, clips._replace(frames=(rows, rows[:, None]))
+    training = dataclasses.replace(training, num_steps=250)
+    task = ControlTask(config, training, straight(), both, nothing_said, base, codec, (0, 1))
+    state, _ = optimise(task, progress=False)
+
+    told = TextCondition(jnp.zeros((64, 4)), jnp.ones((64, frames), bool))
+    wanted, noise = jnp.asarray(still[:64]), jax.random.normal(jax.random.key(5), (64, frames, joints, 3))
+    asked = np.zeros((64, frames, joints), np.float32)
+    asked[:, 3, 0] = 1.0
+    network, branch = network_with(config, base), branch_with(config, codec, state.averaged)
+    control, how = Control.of(wanted, asked), {"sampler": straight().sampler, "num_steps": 20}
+
+    def apart(control):
+        made = sample_control(network, branch, straight(), told, control, noise, **how)
+        return float(jnp.linalg.norm(made - wanted, axis=-1)[:, 3, 0].mean())
+
+    # Without a control, or under another clip's, motions are anywhere: two places are 2.3 apart on average.
+    for elsewhere in (control.dropped(), control._replace(positions=control.positions[::-1])):
+        assert apart(control) < 0.65 * apart(elsewhere)
 
 
 def test_the_control_loss_is_in_metres_at_the_asked_points():
