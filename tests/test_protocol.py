@@ -97,7 +97,7 @@ def measured(generator, packed, prepared, classifier):
 
 
 TEXT_TABLES = ("text", "control", "reconstruction")
-TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]} | {"sampling_seconds"}
+TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]} | {"sampling_seconds", "LSD"}
 PROTOCOL_METRICS = (
     set(METRICS) - TEXT_METRICS - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
 )

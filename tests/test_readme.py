@@ -103,6 +103,18 @@ def test_slide_of_the_feet(page, sentence, model):
     assert len(rows) and figure == pytest.approx(rows["value"].mean(), rel=0.1)
 
 
+def test_what_is_said_of_text_to_motion():
+    """A whole sentence and its FID, by the records of MotionPCM's tables."""
+    folder = ROOT / "paper_figures/bandai/laptop/records"
+    quality, times = (pd.read_csv(folder / f"text_pcm{number}.csv").set_index(["model", "steps", "metric"])["value"]
+                      for number in (4, 1))  # fmt: skip
+    (milliseconds,) = stated(r"makes 4\.8 seconds of motion of a caption in (\d+) ms")
+    assert milliseconds == round(1000 * times["MotionPCM-M1", 1, "sampling_seconds"])
+    many, one, student = stated(r"FID of (\d+) in 50 steps, and of (\d+) in 1, .* distilled from it has (\d+) in 1,")
+    rows = (("MotionPCM-teacher", 50), ("MotionPCM-teacher", 1), ("MotionPCM-M1", 1))
+    assert [many, one, student] == [round(quality[(*row, "text_FID")]) for row in rows]
+
+
 def test_number_of_claims():
     assert stated(r"judges each of its (\d+) claims") == (len(load_claims()),)
 
