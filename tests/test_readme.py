@@ -115,6 +115,20 @@ def test_what_is_said_of_text_to_motion():
     assert [many, one, student] == [round(quality[(*row, "text_FID")]) for row in rows]
 
 
+def test_what_is_said_of_the_discriminator():
+    folder = ROOT / "paper_figures/bandai/laptop/records"
+    students = pd.read_csv(folder / "text_pcm2.csv").set_index(["model", "metric"])["value"]
+    others = pd.read_csv(folder / "text_pcm1.csv").set_index(["model", "steps", "metric"])["value"]
+    pattern = (
+        r"FID is ([\d.]+) without it, ([\d.]+) with the paper's 0.1, and ([\d.]+) with 1, .* student has ([\d.]+)\."
+    )
+    *ours, latent = stated(pattern, RESULTS)
+    names = ("MotionPCM-M1-lambda0", "MotionPCM-M1", "MotionPCM-M1-lambda1")
+    assert ours == [round(students[name, "text_FID"], 1) for name in names]
+    assert latent == round(others["MotionLCM-V2", 1, "text_FID"], 1)
+    assert students["MotionPCM-M1-lambda1", "R_precision_1"] >= students["MotionPCM-M1", "R_precision_1"]
+
+
 def test_number_of_claims():
     assert stated(r"judges each of its (\d+) claims") == (len(load_claims()),)
 
