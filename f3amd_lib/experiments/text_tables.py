@@ -48,7 +48,7 @@ from f3amd_lib.training.text_models import (
 
 PAPERS = {
     "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),
-    "motionpcm": ("text_pcm1", "text_pcm2", "text_pcm3", "text_pcm4"),
+    "motionpcm": ("text_pcm1", "text_pcm2", "text_pcm3", "text_pcm4", "text_guidance"),
 }
 """Paper -> its tables that `measure_text_table` knows."""
 
@@ -310,7 +310,7 @@ def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: 
     """Return the figures of a teacher or a student of MotionPCM in so many steps; without a model, of real motion."""
     if trained is None:
         return bench.quality(None)
-    draw = latent_sampler(trained, row.get("steps"))
+    draw = latent_sampler(trained, row.get("steps"), row.get("guidance"))
     made = bench.quality(lambda *asked: latent_motions(trained, *asked, draw=draw))
     if not about.get("timed"):
         return made
