@@ -10,6 +10,7 @@ from test_text_judge import OneVectorAWord
 
 from f3amd_lib.experiments import text_tables
 from f3amd_lib.experiments.text_tables import PAPERS, measure_text_table, reconstruction_rows
+from f3amd_lib.generation.latent_motion import TEACHER_GUIDANCE
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -29,7 +30,13 @@ ROWS = {
     "text_pcm1": [REAL, {"dataset": "bandai", **STUDENT, "steps": 2}],
     "text_pcm3": [{"model": "MotionPCM-VAE", "trained": "tiny-VAE"}],
     "text_pcm4": [{**TEACHER, "steps": 3}, {**TEACHER, "steps": 1}],
+    "text_guidance": [{**TEACHER, "steps": 3, "guidance": w} for w in (1.0, TEACHER_GUIDANCE)],
 }
+
+
+def _keys(name: str) -> list[str]:
+    """Columns that name a row; guidance is of no claim, and so of no schema."""
+    return SCHEMAS.get(name, ["model", "steps", "guidance", "metric"])
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +63,17 @@ def tables(data, tmp_path_factory):
 @pytest.mark.slow
 def test_rows_have_the_ledgers_columns_steps_arrive_and_real_motion_is_real(tables):
     for name, table in tables.items():
-        assert {*SCHEMAS[name], "trained", "windows", "weights"} <= set(table)
-        assert not table.duplicated(SCHEMAS[name]).any() and np.isfinite(table["value"]).all()
+        keys = _keys(name)
+        assert {*keys, "trained", "windows", "weights"} <= set(table)
+        assert not table.duplicated(keys).any() and np.isfinite(table["value"]).all()
     first = tables["text_pcm1"].set_index(["model", "metric"])["value"]
     assert first["Real", "text_FID"] == pytest.approx(0.0, abs=1e-6)
     assert first["MotionPCM-M2", "text_FID"] > 1e-3
     assert first["MotionPCM-M2", "sampling_seconds"] > 0.0 and ("Real", "sampling_seconds") not in first
     one, three = (tables["text_pcm4"].query(f"steps == {steps}")["value"].to_numpy() for steps in (1, 3))
     assert not np.array_equal(one, three)
+    none, usual = (part["value"].to_numpy() for _, part in tables["text_guidance"].groupby("guidance"))
+    assert np.array_equal(usual, three) and not np.array_equal(none, three)
     assert {"reconstruction_error", "feature_error", "text_FID"} <= set(tables["text_pcm3"]["metric"])
 
 
@@ -96,9 +106,9 @@ def test_the_files_rows_name_presets_columns_and_commands():
     assert set(PAPERS["motionpcm"]) == set(about)
     typed = " ".join(run for runs in claims.load_commands("motionpcm").values() for run in runs)
     for name, table in about.items():
-        assert f"f3amd measure {name} " in typed or name == "text_pcm3"  # no claim is about reconstruction
+        assert f"f3amd measure {name} " in typed or name in ("text_pcm3", "text_guidance")  # of no claim
         for row in table["rows"]:
-            assert {*row} - {"trained"} == set(SCHEMAS[name]) - {"metric"}
+            assert {*row} - {"trained"} == set(_keys(name)) - {"metric"}
             if row["model"] == "Real":
                 continue
             model, trained = presets.find_preset(row["model"]), presets.find_preset(row["trained"])
