@@ -674,8 +674,8 @@ def measure(
 
     Args:
       names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_judge,
-        hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4, text_guidance, by name
-        alone.
+        hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4,
+        text_guidance, by name alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
