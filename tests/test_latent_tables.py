@@ -34,11 +34,6 @@ ROWS = {
 }
 
 
-def _keys(name: str) -> list[str]:
-    """Columns that name a row; guidance is of no claim, and so of no schema."""
-    return SCHEMAS.get(name, ["model", "steps", "guidance", "metric"])
-
-
 @pytest.fixture(scope="module")
 def data():
     return captioned_walks(synthetic.STYLES[:2], ("test", "test", "validation", "train"), num_frames=40)
@@ -63,7 +58,7 @@ def tables(data, tmp_path_factory):
 @pytest.mark.slow
 def test_rows_have_the_ledgers_columns_steps_arrive_and_real_motion_is_real(tables):
     for name, table in tables.items():
-        keys = _keys(name)
+        keys = SCHEMAS[name]
         assert {*keys, "trained", "windows", "weights"} <= set(table)
         assert not table.duplicated(keys).any() and np.isfinite(table["value"]).all()
     first = tables["text_pcm1"].set_index(["model", "metric"])["value"]
@@ -108,7 +103,7 @@ def test_the_files_rows_name_presets_columns_and_commands():
     for name, table in about.items():
         assert f"f3amd measure {name} " in typed or name in ("text_pcm3", "text_guidance")  # of no claim
         for row in table["rows"]:
-            assert {*row} - {"trained"} == set(_keys(name)) - {"metric"}
+            assert {*row} - {"trained"} == set(SCHEMAS[name]) - {"metric"}
             if row["model"] == "Real":
                 continue
             model, trained = presets.find_preset(row["model"]), presets.find_preset(row["trained"])
