@@ -56,3 +56,8 @@ def checked_seed(seed) -> int:
 def row_label(model: str, steps: int) -> str:
     """Return how a system is called in tables and legends: "F3AMD-FNO-96, 8 steps"."""
     return f"{model}, {steps} step{'s' if steps > 1 else ''}"
+
+
+def counted_cores(record: Mapping) -> str:
+    """Return on how many cores a record was made, as a text says it: "1 core", "2 cores"."""
+    return f"{record['cores']} core{'s' * (record['cores'] != 1)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
+from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import folder_reason, read_table
 
@@ -48,10 +49,10 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
         how = f"`make measure MEASURE={measurement} DATA=bandai`"
         return None, f"Not measured yet: `{name}`. {how} measures it."
     table, record = found
-    table.attrs["dataset"], cores = record["dataset"], record["cores"]
+    table.attrs["dataset"] = record["dataset"]
     sentence = (
         f"Stored result `{name}`: data {record['dataset']}, profile {record['profile']}, "
-        f"{cores} core{'s' * (cores != 1)} ({record['device_platform']}), {record['date_utc'][:10]}. "
+        f"{counted_cores(record)} ({record['device_platform']}), {record['date_utc'][:10]}. "
         f"{record['dataset_credit'] or ''}"
     )
     if table.attrs["stale"]:

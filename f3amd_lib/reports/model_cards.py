@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
@@ -71,7 +72,7 @@ def _filled(name: str, path: Path, trained, params, **fields) -> str:
         weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record), date=record["date_utc"][:10],
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        cores=f"{record['cores']} core{'s' * (record['cores'] != 1)}",
+        cores=counted_cores(record),
         loss=history["held_out_loss"].dropna().iloc[-1], **fields,
     )  # fmt: skip
 
