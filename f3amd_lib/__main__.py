@@ -169,6 +169,7 @@ def train(
     motion: Data, preset: Repeatable = (), minutes: float | None = None, steps: int | None = None,
     batch_size: int | None = None, seed: int | None = None, out: Path | None = None, all_devices: bool = False,
     processes: int | None = None, process: int | None = None, coordinator: str | None = None, cluster: bool = False,
+    teacher: Path | None = None,
 ) -> int:  # fmt: skip
     """Train a model; a killed run goes on where it stopped.
 
@@ -186,13 +187,16 @@ def train(
       process: number of this one, from 0.
       coordinator: HOST:PORT of process 0.
       cluster: train in all processes of a job of Slurm, Open MPI or Kubernetes together.
+      teacher: file of the teacher of a MotionPCM student, such as the one that ships, instead of training one.
     """
     from f3amd_lib.experiments.learning_curves import train_family
     from f3amd_lib.training import parallel
     from f3amd_lib.training.pipeline import model_files
 
+    if teacher is not None and not (preset and all(name.startswith(("MotionPCM", "MotionLCM")) for name in preset)):
+        raise ValueError("--teacher is for students of MotionPCM: leave it out")
     if any(name == "judge" or "ACMDM" in name or name.startswith(("MotionPCM", "MotionLCM")) for name in preset):
-        return _train_text(motion, preset, minutes, steps, batch_size, seed, out)
+        return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
     together = (coordinator, processes, process)
     named = any(value is not None for value in together)
     if cluster and named:
@@ -216,7 +220,7 @@ def train(
     return status
 
 
-def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out) -> int:
+def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
     """Train models of text to motion, or their judge; what is finished is left as it is."""
     from f3amd_lib.data.text_encoders import load_text_encoder
     from f3amd_lib.ground.profiles import load_profile
@@ -235,7 +239,7 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out) -> i
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
         if is_latent(name):
-            settings = {"batch_size": batch_size, "folder": out}
+            settings = {"batch_size": batch_size, "folder": out, "teacher": teacher}
             done = latent_models.train_latent_model(data, encoder, profile, name, stop_at=stop_at, **settings)
         elif name != text_models.JUDGE:
             settings = {"window": motion.window, "batch_size": batch_size, "folder": out}
@@ -351,14 +355,14 @@ def text(
       caption: such as "an elderly person raises the left hand".
       then: what the person does after that, without a stop; repeatable. Needs a model of the prefix form.
       model: a preset, such as ACMDM-S-PS22-raw-n3; by default the newest of ACMDM's that is trained.
-        motionpcm stands for MotionPCM-M1-small.
+        motionpcm stands for its small student of so many --steps, MotionPCM-M1-small by default.
       data: the data set that it was trained on.
       weights: a weights file instead.
       seconds: of each caption.
-      guidance: how hard the caption pushes; by default the model's own, else the paper's 3 (control 2.5, a stream 4,
-        MotionPCM 14).
+      guidance: how hard the caption pushes; by default the model's own, else the paper's 3 (control 2.5, a stream 4).
+        MotionPCM counts from 0, not from 1: 14, of a student between 5 and 15; its teacher 6.5.
       steps: of Euler's method; by default the model's own sampler, which may choose its steps itself. A student of
-        MotionPCM takes as many as it was trained for, its teacher (MotionPCM-teacher-small) any number.
+        MotionPCM takes 1, 2 or 4, as it was trained for, its teacher (MotionPCM-teacher-small) any number.
       seed: of the noise.
       control: CSV with the header frame,x,y,z: where a joint should be, frames from 0, metres. Needs a control branch.
       joint: that is controlled: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
@@ -376,23 +380,27 @@ def text(
     from f3amd_lib.motion.inverse_kinematics import fitted
     from f3amd_lib.motion.skeleton import Motion
     from f3amd_lib.serving.player import Character, Scene
-    from f3amd_lib.training.latent_models import find_latent_model, is_latent_preset, load_latent_model
+    from f3amd_lib.training.checkpoints import file_kind
+    from f3amd_lib.training.latent_models import KIND, find_latent_model, is_latent_preset, load_latent_model
     from f3amd_lib.training.text_models import find_text_model, load_text_model
 
     captions = [caption, *then]
     check_captions(captions)
     captioned_motion.check_solver(steps, guidance)
-    latent = model is not None and (model.lower() == "motionpcm" or is_latent_preset(model))
+    if weights is None:
+        latent = model is not None and (model.lower() == "motionpcm" or is_latent_preset(model))
+    else:
+        latent = file_kind(weights) == KIND  # the file itself says whose it is
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
     if latent and (then or control):
-        raise ValueError(f"{model} makes whole motions of one caption: leave out --then and --control")
+        raise ValueError(f"{model or weights} makes whole motions of one caption: leave out --then and --control")
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
     targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
     Model(overwrite=overwrite).check_free(*targets)
     preset = model or (captioned_motion.STREAM_PRESET if then else None)
     if latent:
-        trained = load_latent_model(weights or find_latent_model(data, model))
+        trained = load_latent_model(weights or find_latent_model(data, model, steps))
     else:
         trained = load_text_model(weights or find_text_model(data, preset, control=control is not None))
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
@@ -675,7 +683,7 @@ def measure(
     Args:
       names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_judge,
         hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4,
-        text_guidance, by name alone.
+        text_guidance, text_one_caption, by name alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.

@@ -1,15 +1,23 @@
-"""Distilling a denoiser of locomotion into one step: where a student begins, what it is asked, what it learns."""
+"""Distilling a denoiser of locomotion into few steps: where a student begins, what it is asked, what it learns."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
-from builders import tiny_task
+from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_task, tiny_trained
 
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
+from f3amd_lib.experiments import measure
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table, run_record
+from f3amd_lib.training import consistency_task
+from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.consistency_task import ConsistencyTask
 from f3amd_lib.training.optimise import advance, initial_state
+from f3amd_lib.training.pipeline import PreparedData
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +53,86 @@ def test_identity_names_the_teacher(task):
     other = dataclasses.replace(task, teacher=jax.tree.map(jnp.zeros_like, task.teacher))
     assert task.identity()["teacher"] != other.identity()["teacher"]
     assert task.identity()["training"] == other.identity()["training"]
+    levels = ConsistencyTask(
+        tiny_task(num_steps=8, diffusion=variance_preserving_cosine(8)), task.teacher, num_phases=2
+    )
+    assert levels.identity()["teacher"] != dataclasses.replace(levels, num_phases=4).identity()["teacher"]
+
+
+@pytest.mark.parametrize(("num_phases", "after"), [(1, [8] * 8), (2, [4] * 4 + [8] * 4), (4, [2, 2, 4, 4, 6, 6, 8, 8])])
+def test_a_question_ends_where_its_phase_does_and_the_sampler_asks_there(task, num_phases, after, monkeypatch):
+    levels = variance_preserving_cosine(8)
+    student = ConsistencyTask(tiny_task(num_steps=8, diffusion=levels), task.teacher, num_phases=num_phases)
+    asked = []
+
+    def answer(teacher, target, x_noisy, sigma, sigma_next, sigma_edge):
+        asked.append(np.stack([sigma, sigma_next, sigma_edge]))
+        return jnp.zeros_like(x_noisy)
+
+    monkeypatch.setattr(consistency_task, "consistency_answer", answer)
+    (batch, target), key = student.draw(initial_state(student), jax.random.key(0))
+    for number in range(6):
+        student._terms(student.teacher, target, batch, jax.random.fold_in(key, number), training=False)
+    sigma, sigma_next, sigma_edge = np.concatenate(asked, axis=1)
+    grid = levels.grid(8).astype(np.float32)
+    place = np.searchsorted(-grid, -sigma)
+    assert set(place) == set(range(8))
+    np.testing.assert_array_equal(sigma_next, grid[place + 1])
+    np.testing.assert_array_equal(sigma_edge, grid[np.array(after)[place]])
+    # A rollout of M steps asks at the beginning of each phase.
+    visited = levels.grid(num_phases, consistency_task.STUDENT_SPACING)
+    np.testing.assert_allclose(visited, levels.grid(8)[[0, *sorted(set(after))]])
+
+
+def test_phases_that_no_sampler_visits_are_refused(task):
+    with pytest.raises(ValueError, match="must divide the 4 steps"):
+        dataclasses.replace(task, num_phases=3)
+    with pytest.raises(ValueError, match="not the edges of 2 phases"):
+        dataclasses.replace(task, num_phases=2)
+
+
+def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learned(tmp_path, monkeypatch):
+    levels = variance_preserving_cosine(8)
+    config = tiny_camdm(noise_levels=tuple(levels.levels.tolist()))
+    models = {"CAMDM": tiny_trained(config=config, diffusion=levels), "F3AMD-FNO-96-plus": tiny_trained()}
+    profile = load_profile("smoke", "synthetic", batch_size=2, window=WINDOW)
+    distilled, walked = [], []
+
+    def distil(prepared, profile, teacher, folder, *, num_steps, num_phases, batch_size):
+        distilled.append((teacher.diffusion.kind, folder.name, num_phases, num_steps))
+        return dataclasses.replace(teacher, params=jax.tree.map(lambda leaf: leaf + num_phases, teacher.params)), None
+
+    def measure_model(generator, packed, classifier, protocol, held_out, *, name):
+        walked.append((name, generator.sampler, generator.sigmas, weights_digest(generator.trained.params)))
+        row = {"model": name, "metric": "FID", "unit": "", "better": "down", "varies": "seeds", "value": 1.0}
+        return pd.DataFrame([row | {"window_frames": WINDOW, "steps": generator.num_steps, "seed": 0}]), None
+
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    record = run_record(profile=profile, dataset="synthetic", seed=0, classifier_weights="cc")
+    for name, answer in {
+        "available_models": lambda profile: list(models),
+        "obtain_model": lambda prepared, profile, *, preset: (models[preset], None, "earlier run"),
+        "protocol_of": lambda *arguments: (None, None, dict(record)),
+        "input_use": lambda *arguments, **settings: pd.DataFrame([{"metric": "use_of_x", "value": 1.0}]),
+        "held_out_condition": lambda *arguments: None,
+        "distil": distil,
+        "measure_model": measure_model,
+    }.items():
+        monkeypatch.setattr(measure, name, answer)
+    path = measure.measure_one_step(PreparedData(tiny_packed(), WINDOW, HISTORY), profile)
+    steps = measure.STUDENT_STEPS["smoke"]
+    of_camdm = [("variance_preserving_cosine", f"M{phases}", phases, steps) for phases in (1, 2, 4)]
+    assert distilled == [*of_camdm, ("variance_exploding", "M1", 1, steps)]
+    assert {sampler for _, sampler, _, _ in walked} == {"ddim"}
+    grid, digest = levels.grid(8), {name: weights_digest(model.params) for name, model in models.items()}
+    wanted = [("CAMDM, by DDIM", 1), *[("CAMDM, distilled", 8 // phases) for phases in (1, 2, 4)]]
+    assert [name for name, *_ in walked] == [*[name for name, _ in wanted], "F3AMD-FNO-96-plus, distilled"]
+    for (_, stride), (_, _, sigmas, _) in zip(wanted, walked, strict=False):
+        np.testing.assert_allclose(sigmas, grid[::stride])
+    assert walked[-1][2].tolist() == pytest.approx([128.0, 0.0])
+    # The students walk, not their teachers; rows carry the teacher's weights, which they go stale with.
+    assert walked[0][3] == digest["CAMDM"] and len({one[3] for one in walked}) == 5
+    table, told = read_table(path)
+    assert table["steps"].tolist() == [8, 1, 2, 4, 1]
+    assert told["weights_digests"]["CAMDM, distilled"] == [digest["CAMDM"]]
+    assert len(read_table(path.with_name("one_step_input_use.csv"))[0]) == 5

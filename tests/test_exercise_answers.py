@@ -309,10 +309,11 @@ RIGHT["11.d"] = [
     jnp.asarray([128.0, 3.0, 2.0, 1.0]),
 ]
 WRONG["11.d"] = [
-    ([128, 40.41, 6.06, 0.01], r"4\d% hit the wall"),  # the paper's
+    ([128, 40.41, 6.06, 0.01], r"4\d\.\d% hit the wall"),  # the paper's
     ([128, 0.5, 0.25, 0.1], "others pass at 1.[01]. m, the data at 1.39 m"),  # all after the decision
     ([128, 10, 5, 2], "hit the wall"),
-    ([128, 0.1, 0.05, 0.01], "100% hit the wall"),
+    ([128, 0.1, 0.05, 0.01], "100.0% hit the wall"),
+    ([128, 6, 3, 1.5], r"5\.0% hit the wall, fewer than 5 % may"),  # just too many
     ([128, 1e-30, 1e-38, 1e-44], "so low"),
     ([60, 6, 3, 1], "first level is 128"),
     ([128, 3, 6, 1], "lower than the one before"),

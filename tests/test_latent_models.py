@@ -1,6 +1,8 @@
 """MotionPCM's models as files, and their training by name, one stage after the other."""
 
+import dataclasses
 import types
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +10,21 @@ import numpy as np
 import pytest
 from test_text_judge import OneVectorAWord
 
+from f3amd_lib import __main__ as command_line
+from f3amd_lib.data.text_encoders import embed_captions, load_text_encoder
 from f3amd_lib.data.text_motions import text_motions
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
-from f3amd_lib.generation.latent_motion import decode_latent, latent_motions, reconstruction, sample_student, steps_of
+from f3amd_lib.experiments.text_probes import ONE_CAPTION, measure_one_caption
+from f3amd_lib.generation import latent_motion
+from f3amd_lib.generation.latent_motion import (
+    decode_latent,
+    guidance_of,
+    latent_motions,
+    reconstruction,
+    sample_latent_student,
+    sample_student,
+    steps_of,
+)
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion import synthetic
@@ -18,15 +32,17 @@ from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.training import latent_models, text_models
-from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.latent_models import (
     is_latent_preset,
     load_latent_model,
+    named_model,
     stage_of,
     stands_on,
     train_latent_model,
 )
 from f3amd_lib.training.latent_motion import FrameStatistics
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.text_models import text_model_files
 
 SIZES = {"window": 2, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}
@@ -71,7 +87,79 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
         assert latent_models.find_latent_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
     with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
         latent_models.find_latent_model("bandai", "MotionPCM-M4-small")
+    # A student is trained for one number of steps: the steps that are asked for choose it.
+    for steps, wanted in ((None, "M1"), (1, "M1"), (2, "M2"), (4, "M4")):
+        name = named_model("MotionPCM", steps)
+        assert name == f"MotionPCM-{wanted}-small"
+        assert presets.find_preset(name).training.get("num_phases", 1) == (steps or 1)
+    assert named_model("MotionPCM-M1-small", 4) == "MotionPCM-M1-small"
+    with pytest.raises(ValueError, match="no trained MotionPCM-M2-small"):
+        latent_models.find_latent_model("bandai", "motionpcm", 2)
+    for steps in (3, 50):
+        with pytest.raises(ValueError, match=f"for 1, 2 or 4 steps, none for {steps}; .* MotionPCM-teacher-small"):
+            latent_models.find_latent_model("bandai", "motionpcm", steps)
     assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
+
+
+SHIPPED = PRETRAINED_DIR / "bandai" / "text"
+
+
+def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_guidance(tmp_path, monkeypatch):
+    """`f3amd text ... --model motionpcm --steps 1`: the caption alone to one jump from level 999 to 0."""
+    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
+    made, asked = [], []
+
+    def written(targets, motion, scene, trained, *, overwrite):
+        made.append((trained.name, motion))
+
+    def follow(predict, schedule, noise, times):
+        asked.append((noise.shape, list(times)))
+        return real(predict, schedule, noise, times)
+
+    real = latent_motion.follow
+    monkeypatch.setattr(command_line, "_write_shown", written)
+    monkeypatch.setattr(latent_motion, "follow", follow)
+    words = ["text", "a person raises the left hand", "--seconds", "1.2", "--seed", "3", "--out", str(tmp_path)]
+    assert command_line.main([*words, "--model", "motionpcm", "--steps", "1"]) == 0
+    ((name, motion),), ((shape, times),) = made, asked
+    assert (name, shape, times) == ("MotionPCM-M1-small", (1, 16, 32), [999, 0])
+    student = load_latent_model(SHIPPED / "MotionPCM-M1-small.safetensors")
+    pooled = embed_captions(["a person raises the left hand"], load_text_encoder()).pooled
+    wanted = latent_motions(student, pooled, 24, jax.random.key(3), guidance=14.0)[0]
+    other = latent_motions(student, pooled, 24, jax.random.key(3), guidance=5.0)[0]
+    # Joints are moved a little, so that bones keep their lengths.
+    away = np.abs(motion.positions - wanted).mean()
+    assert away < 0.03 and np.abs(motion.positions - other).mean() > 1.5 * away
+    # The file itself says whose it is.
+    assert command_line.main([*words, "--weights", str(SHIPPED / "MotionPCM-M1-small.safetensors")]) == 0
+    np.testing.assert_array_equal(made[1][1].positions, motion.positions)
+
+
+@pytest.mark.parametrize("steps, model, told", [
+    ("3", "motionpcm", "students of MotionPCM are trained for 1, 2 or 4 steps, none for 3"),
+    ("50", "motionpcm", "--model MotionPCM-teacher-small"),
+    ("4", "motionpcm", "no trained MotionPCM-M4-small for data set 'bandai'; train it: f3amd train"),
+    ("2", "MotionPCM-M1-small", "MotionPCM-M1-small takes 1 step, got 2"),
+])  # fmt: skip
+def test_steps_that_no_student_takes_are_refused(steps, model, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
+    words = ["text", "a person walks forward", "--model", model, "--steps", steps, "--out", str(tmp_path / "out")]
+    assert command_line.main(words) == 2
+    assert told in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_student_is_told_no_guidance_that_it_has_never_heard():
+    student, teacher = (
+        load_latent_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher")
+    )
+    assert [guidance_of(student, 1, w) for w in (None, 5.0, 15.0)] == [14.0, 5.0, 15.0]
+    assert [guidance_of(teacher, 50, w) for w in (None, 0.0, 20.0)] == [6.5, 0.0, 20.0]
+    told = {**student.record["identity"]["training"], "consistency": "latent"}
+    latent = dataclasses.replace(student, record={"identity": {"training": told}})
+    assert [guidance_of(latent, steps) for steps in (1, 2, 4)] == [7.0, 11.5, 12.5]
+    for w in (0.0, 4.9, 15.1):
+        with pytest.raises(ValueError, match="MotionPCM-M1-small was trained with a guidance of 5 to 15, got"):
+            latent_motions(student, np.zeros((1, 256), np.float32), 24, jax.random.key(0), guidance=w)
 
 
 @pytest.fixture
@@ -122,7 +210,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
 
 
 @pytest.mark.slow
-def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path):
+def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeypatch):
     made = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     files = {name: text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
     teacher, student = (load_latent_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
@@ -138,6 +226,32 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path):
     for name, term in (("tiny-VAE", "joints"), ("tiny-teacher", "loss"), ("tiny-M2", "discriminator")):
         history, _ = read_table(text_model_files(PROFILE, name, folder=tmp_path).history)
         assert np.isfinite(history[f"held_out_{term}"].dropna()).all() and history[f"held_out_{term}"].notna().any()
+    # The same student from the teacher's file alone, where nothing else lies; other files are refused.
+    elsewhere = tmp_path / "elsewhere"
+    from_file = partial(train_latent_model, data, OneVectorAWord(), PROFILE, folder=elsewhere, **QUIET)
+    alone = from_file("tiny-M2", teacher=files["tiny-teacher"])
+    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
+    assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
+    for name, file, reason in (
+        ("tiny-VAE", "tiny-teacher", "tiny-VAE is no student"),
+        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, but tiny-M2 is distilled from tiny-teacher"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            from_file(name, teacher=files[file])
+    others = data.select(np.arange(len(data.captions) - 1))
+    with pytest.raises(ValueError, match="trained on other clips"):
+        train_latent_model(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
+    # What is kept of one caption: the latent of the student in that file, from the noise of the seed.
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
+    kept, told = read_table(measure_one_caption(data, OneVectorAWord(), PROFILE, models=["tiny-M2"], folder=tmp_path))
+    text = embed_captions([ONE_CAPTION], OneVectorAWord()).pooled
+    start = jax.random.normal(jax.random.key(PROFILE.seed), (1, 2, 3))
+    wanted = sample_latent_student(
+        network_with(student.config, student.params), student.schedule, text, start, jax.random.key(9),
+        guidance=guidance_of(student, 1),
+    )  # fmt: skip
+    np.testing.assert_allclose(kept[[f"channel_{n}" for n in range(3)]], wanted[0], rtol=1e-5)
+    assert told["caption"] == ONE_CAPTION and set(kept["weights"]) == {weights_digest(student.params)}
     # Finished models are read, and other settings are refused by name.
     again = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))

@@ -17,7 +17,7 @@ from f3amd_lib.generation.latent_motion import sample_latent_student, sample_stu
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.redundant import grouped_statistics
 from f3amd_lib.motion.skeleton import resample
-from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig, student_of
+from f3amd_lib.networks.motionpcm import DiscriminatorConfig, LatentAutoencoderConfig, LatentDenoiserConfig, student_of
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training import latent_motion
 from f3amd_lib.training.checkpoints import network_with
@@ -29,8 +29,10 @@ from f3amd_lib.training.latent_motion import (
     LatentTable,
     TeacherTask,
     clip_error,
+    draw_latent,
     latent_motion_recipe,
     latent_table,
+    reconstruction_terms,
 )
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
 
@@ -78,7 +80,9 @@ def start():
 
 @pytest.fixture(scope="module")
 def batch(start):
-    return jax.jit(lambda state: usual_task().draw(state, jax.random.key(3)))(start)[0]
+    drawn = jax.jit(lambda state: usual_task().draw(state, jax.random.key(4)))(start)[0]
+    assert set(np.asarray(drawn.edge)) == {0, 499}  # of both phases
+    return drawn
 
 
 # ------------------------------------------------------------------------------------------------------------- recipes
@@ -115,6 +119,31 @@ def test_an_error_is_a_mean_over_numbers_then_frames_then_clips():
     # 1.5 and 0.125; padding does not count, and a short clip counts as much as a long one.
     assert clip_error(made, true, mask) == pytest.approx((1.5 + 0.125) / 2)
     assert clip_error(made, made, mask) == 0.0
+
+
+def test_a_latent_is_drawn_from_its_gaussian_and_diverges_from_the_standard_one():
+    joints, frames = 2, 4
+
+    class Coder:
+        mean, deviation = 1.0, 2.0
+
+        def encode(self, features, mask, key=None):
+            ones = jnp.ones((len(features), 2, 3))
+            return self.mean * ones, 2.0 * np.log(self.deviation) * ones
+
+        def decode(self, latent, mask, key=None):
+            return jnp.zeros((*mask.shape, 12 * joints - 1))
+
+    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    clips = normal(0, 2, frames, 12 * joints - 1), jnp.ones((2, frames), bool)
+    terms = reconstruction_terms(Coder(), statistics, *clips)
+    # KL(N(1, 4) | N(0, 1)) of each number.
+    assert float(terms["divergence"]) == pytest.approx(0.5 * (1 + 4 - 1 - np.log(4)), rel=1e-5)
+    standard = Coder()
+    standard.mean, standard.deviation = 0.0, 1.0
+    assert float(reconstruction_terms(standard, statistics, *clips)["divergence"]) == 0.0
+    drawn = draw_latent(jax.random.key(0), jnp.full(100_000, 1.0), jnp.full(100_000, 2.0 * np.log(2.0)))
+    assert (float(drawn.mean()), float(drawn.std())) == pytest.approx((1.0, 2.0), abs=0.03)
 
 
 @pytest.mark.slow
@@ -351,6 +380,56 @@ def test_each_player_learns_from_its_own_loss_alone(batch, start):
     assert terms(step("student", adversarial))["adversarial"] < before["adversarial"]
     better = terms(step("discriminator", critic))
     assert better["discriminator"] < before["discriminator"] and better["adversarial"] > before["adversarial"]
+
+
+def test_the_critic_sees_the_students_end_carried_to_its_time_and_the_data_through_the_teacher(batch, monkeypatch):
+    """Algorithm 1, lines 11, 12 and 15: what is shown, at which time, under which caption, in which order."""
+    read = []
+
+    class Reading(Looking):
+        def __init__(self, params):
+            super().__init__()
+            self.params = params
+
+        def features(self, state, time, context):
+            read.append((self.params, state, time, context))
+            return [state]
+
+    silent = lambda features: jnp.zeros(len(features[0]))
+    monkeypatch.setattr(
+        latent_motion,
+        "network_with",
+        lambda config, params: silent if isinstance(config, DiscriminatorConfig) else Reading(params),
+    )
+    loss, (terms, _) = usual_task().loss({"student": {}, "discriminator": {}}, None, batch, None)
+    # A student that answers 0 jumps along its own state; from there fresh noise carries it.
+    alpha, edge, there = (np.asarray(shares(SCHEDULE, t)[0]).reshape(-1, 1, 1)
+                          for t in (batch.time, batch.edge, batch.critic_time))  # fmt: skip
+    kept = there / edge
+    fake = kept * (edge / alpha * batch.state) + np.sqrt(np.maximum(1 - kept**2, 0)) * batch.fresh
+    assert len(read) == 3  # the student's own, the data, the same made thing once more
+    for (params, state, time, context), wanted in zip(read, (fake, batch.real, fake), strict=True):
+        assert params is teacher_weights()
+        np.testing.assert_allclose(state, wanted, atol=1e-4)
+        np.testing.assert_array_equal(time, batch.critic_time)
+        np.testing.assert_array_equal(context, batch.text)
+    # Scores of 0: 1 for the student, 2 for the heads.
+    assert (float(terms["adversarial"]), float(terms["discriminator"])) == (1.0, 2.0)
+    assert float(loss) == pytest.approx(float(terms["consistency"]) + 0.1 + 2.0)
+
+
+def test_the_critic_looks_from_end_to_end_of_phases_that_are_not_of_one_length(monkeypatch):
+    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: Looking())
+    count = 20_000
+    drawn = distillation(num_phases=4).questions(
+        {}, jnp.zeros((count, 1, 1)), jnp.zeros((count, 4)), jax.random.key(2)
+    )  # fmt: skip
+    seen = {int(edge): np.asarray(drawn.critic_time[drawn.edge == edge]) for edge in np.unique(drawn.edge)}
+    assert {edge: (times.min(), times.max()) for edge, times in seen.items()} == {
+        0: (0, 199), 199: (199, 499), 499: (499, 699), 699: (699, 999)
+    }  # fmt: skip
+    for edge, times in seen.items():
+        assert times.mean() == pytest.approx((times.min() + times.max()) / 2, abs=6), edge
 
 
 @pytest.mark.slow

@@ -162,6 +162,23 @@ def test_a_student_is_its_teacher_at_first_whatever_it_is_told(teacher):
     assert dataclasses.replace(student.config, guidance_features=0) == teacher.config
 
 
+def test_guidance_joins_the_waves_of_the_time_before_their_layers(teacher):
+    """Waves of 1,000 w, sines first, last frequency 1/10,000, by a layer without bias (MotionLCM's released code)."""
+    student = student_of(teacher.network, jax.random.key(9))
+    kernel = 0.1 * normal(3, 256, 12)
+    student.guidance.kernel[...] = kernel
+    w, time = 7.25, 499
+    angle = 1000.0 * w * 10000.0 ** (-np.arange(128) / 127.0)
+    told = np.r_[np.sin(angle), np.cos(angle)]
+    of_time = np.asarray(waves(time, 12, 6.0)) + told @ np.asarray(kernel)
+    wanted = student.time_second(jax.nn.silu(student.time_first(jnp.asarray(of_time, jnp.float32))))
+    asked = normal(1, 1, 4, 3), jnp.asarray([time]), student.encode(normal(2, 1, 5)), jnp.asarray([w])
+    found = student._tokens(*asked)[0, 4] - student.positions[...][4]  # after the four tokens of the latent
+    np.testing.assert_allclose(found, wanted, atol=2e-3)
+    away = student._tokens(*asked[:3], jnp.asarray([w + 0.01]))[0, 4] - student.positions[...][4]
+    assert np.abs(away - wanted).max() > 2e-2
+
+
 @pytest.mark.parametrize("change", ["state", "time", "text"])
 def test_each_input_moves_the_answer(teacher, change):
     inputs = {"state": normal(1, 1, 4, 3), "time": jnp.asarray([499.0]), "text": normal(2, 1, 5)}

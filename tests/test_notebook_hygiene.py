@@ -33,6 +33,11 @@ MACHINE_PATH = re.compile(rf"(?<![\w.\-/:<>])/(?:{_FOLDERS})/|\b[A-Z]:\\\\?(?:Us
 BINARY = {".png", ".gif", ".webp", ".npz", ".safetensors", ".jpg", ".pdf"}
 
 
+def prose(notebook) -> list[str]:
+    """What a notebook's cells of text say."""
+    return [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+
+
 def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
     """Everything about a notebook file that should not be committed, one sentence each.
 
@@ -54,6 +59,10 @@ def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
         faults.append("papermill metadata")
     if "widgets" in notebook.metadata or "application/vnd.jupyter.widget" in text:
         faults.append("widget state")
+
+    formulas = " ".join(re.findall(r"\$[^$\n]+\$", " ".join(prose(notebook))))
+    if doubled := re.search(r"\\\\[A-Za-z]+", formulas):
+        faults.append(f"{doubled[0]} ends a line where a sign is meant")
 
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     if any(not cell.source.strip() for cell in code):
@@ -183,6 +192,46 @@ def test_every_committed_result_is_one_that_a_notebook_writes():
     assert orphans(results, NOTEBOOKS) == []
 
 
+NO_DATA = re.compile(
+    r"00_(paper_claim|road_map)|01_rotations|02_\w+|03_\w+|04_(noise_levels|schedules)|05_rounds|06_\w+|07_(drift|disagree)"
+    r"|08_verdicts|10_(collapse|two_updates|noticing|small_\w+)|11_(distances|spread|fork|outcomes|wall|errors)"
+    r"|12_(layers|ramp|wrapped|families|svd|film_shares|delay_line|interactions)|16_(one_line|costs)|18_\w+|19_captions"
+    r"|20_(forms|cache)|22_wall"
+)
+"""Pictures of theory, of counted operations and of the paper's own figures: there is no data set to name."""
+
+TITLED = {"00_first_walk", "07_settling", "10_updates_on_models", "10_halvings"}
+"""Pictures whose titles or legends come with the data set's name from another cell."""
+
+
+def unnamed_pictures(path: Path) -> list[str]:
+    """Kept pictures of motion, or of what was measured on it, that do not name their data set."""
+    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    calls = [(cell, node) for cell in cells if "keep_figure(" in cell for node in ast.walk(ast.parse(cell))
+             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "keep_figure"]  # fmt: skip
+    unnamed = [(cell, ast.unparse(call.args[2]).strip("'")) for cell, call in calls
+               if not any(word.arg == "data" for word in call.keywords)]  # fmt: skip
+    in_title = re.compile(r"""\{(data|shown|label|source|data_of\(.*)\}|\[['"]dataset['"]\]""")
+    return [name for cell, name in unnamed if not (in_title.search(cell) or NO_DATA.fullmatch(name) or name in TITLED)]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_picture_of_motion_names_its_data_set(path):
+    assert unnamed_pictures(path) == []
+
+
+def test_a_picture_that_names_no_data_set_is_found(tmp_path):
+    sources = [
+        'keep_figure(figure, results, "15_one")',
+        'keep_figure(figure, results, "15_two", data=data)',
+        'axis.set_title(f"{data}: feet")\nkeep_figure(figure, results, "15_three")',
+        'keep_figure(figure, results, "02_flow")',
+    ]
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in sources])
+    nbformat.write(notebook, tmp_path / "15_words.ipynb")
+    assert unnamed_pictures(tmp_path / "15_words.ipynb") == ["15_one"]
+
+
 def announced(path: Path) -> list[str]:
     """Results that a notebook's head says it writes, "02_spread.csv"; a part in braces stands for several."""
     head = nbformat.read(path, as_version=4).cells[0].source
@@ -274,7 +323,9 @@ def save(folder: Path, notebook: dict, name: str = "00_good.ipynb") -> Path:
 
 
 def test_a_good_notebook_has_no_faults(tmp_path):
-    assert notebook_faults(save(tmp_path, good_notebook())) == []
+    notebook = good_notebook()
+    notebook["cells"].append(said(r"Divided by $\alpha_t$: two lines, $$a \\ b$$."))
+    assert notebook_faults(save(tmp_path, notebook)) == []
 
 
 def set_parameters(source):
@@ -283,6 +334,11 @@ def set_parameters(source):
 
 def set_verdict(**changes):
     return lambda notebook: notebook["cells"][1].update(changes)
+
+
+def said(source):
+    """A cell of text."""
+    return {"cell_type": "markdown", "metadata": {}, "source": source, "id": "said"}
 
 
 ERROR_OUTPUT = {"output_type": "error", "ename": "E", "evalue": "", "traceback": []}
@@ -300,6 +356,7 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
         (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
         (set_verdict(source="  "), "empty code cell"),
+        (lambda notebook: notebook["cells"].append(said(r"Divided by $\\alpha_t$.")), r"\\alpha ends a line"),
         (set_verdict(metadata={"papermill": {}}), "papermill metadata"),
         (lambda notebook: notebook["metadata"].update(papermill={}), "papermill metadata"),
         (lambda notebook: notebook["metadata"].update(widgets={}), "widget state"),

@@ -13,23 +13,21 @@ from f3amd_lib import reproduce
 from f3amd_lib.ground import profiles
 
 ROOT = Path(__file__).resolve().parents[1]
-PICTURES = shutil.ignore_patterns("*.png", "*.gif", "*.html", "__pycache__", ".ipynb_checkpoints")
+PICTURES = shutil.ignore_patterns("*.png", "*.gif", "__pycache__", ".ipynb_checkpoints")
 
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory) -> Path:
     """A repository with library, notebooks and stored results, and no runs."""
     folder = tmp_path_factory.mktemp("repository")
-    for name in ("f3amd_lib", "notebooks", "paper_figures"):
+    for name in ("f3amd_lib", "notebooks", "paper_figures", "tests"):  # 00 counts the tests of each equation
         shutil.copytree(ROOT / name, folder / name, ignore=PICTURES)
     shutil.copy(ROOT / "pyproject.toml", folder)
     return folder
 
 
 NOTEBOOKS = reproduce.find_notebooks(ROOT / "notebooks")
-TRAIN_TOYS = ("02", "10", "11", "12")
-"""Notebooks whose statements rest on random samples or on small networks trained in the notebook: seed 2 as well."""
-RUNS = [(path, 1) for path in NOTEBOOKS] + [(path, 2) for path in NOTEBOOKS if path.name.startswith(TRAIN_TOYS)]
+RUNS = [(path, seed) for path in NOTEBOOKS for seed in (1, 2)]
 
 
 @pytest.mark.long

@@ -4,11 +4,13 @@ import dataclasses
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import bimodal_paths as toy
 from helpers import one_step_ways as ways
 
 from f3amd_lib.diffusion.schedules import variance_exploding
+from f3amd_lib.ground.profiles import repository_root
 
 DATA, EXPLODING = toy.BimodalPaths(num_frames=8, num_modes=4), variance_exploding()
 
@@ -49,3 +51,32 @@ def test_students_begin_as_the_networks_and_come_to_use_their_noise():
 
 def _recipe():
     return ways.TrainingConfig(10, 8, 1e-3)
+
+
+@pytest.fixture(scope="module")
+def of_record():
+    """Value of (model, steps, metric), by the records that notebook 22 draws."""
+    folder = repository_root() / "paper_figures/bandai/laptop/records"
+    rows = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
+    return rows.set_index(["model", "steps", "metric"])
+
+
+def test_what_notebook_22_says_of_variety_follows_from_the_records(of_record):
+    value = of_record["value"]
+    for metric in ("diversity", "seed_spread"):
+        student, walk = value["CAMDM, distilled", 1, metric], value["CAMDM, by DDIM", 8, metric]
+        assert student > walk > value["CAMDM", 1, metric]
+        plus = value["F3AMD-FNO-96-plus, distilled", 1, metric] / value["F3AMD-FNO-96-plus", 1, metric]
+        assert 1.7 < plus < 2.4  # "twice"
+    for name in ("CAMDM", "F3AMD-FNO-96-plus"):  # one plain step loses variety, and no FID by the intervals
+        assert value[name, 1, "diversity"] < value[name, 8, "diversity"]
+        assert of_record.loc[(name, 1, "FID"), "low"] < of_record.loc[(name, 8, "FID"), "high"]
+
+
+def test_what_notebook_22_says_of_the_price_follows_from_the_records(of_record):
+    value = of_record["value"]
+    for metric in ("foot_sliding", "joint_acceleration"):
+        one, two, four = (value["CAMDM, distilled", steps, metric] for steps in (1, 2, 4))
+        assert one > two > four and one > 1.2 * value["CAMDM, by DDIM", 8, metric]
+        plus = value["F3AMD-FNO-96-plus, distilled", 1, metric] / value["F3AMD-FNO-96-plus", 1, metric]
+        assert plus < 1.25

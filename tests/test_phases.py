@@ -280,11 +280,7 @@ def test_a_perfect_target_answers_with_the_end_of_the_path_and_a_mean_does_not()
     """Exploding state, exact teacher: neighbours on a path have its end, whatever the level; at 0 it is reached."""
     mixture = GaussianMixture([-1.0, 0.6], 0.15, [0.4, 0.6])
     denoise = lambda x, sigma: jnp.asarray(mixture.denoise(np.asarray(x), np.asarray(sigma)[:, None]))
-    end = lambda x, sigma: jnp.asarray(
-        np.stack(
-            [mixture.flow(np.asarray(one)[None], float(level), 0.0)[0] for one, level in zip(x, sigma, strict=True)]
-        )
-    )
+    end = end_at(mixture, jnp.zeros(4))
     sigma = jnp.array([3.0, 1.0, 0.3, 0.2])
     x = jnp.array([[2.0], [-0.7], [0.5], [0.4]])
     near = 0.98 * sigma
@@ -297,3 +293,28 @@ def test_a_perfect_target_answers_with_the_end_of_the_path_and_a_mean_does_not()
     last = consistency_answer(denoise, nonsense, x, sigma, jnp.zeros(4))
     np.testing.assert_allclose(last, denoise(x, sigma), atol=1e-6)
     assert (consistency_answer(denoise, nonsense, x, sigma, near) == 99.0).all()
+    # Inside a phase the answer is that whose straight line leads to where the path crosses the phase's end.
+    edge = jnp.array([1.0, 0.5, 0.2, 0.1])
+    answer = consistency_answer(denoise, end_at(mixture, edge), x, sigma, near, edge)
+    kept = (edge / sigma)[:, None]
+    crossing = flowed(mixture, x, sigma, edge)
+    np.testing.assert_allclose(answer + kept * (x - answer), crossing, atol=0.01)
+    assert np.abs(answer - wanted).max() > 0.1  # and that is not where the whole path ends
+    last = consistency_answer(denoise, nonsense, x, sigma, edge, edge)
+    np.testing.assert_allclose(last, denoise(x, sigma), atol=1e-5)
+
+
+def flowed(mixture: GaussianMixture, x, sigma, edge):
+    """Where the exact path of each row crosses a lower level, [B, ...]."""
+    rows = zip(*map(np.asarray, (x, sigma, edge)), strict=True)
+    return np.stack([mixture.flow(one[None], float(level), float(to))[0] for one, level, to in rows])
+
+
+def end_at(mixture: GaussianMixture, edge):
+    """A denoiser whose jump from (x, sigma) leads to where the exact path crosses the level of each row's edge."""
+
+    def answer(x, sigma):
+        kept = np.asarray(edge / sigma)[:, None]
+        return jnp.asarray((flowed(mixture, x, sigma, edge) - kept * np.asarray(x)) / (1.0 - kept))
+
+    return answer

@@ -103,6 +103,54 @@ def test_slide_of_the_feet(page, sentence, model):
     assert len(rows) and figure == pytest.approx(rows["value"].mean(), rel=0.1)
 
 
+def test_what_is_said_of_the_level_of_one_step():
+    quality = committed_quality("bandai").query("metric == 'FID' and steps == 1").set_index("model")["value"]
+    said = stated(r"at its noisiest level, `CAMDM` has an FID of (\d+)\. .* the least noisy one: (\d+)\.")
+    assert said == (round(quality["CAMDM"]), round(quality["CAMDM, leading"]))
+
+
+def test_what_is_said_of_students_of_locomotion():
+    folder = ROOT / "paper_figures/bandai/laptop/records"
+    record = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
+    rows, plus = record.set_index(["model", "steps", "metric"]), "F3AMD-FNO-96-plus"
+    value, camdm = rows["value"], "CAMDM, distilled"
+
+    def same(said, *asked):
+        return [float(figure) for figure in said] == [round(value[key], 2) for key in asked]
+
+    variety = stated(
+        r"a diversity of ([\d.]+) cm; .* `CAMDM` has ([\d.]+), and the walk that the\s+student was taught ([\d.]+)\.",
+        RESULTS,
+    )
+    assert same(variety, *[(*key, "diversity") for key in ((camdm, 1), ("CAMDM", 1), ("CAMDM, by DDIM", 8))])
+    feet = stated(
+        r"Foot is ([\d.]+) after distilling, ([\d.]+) before\. Students of 2 and 4 steps have (0\.\d+) and (0\.\d+)",
+        RESULTS,
+    )
+    assert same(feet, *[(*key, "foot_sliding") for key in ((camdm, 1), ("CAMDM", 1), (camdm, 2), (camdm, 4))])
+    *small, before, after = stated(
+        r"from ([\d.]+) cm to ([\d.]+) by distilling, and Foot from (0\.\d+) to (0\.\d+)\. Its FID\D+(\d+) to (\d+)",
+        RESULTS,
+    )
+    ways = ((plus, 1), (plus + ", distilled", 1))
+    assert same(small, *[(*key, metric) for metric in ("diversity", "foot_sliding") for key in ways])
+    assert [before, after] == [round(value[(*key, "FID")]) for key in ways]
+    assert rows.loc[(*ways[0], "FID"), "low"] < rows.loc[(*ways[1], "FID"), "high"]
+
+
+def test_what_is_said_of_one_step():
+    assert README.count("samples of one condition are millimetres apart, in 8 steps as in 1.") == 1
+    rows = committed_quality("bandai").query(f"model == '{FNO}' and window_frames == 32 and metric == 'diversity'")
+    centimetres = rows.set_index("steps")["value"]
+    assert all(0.1 < centimetres[steps] < 1.0 for steps in (8, 1))
+
+
+def test_times_are_said_to_be_of_the_data_that_were_timed():
+    """`fastest` reads the record of `synthetic`; motion is that of `bandai`."""
+    assert README.count("Motion is `bandai`, real motion capture; times are of `synthetic`, on two CPU cores") == 1
+    assert "paper_figures/synthetic/laptop/records/synthesis_time.csv" in RESULTS
+
+
 def test_what_is_said_of_text_to_motion():
     """A whole sentence and its FID, by the records of MotionPCM's tables."""
     folder = ROOT / "paper_figures/bandai/laptop/records"

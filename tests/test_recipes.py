@@ -10,7 +10,7 @@ from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_tra
 
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, recipes
-from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
 from f3amd_lib.training.pipeline import PreparedData
@@ -156,3 +156,12 @@ def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkey
     found = table.set_index(["model", "metric"])["value"]
     assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(0.25)
     assert np.isnan(found["F3AMD-FNO-48", "held_out_fall"]) and set(record["weights_digests"]) == set(histories)
+
+
+def test_what_notebook_15_says_of_single_changes_follows_from_the_record():
+    rows, _ = read_table(repository_root() / "paper_figures/bandai/laptop/records/campaign.csv")
+    rows = rows.query("model == 'F3AMD-FNO-96' and windows == 200_000 and seed == 0 and steps in [0, 8]")
+    table = rows.pivot(index="recipe", columns="metric", values="value")
+    assert table.index[table["x0_error_ratio"] < 0.9].tolist() == ["block-residual"]
+    assert table["held_out_loss"].idxmin() == "higher-learning-rate"
+    assert table["held_out_loss"]["block-residual"] > table["held_out_loss"]["paper"]  # "the loss most", not its loss

@@ -60,6 +60,12 @@ REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weigh
         ("walking", {"weights_digests": {"A": ["ab"]}}, "was measured with other weights of A (ab, now aa)"),
         ("walking", {"weights_digests": {"A": ["aa", "ab"]}}, "was measured with other weights of A (aa, ab, now aa)"),
         ("walking", {}, "does not say which weights it was measured with"),
+        ("one_step", {"weights_digests": {"A, distilled": ["aa"]}, "classifier_weights": "cc"}, ""),
+        (
+            "one_step",
+            {"weights_digests": {"A, distilled": ["ab"]}},
+            "was measured with other weights of A (ab, now aa)",
+        ),
         ("literal_update", {"weights_digests": {"A": ["aa"]}, "classifier_weights": "cc"}, ""),
         ("quality_by_epoch", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
         ("quality_by_epoch", {}, "was seen through another style classifier (None, now cc)"),

@@ -124,21 +124,30 @@ def target_end(schedule: NoiseSchedule, state, eps, time, edge):
     return jnp.where(beside(time <= edge, state), state, jump(schedule, state, eps, time, edge))
 
 
-def consistency_answer(teacher: Callable, target: Callable, x_noisy, sigma, sigma_next):
-    """Return what a denoiser of one step has to say at a point of its teacher's walk: MotionPCM's target with M = 1.
+def consistency_answer(teacher: Callable, target: Callable, x_noisy, sigma, sigma_next, sigma_edge=0.0):
+    """Return what a student's denoiser has to say at a point of its teacher's walk: MotionPCM's target.
 
-    The teacher takes one DDIM step, and the target says where the path ends from there; at level 0 it has ended. The
-    state is the variance-exploding one, in which a jump to the data is the clean estimate itself.
+    The teacher takes one DDIM step, and the target jumps from there to the end of the phase; at the end itself it is
+    not heard. The answer is the clean estimate whose straight line leads from x_noisy to that same end. The state is
+    the variance-exploding one: with one phase, whose end is level 0, that is the place where the target says the path
+    ends.
 
     Args:
       teacher, target: denoisers, `(x_noisy, sigma [B]) -> x0_hat`.
       x_noisy: states, [B, ...].
-      sigma, sigma_next: levels of the walk, [B], sigma > sigma_next >= 0.
+      sigma, sigma_next: levels of the walk, [B], sigma > sigma_next >= sigma_edge.
+      sigma_edge: level at which the phase ends, [B] or a scalar.
+
+    Source: MotionPCM section 4.2 and Algorithm 1, lines 8 to 10.
     """
-    solved = ddim_step(x_noisy, teacher(x_noisy, sigma), beside(sigma, x_noisy), beside(sigma_next, x_noisy))
     # A denoiser is not asked at level 0; what it says in that place is not taken.
-    answer = target(solved, jnp.where(sigma_next > 0.0, sigma_next, sigma))
-    return jnp.where(beside(sigma_next > 0.0, x_noisy), answer, solved)
+    asked = jnp.where(sigma_next > sigma_edge, sigma_next, sigma)
+    level, level_next, level_asked, edge = (beside(s, x_noisy) for s in (sigma, sigma_next, asked, sigma_edge))
+    solved = ddim_step(x_noisy, teacher(x_noisy, sigma), level, level_next)
+    jumped = ddim_step(solved, target(solved, asked), level_asked, edge)
+    end = jnp.where(level_next > edge, jumped, solved)
+    kept = edge / level  # share of the state's noise that is left at the end
+    return (end - kept * x_noisy) / (1.0 - kept)
 
 
 def noise_travel(schedule: NoiseSchedule, state, time, time_next, noise):

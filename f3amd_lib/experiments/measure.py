@@ -54,6 +54,7 @@ from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.online_feet import lock_rollout_online
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
@@ -62,7 +63,7 @@ from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
-from f3amd_lib.training.consistency_task import distil
+from f3amd_lib.training.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.published import NAME as PUBLISHED
@@ -92,8 +93,9 @@ PRECISION_SEEDS = 5
 SNAPSHOTS = 10
 """Measurements on the way of a training in `measure_quality_by_epoch`."""
 
-ONE_STEP_MODELS = ("CAMDM", "F3AMD-FNO-96-plus")
-"""Models that `measure_one_step` distils."""
+ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-plus": (1,)}
+"""Models that `measure_one_step` distils -> the numbers of phases, each a student of its own. A continuous schedule's
+grid of 2 steps does not visit the middle of its grid of 8, so that its student has one phase."""
 
 STUDENT_STEPS, STUDENT_BATCH = {"smoke": 4, "laptop": 300, "gpu": 20_000}, 32
 """Optimiser steps of a student by profile, and windows of each."""
@@ -383,7 +385,8 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     Whether FID and EMD order graded corruptions, and how many windows they need before they settle.
 
     Returns:
-      The table `records/corruptions.csv`; beside it `settling.csv`. Both are measured anew.
+      The table `records/corruptions.csv`; beside it `settling.csv`, where every style has windows to halve. Both are
+      measured anew.
 
     Raises:
       ValueError: if models are named.
@@ -391,10 +394,12 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     _refuse_models(models, "the metrics are asked about real motion")
     classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
     graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
-    tables = {"settling": sensitivity.settling(classifier), "corruptions": sensitivity.summarise_corruptions(graded)}
-    for name, table in tables.items():
-        path = write_table(_records_dir(profile) / f"{name}.csv", table, record)
-    return path
+    folder = _records_dir(profile)
+    if sensitivity.most_windows(classifier):
+        write_table(folder / "settling.csv", sensitivity.settling(classifier), record)
+    else:
+        log.warning("settling is not measured: a style has fewer than two windows on a side")
+    return write_table(folder / "corruptions.csv", sensitivity.summarise_corruptions(graded), record)
 
 
 def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -631,15 +636,19 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     )
 
 
-DISTILLED = ", distilled"
-"""Added to the name of a network in rows of its student of one step."""
+DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
+"""Added to the name of a network in rows of its students of few steps, and of the walk that they learned."""
 
 
 def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Distil trained models into one step and run the evaluation protocol on the students; long.
+    """Distil trained models into few steps and run the evaluation protocol on the students; long.
+
+    A student has as many phases as steps (`training.consistency_task`). Where a model's own sampler adds noise on the
+    way, the walk without it, which the students learned, has a row, too.
 
     Returns:
-      The table `records/one_step.csv`; beside it `one_step_by_seed.csv`.
+      The table `records/one_step.csv`; beside it `one_step_by_seed.csv`, and `one_step_input_use.csv`, how far the
+      students' estimates move with noisy input and noise level (see `denoising.input_use`).
     """
     packed, asked = prepared.packed, _names(models)
     classifier, protocol, record = protocol_of(prepared, profile, "one_step")
@@ -648,21 +657,33 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
     trained = _trained(prepared, profile, asked or [name for name in ONE_STEP_MODELS if name in known])
     folder, digests = runs_dir(profile.dataset, profile.name) / "one_step", _digests(trained)
     record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
+    keys = ["model", "window_frames", "steps"]
     records = Records(
-        _records_dir(profile), record, {"one_step_by_seed": ["model", "window_frames", "steps"]}, again=asked,
+        _records_dir(profile), record, {"one_step_by_seed": keys, "one_step_input_use": keys}, again=asked,
         summaries={"one_step": ("one_step_by_seed", summarise)},
     )  # fmt: skip
 
     def score(row: Mapping) -> dict:
-        teacher = trained[row["model"].removesuffix(DISTILLED)]
-        student, _ = distil(prepared, profile, teacher, folder, num_steps=num_steps, batch_size=STUDENT_BATCH)
-        made = MotionGenerator(student, 1)
-        rows, _ = measure_model(made, packed, classifier, protocol, held_out, name=row["model"])
-        return {"one_step_by_seed": rows}
+        walker, steps = trained[asked_network(row["model"])], row["steps"]
+        made = {"sampler": "ddim"}
+        if row["model"].endswith(DISTILLED):
+            settings = {"num_steps": num_steps, "num_phases": steps, "batch_size": STUDENT_BATCH}
+            walker, _ = distil(prepared, profile, walker, folder / f"M{steps}", **settings)
+            made |= {"spacing": STUDENT_SPACING}
+        generator = MotionGenerator(walker, steps, **made)
+        rows, _ = measure_model(generator, packed, classifier, protocol, held_out, name=row["model"])
+        use = input_use(walker, held_out_condition(held_out, walker), seed=profile.seed)
+        return {"one_step_input_use": use, "one_step_by_seed": rows}
 
-    shared = {"window_frames": profile.window, "steps": 1}
-    todo = [{"model": name + DISTILLED, **shared, "weights": digest} for name, digest in digests.items()]
-    return records.measure(todo, score)
+    todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
+    walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
+    return records.measure(
+        [
+            {"model": model, "window_frames": profile.window, "steps": steps, "weights": digests[asked_network(model)]}
+            for model, steps in walks + todo
+        ],
+        score,
+    )
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:

@@ -144,6 +144,12 @@ def rank_agreement(rows: pd.DataFrame) -> pd.DataFrame:
 # ---------------------------------------------------------------------------------------- settling
 
 
+def most_windows(classifier: StyleClassifier) -> int:
+    """Return how many windows of a style `settling` may draw: half of what the poorest has on either side."""
+    clouds = (classifier.reference(split, style) for split in ("held_out", "train") for style in classifier.styles)
+    return min(map(len, clouds)) // 2
+
+
 def settling(
     classifier: StyleClassifier, sizes: Sequence[int] | None = None, *, repeats: int = 5, seed: int = 0
 ) -> pd.DataFrame:
@@ -171,7 +177,7 @@ def settling(
     sides = [
         {style: classifier.reference(split, style) for style in classifier.styles} for split in ("held_out", "train")
     ]
-    most = min(len(cloud) for side in sides for cloud in side.values()) // 2
+    most = most_windows(classifier)
     if sizes is None:
         sizes = [most >> k for k in range(10, -1, -1) if most >> k]
     if not len(sizes) or not 1 <= min(sizes) <= max(sizes) <= most:

@@ -1,7 +1,8 @@
 """What the judge of text to motion sees, and which hand a model raises: `f3amd measure text_judge` and `hands`.
 
 Both are asked about real motion first, and about motion that is wrong on purpose: a judge that takes that for right,
-or a count of hands that does, would be worth nothing.
+or a count of hands that does, would be worth nothing. `text_one_caption` keeps what a model that does not ship makes
+of one caption.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -20,12 +22,14 @@ from f3amd_lib.data.text_motions import TextMotions
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.experiments.text_tables import TABLES, bench_of, measure_text_table
 from f3amd_lib.generation.captioned_motion import draw_motions
+from f3amd_lib.generation.latent_motion import guidance_of, sample_latent_student
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.text_judge import judge_motions
 from f3amd_lib.measures.text_metrics import RAISED, raised_hands
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
-from f3amd_lib.training.checkpoints import weights_digest
+from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.latent_models import find_latent_model, load_latent_model
 from f3amd_lib.training.text_models import find_text_model, load_text_model
 
 TREMBLE = 0.02
@@ -189,8 +193,48 @@ def measure_hands(
     return records.measure(todo, lambda row: {"hands": rows[row["model"]]()})
 
 
+ONE_CAPTION = "a person walks forward"
+"""The caption of `measure_one_caption`, and of notebook 21's strip."""
+
+
+def measure_one_caption(
+    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, folder=None,
+    **leg,
+) -> Path:  # fmt: skip
+    """Keep the latent that MotionLCM's student makes of one caption in one step, from the noise of the profile's seed.
+
+    The autoencoder that ships decodes it, so that a picture needs no weights of the student.
+
+    Args:
+      data, encoder, profile: captioned motion, what embeds the caption, where results lie.
+      models: presets with weights; by default MotionLCM's.
+      folder: where weights lie, instead of the user's own and the shipped ones.
+
+    Returns:
+      The table, `records/text_one_caption.csv`: a row a token of the latent, its numbers in columns; `weights` are the
+      student's, `autoencoder` those that decode.
+    """
+    record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="text_one_caption",
+                        text_encoder=encoder.identity, caption=ONE_CAPTION)  # fmt: skip
+    text, rows = jnp.asarray(embed_captions([ONE_CAPTION], encoder).pooled), []
+    for name in models or ["MotionLCM-V2-small"]:
+        path = find_latent_model(profile.dataset, name) if folder is None else Path(folder) / f"{name}.safetensors"
+        trained = load_latent_model(path)
+        noise = jax.random.normal(jax.random.key(profile.seed), trained.config.state_shape(1))
+        latent = sample_latent_student(
+            network_with(trained.config, trained.params), trained.schedule, text, noise, jax.random.key(profile.seed),
+            guidance=guidance_of(trained, 1),
+        )  # fmt: skip
+        table = pd.DataFrame(np.asarray(latent[0]), columns=[f"channel_{n}" for n in range(latent.shape[-1])])
+        digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
+        rows.append(table.assign(model=trained.name, steps=1, token=range(len(table)), **digests))
+    path = results_dir(profile.dataset, profile.name) / "records" / "text_one_caption.csv"
+    return write_table(path, pd.concat(rows), record)
+
+
 TEXT_MEASUREMENTS = {name: partial(measure_text_table, name) for name in TABLES} | {
     "text_judge": measure_judge,
     "hands": measure_hands,
+    "text_one_caption": measure_one_caption,
 }
 """What `f3amd measure` knows of text to motion, by name: functions of captioned motion, encoder and profile."""

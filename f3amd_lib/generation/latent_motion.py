@@ -138,8 +138,31 @@ def steps_of(trained: LatentModel, num_steps: int | None = None) -> int:
         fits, own = (told["num_phases"],), told["num_phases"]
     if (num_steps or own) not in fits:
         known = " or ".join(map(str, fits)) if len(fits) < 4 else f"1 to {levels}"
-        raise ValueError(f"{trained.name} takes {known} steps, got {num_steps}; see f3amd presets --paper motionpcm")
+        steps = "step" if known == "1" else "steps"
+        raise ValueError(f"{trained.name} takes {known} {steps}, got {num_steps}; see f3amd presets --paper motionpcm")
     return num_steps or own
+
+
+def guidance_of(trained: LatentModel, num_steps: int, guidance: float | None = None) -> float:
+    """Return w of MotionPCM Eq. 11 that a model is told.
+
+    Args:
+      trained: a teacher or a student.
+      num_steps: as `steps_of` has it.
+      guidance: asked for; by default the paper's 14 of a student, 6.5 of a teacher, MotionLCM's own.
+
+    Raises:
+      ValueError: for a guidance that a student was never told in its training; a teacher is guided by any.
+    """
+    told = trained.training
+    if not trained.config.guidance_features:
+        return TEACHER_GUIDANCE if guidance is None else guidance
+    if guidance is None:
+        return LATENT_CONSISTENCY_GUIDANCE[num_steps] if told["consistency"] == "latent" else STUDENT_GUIDANCE
+    least, most = told["least_guidance"], told["most_guidance"]
+    if not least <= guidance <= most:
+        raise ValueError(f"{trained.name} was trained with a guidance of {least:g} to {most:g}, got {guidance:g}")
+    return guidance
 
 
 def latent_sampler(trained: LatentModel, num_steps: int | None = None, guidance: float | None = None) -> Callable:
@@ -148,15 +171,14 @@ def latent_sampler(trained: LatentModel, num_steps: int | None = None, guidance:
     Args:
       trained: a teacher or a student.
       num_steps: as `steps_of` has it.
-      guidance: w of MotionPCM Eq. 11; by default the paper's 14 of a student, 6.5 of a teacher, MotionLCM's own.
+      guidance: as `guidance_of` has it.
 
     Raises:
-      ValueError: as `steps_of`.
+      ValueError: as `steps_of` and `guidance_of`.
     """
     steps, config, schedule = steps_of(trained, num_steps), trained.config, trained.schedule
     is_teacher, is_latent = not config.guidance_features, trained.training["consistency"] == "latent"
-    usual = TEACHER_GUIDANCE if is_teacher else LATENT_CONSISTENCY_GUIDANCE[steps] if is_latent else STUDENT_GUIDANCE
-    how = {"num_steps": steps, "guidance": usual if guidance is None else guidance}
+    how = {"num_steps": steps, "guidance": guidance_of(trained, steps, guidance)}
 
     @jax.jit
     def draw(params, autoencoder, text, mask, key):
@@ -188,7 +210,7 @@ def latent_motions(trained: LatentModel, pooled, num_frames, key, *, draw: Calla
       Positions, [B, L, J, 3], metres, starting over the origin facing +Z; L the longest; 0 in the padding.
 
     Raises:
-      ValueError: as `steps_of`, or for more frames than the model was trained on.
+      ValueError: as `latent_sampler`, or for more frames than the model was trained on.
     """
     lengths = np.broadcast_to(num_frames, len(pooled))
     if lengths.max() > trained.most_frames:

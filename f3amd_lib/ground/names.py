@@ -61,3 +61,8 @@ def row_label(model: str, steps: int) -> str:
 def counted_cores(record: Mapping) -> str:
     """Return on how many cores a record was made, as a text says it: "1 core", "2 cores"."""
     return f"{record['cores']} core{'s' * (record['cores'] != 1)}"
+
+
+def asked_network(row: str) -> str:
+    """Return the network that a row is about: "CAMDM, leading" and "CAMDM, distilled" are ways to ask CAMDM."""
+    return row.split(",")[0]

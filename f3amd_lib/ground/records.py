@@ -24,6 +24,7 @@ import pandas as pd
 
 import f3amd_lib
 from f3amd_lib.ground.files import set_aside, whole_file
+from f3amd_lib.ground.names import asked_network
 
 log = logging.getLogger("f3amd")
 
@@ -40,12 +41,13 @@ _CIRCUMSTANCES = (
 ON_WEIGHTS = frozenset(
     "quality quality_by_seed quality_by_round literal_update literal_update_by_seed literal_update_windows noise_use "
     "x0_by_sigma input_use posterior precision walking feet trained foot_spectrum gradient_norm "
-    "round_times".split()
+    "round_times one_step one_step_by_seed one_step_input_use".split()
 )
 """Tables that were measured on trained models: what they say goes with the weights."""
 
 THROUGH_CLASSIFIER = frozenset(
-    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling".split()
+    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling one_step "
+    "one_step_by_seed".split()
 )
 """Tables with FID or EMD, seen through one style classifier; rows of `campaign` name theirs."""
 
@@ -288,6 +290,13 @@ _OF_MEASURES = ("corruptions", "settling")
 """Tables that ask FID and EMD themselves: of a classifier's own, which they name, and compared with no model's."""
 
 
+def _digests_by_network(record: dict) -> dict[str, set[str]]:
+    digests = {}
+    for model, used in (record.get("weights_digests") or {}).items():
+        digests.setdefault(asked_network(model), set()).update(set(used) - {""})
+    return digests
+
+
 def stale_reason(name: str, record: dict, reference: dict) -> str:
     """Say why a table does not belong with the quality table of its folder.
 
@@ -299,10 +308,7 @@ def stale_reason(name: str, record: dict, reference: dict) -> str:
     Returns:
       The reason, such as "was measured with other weights of CAMDM (a1b2, now c3d4)"; "" if there is none.
     """
-    now, there = (
-        {model: set(digests) - {""} for model, digests in (of.get("weights_digests") or {}).items()}
-        for of in (reference, record)
-    )
+    now, there = map(_digests_by_network, (reference, record))
     if name in ON_WEIGHTS and now and not there:
         return "does not say which weights it was measured with"
     for model in now.keys() & there.keys() if name in ON_WEIGHTS else ():

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 
@@ -122,6 +123,6 @@ def stored_result(dataset: str, name: str, *, profile: str = "laptop", digits: i
     frame, record = read_table(path)
     origin = (
         f"Stored result: `{name}`, profile {record['profile']}, data {record['dataset']}, "
-        f"{record['cores']} cores ({record['device_platform']}), {record['date_utc'][:10]}."
+        f"{counted_cores(record)} ({record['device_platform']}), {record['date_utc'][:10]}."
     )
     return f"{origin}\n\n{markdown_table(frame, digits=digits)}"

@@ -20,7 +20,7 @@ from flax import nnx
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES
 from f3amd_lib.networks.attention import check_num_heads
-from f3amd_lib.networks.config import CheckedConfig
+from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 
 TIME_FEATURES = 256
 
@@ -256,7 +256,7 @@ class Trunk(nnx.Module):
         # As a convolution starts in PyTorch, but for its bias.
         start = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
         self.patch = nnx.Linear(config.patch_joints * config.channels, width, kernel_init=start, rngs=rngs)
-        narrow = nnx.initializers.normal(0.02)
+        narrow = lambda key, shape, dtype: scaled_normal(key, 0.02, shape)
         self.time_first = nnx.Linear(TIME_FEATURES, width, kernel_init=narrow, rngs=rngs)
         self.time_second = nnx.Linear(width, width, kernel_init=narrow, rngs=rngs)
         self.text = linear(config.text_width, width, rngs)

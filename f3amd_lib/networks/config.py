@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -129,6 +130,12 @@ def scaled_input(config: NetworkConfig, x_noisy, sigma):
         return x_noisy
     scale = (sigma**2 + config.sigma_data**2) ** -0.5
     return x_noisy * scale.reshape(-1, 1, 1)
+
+
+@functools.partial(jax.jit, static_argnames=("scale", "shape"))
+def scaled_normal(key, scale: float, shape: tuple[int, ...]):
+    """Return scale times standard normal numbers, in one program: the same bits in a jit and outside."""
+    return scale * jax.random.normal(key, shape)
 
 
 class LayerKeys:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextContext, Trunk, linear, modulated, root_mean_square_norm
+from f3amd_lib.networks.config import scaled_normal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,7 @@ class MaskedACMDM(Trunk):
     def __init__(self, config: MaskedACMDMConfig, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
         width, numbers = config.latent_width, config.patch_joints * config.channels
-        self.hidden_token = nnx.Param(0.02 * jax.random.normal(rngs.params(), (width,)))
+        self.hidden_token = nnx.Param(scaled_normal(rngs.params(), 0.02, (width,)))
         self.head_input = linear(numbers, width, rngs)
         self.head = nnx.List([HeadLayer(width, rngs=rngs) for _ in range(config.head_depth)])
         self.output_norm = root_mean_square_norm(width, rngs)

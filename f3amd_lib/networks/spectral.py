@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.networks.config import scaled_normal
 
 SPECTRAL_VARIANTS = ("fourier", "cosine", "reduced_rank", "weighted")
 """Spectral layers of Table 8: Eq. 2; the discrete cosine transform; factorised weights; gains."""
@@ -212,9 +212,8 @@ class SpectralConvolution(FrameLayer):
 
         def draw(rows: int, columns: int, parts: int = 2):
             # Unit gain: white input of variance 1 leaves with variance about 1 when no mode is cut.
-            scale = 1.0 / np.sqrt(parts * rows)
-            shape = (num_kept_modes, rows, columns)
-            return nnx.Param(scale * jax.random.normal(rngs.params(), shape))
+            scale = float(1.0 / np.sqrt(parts * rows))
+            return nnx.Param(scaled_normal(rngs.params(), scale, (num_kept_modes, rows, columns)))
 
         if variant == "cosine":
             self.weight = draw(width_in, width_out, parts=1)

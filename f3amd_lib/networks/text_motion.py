@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from f3amd_lib.networks.attention import dropout
+from f3amd_lib.networks.config import scaled_normal
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class _BothWays(nnx.Module):
 
     def __init__(self, width_in: int, hidden: int, width_out: int, *, rngs: nnx.Rngs):
         self.inside = nnx.Linear(width_in, hidden, rngs=rngs)
-        self.start = nnx.Param(0.1 * jax.random.normal(rngs.params(), (2, hidden)))
+        self.start = nnx.Param(scaled_normal(rngs.params(), 0.1, (2, hidden)))
         self.forwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), return_carry=True)
         self.backwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), return_carry=True, reverse=True)
         self.middle = nnx.Linear(2 * hidden, hidden, rngs=rngs)

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import asked_network, nearest_hint
 from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
@@ -270,7 +270,7 @@ class Evidence:
         if wanted:
             table = table[np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])]
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
-            network = row["model"].split(",")[0]  # "CAMDM, leading" is CAMDM, sampled in another way
+            network = asked_network(row["model"])
             self.trained.append((network, row.get("window_frames", 32)))
         if name in OF_TEXT and not self.printed:
             self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}

@@ -1,8 +1,9 @@
-"""Distil a trained denoiser of locomotion into one step: consistency along its own walk (MotionPCM, one phase).
+"""Distil a trained denoiser of locomotion into few steps: phased consistency along its own walk (MotionPCM).
 
-The student begins as its teacher. At a level of the teacher's grid it is asked for the end of the path, and its answer
-has to be the one that its moving average gives a step of the teacher's further on; from the last level that step is the
-end itself. How far two answers are apart, the teacher's own training loss says, with the answer in the data's place.
+The student begins as its teacher. The walk is cut into as many phases as the student will take steps. At a level of
+the teacher's grid the student is asked for the end of the phase, and its jump has to go where its moving average goes
+from a step of the teacher's further on; from the last level of a phase that step is the end itself. How far two answers
+are apart, the teacher's own training loss says, with the answer in the data's place.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import pandas as pd
 
@@ -32,29 +34,50 @@ from f3amd_lib.training.recipe import paper_recipe
 TEACHER_STEPS = 8
 """Levels of the teacher's walk: the steps that F3AMD's tables count as many."""
 
+STUDENT_SPACING = "uniform"
+"""Where a student's steps lie (see the schedule's `times`): one at the beginning of each phase."""
+
 _HELD_OUT_WINDOWS = 128
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("denoising", "teacher"), meta_fields=("num_teacher_steps",)
+    jax.tree_util.register_dataclass,
+    data_fields=("denoising", "teacher"),
+    meta_fields=("num_teacher_steps", "num_phases"),
 )
 @dataclass(frozen=True, eq=False)
 class ConsistencyTask:
-    """A student of one step to distil from a frozen denoiser (a `training.optimise.Task`).
+    """A student of one step a phase, to distil from a frozen denoiser (a `training.optimise.Task`).
 
     Attributes:
       denoising: the teacher's own training: network, windows, disturbances, loss. Its moving average is the target.
       teacher: frozen weights, with which the student begins.
-      num_teacher_steps: levels of the walk that is distilled.
+      num_teacher_steps: levels of the walk that is distilled, N.
+      num_phases: M, the steps that the student will take.
 
-    Source: MotionPCM section 4.2 with M = 1 and without a discriminator, in the variance-exploding state.
+    Raises:
+      ValueError: unless M divides N, and the student's own grid of M steps visits the edges of the phases.
+
+    Source: MotionPCM section 4.2 without a discriminator, in the variance-exploding state.
     """
 
-    name: ClassVar[str] = "student of one step"
+    name: ClassVar[str] = "student of few steps"
 
     denoising: DenoisingTask
     teacher: Any
     num_teacher_steps: int = TEACHER_STEPS
+    num_phases: int = 1
+
+    def __post_init__(self):
+        steps, phases, diffusion = self.num_teacher_steps, self.num_phases, self.denoising.config.diffusion
+        if phases < 1 or steps % phases:
+            raise ValueError(f"num_phases must divide the {steps} steps of the teacher, got {phases}")
+        visited = diffusion.grid(phases, STUDENT_SPACING)
+        if not np.allclose(visited, diffusion.grid(steps)[:: steps // phases]):
+            raise ValueError(
+                f"{phases} steps under {diffusion} visit {np.round(visited, 3)}, which are not the edges of "
+                f"{phases} phases of its walk of {steps}: take num_phases=1"
+            )
 
     @property
     def config(self):
@@ -68,8 +91,8 @@ class ConsistencyTask:
 
     def identity(self) -> dict:
         """Return all that decides the weights."""
-        about = {"num_teacher_steps": self.num_teacher_steps, "weights": weights_digest(self.teacher)}
-        return self.denoising.identity() | {"teacher": about}
+        walk = {"num_teacher_steps": self.num_teacher_steps, "num_phases": self.num_phases}
+        return self.denoising.identity() | {"teacher": walk | {"weights": weights_digest(self.teacher)}}
 
     def init(self, key):
         """Return the teacher's weights."""
@@ -103,9 +126,10 @@ class ConsistencyTask:
         denoiser = lambda network: lambda x_noisy, sigma: network(x_noisy, sigma, context[id(network)])
         levels = jnp.asarray(config.diffusion.grid(self.num_teacher_steps), jnp.float32)
         point = jax.random.randint(key_point, (len(x0),), 0, self.num_teacher_steps)
-        sigma, sigma_next = levels[point], levels[point + 1]
+        of_phase = self.num_teacher_steps // self.num_phases
+        sigma, sigma_next, sigma_edge = (levels[n] for n in (point, point + 1, (point // of_phase + 1) * of_phase))
         x_noisy = add_noise(x0, sigma[:, None, None], jax.random.normal(key_noise, x0.shape))
-        answer = consistency_answer(denoiser(teacher), denoiser(answering), x_noisy, sigma, sigma_next)
+        answer = consistency_answer(denoiser(teacher), denoiser(answering), x_noisy, sigma, sigma_next, sigma_edge)
         answer = jax.lax.stop_gradient(answer)
         x0_hat = denoiser(student)(x_noisy, sigma)
         metres, wanted = map(task.normaliser.denormalise, (x0_hat, answer))
@@ -116,33 +140,33 @@ class ConsistencyTask:
 
 
 def distil(
-    prepared: PreparedData, profile: Profile, teacher: TrainedModel, folder, *, num_steps: int, batch_size: int = 64,
-    learning_rate: float = 2e-4, ema_decay: float = 0.95, **leg,
+    prepared: PreparedData, profile: Profile, teacher: TrainedModel, folder, *, num_steps: int, num_phases: int = 1,
+    batch_size: int = 64, learning_rate: float = 2e-4, ema_decay: float = 0.95, **leg,
 ) -> tuple[TrainedModel | None, pd.DataFrame]:  # fmt: skip
-    """Distil a trained model into one step, going on from a training state if there is one.
+    """Distil a trained model into one step a phase, going on from a training state if there is one.
 
     Args:
       prepared: the data that it was trained on.
       profile: names the data set, and gives the seed.
       teacher: the model; its own training loss and disturbances are kept.
       folder: where files go.
-      num_steps, batch_size, learning_rate, ema_decay: of the distillation.
+      num_steps, num_phases, batch_size, learning_rate, ema_decay: of the distillation.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       (student, history); the student is None where `stop_at` came first.
 
     Raises:
-      ValueError: if a training state of other settings lies there.
+      ValueError: if a training state of other settings lies there, or for phases that the task refuses.
     """
     settings = {"batch_size": batch_size, "learning_rate": learning_rate, "ema_decay": ema_decay, "seed": profile.seed}
     config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
-    task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params)
+    task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params, num_phases=num_phases)
     files = model_files(profile, teacher.name, folder=Path(folder))
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=config.seed, model=teacher.name, training=config.to_dict(),
         held_out_split=prepared.held_out_split, num_train_windows=int(task.denoising.windows.num_windows),
-        distilled_from=weights_digest(teacher.params),
+        distilled_from=weights_digest(teacher.params), num_phases=num_phases,
     )  # fmt: skip
     with alone_with(files):
         state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)

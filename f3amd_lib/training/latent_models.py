@@ -40,7 +40,8 @@ from f3amd_lib.training.latent_motion import (
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
 from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files, text_model_folders
 
-_KIND = "latent motion model"
+KIND = "latent motion model"
+"""What a file of this module says that it holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def save_latent_model(path: Path, trained: LatentModel, dtype=jnp.bfloat16) -> N
     """
     weights = {"autoencoder": trained.autoencoder_params}
     save_captioned_model(
-        path, _KIND, trained, autoencoder=trained.autoencoder, weights=weights, arrays=trained.statistics._asdict(),
+        path, KIND, trained, autoencoder=trained.autoencoder, weights=weights, arrays=trained.statistics._asdict(),
         extra={}, dtype=dtype,
     )  # fmt: skip
 
@@ -105,7 +106,7 @@ def load_latent_model(path: Path) -> LatentModel:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
     with errors_name(path):
-        common, autoencoder, tree, _ = load_captioned_model(path, _KIND, _shapes)
+        common, autoencoder, tree, _ = load_captioned_model(path, KIND, _shapes)
         statistics = FrameStatistics(tree["mean"], tree["deviation"])
         return LatentModel(
             autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **common
@@ -143,21 +144,42 @@ def stands_on(preset: Preset) -> str:
     return next(name for name, other in presets.PRESETS.items() if fits(other))
 
 
-DEFAULT_STUDENT = "MotionPCM-M1-small"
-"""The model that `f3amd text --model motionpcm` means where no other is named."""
+STUDENTS = {phases: f"MotionPCM-M{phases}-small" for phases in (1, 2, 4)}
+"""The models that `f3amd text --model motionpcm` means, by --steps: a student is trained for one number of them."""
 
 
-def find_latent_model(dataset: str, name: str) -> Path:
+def named_model(name: str, num_steps: int | None = None) -> str:
+    """Return the preset that a user means.
+
+    Args:
+      name: of a teacher's or a student's preset, or of the paper, "motionpcm".
+      num_steps: asked for; of the paper's students it chooses one, by default that of one step.
+
+    Raises:
+      ValueError: for an unknown name, or a number of steps that no student takes.
+    """
+    if name.lower() != "motionpcm":
+        return presets.find_preset(name).name
+    if (steps := num_steps or 1) not in STUDENTS:
+        *some, last = STUDENTS
+        raise ValueError(
+            f"students of MotionPCM are trained for {', '.join(map(str, some))} or {last} steps, none for {steps}; "
+            "their teacher takes any number: --model MotionPCM-teacher-small"
+        )
+    return STUDENTS[steps]
+
+
+def find_latent_model(dataset: str, name: str, num_steps: int | None = None) -> Path:
     """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
 
     Args:
       dataset: that it was trained on.
-      name: of a teacher's or a student's preset, or of the paper, "motionpcm", for `DEFAULT_STUDENT`.
+      name, num_steps: as of `named_model`.
 
     Raises:
-      ValueError: if there is none, saying how to train it.
+      ValueError: as `named_model`, or if there is no file, saying how to train it.
     """
-    name = DEFAULT_STUDENT if name.lower() == "motionpcm" else presets.find_preset(name).name
+    name = named_model(name, num_steps)
     for folder in text_model_folders(dataset):
         if (path := folder / f"{name}.safetensors").is_file():
             return path
@@ -205,9 +227,22 @@ def _task(preset: Preset, config: LatentMotionTraining, data: TextMotions, encod
     return DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
 
 
+def _named_teacher(path, preset: Preset, data: TextMotions) -> LatentModel:
+    """Read the teacher of a student; ValueError for what is no student, no teacher, or knows other clips."""
+    if stage_of(preset) != "student":
+        raise ValueError(f"{preset.name} is no student and has no teacher: leave --teacher out")
+    before = load_latent_model(path)
+    wanted = stands_on(preset)
+    if before.name != wanted:
+        raise ValueError(f"{path}: holds {before.name}, but {preset.name} is distilled from {wanted}")
+    if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
+        raise ValueError(f"{path}: was trained on other clips than these; leave --teacher out to train one")
+    return before
+
+
 def train_latent_model(
     data: TextMotions, encoder: TextEncoder, profile: Profile, name: str, *,
-    batch_size: int | None = None, folder=None, **leg,
+    batch_size: int | None = None, folder=None, teacher=None, **leg,
 ) -> LatentModel | None:  # fmt: skip
     """Train a preset, and first what it stands on, unless that is finished already.
 
@@ -220,18 +255,22 @@ def train_latent_model(
       name: of a preset of MotionPCM.
       batch_size: instead of the recipe's.
       folder: where files go instead of `runs/`.
+      teacher: file of the teacher that a student is distilled from, such as one that ships, instead of training one.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       The model as its file has it; None where `stop_at` came first.
 
     Raises:
-      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data.
+      ValueError: if a model or a state of other settings lies there, or the teacher that was named is none of these
+        clips, or is named for what is no student.
       TrainingDiverged: if the loss stops being a number.
     """
     preset, before = presets.find_preset(name), None
     stage, files = stage_of(preset), text_model_files(profile, preset.name, folder=folder)
-    if earlier := stands_on(preset):
+    if teacher is not None:
+        before = _named_teacher(teacher, preset, data)
+    elif earlier := stands_on(preset):
         before = train_latent_model(data, encoder, profile, earlier, batch_size=batch_size, folder=folder, **leg)
         if before is None:
             return None

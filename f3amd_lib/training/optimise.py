@@ -102,17 +102,13 @@ class Task(Protocol):
         """Return terms by name on held-out data; only asked where such data are given."""
 
 
-@jax.jit
-def _initial_state(task: Task, key) -> TrainingState:
-    params, statistics = task.init(key)
-    return TrainingState(params, None, task.optimiser.init(params), jnp.zeros((), jnp.int32), statistics)
-
-
 def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
     """Return the state before the first step, on every device of the mesh."""
-    state = _initial_state(task, jax.random.fold_in(jax.random.key(task.config.seed), 0))
-    if task.config.ema_decay is not None:
-        state = state._replace(ema=jax.tree.map(jnp.copy, state.params))
+    # Not compiled as a whole: that takes seconds for each network, and the programs of its layers are few.
+    params, statistics = task.init(jax.random.fold_in(jax.random.key(task.config.seed), 0))
+    params = jax.tree.map(jnp.copy, params)  # a student begins with weights that stay its teacher's
+    ema = None if task.config.ema_decay is None else jax.tree.map(jnp.copy, params)
+    state = TrainingState(params, ema, task.optimiser.init(params), jnp.zeros((), jnp.int32), statistics)
     return parallel.replicate(state, mesh)
 
 
