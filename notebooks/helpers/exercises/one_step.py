@@ -85,13 +85,13 @@ def _four_levels(answer) -> str | None:
         return "a level is so low that float32 has no room for it"
     share = outcome_shares(data, ends)["wall"]
     if share >= 0.05:
-        return f"with these levels {share:.0%} hit the wall; put them where the side is decided"
+        return f"with these levels {share:.1%} hit the wall, fewer than 5 % may; put them where the side is decided"
     place = np.abs(crossing(ends))
     passed = place[place >= data.wall].mean()
     wanted = crossing(data.mean_paths)[0]
     if abs(passed - wanted) > 0.15:
         return (
-            f"{share:.0%} hit the wall, but the others pass at {passed:.2f} m, the data at {wanted:.2f} m; "
+            f"{share:.1%} hit the wall, but the others pass at {passed:.2f} m, the data at {wanted:.2f} m; "
             "at levels below those where the side is decided the denoiser hardly moves a walker any more"
         )
     return None
