@@ -23,6 +23,7 @@ from f3amd_lib.generation.latent_motion import (
     reconstruction,
     sample_latent_student,
     sample_student,
+    sample_teacher,
     steps_of,
 )
 from f3amd_lib.ground.profiles import load_profile
@@ -241,17 +242,26 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     others = data.select(np.arange(len(data.captions) - 1))
     with pytest.raises(ValueError, match="trained on other clips"):
         train_latent_model(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
-    # What is kept of one caption: the latent of the student in that file, from the noise of the seed.
+    # What is kept of one caption: the latent that each model makes in its own steps, from the noise of the seed.
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
-    kept, told = read_table(measure_one_caption(data, OneVectorAWord(), PROFILE, models=["tiny-M2"], folder=tmp_path))
+    asked = {"models": ["tiny-M2", "tiny-teacher"], "folder": tmp_path}
+    kept, told = read_table(measure_one_caption(data, OneVectorAWord(), PROFILE, **asked))
     text = embed_captions([ONE_CAPTION], OneVectorAWord()).pooled
     start = jax.random.normal(jax.random.key(PROFILE.seed), (1, 2, 3))
-    wanted = sample_latent_student(
-        network_with(student.config, student.params), student.schedule, text, start, jax.random.key(9),
-        guidance=guidance_of(student, 1),
-    )  # fmt: skip
-    np.testing.assert_allclose(kept[[f"channel_{n}" for n in range(3)]], wanted[0], rtol=1e-5)
-    assert told["caption"] == ONE_CAPTION and set(kept["weights"]) == {weights_digest(student.params)}
+    of_student = [network_with(student.config, student.params), student.schedule, text]
+    of_teacher = [network_with(teacher.config, teacher.params), teacher.schedule, text, np.zeros(text.shape[-1])]
+    wanted = {
+        "tiny-M2": (2, sample_student(*of_student, start, num_steps=2, skip=student.training["skip"])),
+        "tiny-teacher": (50, sample_teacher(*of_teacher, start)),
+    }
+    for name, (steps, latent) in wanted.items():
+        rows = kept[kept["model"] == name]
+        assert set(rows["steps"]) == {steps}
+        np.testing.assert_allclose(rows[[f"channel_{n}" for n in range(3)]], latent[0], rtol=1e-4, atol=1e-6)
+    lcm = sample_latent_student(*of_student, start, jax.random.key(PROFILE.seed), guidance=14.0)
+    assert np.abs(lcm - wanted["tiny-M2"][1]).max() > 1e-3  # MotionLCM's walk is another
+    digests = {weights_digest(model.params) for model in (student, teacher)}
+    assert told["caption"] == ONE_CAPTION and set(kept["weights"]) == digests
     # Finished models are read, and other settings are refused by name.
     again = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))

@@ -22,7 +22,7 @@ from f3amd_lib.data.text_motions import TextMotions
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.experiments.text_tables import TABLES, bench_of, measure_text_table
 from f3amd_lib.generation.captioned_motion import draw_motions
-from f3amd_lib.generation.latent_motion import guidance_of, sample_latent_student
+from f3amd_lib.generation.latent_motion import latent_walk, steps_of
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.text_judge import judge_motions
@@ -201,18 +201,18 @@ def measure_one_caption(
     data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, folder=None,
     **leg,
 ) -> Path:  # fmt: skip
-    """Keep the latent that MotionLCM's student makes of one caption in one step, from the noise of the profile's seed.
+    """Keep the latent that a model makes of one caption in its own steps, from the noise of the profile's seed.
 
     The autoencoder that ships decodes it, so that a picture needs no weights of the student.
 
     Args:
       data, encoder, profile: captioned motion, what embeds the caption, where results lie.
-      models: presets with weights; by default MotionLCM's.
+      models: presets with weights; by default MotionLCM's, one step.
       folder: where weights lie, instead of the user's own and the shipped ones.
 
     Returns:
       The table, `records/text_one_caption.csv`: a row a token of the latent, its numbers in columns; `weights` are the
-      student's, `autoencoder` those that decode.
+      model's, `autoencoder` those that decode.
     """
     record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="text_one_caption",
                         text_encoder=encoder.identity, caption=ONE_CAPTION)  # fmt: skip
@@ -221,13 +221,12 @@ def measure_one_caption(
         path = find_latent_model(profile.dataset, name) if folder is None else Path(folder) / f"{name}.safetensors"
         trained = load_latent_model(path)
         noise = jax.random.normal(jax.random.key(profile.seed), trained.config.state_shape(1))
-        latent = sample_latent_student(
-            network_with(trained.config, trained.params), trained.schedule, text, noise, jax.random.key(profile.seed),
-            guidance=guidance_of(trained, 1),
-        )  # fmt: skip
+        network, key = network_with(trained.config, trained.params), jax.random.key(profile.seed)
+        steps = steps_of(trained)
+        latent = latent_walk(trained)(network, text, noise, key)
         table = pd.DataFrame(np.asarray(latent[0]), columns=[f"channel_{n}" for n in range(latent.shape[-1])])
         digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
-        rows.append(table.assign(model=trained.name, steps=1, token=range(len(table)), **digests))
+        rows.append(table.assign(model=trained.name, steps=steps, token=range(len(table)), **digests))
     path = results_dir(profile.dataset, profile.name) / "records" / "text_one_caption.csv"
     return write_table(path, pd.concat(rows), record)
 

@@ -165,31 +165,41 @@ def guidance_of(trained: LatentModel, num_steps: int, guidance: float | None = N
     return guidance
 
 
-def latent_sampler(trained: LatentModel, num_steps: int | None = None, guidance: float | None = None) -> Callable:
-    """Return `draw(text, mask, key)`, compiled once for a shape: redundant vectors [B, L, 12 J - 1].
+def latent_walk(trained: LatentModel, num_steps: int | None = None, guidance: float | None = None) -> Callable:
+    """Return `walk(network, text, noise, key)`: from noise to latents [B, window, channels], as the model was trained.
 
     Args:
-      trained: a teacher or a student.
+      trained: a teacher or a student; a teacher goes by DDIM, MotionLCM's student with fresh noise from the key.
       num_steps: as `steps_of` has it.
       guidance: as `guidance_of` has it.
 
     Raises:
       ValueError: as `steps_of` and `guidance_of`.
     """
-    steps, config, schedule = steps_of(trained, num_steps), trained.config, trained.schedule
-    is_teacher, is_latent = not config.guidance_features, trained.training["consistency"] == "latent"
+    steps, schedule = steps_of(trained, num_steps), trained.schedule
     how = {"num_steps": steps, "guidance": guidance_of(trained, steps, guidance)}
+    if not trained.config.guidance_features:
+        return lambda network, text, noise, key: sample_teacher(
+            network, schedule, text, jnp.zeros(text.shape[-1]), noise, **how
+        )
+    if trained.training["consistency"] == "latent":
+        return lambda network, text, noise, key: sample_latent_student(network, schedule, text, noise, key, **how)
+    skip = trained.training["skip"]
+    return lambda network, text, noise, key: sample_student(network, schedule, text, noise, skip=skip, **how)
+
+
+def latent_sampler(trained: LatentModel, num_steps: int | None = None, guidance: float | None = None) -> Callable:
+    """Return `draw(text, mask, key)`, compiled once for a shape: redundant vectors [B, L, 12 J - 1].
+
+    Arguments and errors are those of `latent_walk`.
+    """
+    config, walk = trained.config, latent_walk(trained, num_steps, guidance)
 
     @jax.jit
     def draw(params, autoencoder, text, mask, key):
-        network, (key_noise, key_fresh) = network_with(config, params), jax.random.split(key)
+        key_noise, key_fresh = jax.random.split(key)
         noise = jax.random.normal(key_noise, config.state_shape(len(text)))
-        if is_teacher:
-            latent = sample_teacher(network, schedule, text, jnp.zeros(text.shape[-1]), noise, **how)
-        elif is_latent:
-            latent = sample_latent_student(network, schedule, text, noise, key_fresh, **how)
-        else:
-            latent = sample_student(network, schedule, text, noise, skip=trained.training["skip"], **how)
+        latent = walk(network_with(config, params), text, noise, key_fresh)
         return decode_latent(network_with(trained.autoencoder, autoencoder), trained.statistics, latent, mask)
 
     return lambda text, mask, key: draw(trained.params, trained.autoencoder_params, jnp.asarray(text), mask, key)
