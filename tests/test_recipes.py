@@ -160,8 +160,24 @@ def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkey
 
 def test_what_notebook_15_says_of_single_changes_follows_from_the_record():
     rows, _ = read_table(repository_root() / "paper_figures/bandai/laptop/records/campaign.csv")
-    rows = rows.query("model == 'F3AMD-FNO-96' and windows == 200_000 and seed == 0 and steps in [0, 8]")
-    table = rows.pivot(index="recipe", columns="metric", values="value")
-    assert table.index[table["x0_error_ratio"] < 0.9].tolist() == ["block-residual"]
-    assert table["held_out_loss"].idxmin() == "higher-learning-rate"
-    assert table["held_out_loss"]["block-residual"] > table["held_out_loss"]["paper"]  # "the loss most", not its loss
+    rows = rows.query("model == 'F3AMD-FNO-96' and seed == 0 and window_frames == 32 and steps in [0, 8]")
+    table = rows.pivot(index=["recipe", "windows"], columns="metric", values="value")
+    short, longer = (table.xs(windows, level="windows") for windows in (200_000, 400_000))
+    users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise"}
+    assert set(short.index[short["x0_error_ratio"] < 0.8]) == users
+    assert short["x0_error_ratio"].drop(users).min() > 0.9 and len(short) == 12  # eleven changes and the paper's text
+    # Noise that stays in the motion, and joints that tremble.
+    assert short["seed_spread"][["skip-and-output-scaling", "log-normal-noise"]].round().tolist() == [10, 6]
+    assert short["joint_acceleration"]["skip-and-output-scaling"] > 5 * short["joint_acceleration"]["paper"]
+    # Twice as long.
+    assert longer["x0_error_ratio"][["block-residual", "residual-prior"]].round(2).tolist() == [0.65, 0.19]
+    loss = table["held_out_loss"]
+    assert loss["block-residual", 400_000] == pytest.approx(loss["paper", 400_000], rel=0.03)
+    assert loss["residual-prior", 400_000] == pytest.approx(loss["paper", 800_000], rel=0.03)
+    assert short["held_out_loss"].idxmin() == "higher-learning-rate"
+    assert loss["higher-learning-rate", 200_000] == pytest.approx(loss["paper", 400_000], rel=0.05)
+    assert longer["x0_error_ratio"].get("higher-learning-rate", 1.0) > 0.9
+    # A loss is no walk.
+    assert (loss["history-anchor"] < loss["paper"].loc[[200_000, 400_000]]).all()
+    shaking = table["joint_acceleration"]["history-anchor"]
+    assert shaking[200_000] > 5 * shaking[400_000]

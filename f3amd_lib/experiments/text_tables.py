@@ -438,7 +438,9 @@ def measure_text_table(
     def trained(preset: str) -> TextModel | LatentModel | None:
         if is_latent_preset(preset.removesuffix(CONTROL)):  # these see clips of a length of their own
             return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
-        own = "window" in presets.find_preset(preset.removesuffix(CONTROL)).network
+        form = presets.find_preset(preset.removesuffix(CONTROL))
+        # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
+        own = "prefix_frames" in form.training or "block_frames" in form.network
         window = None if own else most_frames
         return train_text_model(cut, encoder, brief, preset, window=window, folder=apart, **leg)
 
