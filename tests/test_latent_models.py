@@ -136,6 +136,16 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     np.testing.assert_array_equal(made[1][1].positions, motion.positions)
 
 
+@pytest.mark.parametrize("presets", [[], ["F3AMD-FNO-96"], ["ACMDM-S-PS22-n2"], ["MotionPCM-M1-small", "CAMDM"]])
+def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, capsys):
+    words = ["train", "--data", "synthetic", "--profile", "smoke", "--out", str(tmp_path)]
+    words += [word for name in presets for word in ("--preset", name)]
+    words += ["--teacher", str(SHIPPED / "MotionPCM-teacher-small.safetensors")]
+    assert command_line.main(words) == 2
+    assert "--teacher is for students of MotionPCM: leave it out" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("steps, model, told", [
     ("3", "motionpcm", "students of MotionPCM are trained for 1, 2 or 4 steps, none for 3"),
     ("50", "motionpcm", "--model MotionPCM-teacher-small"),
