@@ -4,13 +4,12 @@ import dataclasses
 
 import jax
 import numpy as np
-import pandas as pd
 import pytest
+from builders import rows_of_one_step
 from helpers import bimodal_paths as toy
 from helpers import one_step_ways as ways
 
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.ground.profiles import repository_root
 
 DATA, EXPLODING = toy.BimodalPaths(num_frames=8, num_modes=4), variance_exploding()
 
@@ -56,9 +55,7 @@ def _recipe():
 @pytest.fixture(scope="module")
 def of_record():
     """Value of (model, steps, metric), by the records that notebook 22 draws."""
-    folder = repository_root() / "paper_figures/bandai/laptop/records"
-    rows = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
-    return rows.set_index(["model", "steps", "metric"])
+    return rows_of_one_step()
 
 
 def test_what_notebook_22_says_of_variety_follows_from_the_records(of_record):

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from builders import rows_of_one_step
 from PIL import Image
 
 from f3amd_lib.ground.papers import load_paper_file
@@ -110,9 +111,7 @@ def test_what_is_said_of_the_level_of_one_step():
 
 
 def test_what_is_said_of_students_of_locomotion():
-    folder = ROOT / "paper_figures/bandai/laptop/records"
-    record = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
-    rows, plus = record.set_index(["model", "steps", "metric"]), "F3AMD-FNO-96-plus"
+    rows, plus = rows_of_one_step(), "F3AMD-FNO-96-plus"
     value, camdm = rows["value"], "CAMDM, distilled"
 
     def same(said, *asked):

@@ -1,6 +1,7 @@
 """Tables of text to motion, rehearsed at the smallest size: trained, measured, kept, and read by the ledger."""
 
 import time
+import types
 
 import numpy as np
 import pytest
@@ -100,6 +101,21 @@ def test_guidance_and_first_frames_arrive(tables):
     assert not np.array_equal(one, other)  # three steps of training: the text hardly matters yet
     one, other = (part["value"].to_numpy() for _, part in tables["text_tableA5"].groupby("first_prefix"))
     assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize(("preset", "window"), [
+    ("ACMDM-S-PS22-raw-n2", 80), ("ACMDM-S-PS22-redundant-n2", 80), ("ACMDM-S-PS22-n2", 80),
+    ("ACMDM-n4-PS22-prefix", None), ("ACMDM-n4-PS22-noisy-condition", None),
+])  # fmt: skip
+def test_states_are_as_long_as_the_clips_but_for_prefixes_and_blocks(preset, window, data, tmp_path, monkeypatch):
+    asked, settings = [], {"most_frames": 80}
+    bench = types.SimpleNamespace(settings=settings, record=lambda *arguments: {"settings": settings})
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
+    monkeypatch.setattr(text_tables, "train_text_model", lambda *named, window, **how: asked.append((named[3], window)))
+    rows = [{"model": "ACMDM-S-PS22-raw", "trained": preset}]
+    assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
+    assert asked == [(preset, window)]
 
 
 def test_asked_frames_are_so_many_of_the_true_length():
