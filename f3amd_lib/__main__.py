@@ -175,7 +175,8 @@ def train(
 
     Args:
       preset: such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order. Of text to motion
-        (--data bandai) such as ACMDM-S-PS22-raw-n3; NAME+control its control branch; judge the judge;
+        (--data bandai) such as ACMDM-S-PS22-raw-n3; NAME+control its control branch, NAME+control-pelvis one that
+        knows the pelvis alone; judge the judge;
         MotionPCM-M1-small and so on a student, with the autoencoder and the teacher before it.
       minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
       steps: optimiser steps; by default the profile's.
@@ -228,7 +229,8 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     from f3amd_lib.training import latent_models, text_models
     from f3amd_lib.training.evaluator_task import EvaluatorTraining
 
-    is_latent = lambda name: name != text_models.JUDGE and latent_models.is_latent_preset(name.removesuffix("+control"))
+    preset_of = lambda name: text_models.preset_and_branch(name)[0]
+    is_latent = lambda name: name != text_models.JUDGE and latent_models.is_latent_preset(preset_of(name))
     for name in names:
         if name != text_models.JUDGE and not (is_latent(name) or text_models.is_text_preset(name)):
             raise ValueError(f"{name} needs no captions: train it by a call of its own")

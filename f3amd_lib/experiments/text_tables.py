@@ -21,7 +21,7 @@ import pandas as pd
 from f3amd_lib.data.text_encoders import TextEncoder, embed_captions
 from f3amd_lib.data.text_motions import TextMotions, frame_mask, pad_motions
 from f3amd_lib.experiments.runner import Records
-from f3amd_lib.generation.captioned_motion import draw_motions
+from f3amd_lib.generation.captioned_motion import draw_motions, motion_drawer
 from f3amd_lib.generation.latent_motion import latent_motions, latent_sampler, reconstruction
 from f3amd_lib.generation.noise_optimisation import control_distance, optimise_noise
 from f3amd_lib.generation.text_to_motion import continue_prefix, sample_control, sample_text
@@ -127,26 +127,26 @@ class Bench:
 def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
     """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
     how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
-    return bench.quality(lambda pooled, lengths, key: draw_motions(trained, pooled, lengths, key, **how))
+    draw = motion_drawer(trained, **how)
+    return bench.quality(lambda *asked: draw_motions(trained, *asked, draw=draw))
 
 
-def after_first_frames(trained: TextModel, starts, pooled, lengths, key, num_steps: int | None) -> np.ndarray:
-    """Return motions that go on from first frames in the clips' own places, window after window (prefix form).
+def prefix_drawer(trained: TextModel, most_frames: int, num_steps: int | None) -> Callable:
+    """Return what goes on from first frames in the clips' own places, window after window (prefix form).
 
     Args:
       trained: a model of the prefix form.
-      starts: first frames, [N, F, J, 3], metres; at least as many as its prefix has.
-      pooled, lengths: captions [N, W], frames of motion [N].
-      key: JAX random key.
+      most_frames: of motion that is wanted.
       num_steps: of Euler's method.
 
     Returns:
-      [N, L, J, 3], metres, L the longest or more.
+      `draw(starts, pooled, key)`, compiled once for a shape: of first frames [N, F, J, 3], metres, at least as many as
+      its prefix has, and captions [N, W] it makes [N, L, J, 3], metres, L `most_frames` or more.
     """
     codec, config = trained.codec, trained.config
     given = next(iter(trained.starts.values())).shape[0]
     frames = given * codec.frames_per_state
-    windows = -(-(max(lengths) // codec.frames_per_state - given) // (config.window - given))
+    windows = -(-(most_frames // codec.frames_per_state - given) // (config.window - given))
     how = {} if num_steps is None else {"sampler": trained.schedule.sampler, "num_steps": num_steps}
 
     @jax.jit
@@ -157,7 +157,9 @@ def after_first_frames(trained: TextModel, starts, pooled, lengths, key, num_ste
         state = jnp.concatenate([prefix, *parts], axis=1)
         return codec.decode(state, jnp.ones((len(state), state.shape[1] * codec.frames_per_state), bool))
 
-    return codec.axes.restore(np.asarray(draw(jnp.asarray(starts), jnp.asarray(pooled), key)))
+    return lambda starts, pooled, key: codec.axes.restore(
+        np.asarray(draw(jnp.asarray(starts), jnp.asarray(pooled), key))
+    )
 
 
 def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
@@ -166,12 +168,13 @@ def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: M
         return whole_rows(bench, trained, row, about, first)
     count = next(iter(trained.starts.values())).shape[0] * trained.codec.frames_per_state
     true = np.asarray(pad_motions([bench.real.clip(k)[:count] for k in range(bench.real.num_clips)], count).motion)
+    draw = prefix_drawer(trained, int(bench.real.lengths.max()), bench.num_steps(trained))
+    begin = None if first is None else motion_drawer(first, num_steps=bench.num_steps(first))
 
     def make(pooled, lengths, key):
-        starts = true
-        if row["first_prefix"] == "generated":
-            starts = draw_motions(first, pooled, count, jax.random.fold_in(key, 1), num_steps=bench.num_steps(first))
-        return after_first_frames(trained, starts, pooled, lengths, key, bench.num_steps(trained))
+        if begin is None:
+            return draw(true, pooled, key)
+        return draw(draw_motions(first, pooled, count, jax.random.fold_in(key, 1), draw=begin), pooled, key)
 
     return bench.quality(make)
 
@@ -179,9 +182,10 @@ def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: M
 def mesh_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
     """Return the figures of a model that makes vertices: its joints before the judge, and LSD of its meshes."""
     mesh, apart = trained.codec.mesh, []
+    draw = motion_drawer(trained, num_steps=bench.num_steps(trained), mesh=True)
 
     def make(pooled, lengths, key):
-        made = draw_motions(trained, pooled, lengths, key, num_steps=bench.num_steps(trained), mesh=True)
+        made = draw_motions(trained, pooled, lengths, key, draw=draw, mesh=True)
         each = (laplacian_surface_distance(one[:length], mesh.body.vertices, mesh.body.faces).mean()
                 for one, length in zip(made, lengths, strict=True))  # fmt: skip
         apart.append({"metric": "LSD", "value": float(np.mean(list(each)))})

@@ -6,7 +6,7 @@ What a user asks for is checked here, once; `generation.text_to_motion` has the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -29,8 +29,10 @@ from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
 from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.latent_models import LatentModel
-from f3amd_lib.training.text_models import TextModel, controlled_joints
+from f3amd_lib.training.text_models import TextModel
+from f3amd_lib.training.text_motion import branch_with
 
 NEAR = 4
 """Starts of a stream among which the seed chooses: those whose captions are nearest to the first one."""
@@ -137,7 +139,7 @@ def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
 
 def find_joint(trained: TextModel, name: str) -> int:
     """Return a joint that the control branch was trained for, by its role or its own name; ValueError lists them."""
-    known = controlled_joints(trained.skeleton)
+    known = trained.controlled
     own = {trained.skeleton.names[joint]: joint for joint in known.values()}
     if name not in known | own:
         raise ValueError(f"unknown joint {name!r}{nearest_hint(name, known)}")
@@ -164,9 +166,54 @@ def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) ->
     return told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
 
 
+def motion_drawer(
+    trained: TextModel, *, guidance: float | None = None, num_steps: int | None = None, controlled: bool = False,
+    mesh: bool = False,
+) -> Callable:  # fmt: skip
+    """Return `draw(pooled, mask, key, control)`, compiled once for a shape: normalised positions [B, L, J, 3].
+
+    Args:
+      trained: a model of whole motions.
+      guidance, num_steps, mesh: as for `draw_motions`.
+      controlled: whether a control is given to it, or None.
+
+    Raises:
+      ValueError: for a control and no branch.
+    """
+    config, schedule = trained.config, trained.schedule
+    asked = _asked(trained, guidance, num_steps)
+    weights = {"network": trained.params}
+    if controlled:
+        trained.control_branch()  # says how to train one if there is none
+        weights["branch"] = trained.branch
+        asked = {{"guidance": "text_scale"}.get(name, name): value for name, value in asked.items()}
+
+    @jax.jit
+    def compiled(weights, codec, pooled, mask, noise, key, control):
+        network, condition = network_with(config, weights["network"]), TextCondition(pooled, codec.state_mask(mask))
+        if controlled:
+            branch = branch_with(config, codec, weights["branch"])
+            state = sample_control(network, branch, schedule, condition, control, noise, key=key, **asked)
+        elif isinstance(config, MaskedACMDMConfig):
+            state = sample_masked(network, schedule, condition, key, **asked)
+        else:
+            sample = sample_blocks if config.block_frames else sample_text
+            state = sample(network, schedule, condition, noise, key=key, **asked)
+        return codec.decode_vertices(state) if mesh else codec.decode(state, mask)
+
+    def draw(pooled, mask, key, control=None):
+        key_noise, key_solver = jax.random.split(key)
+        frames = trained.codec.state_mask(mask).shape
+        noise = jax.random.normal(key_noise, (*frames, config.num_joints, config.channels))
+        return compiled(weights, trained.codec, jnp.asarray(pooled), mask, noise, key_solver, control)
+
+    return draw
+
+
 def draw_motions(
     trained: TextModel | LatentModel, pooled, num_frames, key, *,
     guidance: float | None = None, num_steps: int | None = None, control: Control | None = None, mesh: bool = False,
+    draw: Callable | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Draw a motion for each caption, whole at once, or block by block or masked, as the model is made for.
 
@@ -180,6 +227,7 @@ def draw_motions(
       num_steps: of Euler's method; by default the model's own sampler. Of MotionPCM as `latent_motion.steps_of`.
       control: where joints should be, normalised, [B, L, J, 3].
       mesh: return the vertices of a model of meshes, [B, L, V, 3], whose `codec.mesh` has joints and faces of them.
+      draw: a `motion_drawer` (of MotionPCM a `latent_sampler`) that is compiled already, told guidance and steps.
 
     Returns:
       Positions, [B, L, J, 3], metres, starting near the origin facing +Z; L the longest; 0 in the padding.
@@ -192,36 +240,17 @@ def draw_motions(
     if isinstance(trained, LatentModel):
         if control is not None:
             raise ValueError(f"{trained.name} has no control branch: leave --control out, or name a model of ACMDM")
-        return latent_motions(trained, pooled, num_frames, key, num_steps=num_steps, guidance=guidance)
+        return latent_motions(trained, pooled, num_frames, key, draw=draw, num_steps=num_steps, guidance=guidance)
     if trained.starts:
         raise ValueError(
             f"{trained.name} goes on from earlier frames: use it for a stream (--then), or another --model"
         )
-    config, schedule, codec = trained.config, trained.schedule, trained.codec
-    branch = None if control is None else trained.control_branch()
+    how = {"guidance": guidance, "num_steps": num_steps, "controlled": control is not None, "mesh": mesh}
+    draw = draw or motion_drawer(trained, **how)
     lengths = np.broadcast_to(num_frames, len(pooled))
     mask = frame_mask(lengths, int(lengths.max()))
-    condition = TextCondition(jnp.asarray(pooled), codec.state_mask(mask))
-    shape = (*condition.mask.shape, config.num_joints, config.channels)
-    key_noise, key_solver = jax.random.split(key)
-    asked = _asked(trained, guidance, num_steps)
-    if control is not None and "guidance" in asked:
-        asked["text_scale"] = asked.pop("guidance")
-
-    @jax.jit
-    def draw(noise, key):
-        network = trained.network()
-        if control is not None:
-            state = sample_control(network, branch, schedule, condition, control, noise, key=key, **asked)
-        elif isinstance(config, MaskedACMDMConfig):
-            state = sample_masked(network, schedule, condition, key, **asked)
-        else:
-            sample = sample_blocks if config.block_frames else sample_text
-            state = sample(network, schedule, condition, noise, key=key, **asked)
-        return codec.decode_vertices(state) if mesh else codec.decode(state, mask)
-
-    made = np.asarray(draw(jax.random.normal(key_noise, shape), key_solver))
-    return codec.axes.restore(made) * np.asarray(mask)[..., None, None]
+    made = np.asarray(draw(pooled, mask, key, control))
+    return trained.codec.axes.restore(made) * np.asarray(mask)[..., None, None]
 
 
 def control_of(trained: TextModel, joint: int, frames, points, num_frames: int) -> Control:

@@ -3,7 +3,8 @@
     captioned clips -> normalised positions -> (autoencoder -> latent) -> denoiser -> (control branch)
 
 Each stage leaves one file that is whole in itself, with the weights of the stages before it. A preset's name with
-"+control" behind it stands for the branch beside the finished model of that name.
+"+control" behind it stands for the branch beside the finished model of that name, with "+control-pelvis" for one that
+knows the pelvis alone.
 """
 
 from __future__ import annotations
@@ -56,6 +57,9 @@ from f3amd_lib.training.text_motion import (
 CONTROL = "+control"
 """Behind a preset's name: the model with its control branch."""
 
+PELVIS = f"{CONTROL}-pelvis"
+"""The same with a branch that learns to control the pelvis alone (ACMDM Table 3, "trained on pelvis")."""
+
 CONTROLLED = {"left_foot": "left_toe", "right_foot": "right_toe"} | {
     name: name for name in ("head", "left_wrist", "right_wrist")
 }
@@ -71,7 +75,7 @@ class TextModel:
     """A trained model of text to motion, or a motion autoencoder alone.
 
     Attributes:
-      name: preset, with "+control" where there is a branch.
+      name: preset, with "+control" or "+control-pelvis" where there is a branch.
       codec: between motion and the network's states: normaliser and autoencoder.
       skeleton, fps: of the motion it was trained on.
       record: how it was trained, on what, under what terms.
@@ -107,6 +111,12 @@ class TextModel:
         return branch_with(self.config, self.codec, self.branch)
 
     @property
+    def controlled(self) -> dict[str, int]:
+        """The joints that its control branch knows, by their names on the command line."""
+        every = controlled_joints(self.skeleton)
+        return {"pelvis": 0} if preset_and_branch(self.name)[1] == PELVIS else every
+
+    @property
     def most_frames(self) -> int:
         """Frames of motion in the longest state."""
         return self.config.window * self.codec.frames_per_state
@@ -115,6 +125,14 @@ class TextModel:
 def controlled_joints(skeleton: Skeleton) -> dict[str, int]:
     """Return the joints that a branch learns to control, by their names on the command line; the pelvis is the root."""
     return {"pelvis": 0} | {name: skeleton.role(role) for name, role in CONTROLLED.items() if skeleton.has_role(role)}
+
+
+def preset_and_branch(name: str) -> tuple[str, str]:
+    """Return a preset's name and what follows it: nothing, `CONTROL` or `PELVIS`; ValueError for another branch."""
+    preset, plus, which = name.partition(CONTROL)
+    if (branch := plus + which) not in ("", CONTROL, PELVIS):
+        raise ValueError(f"unknown branch {branch!r} in {name!r}{nearest_hint(branch, (CONTROL, PELVIS))}")
+    return preset, branch
 
 
 # --------------------------------------------------------------------------------------------------------------- files
@@ -297,17 +315,18 @@ def denoiser_task(
 
 
 def control_task(
-    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: TextMotionTraining
+    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: TextMotionTraining, joints
 ) -> ControlTask:
-    """Return the training of a control branch beside a finished model on the clips of a split."""
+    """Return the training of a branch that controls `joints` beside a finished model, on the clips of a split."""
     part, codec, frames = data.select(data.members(split)), base.codec, base.codec.frames_per_state
     table, pooled = _captioned_states(codec, part, encoder)
     positions = jnp.asarray(np.concatenate(_whole_states(codec, part)), jnp.float32)
     positions = positions.reshape(len(table.frames), frames, *positions.shape[1:])
     table = table._replace(frames=(table.frames, positions))
     fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
-    joints = tuple(controlled_joints(data.skeleton).values())
-    return ControlTask(base.config, config, base.schedule, table, pooled, base.params, codec, joints, fingerprint)
+    return ControlTask(
+        base.config, config, base.schedule, table, pooled, base.params, codec, tuple(joints), fingerprint
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------- training
@@ -337,9 +356,9 @@ def _of_meshes(preset: presets.Preset) -> bool:
 
 
 def is_text_preset(name: str) -> bool:
-    """Say whether a preset, with or without "+control", is one that this file trains."""
+    """Say whether a preset, with or without a branch, is one that this file trains."""
     families = (ACMDMConfig.family, MaskedACMDMConfig.family, *_AUTOENCODERS)
-    return presets.find_preset(name.removesuffix(CONTROL)).family in families
+    return presets.find_preset(preset_and_branch(name)[0]).family in families
 
 
 def train_text_model(
@@ -354,7 +373,7 @@ def train_text_model(
       data: captioned clips.
       encoder: of the captions.
       profile: how long; "gpu" by the paper's recipe, else by the short ones.
-      name: of a preset of ACMDM, or with "+control" behind it.
+      name: of a preset of ACMDM, or with "+control" or "+control-pelvis" behind it.
       window: most frames of motion in a state, instead of the preset's; longer clips are cut to their first frames, so
         that all begin where a caption's motion will: at the origin.
       batch_size: instead of the recipe's.
@@ -368,12 +387,13 @@ def train_text_model(
       ValueError: if a model or a state of other settings lies there, or what it stands on knows other data.
       TrainingDiverged: if the loss stops being a number.
     """
-    preset = presets.find_preset(name.removesuffix(CONTROL))
-    if name.endswith(CONTROL) and _of_meshes(preset):
+    base, branch = preset_and_branch(name)
+    preset = presets.find_preset(base)
+    if branch and _of_meshes(preset):
         raise ValueError(f"{preset.name} has no control branch: its states are of vertices, not of joints")
-    name = preset.name + (CONTROL if name.endswith(CONTROL) else "")
+    name = preset.name + branch
     data = data.cut(window) if window and window < data.lengths.max() else data
-    earlier = preset.name if name.endswith(CONTROL) else preset.latent
+    earlier = preset.name if branch else preset.latent
     before = None
     if earlier:
         lies = text_model_files(profile, earlier, folder=folder).model
@@ -383,8 +403,7 @@ def train_text_model(
             return None
         if before.record["dataset_fingerprint"] != data.fingerprint:
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
-    part = _AUTOENCODERS.get(preset.family, "denoiser")
-    part = "control" if name.endswith(CONTROL) else part
+    part = "control" if branch else _AUTOENCODERS.get(preset.family, "denoiser")
     codec = _codec_of_positions(data, preset) if before is None else before.codec
     settings = {"seed": profile.seed, "unit": max(1, UNIT // codec.frames_per_state)}
     settings |= {} if batch_size is None else {"batch_size": batch_size}
@@ -393,7 +412,8 @@ def train_text_model(
     if part == "denoiser":
         task_of = lambda split: denoiser_task(data, split, encoder, preset.name, config, codec, window)
     elif part == "control":
-        task_of = lambda split: control_task(data, split, encoder, before, config)
+        joints = [0] if branch == PELVIS else controlled_joints(data.skeleton).values()
+        task_of = lambda split: control_task(data, split, encoder, before, config, joints)
     else:
         task_of = lambda split: autoencoder_task(data, split, preset.name, config)
     files, task = text_model_files(profile, name, folder=folder), task_of("train")
@@ -483,26 +503,30 @@ def find_text_model(dataset: str, preset: str | None = None, *, control: bool = 
     Raises:
       ValueError: if there is none, saying how to train it.
     """
-    wanted = None if preset is None else presets.find_preset(preset.removesuffix(CONTROL)).name
+    wanted, branch = (None, "") if preset is None else preset_and_branch(preset)
+    wanted = wanted and presets.find_preset(wanted).name
+    branches = (branch,) if branch else (CONTROL, PELVIS) if control else ("",)
     for folder in text_model_folders(dataset):
-        for path in sorted(folder.glob("*.safetensors"), key=lambda path: -path.stat().st_mtime):
-            name = path.name.removesuffix(".safetensors")
-            fits = name.endswith(CONTROL) == control and wanted in (None, name.removesuffix(CONTROL))
-            if fits and _makes_motion(name):
-                return path
-    name = (wanted or DEFAULT_PRESET) + (CONTROL if control else "")
+        newest = sorted(folder.glob("*.safetensors"), key=lambda path: -path.stat().st_mtime)
+        found = {path: _denoiser(path.name.removesuffix(".safetensors")) for path in newest}
+        for branch in branches:
+            for path, (name, ending) in found.items():
+                if name and ending == branch and wanted in (None, name):
+                    return path
+    name = (wanted or DEFAULT_PRESET) + branches[0]
     raise ValueError(
         f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
     )
 
 
-def _makes_motion(name: str) -> bool:
-    """Say whether a file's name is that of a denoiser of ACMDM, not of a state, the judge or of another paper."""
+def _denoiser(name: str) -> tuple[str, str]:
+    """Return preset and branch of a file's name; "" for a state, the judge, an autoencoder or another paper's model."""
     try:
-        family = presets.find_preset(name.removesuffix(CONTROL)).family
-        return family in (ACMDMConfig.family, MaskedACMDMConfig.family)
+        preset, branch = preset_and_branch(name)
+        made = presets.find_preset(preset).family in (ACMDMConfig.family, MaskedACMDMConfig.family)
     except ValueError:
-        return False
+        made = False
+    return (preset, branch) if made else ("", "")
 
 
 DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"
