@@ -71,7 +71,7 @@ def folder(data, tmp_path_factory):
         patch.setenv("F3AMD_CACHE_DIR", str(folder / "cache"))
         for name, preset in TINY.items():
             patch.setitem(presets.PRESETS, name, preset)
-        for name in ("tiny+control", "tiny-redundant", "tiny-mesh", "tiny-prefix"):
+        for name in ("tiny+control", "tiny+control-pelvis", "tiny-redundant", "tiny-mesh", "tiny-prefix"):
             assert train_text_model(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
         yield folder / "models"
 
@@ -105,6 +105,20 @@ def test_a_name_trains_what_it_stands_on_and_files_are_whole(folder, data):
     np.testing.assert_allclose(
         prefix.starts[f"a person walks {STYLES[0]}"], prefix.codec.encode(clip, np.ones((1, 12), bool))[0], atol=0.05
     )
+
+
+def test_a_branch_of_the_pelvis_learns_the_pelvis_alone(folder):
+    every, pelvis = load(folder, "tiny+control"), load(folder, "tiny+control-pelvis")
+    joints = lambda trained: trained.record["identity"]["model"]["joints"]["of"]
+    assert joints(pelvis) == [0] and joints(every) == list(every.controlled.values()) and len(joints(every)) == 6
+    assert same(every.params, pelvis.params) and not same(every.branch, pelvis.branch)
+    assert pelvis.controlled == {"pelvis": 0}
+    assert captioned_motion.find_joint(pelvis, "pelvis") == 0
+    assert captioned_motion.find_joint(every, "left_wrist") == every.controlled["left_wrist"]
+    with pytest.raises(ValueError, match="unknown joint 'left_wrist'"):
+        captioned_motion.find_joint(pelvis, "left_wrist")
+    with pytest.raises(ValueError, match=r"unknown branch '\+control-pelvs'.*did you mean '\+control-pelvis'"):
+        text_models.preset_and_branch("tiny+control-pelvs")
 
 
 def test_models_come_back_from_their_files(folder, tmp_path):
@@ -288,6 +302,7 @@ def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
     assert find_text_model("bandai", "tiny").name == "tiny.safetensors"
     assert find_text_model("bandai").name in ("tiny.safetensors", "tiny-prefix.safetensors")
     assert find_text_model("bandai", control=True).name == "tiny+control.safetensors"
+    assert find_text_model("bandai", "tiny+control-pelvis", control=True).name == "tiny+control-pelvis.safetensors"
     with pytest.raises(ValueError, match=r"no trained ACMDM-S-PS22 .*f3amd train --preset ACMDM-S-PS22 --data bandai"):
         find_text_model("bandai", "ACMDM-S-PS22")
 

@@ -21,7 +21,7 @@ from f3amd_lib.training import text_models
 
 QUIET = {"progress": False}
 PLAIN, PREFIX = {"model": "ACMDM-S-PS22", "trained": "tiny"}, {"model": "ACMDM-S-PS2-prefix", "trained": "tiny-prefix"}
-SECTIONS = ("trained on all joints", "noise optimisation", "upper-body edit")
+SECTIONS = ("trained on pelvis", "trained on all joints", "noise optimisation", "upper-body edit")
 ROWS = {
     "text_table1": [{"model": "ACMDM-S-PS22-raw", "trained": "tiny"}],
     "text_tableA1": [PLAIN | {"cfg": "yes"}, PLAIN | {"cfg": "no"}],
@@ -52,6 +52,8 @@ def tables(data, tmp_path_factory):
         for name, rows in ROWS.items():
             path = measure_text_table(name, data, ENCODER, PROFILE, folder=root / "models", rows=rows, **QUIET)
             made[name] = read_table(path)[0]
+            for beside in load_paper_file("experiments", "acmdm")[name].get("beside", ()):
+                made[beside] = read_table(path.with_name(f"{beside}.csv"))[0]
             if name == "text_table1":
                 # What is measured is not measured again, and a leg without time stops before the next row.
                 before = path.read_bytes()
@@ -87,6 +89,29 @@ def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
         assert len(errors) == 1 + 6 and errors["average"] == pytest.approx(errors.drop("average").mean())
         assert table[section, "average", "sampling_seconds"] > 0
     assert "text_FID" in table["upper-body edit", "pelvis and feet"].index
+    # A branch that knows the pelvis alone is asked about the pelvis alone.
+    assert set(table["trained on pelvis"].index.get_level_values("joint")) == {"pelvis"}
+    weights = tables["text_table3"].groupby("section")["weights"].first()
+    assert weights["trained on pelvis"] != weights["trained on all joints"] == weights["upper-body edit"]
+
+
+@pytest.mark.slow
+def test_table_3_is_the_mean_over_numbers_of_frames(tables):
+    each = tables["text_control"]
+    assert list(each["frames"].unique()) == ["1", "2", "5", "25%", "100%"]
+    keys = ["section", "joint", "metric"]
+    means, table = each.groupby(keys)["value"].mean(), tables["text_table3"].set_index(keys)["value"]
+    assert len(means) > 0 and table[means.index].to_numpy() == pytest.approx(means.to_numpy())
+
+
+@pytest.mark.slow
+def test_where_all_clips_are_controlled_the_judge_looks_too(tables):
+    """The rehearsal's bench has as many clips as it controls; optimised noise has fewer."""
+    looked = tables["text_control"].groupby("section")["metric"].unique().map(set)
+    assert {"text_FID", "R_precision_3", "foot_skating"} <= looked["trained on all joints"]
+    assert looked["noise optimisation"] == {
+        "control_trajectory_error", "control_location_error", "control_average_error",
+    }  # fmt: skip
 
 
 @pytest.mark.slow

@@ -40,8 +40,10 @@ from f3amd_lib.training.latent_models import LatentModel, is_latent_preset, trai
 from f3amd_lib.training.text_models import (
     CONTROL,
     JUDGE,
+    PELVIS,
     TextModel,
     controlled_joints,
+    preset_and_branch,
     text_model_files,
     train_text_model,
 )
@@ -56,6 +58,9 @@ TABLES = tuple(name for names in PAPERS.values() for name in names)
 
 HELD = ("pelvis", "left_foot", "right_foot")
 """Joints that stay where they are in upper-body editing (ACMDM section 4.4)."""
+
+BRANCHES = {"trained on pelvis": PELVIS, "trained on all joints": CONTROL, "upper-body edit": CONTROL}
+"""The branch that a section of Table 3 asks; noise is optimised without one."""
 
 _EULER_STEPS = 10
 """Of the sampler whose noise is optimised (ACMDM Appendix F)."""
@@ -108,6 +113,15 @@ class Bench:
         )  # fmt: skip
         table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
         return table[["metric", "value", "low", "high"]]
+
+    def look(self, motions, told) -> dict[str, float]:
+        """Return the figures of one motion [L, J, 3] for each clip, made of the captions `told`."""
+        table = judge_motions(
+            self.judge, self.encoder, self.real, {"made": lambda repeat: (motions, told)}, repeats=1, seed=self.seed,
+            group=self.settings["group"], bar=self.settings["sight"],
+        )  # fmt: skip
+        share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
+        return {**table[table["system"] == "made"].set_index("metric")["value"], "foot_skating": share}
 
     def record(self, profile: Profile, data: TextMotions, measurement: str, **extra) -> dict:
         """Return the record of a measurement with this judge."""
@@ -249,12 +263,17 @@ def control_drawer(bench: Bench, trained: TextModel, section: str, clips, pooled
     return lambda asked, key: codec.axes.restore(np.asarray(draw(jnp.asarray(asked), key))), np.asarray(batch.motion)
 
 
-def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
-    """Return errors by joint, mean over five densities, and their average with the seconds of one sentence.
+def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> dict[str, pd.DataFrame]:
+    """Return figures by joint and number of frames that are asked for, and their means over numbers of frames.
 
-    With "upper-body edit" pelvis and feet are held in all frames of all clips, and the judge looks.
+    The judge looks, too, where all clips are controlled. The mean over joints has the seconds of one sentence. With
+    "upper-body edit" pelvis and feet are held in all frames of all clips.
+
+    Returns:
+      {"text_table3": means over the five numbers of frames, "text_control": each of them}.
     """
-    real, joints, section = bench.real, controlled_joints(bench.real.skeleton), row["section"]
+    real, section = bench.real, row["section"]
+    joints = controlled_joints(real.skeleton) if trained.branch is None else trained.controlled
     num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
 
     def asked_of(joints, frames):
@@ -268,26 +287,35 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
         def make(pooled, lengths, key):
             return control_drawer(bench, trained, section, np.arange(len(lengths)), pooled)[0](held, key)
 
-        return bench.quality(make).assign(joint="pelvis and feet")
+        return {"text_table3": bench.quality(make).assign(joint="pelvis and feet")}
     few = bench.settings["optimised_clips" if section == "noise optimisation" else "control_clips"]
     clips = np.arange(min(few, real.num_clips))
-    pooled, lengths, rows = bench.captions(0)[1][clips], real.lengths[clips], []
+    told, pooled = bench.captions(0)
+    pooled, lengths, rows = pooled[clips], real.lengths[clips], []
     draw, wanted = control_drawer(bench, trained, section, clips, pooled)
     for number, how_many in enumerate((*about["frames"], *about["shares"])):
+        frames = f"{how_many:.0%}" if isinstance(how_many, float) else str(how_many)
         for name, joint in joints.items():
             generator = np.random.default_rng([bench.seed, number, joint])
             asked = asked_of([joint], asked_frames(generator, lengths, how_many))
-            errors = control_errors(draw(asked, jax.random.fold_in(key, number)), wanted, asked)
-            rows += [{"joint": name.replace("_", " "), "metric": metric, "value": x} for metric, x in errors.items()]
+            made = draw(asked, jax.random.fold_in(key, number))
+            figures = control_errors(made, wanted, asked)
+            if len(clips) == real.num_clips:
+                figures |= bench.look([one[:length] for one, length in zip(made, lengths, strict=True)], told)
+            named = {"joint": name.replace("_", " "), "frames": frames}
+            rows += [named | {"metric": metric, "value": value} for metric, value in figures.items()]
     table = pd.DataFrame(rows)
-    table = pd.concat([table, table.assign(joint="average")]).groupby(["joint", "metric"], sort=False)
+    if len(joints) > 1:
+        table = pd.concat([table, table.assign(joint="average")])
+    each = table.groupby(["joint", "frames", "metric"], sort=False)["value"].mean().reset_index()
     draw, _ = control_drawer(bench, trained, section, clips[:1], pooled[:1])
     asked = asked_of([0], np.ones((1, lengths[0]), bool))
     draw(asked, key)  # compiles
     started = time.perf_counter()
     draw(asked, jax.random.fold_in(key, 1))
-    taken = {"joint": "average", "metric": "sampling_seconds", "value": time.perf_counter() - started}
-    return pd.concat([table["value"].mean().reset_index(), pd.DataFrame([taken])])
+    taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": time.perf_counter() - started}
+    means = each.groupby(["joint", "metric"], sort=False)["value"].mean().reset_index()
+    return {"text_table3": pd.concat([means, pd.DataFrame([taken])]), "text_control": each}
 
 
 # ------------------------------------------------------------------------------------------------------------ MotionPCM
@@ -437,12 +465,14 @@ def measure_text_table(
     brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
     rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
     keys = [column for column in rows[0] if column not in ("trained", "first")]
-    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {name: keys}, again=asked)
+    tables = dict.fromkeys((name, *about.get("beside", ())), keys)
+    records = Records(results_dir(profile.dataset, profile.name) / "records", record, tables, again=asked)
 
     def trained(preset: str) -> TextModel | LatentModel | None:
-        if is_latent_preset(preset.removesuffix(CONTROL)):  # these see clips of a length of their own
+        base = preset_and_branch(preset)[0]
+        if is_latent_preset(base):  # these see clips of a length of their own
             return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
-        form = presets.find_preset(preset.removesuffix(CONTROL))
+        form = presets.find_preset(base)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
         own = "prefix_frames" in form.training or "block_frames" in form.network
         window = None if own else most_frames
@@ -453,8 +483,7 @@ def measure_text_table(
             continue
         model = first = None
         if row["trained"] != REAL:
-            branch = about["kind"] == "control" and row["section"] != "noise optimisation"
-            model = trained(row["trained"] + (CONTROL if branch else ""))
+            model = trained(row["trained"] + BRANCHES.get(row.get("section"), ""))
             if model is not None and "first" in row:
                 first = trained(row["first"])
                 model = None if first is None else model
@@ -469,7 +498,8 @@ def measure_text_table(
             named |= {"windows": steps * told["batch_size"], "weights": weights_digest(_judged(model))}
 
         def measured(row: Mapping, model=model, first=first) -> dict:
-            return {name: KINDS[about["kind"]](bench, model, row, about, first)}
+            made = KINDS[about["kind"]](bench, model, row, about, first)
+            return made if isinstance(made, dict) else {name: made}
 
         records.measure([named], measured)
     return records.path(name)
