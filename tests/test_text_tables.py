@@ -143,6 +143,24 @@ def test_states_are_as_long_as_the_clips_but_for_prefixes_and_blocks(preset, win
     assert asked == [(preset, window)]
 
 
+def test_steps_and_motions_a_step_of_a_table_arrive_where_networks_are_trained(data, tmp_path, monkeypatch):
+    asked = []
+    settings = {"most_frames": 80, "train_steps": 7, "batch_size": 3, "autoencoder_steps": 5}
+    bench = types.SimpleNamespace(settings=settings, record=lambda *arguments: {"settings": settings})
+
+    def train(data, encoder, profile, preset, *, batch_size=None, **how):
+        asked.append((preset, profile.train_steps, batch_size))
+        return None if preset == "ACMDM-S-PS22-n2" else preset
+
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
+    monkeypatch.setattr(text_tables, "train_text_model", train)
+    rows = [{"model": "ACMDM-S-PS22", "trained": "ACMDM-S-PS22-n2"}]
+    assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
+    # The autoencoder by its own recipe's batch, before the denoiser that stands on it.
+    assert asked == [("ACMDM-causal-AE-w64", 5, None), ("ACMDM-S-PS22-n2", 7, 3)]
+
+
 def test_asked_frames_are_so_many_of_the_true_length():
     generator = np.random.default_rng(0)
     assert asked_frames(generator, [40, 24], 5).sum(axis=1).tolist() == [5, 5]

@@ -475,8 +475,12 @@ def measure_text_table(
         form = presets.find_preset(base)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
         own = "prefix_frames" in form.training or "block_frames" in form.network
-        window = None if own else most_frames
-        return train_text_model(cut, encoder, brief, preset, window=window, folder=apart, **leg)
+        where = {"window": None if own else most_frames, "folder": apart, **leg}
+        if form.latent and "autoencoder_steps" in settings:
+            steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
+            if train_text_model(cut, encoder, steps, form.latent, **where) is None:
+                return None
+        return train_text_model(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
 
     for row in rows:
         if asked and row["model"] not in asked:
