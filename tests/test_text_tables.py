@@ -3,13 +3,14 @@
 import time
 import types
 
+import jax
 import numpy as np
 import pytest
 from builders import captioned_walks
 from test_text_models import ENCODER, PROFILE, TINY
 
 from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import PAPERS, asked_frames, measure_text_table
+from f3amd_lib.experiments.text_tables import PAPERS, Bench, asked_frames, measure_text_table
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.text_metrics import control_errors
@@ -79,6 +80,7 @@ def test_every_table_has_the_columns_that_the_ledger_reads(tables):
         # 3 steps of the recipe's batch.
         assert set(table["windows"]) == {3 * 32}
         assert np.isfinite(table["value"]).all()
+    assert "multimodality" in set(tables["text_table1"]["metric"])
 
 
 @pytest.mark.slow
@@ -176,6 +178,24 @@ def test_true_motion_has_no_control_error_and_a_moved_one_has_it(data):
     asked = asked_frames(np.random.default_rng(0), [40], 5)[..., None] & (np.arange(true.shape[2]) == 0)
     assert control_errors(true, true, asked)["control_average_error"] == 0.0
     assert control_errors(true + [0.6, 0, 0], true, asked)["control_location_error"] == 1.0
+
+
+def test_variety_is_that_of_one_captions_motions(data):
+    """Captions that differ must not count as variety, and another draw must."""
+    real = data.select(data.members("test"))
+    judge = types.SimpleNamespace(embed_motions=lambda motions: np.stack([one[0, :2].ravel() for one in motions]))
+    bench = Bench(judge, ENCODER, real, {"group": 2, "repeats": 1}, 0)
+
+    def make(spread):
+        def draw(pooled, lengths, key):
+            told = np.asarray(pooled).sum(axis=1)[:, None, None, None]
+            noise = jax.random.normal(key, (len(lengths), 1, 1, 3))
+            return told + spread * np.asarray(noise) + np.zeros((1, max(lengths), real.skeleton.num_joints, 1))
+
+        return bench.variety(draw)["value"].item()
+
+    assert make(0.0) == 0.0
+    assert make(2.0) == pytest.approx(2 * make(1.0), rel=1e-5) and make(1.0) > 0.1
 
 
 def test_the_files_rows_name_presets_columns_and_commands():

@@ -30,7 +30,12 @@ from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
-from f3amd_lib.measures.text_metrics import control_errors, foot_skating_ratio, laplacian_surface_distance
+from f3amd_lib.measures.text_metrics import (
+    control_errors,
+    foot_skating_ratio,
+    laplacian_surface_distance,
+    multimodality,
+)
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
@@ -61,6 +66,9 @@ HELD = ("pelvis", "left_foot", "right_foot")
 
 BRANCHES = {"trained on pelvis": PELVIS, "trained on all joints": CONTROL, "upper-body edit": CONTROL}
 """The branch that a section of Table 3 asks; noise is optimised without one."""
+
+_VARIETY_DRAWS = 2
+"""Of as many motions as there are clips; of each caption of the group there are several in each."""
 
 _EULER_STEPS = 10
 """Of the sampler whose noise is optimised (ACMDM Appendix F)."""
@@ -114,6 +122,22 @@ class Bench:
         table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
         return table[["metric", "value", "low", "high"]]
 
+    def variety(self, make: Callable) -> pd.DataFrame:
+        """Return how far motions of one caption lie from each other before the judge, over one group of captions.
+
+        As many motions are made at once as in `quality`, so that nothing is compiled again.
+        """
+        count = min(self.settings["group"], self.real.num_clips // 2)
+        clips, made = np.arange(self.real.num_clips) % count, []
+        pooled, lengths = self.captions(0)[1][clips], self.real.lengths[clips]
+        for number in range(_VARIETY_DRAWS):
+            key = jax.random.fold_in(jax.random.key(self.seed), self.settings["repeats"] + number)
+            motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
+            embedded = self.judge.embed_motions(motions)
+            made.append(embedded[: len(clips) // count * count].reshape(-1, count, embedded.shape[-1]))
+        far = multimodality(np.swapaxes(np.concatenate(made), 0, 1), np.random.default_rng([self.seed, 4]))
+        return pd.DataFrame([{"metric": "multimodality", "value": far}])
+
     def look(self, motions, told) -> dict[str, float]:
         """Return the figures of one motion [L, J, 3] for each clip, made of the captions `told`."""
         table = judge_motions(
@@ -142,7 +166,8 @@ def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, f
     """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
     how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
     draw = motion_drawer(trained, **how)
-    return bench.quality(lambda *asked: draw_motions(trained, *asked, draw=draw))
+    make = lambda *asked: draw_motions(trained, *asked, draw=draw)
+    return pd.concat([bench.quality(make), bench.variety(make)])
 
 
 def prefix_drawer(trained: TextModel, most_frames: int, num_steps: int | None) -> Callable:
