@@ -14,6 +14,7 @@ from builders import captioned_walks
 from f3amd_lib.__main__ import main
 from f3amd_lib.data import text_encoders
 from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.reports import model_cards
@@ -23,7 +24,8 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 SHIPPED = sorted(PRETRAINED_DIR.rglob("*.safetensors"))
 WALKERS = [path for path in SHIPPED if path.parent.name != "text"]
-TEXT = [path for path in SHIPPED if path.parent.name == "text"]
+JUDGE = PRETRAINED_DIR / "bandai" / "text" / "judge.safetensors"
+TEXT = [path for path in SHIPPED if path.parent.name == "text" and path != JUDGE]
 
 
 @pytest.mark.parametrize("path", TEXT, ids=lambda path: path.stem)
@@ -34,6 +36,15 @@ def test_every_shipped_model_of_text_has_its_card(path):
     recipe = record["identity"]["training"]  # of the last leg, where there were several
     assert f"({record.get('motions_seen', recipe['num_steps'] * recipe['batch_size']):,} motions" in card
     assert record.get("schedule_note", "") in card
+
+
+def test_the_judge_has_its_card_with_figures_of_its_own_alone():
+    card = JUDGE.with_suffix(".md").read_text(encoding="utf-8")
+    assert card == model_cards.card_of(JUDGE), "write the cards anew: f3amd cards"
+    table, record = committed_table("bandai", "text_judge")
+    assert record["judge_weights"] in card and "captions of other clips" in card and "non-commercial" in card
+    other = model_cards.judge_card(JUDGE, (table, record | {"judge_weights": "another"}))
+    assert "Not measured yet." in other and "captions of other clips" not in other
 
 
 class Asked(Exception):
@@ -98,6 +109,7 @@ def test_checksums_are_those_of_the_files():
 def test_shipped_weights_stay_within_their_megabytes():
     assert sum(path.stat().st_size for path in WALKERS) <= 20_000_000
     assert sum(path.stat().st_size for path in TEXT) <= 8_000_000
+    assert JUDGE.stat().st_size <= 3_000_000
 
 
 def quality(weights: str, **figures) -> pd.DataFrame:

@@ -10,17 +10,21 @@ from builders import captioned_walks
 from test_text_models import ENCODER, PROFILE, TINY
 
 from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import PAPERS, Bench, asked_frames, measure_text_table
+from f3amd_lib.experiments.text_tables import PAPERS, Bench, asked_frames, measure_text_table, obtain_judge
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures.text_judge import load_judge
 from f3amd_lib.measures.text_metrics import control_errors
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.reports import claims
 from f3amd_lib.reports.evidence import SCHEMAS
 from f3amd_lib.training import text_models
+from f3amd_lib.training.checkpoints import weights_digest
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 QUIET = {"progress": False}
+SHIPPED_JUDGE = PRETRAINED_DIR / "bandai" / "text" / "judge.safetensors"
 PLAIN, PREFIX = {"model": "ACMDM-S-PS22", "trained": "tiny"}, {"model": "ACMDM-S-PS2-prefix", "trained": "tiny-prefix"}
 SECTIONS = ("trained on pelvis", "trained on all joints", "noise optimisation", "upper-body edit")
 ROWS = {
@@ -161,6 +165,18 @@ def test_steps_and_motions_a_step_of_a_table_arrive_where_networks_are_trained(d
     assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
     # The autoencoder by its own recipe's batch, before the denoiser that stands on it.
     assert asked == [("ACMDM-causal-AE-w64", 5, None), ("ACMDM-S-PS22-n2", 7, 3)]
+
+
+def test_the_judge_that_ships_looks_at_the_data_that_it_knows_and_at_no_other(data, tmp_path, monkeypatch):
+    shipped, trained = load_judge(SHIPPED_JUDGE), []
+    monkeypatch.setattr(text_tables, "train_judge", lambda *asked, **how: trained.append(asked))
+    its = types.SimpleNamespace(name="bandai", fingerprint=shipped.record["dataset_fingerprint"])
+    reader = types.SimpleNamespace(identity=shipped.text_encoder)
+    found = obtain_judge(its, reader, PROFILE, folder=tmp_path)
+    assert weights_digest(found.params) == weights_digest(shipped.params) and not trained
+    for other in ((data, reader), (its, ENCODER)):
+        assert obtain_judge(*other, PROFILE, folder=tmp_path) is None  # trained, and out of time
+    assert len(trained) == 2
 
 
 def test_asked_frames_are_so_many_of_the_true_length():

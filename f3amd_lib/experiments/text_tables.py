@@ -42,6 +42,7 @@ from f3amd_lib.networks.acmdm_control import Control
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.evaluator_task import EvaluatorTraining
 from f3amd_lib.training.latent_models import LatentModel, is_latent_preset, train_latent_model
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.text_models import (
     CONTROL,
     JUDGE,
@@ -420,10 +421,17 @@ KINDS = {
 
 
 def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> TextJudge | None:
-    """Return the judge of a data set, trained on its training split if it is not; None where `stop_at` comes first."""
+    """Return the judge of a data set: the user's own, else the one that ships, else trained on the training split.
+
+    The one that ships must know these very motions and this encoder. None where `stop_at` comes first.
+    """
     files = text_model_files(profile, JUDGE, folder=folder)
     if files.model.exists():
         return load_judge(files.model)
+    if (shipped := PRETRAINED_DIR / data.name / "text" / files.model.name).exists():
+        judge = load_judge(shipped)
+        if (judge.record["dataset_fingerprint"], judge.text_encoder) == (data.fingerprint, encoder.identity):
+            return judge
     # A check of the way needs no judge that sees.
     training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
     judge = train_judge(data, encoder, training, checkpoint=files.state, **leg)

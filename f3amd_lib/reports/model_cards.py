@@ -23,14 +23,16 @@ from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import METRICS, SHOWN
+from f3amd_lib.measures.text_judge import load_judge
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.reports.quality_tables import figure_text, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.latent_models import is_latent_preset, load_latent_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
-from f3amd_lib.training.text_models import load_text_model
+from f3amd_lib.training.text_models import JUDGE, load_text_model
 
 log = logging.getLogger("f3amd")
 
@@ -217,6 +219,37 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     )  # fmt: skip
 
 
+def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
+    """Write the card of a judge of text to motion.
+
+    Args:
+      path: its file.
+      seen: `records/text_judge.csv` with its record, or None; figures of another judge are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    path = Path(path)
+    judge = load_judge(path)
+    record, digest, measured = judge.record, weights_digest(judge.params), "Not measured yet."
+    if seen is not None and seen[1]["judge_weights"] == digest:
+        table, shown = seen[0], ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
+        wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), shown]
+        wide.columns = [METRICS[metric].title for metric in shown]
+        measured = (
+            "Asked about real held-out clips and about clips that are wrong on purpose "
+            f"(means of {seen[1]['settings']['repeats']} repeats):\n\n{markdown_table(wide.reset_index(), digits=3)}"
+        )
+    return Path(__file__).with_name("judge_card.template").read_text(encoding="utf-8").format(
+        judge=judge, record=record, file=path.name, megabytes=path.stat().st_size / 1e6, training=record["training"],
+        count=sum(leaf.size for leaf in jax.tree.leaves(judge.params)), terms=_terms(record), digest=digest,
+        cores=counted_cores(record), date=record["date_utc"][:10], commit=record["git_commit"][:10], measured=measured,
+    )  # fmt: skip
+
+
 def _terms(record: dict) -> str:
     return ": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else ""
 
@@ -277,6 +310,8 @@ def committed_latent_tables(dataset: str) -> dict[str, pd.DataFrame]:
 
 def card_of(path: Path) -> str:
     """Return the card of a shipped file, `<data set>/NAME` or `<data set>/text/NAME`, from committed results."""
+    if path.stem == JUDGE:
+        return judge_card(path, committed_table(path.parent.parent.name, "text_judge"))
     if path.parent.name == "text" and is_latent_preset(path.stem):
         return latent_model_card(path, committed_latent_tables(path.parent.parent.name))
     if path.parent.name == "text":
