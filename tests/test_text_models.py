@@ -121,6 +121,24 @@ def test_a_branch_of_the_pelvis_learns_the_pelvis_alone(folder):
         text_models.preset_and_branch("tiny+control-pelvs")
 
 
+def test_a_branch_stands_beside_the_network_that_ships_where_that_knows_the_motions(
+    folder, data, tmp_path, monkeypatch
+):
+    shipped, encoder = load(folder, "tiny"), ENCODER
+    place = tmp_path / "pretrained" / "bandai" / "text"
+    place.mkdir(parents=True)
+    marked = dataclasses.replace(shipped, record=shipped.record | {"guidance": 1.5})
+    save_text_model(place / "tiny.safetensors", marked, jnp.float32)
+    monkeypatch.setattr(text_models, "PRETRAINED_DIR", tmp_path / "pretrained")
+    made = train_text_model(data, encoder, PROFILE, "tiny+control", folder=tmp_path / "own", **QUIET)
+    assert not (tmp_path / "own" / "tiny.safetensors").exists() and made.record["guidance"] == 1.5
+    for one, other in zip(jax.tree.leaves(made.params), jax.tree.leaves(shipped.params), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.01)  # written in 16 bits
+    # Of other motions it knows nothing: the base is trained first.
+    train_text_model(data.cut(32), encoder, PROFILE, "tiny+control", folder=tmp_path / "other", **QUIET)
+    assert (tmp_path / "other" / "tiny.safetensors").exists()
+
+
 def test_models_come_back_from_their_files(folder, tmp_path):
     for name in ("tiny+control", "tiny-prefix", "tiny-redundant", "tiny-AE"):
         trained = load(folder, name)

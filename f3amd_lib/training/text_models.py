@@ -367,7 +367,8 @@ def train_text_model(
 ) -> TextModel | None:  # fmt: skip
     """Train a preset, and first what it stands on, unless that is finished already, with whatever settings.
 
-    A killed training goes on where it was; a finished model is only read.
+    A branch may stand beside the network that ships, where that knows these motions. A killed training goes on where it
+    was; a finished model is only read.
 
     Args:
       data: captioned clips.
@@ -398,7 +399,10 @@ def train_text_model(
     if earlier:
         lies = text_model_files(profile, earlier, folder=folder).model
         asked = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
-        before = load_text_model(lies) if lies.exists() else train_text_model(data, encoder, profile, earlier, **asked)
+        before = load_text_model(lies) if lies.exists() else None
+        if before is None and branch:
+            before = _shipped(earlier, data, encoder)
+        before = before or train_text_model(data, encoder, profile, earlier, **asked)
         if before is None:
             return None
         if before.record["dataset_fingerprint"] != data.fingerprint:
@@ -434,7 +438,8 @@ def train_text_model(
     if preset.family in _AUTOENCODERS:
         made = TextModel(codec=_codec_of(task, codec, state.averaged, data), **about)
     elif part == "control":
-        made = dataclasses.replace(before, branch=state.averaged, name=name, record=record)
+        kept = {key: before.record[key] for key in ("guidance",) if key in before.record}
+        made = dataclasses.replace(before, branch=state.averaged, name=name, record=record | kept)
     else:
         trained_on = data.select(data.members("train"))
         made = TextModel(
@@ -444,6 +449,14 @@ def train_text_model(
         )  # fmt: skip
     save_text_model(files.model, made)
     return load_text_model(files.model)
+
+
+def _shipped(name: str, data: TextMotions, encoder: TextEncoder) -> TextModel | None:
+    """Return the model of this name that ships, if it was trained on these very motions with this encoder."""
+    path = PRETRAINED_DIR / data.name / "text" / f"{name}.safetensors"
+    found = load_text_model(path) if path.exists() else None
+    known = found and (found.record["dataset_fingerprint"], found.text_encoder) == (data.fingerprint, encoder.identity)
+    return found if known else None
 
 
 def _codec_of_positions(data: TextMotions, preset: presets.Preset) -> MotionCodec:
