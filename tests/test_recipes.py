@@ -50,6 +50,18 @@ def test_every_recipe_changes_one_thing(prepared):
 
 def test_unknown_recipe_names_the_nearest():
     refused("'wide-decodr'; did you mean 'wide-decoder'", recipes.find_recipe, "wide-decodr")
+    refused("'residual-prio'; did you mean", recipes.find_recipe, "higher-learning-rate+residual-prio")
+
+
+def test_two_changes_in_one_recipe_are_both_made(prepared):
+    both = recipes.find_recipe("residual-prior+higher-learning-rate")
+    one, other = (recipes.RECIPES[name] for name in both.name.split("+"))
+    assert (both.network, both.training) == (one.network, other.training)
+    assert both.config(100, 8, 0) == other.config(100, 8, 0)
+    assert prepared.model_config(both.preset, num_kept_modes=5, **both.network).residual_prior
+    assert one.change in both.change and other.change in both.change
+    for name in ("log-normal-noise+mixed-noise", "residual-prior+plus"):
+        refused("change the same thing, or start from unlike networks", recipes.find_recipe, name)
 
 
 @pytest.fixture

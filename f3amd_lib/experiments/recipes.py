@@ -7,6 +7,7 @@ rows stand in `papers/f3amd/recipes.toml`; all take the same number of steps fro
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,10 +60,24 @@ RECIPES: dict[str, Recipe] = {name: Recipe(name, **row) for name, row in load_pa
 
 
 def find_recipe(name: str) -> Recipe:
-    """Return a recipe by name; ValueError for an unknown one, with the nearest."""
-    if name not in RECIPES:
-        raise ValueError(f"unknown recipe {name!r}{nearest_hint(name, RECIPES)}")
-    return RECIPES[name]
+    """Return a recipe by name, or several changes in one: "residual-prior+higher-learning-rate".
+
+    Raises:
+      ValueError: for an unknown name, with the nearest, or for changes of unlike networks or of the same thing.
+    """
+    parts = name.split("+")
+    for part in parts:
+        if part not in RECIPES:
+            raise ValueError(f"unknown recipe {part!r}{nearest_hint(part, RECIPES)}")
+    if len(parts) == 1:
+        return RECIPES[name]
+    rows = [RECIPES[part] for part in parts]
+    changed = [field for row in rows for field in (*row.network, *row.training)]
+    if len(set(changed)) < len(changed) or len({row.preset for row in rows}) > 1:
+        raise ValueError(f"{name}: these recipes change the same thing, or start from unlike networks; ask for each")
+    together = {field: dict(ChainMap(*(getattr(row, field) for row in rows))) for field in ("network", "training")}
+    words = [", ".join(getattr(row, field) for row in rows) for field in ("change", "source")]
+    return Recipe(name, *words, rows[0].preset, **together)
 
 
 def train_recipe(prepared: PreparedData, profile: Profile, name: str, *, folder, progress: bool = True) -> TrainedModel:
