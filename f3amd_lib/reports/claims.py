@@ -134,7 +134,14 @@ class Claim:
 
 # ------------------------------------------------------------------------------------- the paper's file
 
-_KINDS = judging.KINDS | theory.KINDS
+_KINDS = {
+    name: kind
+    for module in (judging, theory)
+    for name, kind in inspect.getmembers(module, inspect.isfunction)
+    if kind.__annotations__.get("return") == "Finding" and not name.startswith("_")
+}
+"""Kind of judgement, as a paper's file names it -> function of the evidence and the statement's parameters."""
+
 _MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
 _RANGES = {
     "within": lambda low, high: (low, high),
