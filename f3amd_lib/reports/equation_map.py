@@ -33,7 +33,6 @@ _MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?
 _TEST_NAME = r"test_(?:({papers})_)?(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|({marks}))_"
 _DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
 _OTHERS = re.compile(r"et al\.|\b(?:19|20)\d\d\b")  # a citation, whose equations are not ours to find
-_NAMED = re.compile(r"\b([A-Z][\w-]*)\s+Eqs?\.?\s+\d")
 
 
 def equation_labels(paper: str = _DEFAULT) -> list[str]:
@@ -60,23 +59,6 @@ def mentioned_equations(text: str, paper: str = _DEFAULT) -> set[str]:
     clause ("Zhou et al. 2019, Eq. 15").
     """
     return _mentions(text, paper) & set(equation_labels(paper))
-
-
-def unknown_equations(text: str) -> list[str]:
-    """Return equations that a text names and no paper has: a number beyond the last, or a name without a folder.
-
-    Citations are left out, as in `mentioned_equations`.
-    """
-    unknown = set()
-    for paper in paper_folders():
-        name = load_paper_file("paper", paper)["name"]
-        unknown |= {f"{name} {label}" for label in _mentions(text, paper) - set(equation_labels(paper))}
-    names = {load_paper_file("paper", paper)["name"] for paper in paper_folders()}
-    for clause in _clauses(text):
-        for match in _NAMED.finditer(clause):
-            if match[1] not in names and not _OTHERS.search(clause[: match.start()]):
-                unknown.add(match[0])
-    return sorted(unknown)
 
 
 def _clauses(text: str) -> list[str]:
