@@ -22,7 +22,7 @@ from f3amd_lib.benchmarking.fft_reference import fft_reference
 from f3amd_lib.benchmarking.machine import PRECISIONS, device_name, matmul_precision, matmul_probe
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
 from f3amd_lib.networks.config import NetworkConfig, cast_network
@@ -208,8 +208,7 @@ def prepare_round(implementation: str, workload: Workload) -> Round:
       ValueError: for an unknown implementation.
       NotPossible: if it does not work for the workload or on this machine.
     """
-    if implementation not in IMPLEMENTATIONS:
-        raise ValueError(f"unknown implementation {implementation!r}{nearest_hint(implementation, IMPLEMENTATIONS)}")
+    check_known("implementation", implementation, IMPLEMENTATIONS)
     try:
         return IMPLEMENTATIONS[implementation][1](workload)
     except (ImportError, ValueError, RuntimeError) as error:

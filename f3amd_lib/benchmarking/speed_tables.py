@@ -16,14 +16,10 @@ _ASKED = read_toml(Path(__file__).with_name("speed_bars.toml"))
 
 def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, implementations: str) -> pd.Series | None:
     """Return the fastest row of a system at 32 frames in float32; None if there is none."""
-    rows = table[
-        (table["model"] == model)
-        & (table["steps"] == steps)
-        & (table["characters"] == characters)
-        & (table["window_frames"] == 32)
-        & (table["precision"] == "float32")
-        & table["way"].isin(_ASKED["implementations"][implementations])
-    ]
+    row = {"model": model, "steps": steps, "characters": characters, "window_frames": 32, "precision": "float32"}
+    rows = table[table["way"].isin(_ASKED["implementations"][implementations])]
+    for column, value in row.items():
+        rows = rows[rows[column] == value]
     return None if rows.empty else rows.loc[rows["value"].idxmin()]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from f3amd_lib.benchmarking.machine import usable_cores
 from f3amd_lib.diffusion.samplers import ddim_step, ddpm_step
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.networks.attention import position_code
 from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE, CAMDMConfig, step_features
 from f3amd_lib.networks.conditioning import Condition, noise_features
@@ -221,8 +221,7 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     """
     if not isinstance(network, CAMDM):
         raise ValueError(f"only CAMDM has a form in PyTorch, got a {type(network).__name__}")
-    if products not in PRODUCTS:
-        raise ValueError(f"unknown products {products!r}{nearest_hint(products, PRODUCTS)}")
+    check_known("products", products, PRODUCTS)
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     torch.set_num_threads(usable_cores())

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 
 _FOLDER = Path(__file__).parents[1] / "papers"
 
@@ -36,8 +36,7 @@ def load_paper_file(name: str, paper: str = "f3amd") -> dict:
     Raises:
       ValueError: for an unknown paper, a missing file, or one that is no TOML.
     """
-    if paper not in paper_folders():
-        raise ValueError(f"unknown paper {paper!r}{nearest_hint(paper, paper_folders())}")
+    check_known("paper", paper, paper_folders())
     path = _FOLDER / paper / f"{name}.toml"
     try:
         return read_toml(path)

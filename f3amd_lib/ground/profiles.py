@@ -14,7 +14,7 @@ import os
 from pathlib import Path
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import checked_seed, nearest_hint
+from f3amd_lib.ground.names import check_known, checked_seed
 
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
@@ -103,8 +103,7 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
     _check_names(dataset, name)
     types = {item.name: item.type for item in dataclasses.fields(Profile) if item.name not in ("name", "dataset")}
     for key in overrides:
-        if key not in types:
-            raise ValueError(f"unknown profile field {key!r}{nearest_hint(key, types)}")
+        check_known("profile field", key, types)
     values = _NUMBERS["common"] | _NUMBERS[name] | _NUMBERS["on"].get(dataset, {}).get(name, {}) | overrides
     return Profile(name=name, dataset=dataset, **{key: _checked(key, values.get(key), types[key]) for key in types})
 
@@ -132,9 +131,8 @@ def _checked(key: str, value, annotation: str):
 
 
 def _check_names(dataset: str, profile: str) -> None:
-    for what, value, known in (("profile", profile, PROFILES), ("data set", dataset, DATASETS)):
-        if value not in known:
-            raise ValueError(f"unknown {what} {value!r}{nearest_hint(value, known)}")
+    check_known("profile", profile, PROFILES)
+    check_known("data set", dataset, DATASETS)
 
 
 def repository_root() -> Path:

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import f3amd_lib
-from f3amd_lib.ground.files import set_aside, whole_file
+from f3amd_lib.ground.files import read_toml, set_aside, whole_file
 from f3amd_lib.ground.names import asked_network
 
 log = logging.getLogger("f3amd")
@@ -38,17 +38,12 @@ _CIRCUMSTANCES = (
     "not_possible weights_digests table"
 ).split()
 
-ON_WEIGHTS = frozenset(
-    "quality quality_by_seed quality_by_round literal_update literal_update_by_seed literal_update_windows noise_use "
-    "x0_by_sigma input_use posterior precision walking feet trained foot_spectrum gradient_norm "
-    "round_times one_step one_step_by_seed one_step_input_use".split()
-)
+_TABLES = read_toml(Path(__file__).with_name("records.toml"))
+
+ON_WEIGHTS = frozenset(_TABLES["on_weights"])
 """Tables that were measured on trained models: what they say goes with the weights."""
 
-THROUGH_CLASSIFIER = frozenset(
-    "quality quality_by_seed quality_by_epoch literal_update literal_update_by_seed corruptions settling one_step "
-    "one_step_by_seed".split()
-)
+THROUGH_CLASSIFIER = frozenset(_TABLES["through_classifier"])
 """Tables with FID or EMD, seen through one style classifier; rows of `campaign` name theirs."""
 
 

@@ -70,6 +70,11 @@ def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
     return "\n".join([line(header), line(rule), *(line(row) for row in rows)]) + "\n"
 
 
+def compact_table(frame: pd.DataFrame) -> str:
+    """Render a table as `markdown_table` does, without columns of blanks, so that a changed cell is a changed line."""
+    return re.sub(r" {2,}", " ", re.sub(r"-{4,}", "---", markdown_table(frame)))
+
+
 def metric_heading(metric: str, unit: str = "", better: str = "") -> str:
     """Return a column heading such as "trajectory error (m) ↓"; other ways than "down" and "up" have no arrow."""
     heading = str(metric).replace("_", " ")

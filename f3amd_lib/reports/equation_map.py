@@ -24,7 +24,7 @@ import pandas as pd
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.ground.tables import compact_table
 
 _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
 
@@ -33,7 +33,6 @@ _MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?
 _TEST_NAME = r"test_(?:({papers})_)?(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|({marks}))_"
 _DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
 _OTHERS = re.compile(r"et al\.|\b(?:19|20)\d\d\b")  # a citation, whose equations are not ours to find
-_NAMED = re.compile(r"\b([A-Z][\w-]*)\s+Eqs?\.?\s+\d")
 
 
 def equation_labels(paper: str = _DEFAULT) -> list[str]:
@@ -60,23 +59,6 @@ def mentioned_equations(text: str, paper: str = _DEFAULT) -> set[str]:
     clause ("Zhou et al. 2019, Eq. 15").
     """
     return _mentions(text, paper) & set(equation_labels(paper))
-
-
-def unknown_equations(text: str) -> list[str]:
-    """Return equations that a text names and no paper has: a number beyond the last, or a name without a folder.
-
-    Citations are left out, as in `mentioned_equations`.
-    """
-    unknown = set()
-    for paper in paper_folders():
-        name = load_paper_file("paper", paper)["name"]
-        unknown |= {f"{name} {label}" for label in _mentions(text, paper) - set(equation_labels(paper))}
-    names = {load_paper_file("paper", paper)["name"] for paper in paper_folders()}
-    for clause in _clauses(text):
-        for match in _NAMED.finditer(clause):
-            if match[1] not in names and not _OTHERS.search(clause[: match.start()]):
-                unknown.add(match[0])
-    return sorted(unknown)
 
 
 def _clauses(text: str) -> list[str]:
@@ -267,18 +249,6 @@ def _notebook_text(path: Path) -> str:
 
 # ------------------------------------------------------------------------------------------------------------- the page
 
-_PREFACE = """\
-# Every equation, and where it is
-
-*Written by `python -m f3amd_lib.reports.equation_map`; a test compares this page with what that writes.*
-
-Docstrings, names of tests and sections of notebooks say which equation they are about, and these tables are read off
-them. All equations that carry a number are here, and of those without one Appendix F of F3AMD. *Cited only* says why
-no function computes an equation. A dash means that no test or no section of a notebook names it. Functions stand in
-`f3amd_lib/`; [the library](/docs/api/index.md) has their docstrings. [Where we differ](differences.md) says why a
-formula here is not always the one in print.
-"""
-
 
 def equations_markdown(*, root=None) -> str:
     """Return the page docs/equations.md: for each paper a table of its equations with functions, tests and sections.
@@ -291,7 +261,8 @@ def equations_markdown(*, root=None) -> str:
     root = Path(root) if root is not None else repository_root()
     papers = [paper for paper in paper_folders() if load_paper_file("paper", paper).get("equation")]
     papers.sort(key=lambda paper: paper != _DEFAULT)
-    return _PREFACE + "".join(f"\n{_paper_markdown(root, paper)}" for paper in papers)
+    preface = Path(__file__).with_suffix(".template").read_text(encoding="utf-8")
+    return preface + "".join(f"\n{_paper_markdown(root, paper)}" for paper in papers)
 
 
 def _paper_markdown(root: Path, paper: str) -> str:
@@ -310,8 +281,7 @@ def _paper_markdown(root: Path, paper: str) -> str:
             "notebooks": [_section_links(root, cells) or "–" for cells in rows["cells"]],
         }
     )
-    text = re.sub(r" {2,}", " ", re.sub(r"-{4,}", "---", markdown_table(table)))  # without columns of blanks
-    return f"## {about['name']}\n\n{text}"
+    return f"## {about['name']}\n\n{compact_table(table)}"
 
 
 def _code(names: str) -> str:

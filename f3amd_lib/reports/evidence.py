@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import asked_network, nearest_hint
+from f3amd_lib.ground.names import asked_network, check_known, nearest_hint
 from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
@@ -433,10 +433,8 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
       ValueError: for an unknown data set or profile; later, for a table without a run record, one
         that its record does not describe, or a record of another data set, profile or device.
     """
-    known = tuple(name for name in PROFILES if name != "smoke")
-    for what, value, names in (("data set", dataset, DATASETS), ("profile", profile, known)):
-        if value not in names:
-            raise ValueError(f"unknown {what} {value!r}{nearest_hint(value, names)}")
+    check_known("data set", dataset, DATASETS)
+    check_known("profile", profile, [name for name in PROFILES if name != "smoke"])
 
     def load(name: str):
         path = Path(root) / dataset / profile / "records" / f"{name}.csv"

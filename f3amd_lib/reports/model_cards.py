@@ -24,11 +24,11 @@ from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
-from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.ground.tables import fill_tables, markdown_table
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.measures.text_judge import load_judge
 from f3amd_lib.networks.presets import find_preset
-from f3amd_lib.reports.quality_tables import figure_text, measured_table
+from f3amd_lib.reports.quality_tables import figure_column, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.latent_models import is_latent_preset, load_latent_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -39,16 +39,12 @@ log = logging.getLogger("f3amd")
 
 def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
     """Return the table of a model's figures beside real motion's."""
-    columns = {f"{steps} steps" if steps > 1 else "1 step": measured[measured["steps"] == steps]
-               for steps in sorted(measured["steps"].unique(), reverse=True)}  # fmt: skip
-    rows = []
-    for metric in SHOWN["card"]:
-        row = {"figure": "Dir. (degrees)" if metric.name == "direction_error" else metric.title}
-        for label, part in (columns | {"real motion": real}).items():
-            figure = part[part["metric"] == metric.name]
-            row[label] = "–" if figure.empty else figure_text(*figure.iloc[0][["value", "low", "high"]])
-        rows.append(row)
-    return pd.DataFrame(rows)
+    shown = SHOWN["card"]
+    columns = {"figure": ["Dir. (degrees)" if metric.name == "direction_error" else metric.title for metric in shown]}
+    for steps in sorted(measured["steps"].unique(), reverse=True):
+        rows = measured[measured["steps"] == steps]
+        columns[f"{steps} steps" if steps > 1 else "1 step"] = figure_column(rows, shown)
+    return pd.DataFrame(columns | {"real motion": figure_column(real, shown)})
 
 
 def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
@@ -268,16 +264,14 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
 
     Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
     """
-    folder = repository_root() / "paper_figures" / dataset / "laptop" / "records"
     tables = []
-    if (folder / "quality.csv").exists():
-        table, _ = read_table(folder / "quality.csv")
-        by_seed, _ = read_table(folder / "quality_by_seed.csv")
+    if found := committed_table(dataset, "quality"):
         keys = ["model", "window_frames", "steps"]
+        by_seed, _ = committed_table(dataset, "quality_by_seed")
         weights = by_seed[[*keys, "weights"]].drop_duplicates(keys)
-        tables.append(table.merge(weights, on=keys, how="left"))
-    if (folder / "walking.csv").exists():
-        tables.append(_walking_rows(read_table(folder / "walking.csv")[0]))
+        tables.append(found[0].merge(weights, on=keys, how="left"))
+    if found := committed_table(dataset, "walking"):
+        tables.append(_walking_rows(found[0]))
     return pd.concat(tables, ignore_index=True) if tables else None
 
 
@@ -296,12 +290,6 @@ def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def committed_hands(dataset: str) -> pd.DataFrame | None:
-    """Return what is on record of the hands that captions raise, or None."""
-    path = repository_root() / "paper_figures" / dataset / "laptop" / "records" / "hands.csv"
-    return read_table(path)[0] if path.exists() else None
-
-
 def committed_latent_tables(dataset: str) -> dict[str, pd.DataFrame]:
     """Return what is on record of MotionPCM's models, by table."""
     folder = repository_root() / "paper_figures" / dataset / "laptop" / "records"
@@ -310,13 +298,15 @@ def committed_latent_tables(dataset: str) -> dict[str, pd.DataFrame]:
 
 def card_of(path: Path) -> str:
     """Return the card of a shipped file, `<data set>/NAME` or `<data set>/text/NAME`, from committed results."""
+    if path.parent.name != "text":
+        return model_card(path, committed_quality(path.parent.name))
+    dataset = path.parent.parent.name
     if path.stem == JUDGE:
-        return judge_card(path, committed_table(path.parent.parent.name, "text_judge"))
-    if path.parent.name == "text" and is_latent_preset(path.stem):
-        return latent_model_card(path, committed_latent_tables(path.parent.parent.name))
-    if path.parent.name == "text":
-        return text_model_card(path, committed_hands(path.parent.parent.name))
-    return model_card(path, committed_quality(path.parent.name))
+        return judge_card(path, committed_table(dataset, "text_judge"))
+    if is_latent_preset(path.stem):
+        return latent_model_card(path, committed_latent_tables(dataset))
+    hands, _ = committed_table(dataset, "hands") or (None, None)
+    return text_model_card(path, hands)
 
 
 def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
@@ -350,11 +340,8 @@ def write_measured_table(path: Path, quality: pd.DataFrame) -> None:
       ValueError: if the marks are not there.
     """
     text = Path(path).read_text(encoding="utf-8")
-    parts = re.split(r"(<!-- measured: (?:begin|end) -->\n)", text)
-    if len(parts) != 5:
-        raise ValueError(f"{path}: no `<!-- measured: begin -->` and `end` line around the table")
-    parts[2] = "\n" + measured_table(quality) + "\n"
-    Path(path).write_text("".join(parts), encoding="utf-8")
+    page = fill_tables(text, {"measured": measured_table(quality)}, str(path))
+    Path(path).write_text(page, encoding="utf-8")
 
 
 def main() -> int:

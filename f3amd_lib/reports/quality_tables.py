@@ -8,8 +8,8 @@ disk but the paper's numbers.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import PAPER_TABLES, load_paper_table
 from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
-from f3amd_lib.measures.registry import SHOWN
+from f3amd_lib.measures.registry import SHOWN, Metric
 from f3amd_lib.networks import presets
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
@@ -44,20 +44,21 @@ _EXTRA_NOTES = {
 _KEYS = ["model", "window_frames", "steps", "metric"]
 
 
-def figure_text(value: float, low: float = np.nan, high: float = np.nan) -> str:
+def figure_text(value: float, low: float = np.nan, high: float = np.nan, decimals: int | None = None) -> str:
     """Write a mean with its interval: "7.386 ± 0.121", three decimals or four digits.
 
     Args:
       value: the mean; NaN gives a dash.
       low, high: 95 % interval, symmetric about the mean as Student's t gives it; NaN (a single
         repeat) leaves it out.
+      decimals: so many in place of those.
 
     Raises:
       ValueError: for an interval that does not hold its mean in the middle.
     """
     if np.isnan(value):
         return "–"
-    decimals = max(0, 3 - int(np.log10(max(abs(value), 1.0))))
+    decimals = max(0, 3 - int(np.log10(max(abs(value), 1.0)))) if decimals is None else decimals
     text = f"{value:.{decimals}f}"
     if np.isnan(low) or np.isnan(high):
         return text
@@ -65,6 +66,20 @@ def figure_text(value: float, low: float = np.nan, high: float = np.nan) -> str:
     if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
         raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
     return f"{text} ± {half:.{decimals}f}"
+
+
+def figure_column(rows: pd.DataFrame, metrics: Sequence[Metric], *, fixed: bool = False) -> list[str]:
+    """Write metrics of one system, a dash for one that it lacks.
+
+    Args:
+      rows: tidy, the system's own: metric, value, low, high. Of two of one metric the first counts.
+      metrics: which, in this order.
+      fixed: each with as many decimals as the registry says, in place of four digits.
+    """
+    figures = rows.drop_duplicates("metric").set_index("metric")[["value", "low", "high"]]
+    figures = figures.reindex([metric.name for metric in metrics]).to_numpy()
+    return [figure_text(*figure, metric.decimals if fixed else None)
+            for metric, figure in zip(metrics, figures, strict=True)]  # fmt: skip
 
 
 def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.DataFrame:
@@ -148,11 +163,8 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
       Columns model, frames and steps where needed, source, and the nine figures; all text.
     """
     made = rows[rows["steps"] > 0]
-    varied = [
-        (column, heading)
-        for column, heading in (("window_frames", "frames"), ("steps", "steps"))
-        if made[column].nunique() > 1
-    ]
+    headings = {"window_frames": "frames", "steps": "steps"}
+    varied = {column: heading for column, heading in headings.items() if made[column].nunique() > 1}
     arrows = dict(zip(rows["metric"], rows["better"].map(ARROWS), strict=True))
     lines: list[dict] = []
     for _, cells in rows.groupby("line", sort=False):
@@ -162,7 +174,7 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
             lines[-1]["source"] += f"; ours {NOT_MEASURED}"
             continue
         shown = {"model": first["model"]}
-        for column, heading in varied:
+        for column, heading in varied.items():
             shown[heading] = str(first[column]) if first[column] else ""
         shown["source"] = first["source"] + (f": {NOT_MEASURED}" if missing else "")
         for metric, text in zip(cells["metric"], cells["printed"], strict=True):
@@ -191,16 +203,8 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
 
 
-MEASURED_COLUMNS = {
-    ("real", 0): "real",
-    ("frozen pose", 0): "frozen pose",
-    ("CAMDM", 8): "`CAMDM`, 8 steps",
-    ("F3AMD-FNO-96", 8): "`F3AMD-FNO-96`, 8 steps",
-    ("F3AMD-FNO-96", 1): "1 step",
-    ("F3AMD-FNO-96-plus", 8): "`-plus`, 8 steps",
-    ("F3AMD-FNO-96-plus", 1): "1 step ",
-}
-"""Model and steps of the columns of docs/results.md, with their headings."""
+MEASURED_COLUMNS = pd.read_csv(Path(__file__).with_name("results_columns.csv"))
+"""Headings of the columns of docs/results.md, with their model and steps."""
 
 
 def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
@@ -213,19 +217,12 @@ def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
     Returns:
       Markdown: means with 95 % intervals; a figure that a column does not have is a dash.
     """
-    own = quality[quality["window_frames"] == window].set_index(["model", "steps", "metric"])
-    rows = []
-    for metric in SHOWN["results"]:
-        row = {"": "style coverage (%)" if metric.name == "style_coverage" else metric.title}
-        for (model, steps), title in MEASURED_COLUMNS.items():
-            row[title] = "–"
-            if (model, steps, metric.name) in own.index:
-                value, low, high = own.loc[(model, steps, metric.name), ["value", "low", "high"]]
-                row[title] = f"{value:.{metric.decimals}f}"
-                if not math.isnan(high - low):  # one clip, or one seed, has no interval
-                    row[title] += f" ± {0.5 * (high - low):.{metric.decimals}f}"
-        rows.append(row)
-    return markdown_table(pd.DataFrame(rows))
+    own = quality[quality["window_frames"] == window]
+    shown = SHOWN["results"]
+    columns = {"": ["style coverage (%)" if metric.name == "style_coverage" else metric.title for metric in shown]}
+    for title, model, steps in MEASURED_COLUMNS.itertuples(index=False):
+        columns[title] = figure_column(own[(own["model"] == model) & (own["steps"] == steps)], shown, fixed=True)
+    return markdown_table(pd.DataFrame(columns))
 
 
 # ------------------------------------------------------- rollouts beside real clips, a column a system
