@@ -155,7 +155,7 @@ def what_to_open(results: Path) -> list[str]:
 
 
 def reproduce(
-    dataset: str, profile: str, *, only: Iterable[str] = (), parameters: Mapping | None = None, notebooks_dir=None,
+    dataset: str, profile: str, *, only: Iterable[str] = (), parameters: Mapping | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> pd.DataFrame:  # fmt: skip
     """Run the numbered notebooks with a data set and a profile; stop at the first that fails.
@@ -168,7 +168,6 @@ def reproduce(
       profile: one of `profiles.PROFILES`, passed as `profile`.
       only: see `select_notebooks`.
       parameters: more of them, passed to every selected notebook.
-      notebooks_dir: where the notebooks lie; the checkout's `notebooks/` by default.
       say: called with each line of news.
 
     Returns:
@@ -181,8 +180,7 @@ def reproduce(
     """
     defaults = load_profile(profile, dataset)  # refuses unknown names before anything starts
     parameters = {"profile": profile, "data": dataset, **(parameters or {})}
-    folder = notebooks_dir or profiles.repository_root() / "notebooks"
-    available = find_notebooks(folder)
+    available = find_notebooks(profiles.repository_root() / "notebooks")
     selected = select_notebooks(available, only)
     check_parameters(selected, parameters)
 

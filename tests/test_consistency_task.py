@@ -113,12 +113,13 @@ def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learn
         "available_models": lambda profile: list(models),
         "obtain_model": lambda prepared, profile, *, preset: (models[preset], None, "earlier run"),
         "protocol_of": lambda *arguments: (None, None, dict(record)),
-        "input_use": lambda *arguments, **settings: pd.DataFrame([{"metric": "use_of_x", "value": 1.0}]),
-        "held_out_condition": lambda *arguments: None,
         "distil": distil,
         "measure_model": measure_model,
     }.items():
         monkeypatch.setattr(measure, name, answer)
+    use = pd.DataFrame([{"metric": "use_of_x", "value": 1.0}])
+    monkeypatch.setattr(measure.denoising, "input_use", lambda *arguments, **settings: use)
+    monkeypatch.setattr(measure.denoising, "held_out_condition", lambda *arguments: None)
     path = measure.measure_one_step(PreparedData(tiny_packed(), WINDOW, HISTORY), profile)
     steps = measure.STUDENT_STEPS["smoke"]
     of_camdm = [("variance_preserving_cosine", f"M{phases}", phases, steps) for phases in (1, 2, 4)]

@@ -291,18 +291,14 @@ def mean_poses(windows: WindowSet) -> jax.Array:
     return total / jnp.maximum(count, 1.0)[:, None]
 
 
-def fit_normaliser(windows: WindowSet, key, *, num_samples: int = 8192) -> Normaliser:
+@jax.jit
+def fit_normaliser(windows: WindowSet, key) -> Normaliser:
     """Measure mean and deviation of each channel over randomly turned training windows.
 
     Deviations are kept above 0.02, so that a joint which hardly moves does not turn rounding of the
     packed rotations into signal.
     """
-    return _fit_normaliser(windows, key, min(num_samples, 4 * windows.num_windows))
-
-
-@functools.partial(jax.jit, static_argnames="num_samples")
-def _fit_normaliser(windows: WindowSet, key, num_samples: int) -> Normaliser:
-    batch = sample_windows(windows, key, num_samples)
+    batch = sample_windows(windows, key, min(8192, 4 * windows.num_windows))
     flat = batch.future.reshape(-1, batch.future.shape[-1])
     mean, deviation = flat.mean(axis=0), flat.std(axis=0)
     # A random turn makes x and z alike, of the root and of its rotation: measure

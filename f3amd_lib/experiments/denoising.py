@@ -56,16 +56,13 @@ def _joint_error(trained: TrainedModel, x0_hat, batch: Batch) -> float:
     return CM * float(np.mean(np.linalg.norm(trained.joint_positions(x0_hat) - real, axis=-1)))
 
 
-def x0_error_by_sigma(
-    trained: TrainedModel, windows: WindowSet, sigmas, *, num_samples: int = 512, seed: int = 0
-) -> pd.DataFrame:
+def x0_error_by_sigma(trained: TrainedModel, windows: WindowSet, sigmas, *, seed: int = 0) -> pd.DataFrame:
     """Measure the error of the clean estimate at each noise level, on one draw of noise.
 
     Args:
       trained: the model.
       windows: held-out windows.
       sigmas: noise levels, [N].
-      num_samples: windows to use.
       seed: of the noise, the same at every level.
 
     Returns:
@@ -73,7 +70,7 @@ def x0_error_by_sigma(
       the error of the noisy input itself, which is sigma. Where x0_error does not fall below its
       value at high sigma although sigma does, the network does not use its input.
     """
-    batch = held_out_batch(windows, trained, num_samples)
+    batch = held_out_batch(windows, trained)
     x0, condition = network_inputs(batch, trained.normaliser)
     denoise = trained.denoiser(condition)
     noise, rows = jax.random.normal(jax.random.key(seed), x0.shape), []
@@ -84,17 +81,14 @@ def x0_error_by_sigma(
     return pd.DataFrame(rows, columns=["sigma", "x0_error", "joint_error_cm", "input_error"])
 
 
-def gradient_norm_by_sigma(
-    task: DenoisingTask, params, windows: WindowSet, sigmas, *, num_samples: int = 64, seed: int = 0
-) -> pd.DataFrame:
+def gradient_norm_by_sigma(task: DenoisingTask, params, windows: WindowSet, sigmas, *, seed: int = 0) -> pd.DataFrame:
     """Measure how strongly a single window pulls at the weights at each noise level (claim T5).
 
     Args:
       task: whose loss is asked, the sum that it is trained on.
       params: weights at which the gradient is taken.
-      windows: held-out windows.
+      windows: held-out windows; 64 of them are taken, one gradient each.
       sigmas: noise levels, [N].
-      num_samples: windows to use, one gradient each.
       seed: of the noise, the same at every level.
 
     Returns:
@@ -102,7 +96,7 @@ def gradient_norm_by_sigma(
 
     Source: paper section 6 ("small-noise samples contribute little to the gradient").
     """
-    batch = spread_windows(windows, num_samples)
+    batch = spread_windows(windows, 64)
     keys = jax.random.split(jax.random.key(seed), batch.future.shape[0])
 
     @jax.jit
@@ -118,7 +112,7 @@ def gradient_norm_by_sigma(
     return pd.DataFrame(rows)
 
 
-def window_quality(generator: MotionGenerator, windows: WindowSet, *, num_samples: int = 512, seed: int = 0) -> dict:
+def window_quality(generator: MotionGenerator, windows: WindowSet, *, seed: int = 0) -> dict:
     """Sample one window for each of many held-out conditions and compare with what was captured.
 
     Returns:
@@ -126,7 +120,7 @@ def window_quality(generator: MotionGenerator, windows: WindowSet, *, num_sample
       mean joint step from the last history frame to the first of the window, and its real value.
     """
     trained = generator.trained
-    batch = held_out_batch(windows, trained, num_samples)
+    batch = held_out_batch(windows, trained)
     _, condition = network_inputs(batch, trained.normaliser)
     x0_hat = generator.sample(jax.random.key(seed), condition)
     predicted = trained.joint_positions(x0_hat)

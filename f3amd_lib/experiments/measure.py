@@ -15,6 +15,7 @@ Each returns the path of its table.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -25,16 +26,10 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import spread_windows
-from f3amd_lib.experiments import literal_update, sensitivity
+from f3amd_lib.experiments import denoising, literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
-from f3amd_lib.experiments.denoising import (
-    gradient_norm_by_sigma,
-    held_out_condition,
-    input_use,
-    window_row,
-    x0_error_by_sigma,
-)
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
 from f3amd_lib.experiments.posterior import measure_posterior
 from f3amd_lib.experiments.protocol import (
@@ -60,6 +55,7 @@ from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.walking import walking_figures
+from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
@@ -142,8 +138,38 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
     return run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement, **settings)
 
 
+def _asked(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False
+) -> tuple[list[str], dict[str, TrainedModel]]:
+    """Return the presets that were asked for by name, and the models: theirs, or all that have weights."""
+    asked, known = _names(models), _models_with_weights if at_least_one else available_models
+    return asked, _trained(prepared, profile, asked or known(profile))
+
+
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
     return {name: weights_digest(model.params) for name, model in trained.items()}
+
+
+def _with_weights(rows: Iterable[dict], trained: Mapping[str, TrainedModel], *, other: str = "") -> list[dict]:
+    """Add to what is to be measured the digest of its network's weights, `other` where there is no network."""
+    digests = _digests(trained)
+    return [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in rows]
+
+
+def _write_anew(
+    prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, trained: Mapping[str, TrainedModel],
+    **settings,
+) -> Path:  # fmt: skip
+    """Write a table that is measured as a whole; its record names the weights of its models."""
+    digests = {model: [digest] for model, digest in _digests(trained).items()}
+    record = _record(prepared, profile, name, **settings, weights_digests=digests)
+    return write_table(_records_dir(profile) / f"{name}.csv", table, record)
+
+
+def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> list[tuple[str, Motion]]:
+    """Return (style, motion) of the real clips that stand beside rollouts."""
+    clips = reference_clips(packed, styles, window=profile.window)
+    return [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
 
 
 def protocol_of(prepared: PreparedData, profile: Profile, measurement: str) -> tuple[StyleClassifier, Protocol, dict]:
@@ -192,35 +218,29 @@ def measure_quality(
       The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
       `quality_by_round.csv`.
     """
-    packed, asked = prepared.packed, _names(models)
+    packed = prepared.packed
     classifier, protocol, record = protocol_of(prepared, profile, "quality")
     held_out = prepared.windows(prepared.held_out_split)
-    trained = _trained(prepared, profile, asked or available_models(profile))
+    asked, trained = _asked(prepared, profile, models)
     if published is not None:
-        trained |= {PUBLISHED: published_model(published, packed)}
+        trained[PUBLISHED] = published_model(published, packed)
     if not trained:
         log.warning(
             "no trained model of %s at %s: only real motion is measured; name models with --model",
             profile.dataset, profile.name,
         )  # fmt: skip
-    # Real motion has no weights, but it is seen through the classifier's.
-    digests = _digests(trained) | dict.fromkeys(REFERENCE_MODELS, record["classifier_weights"])
     todo = [(model, 0) for model in REFERENCE_MODELS]
     for name, model in trained.items():
         levels = len(getattr(model.config, "noise_levels", ()))
         counts = [steps for steps in STEPS if steps <= (levels or max(STEPS))]
         todo += [(name, steps) for steps in counts]
         if levels:  # respaced in the other way that is in use, see `NoiseSchedule.times`
-            digests[name + LEADING] = digests[name]
             todo += [(name + LEADING, steps) for steps in counts if steps < levels]
     keys = ["model", "window_frames", "steps"]
     records = Records(
-        _records_dir(profile),
-        record,
-        {"quality_by_seed": keys, "quality_by_round": keys},
-        again=asked,
+        _records_dir(profile), record, {"quality_by_seed": keys, "quality_by_round": keys}, again=asked,
         summaries={"quality": ("quality_by_seed", summarise)},
-    )
+    )  # fmt: skip
 
     def score(row: Mapping) -> dict:
         started, tables = time.perf_counter(), {}
@@ -233,13 +253,19 @@ def measure_quality(
             rows = measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
         return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
 
-    return records.measure(
-        [
-            {"model": model, "window_frames": profile.window, "steps": steps, "weights": digests[model]}
-            for model, steps in todo
-        ],
-        score,
-    )
+    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in todo]
+    # Real motion has no weights, but it is seen through the classifier's.
+    return records.measure(_with_weights(rows, trained, other=record["classifier_weights"]), score)
+
+
+def _on_short_paths(prepared: PreparedData, profile: Profile) -> tuple[dict, dict[str, float], dict[int, list]]:
+    """Return settings, the floor of each style, and by seed the paths of `measure_walking` and `measure_feet`."""
+    packed, styles = prepared.packed, _styles(prepared, profile)
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
+    made = packed.dataset == "synthetic"  # its floor is at 0
+    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
+    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
+    return {"num_frames": num_frames, "num_seeds": WALKING_SEEDS, "styles": styles}, floors, paths
 
 
 def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -253,29 +279,24 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
-    styles = _styles(prepared, profile)
-    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
-    record = _record(prepared, profile, "walking", num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
-    made = packed.dataset == "synthetic"  # its floor is at 0, and its source walks any path
-    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
-    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in seeds}
-    trained = _trained(prepared, profile, asked or available_models(profile))
+    packed = prepared.packed
+    settings, floors, paths = _on_short_paths(prepared, profile)
+    styles, record = settings["styles"], _record(prepared, profile, "walking", **settings)
+    asked, trained = _asked(prepared, profile, models)
 
     def motions(row: Mapping):
         """Yield (seed, style, motion)."""
         if row["steps"]:
             generator = MotionGenerator(trained[row["model"]], row["steps"])
-            for seed in seeds:
-                rollout = generator.rollout(paths[seed], styles, seed=seed)
+            for seed, lines in paths.items():
+                rollout = generator.rollout(lines, styles, seed=seed)
                 yield from ((seed, style, rollout.motion(place)) for place, style in enumerate(styles))
-        elif made:
-            for seed in seeds:
-                for style, line in zip(styles, paths[seed], strict=True):
+        elif packed.dataset == "synthetic":  # its source walks any path
+            for seed, lines in paths.items():
+                for style, line in zip(styles, lines, strict=True):
                     yield seed, style, walk_along(style, line.position, line.yaw)
         else:
-            for clip in reference_clips(packed, styles, window=profile.window):
-                yield 0, packed.styles[packed.clip_style[clip]], packed.motion(clip)
+            yield from ((0, style, motion) for style, motion in _real_walks(packed, profile, styles))
 
     def walk(row: Mapping) -> dict:
         rows = [
@@ -284,14 +305,10 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
         ]
         return {"walking": pd.DataFrame(rows)}
 
-    rows = [("real", 0, "")]
-    rows += [(name, steps, digest) for name, digest in _digests(trained).items() for steps in (8, 1)]
-    todo = [
-        {"model": name, "window_frames": profile.window, "steps": steps, "weights": digest}
-        for name, steps, digest in rows
-    ]
+    rows = [("real", 0), *itertools.product(trained, (8, 1))]
+    todo = [{"model": name, "window_frames": profile.window, "steps": steps} for name, steps in rows]
     records = Records(_records_dir(profile), record, {"walking": ["model", "window_frames", "steps"]}, again=asked)
-    return records.measure(todo, walk)
+    return records.measure(_with_weights(todo, trained), walk)
 
 
 TREATMENTS: dict[str, tuple[int, Callable | None]] = {
@@ -313,24 +330,17 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
     Returns:
       The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" as there.
     """
-    packed, seeds, asked = prepared.packed, range(WALKING_SEEDS), _names(models)
-    styles = _styles(prepared, profile)
-    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
-    record = run_record(
-        profile=profile, dataset=packed, seed=profile.seed, measurement="feet",
-        num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles,
-    )  # fmt: skip
-    floors = {style: 0.0 if packed.dataset == "synthetic" else style_floor(packed, style) for style in styles}
-    trained = _trained(prepared, profile, asked or available_models(profile))
+    settings, floors, paths = _on_short_paths(prepared, profile)
+    styles, record = settings["styles"], _record(prepared, profile, "feet", **settings)
+    asked, trained = _asked(prepared, profile, models)
 
     def treat(row: Mapping) -> dict:
         if not row["steps"]:
-            clips = reference_clips(packed, styles, window=profile.window)
-            walks = [("as made", 0, packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
+            walks = [("as made", 0, *walk) for walk in _real_walks(prepared.packed, profile, styles)]
         else:
             generator, walks = MotionGenerator(trained[row["model"]], row["steps"]), []
-            for seed in seeds:
-                made = generator.rollout(evaluation_paths(packed, styles, num_frames, seed=seed), styles, seed=seed)
+            for seed, lines in paths.items():
+                made = generator.rollout(lines, styles, seed=seed)
                 for treatment, (blend_frames, lock) in TREATMENTS.items():
                     treated = blend_rollout(made, blend_frames)
                     treated = lock(treated) if lock else treated
@@ -342,12 +352,9 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
         ]
         return {"feet": pd.DataFrame(figures)}
 
-    digests = _digests(trained)
-    todo = [{"model": "real", "steps": 0, "weights": ""}]
-    todo += [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (8, 1)]
+    todo = [{"model": name, "steps": steps} for name, steps in [("real", 0), *itertools.product(trained, (8, 1))]]
     records = Records(_records_dir(profile), record, {"feet": ["model", "steps"]}, again=asked)
-    records.measure(todo, treat)
-    return records.path("feet")
+    return records.measure(_with_weights(todo, trained), treat)
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -373,10 +380,8 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
         return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
 
     records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
-    digests = _digests({name: model for name, (model, *_) in found.items()})
-    return records.measure(
-        [{"model": name, "window_frames": profile.window, "weights": digests[name]} for name in found], sum_up
-    )
+    todo = [{"model": name, "window_frames": profile.window} for name in found]
+    return records.measure(_with_weights(todo, {name: model for name, (model, *_) in found.items()}), sum_up)
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -410,20 +415,15 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
     """
     packed, styles, seed = prepared.packed, _styles(prepared, profile), profile.seed
     paths = evaluation_paths(packed, styles, profile.rollout_frames, seed=seed)
-    clips = reference_clips(packed, styles, window=profile.window)
-    feet = {
-        ("real", profile.window, 0): [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
-    }
-    trained = _trained(prepared, profile, _names(models) or available_models(profile))
+    feet = {("real", profile.window, 0): _real_walks(packed, profile, styles)}
+    _, trained = _asked(prepared, profile, models)
     for name, model in trained.items():
         log.info("foot spectrum of %s", name)
         rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
-        motions = [rollout.motion(character) for character in range(len(styles))]
-        feet[name, profile.window, profile.num_steps] = list(zip(styles, motions, strict=True))
-    digests = {name: [digest] for name, digest in _digests(trained).items()}
-    settings = {"num_frames": profile.rollout_frames, "styles": styles, "weights_digests": digests}
-    record = _record(prepared, profile, "foot_spectrum", **settings)
-    return write_table(_records_dir(profile) / "foot_spectrum.csv", sensitivity.foot_spectrum(feet), record)
+        walks = [(style, rollout.motion(character)) for character, style in enumerate(styles)]
+        feet[name, profile.window, profile.num_steps] = walks
+    settings = {"num_frames": profile.rollout_frames, "styles": styles}
+    return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
 
 
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -443,8 +443,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     """
     classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
     held_out = prepared.windows(prepared.held_out_split)
-    asked = _names(models)
-    trained = _trained(prepared, profile, asked or _models_with_weights(profile))
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
     for name, model in list(trained.items()):
         if model.diffusion.sampler != literal_update.UPDATES["rescaled"]:
             if asked:
@@ -453,22 +452,16 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
                     "update: name models that sample by DDIM in the VE state"
                 )
             del trained[name]
-    digests = _digests(trained)
 
     def summary(rows: pd.DataFrame) -> pd.DataFrame:
         groups = rows.groupby(["spacing", "update"], sort=False)
         return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
 
+    way = ["model", "spacing", "update", "steps"]
     records = Records(
-        _records_dir(profile),
-        record,
-        {
-            "literal_update_by_seed": ["model", "spacing", "update", "steps"],
-            "literal_update_windows": ["model", "spacing"],
-        },
-        again=asked,
+        _records_dir(profile), record, {"literal_update_by_seed": way, "literal_update_windows": way[:2]}, again=asked,
         summaries={"literal_update": ("literal_update_by_seed", summary)},
-    )
+    )  # fmt: skip
 
     def walk_windows(row: Mapping) -> dict:
         walks = literal_update.walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
@@ -481,19 +474,14 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
         rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out, name=row["model"])
         return {"literal_update_by_seed": rows}
 
-    windows = [
-        {"model": name, "spacing": spacing, "weights": digests[name]} for name in trained for spacing in SPACINGS
-    ]
+    windows = [{"model": name, "spacing": spacing} for name, spacing in itertools.product(trained, SPACINGS)]
     rollouts = [
-        {"model": name, "spacing": spacing, "update": update, "steps": steps, "weights": digests[name]}
-        for name in trained
-        for spacing in SPACINGS
-        for update in literal_update.UPDATES
-        for steps in STEPS
+        {"model": name, "spacing": spacing, "update": update, "steps": steps}
+        for name, spacing, update, steps in itertools.product(trained, SPACINGS, literal_update.UPDATES, STEPS)
         if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
     ]
-    records.measure(windows, walk_windows, into="literal_update_windows")
-    return records.measure(rollouts, walk_rollouts)
+    records.measure(_with_weights(windows, trained), walk_windows, into="literal_update_windows")
+    return records.measure(_with_weights(rollouts, trained), walk_rollouts)
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -507,27 +495,27 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
     """
     record = _record(prepared, profile, "noise_use")
     held_out = prepared.windows(prepared.held_out_split)
-    asked = _names(models)
-    trained = _trained(prepared, profile, asked or _models_with_weights(profile))
-    digests = _digests(trained)
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
 
     def ask(row: Mapping) -> dict:
         model = trained[row["model"]]
         levels = getattr(model.config, "noise_levels", ()) or SIGMAS
         steps = [count for count in (8, 1) if count <= len(levels)]
         return {
-            "noise_use": window_row(model, held_out, steps=steps, seed=profile.seed),
-            "x0_by_sigma": x0_error_by_sigma(model, held_out, levels),
+            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
+            "x0_by_sigma": denoising.x0_error_by_sigma(model, held_out, levels),
         }
 
-    keys = {"x0_by_sigma": ["model"], "noise_use": ["model"], "input_use": ["model"]}
+    keys = dict.fromkeys(["x0_by_sigma", "noise_use", "input_use"], ["model"])
     records = Records(_records_dir(profile), record, keys, again=asked)
-    rows = [{"model": name, "noise": trained[name].diffusion.kind, "weights": digests[name]} for name in trained]
+    rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
+    rows = _with_weights(rows, trained)
     records.measure(rows, ask)
 
     def ask_inputs(row: Mapping) -> dict:
         model = trained[row["model"]]
-        return {"input_use": input_use(model, held_out_condition(held_out, model), seed=profile.seed)}
+        condition = denoising.held_out_condition(held_out, model)
+        return {"input_use": denoising.input_use(model, condition, seed=profile.seed)}
 
     records.measure(rows, ask_inputs, into="input_use")
     return records.path("noise_use")
@@ -545,13 +533,12 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     names = _names(models) or ["F3AMD-FNO-96"]
     if len(names) > 1:
         raise ValueError(f"gradient_norm is a table of one model, got {', '.join(names)}: name one with --model")
-    trained = _trained(prepared, profile, names)[names[0]]
+    by_name = _trained(prepared, profile, names)
+    trained = by_name[names[0]]
     task = prepared.task(trained.name, profile_recipe(profile, trained.name))
     held_out = prepared.windows(prepared.held_out_split)
-    table = gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
-    digests = {trained.name: [weights_digest(trained.params)]}
-    record = _record(prepared, profile, "gradient_norm", weights_digests=digests)
-    return write_table(_records_dir(profile) / "gradient_norm.csv", table.assign(model=trained.name), record)
+    table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
+    return _write_anew(prepared, profile, "gradient_norm", table.assign(model=trained.name), by_name)
 
 
 def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -605,7 +592,7 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
 
     def train_and_ask(row: Mapping) -> dict:
         trained = train_recipe(prepared, profile, row["recipe"], folder=folder)
-        rows = window_row(trained, held_out, seed=profile.seed)
+        rows = denoising.window_row(trained, held_out, seed=profile.seed)
         return {"recipes": rows.assign(**row, weights=weights_digest(trained.params))}
 
     records = Records(_records_dir(profile), record, {"recipes": ["recipe"]})
@@ -618,22 +605,18 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
     Returns:
       The table `records/precision.csv`.
     """
-    packed, asked, styles = prepared.packed, _names(models), _styles(prepared, profile)
+    packed, styles = prepared.packed, _styles(prepared, profile)
     seeds = range(profile.seed, profile.seed + PRECISION_SEEDS)
-    trained = _trained(prepared, profile, asked or _models_with_weights(profile))
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
     record = _record(prepared, profile, "precision", styles=styles, num_seeds=PRECISION_SEEDS)
 
     def compare(row: Mapping) -> dict:
-        frames = profile.rollout_frames
-        model = trained[row["model"]]
-        table = compare_precisions(model, packed, styles, steps=row["steps"], num_frames=frames, seeds=seeds)
-        return {"precision": table}
+        settings = {"steps": row["steps"], "num_frames": profile.rollout_frames, "seeds": seeds}
+        return {"precision": compare_precisions(trained[row["model"]], packed, styles, **settings)}
 
-    digests = _digests(trained)
     records = Records(_records_dir(profile), record, {"precision": ["model", "steps"]}, again=asked)
-    return records.measure(
-        [{"model": name, "steps": steps, "weights": digests[name]} for name in trained for steps in (1, 8)], compare
-    )
+    todo = [{"model": name, "steps": steps} for name, steps in itertools.product(trained, (1, 8))]
+    return records.measure(_with_weights(todo, trained), compare)
 
 
 DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
@@ -655,7 +638,7 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
     held_out, num_steps = prepared.windows(prepared.held_out_split), STUDENT_STEPS[profile.name]
     known = available_models(profile)
     trained = _trained(prepared, profile, asked or [name for name in ONE_STEP_MODELS if name in known])
-    folder, digests = runs_dir(profile.dataset, profile.name) / "one_step", _digests(trained)
+    folder = runs_dir(profile.dataset, profile.name) / "one_step"
     record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
     keys = ["model", "window_frames", "steps"]
     records = Records(
@@ -672,18 +655,13 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
             made |= {"spacing": STUDENT_SPACING}
         generator = MotionGenerator(walker, steps, **made)
         rows, _ = measure_model(generator, packed, classifier, protocol, held_out, name=row["model"])
-        use = input_use(walker, held_out_condition(held_out, walker), seed=profile.seed)
+        use = denoising.input_use(walker, denoising.held_out_condition(held_out, walker), seed=profile.seed)
         return {"one_step_input_use": use, "one_step_by_seed": rows}
 
     todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
     walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
-    return records.measure(
-        [
-            {"model": model, "window_frames": profile.window, "steps": steps, "weights": digests[asked_network(model)]}
-            for model, steps in walks + todo
-        ],
-        score,
-    )
+    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in walks + todo]
+    return records.measure(_with_weights(rows, trained), score)
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -696,7 +674,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     """
     names = _names(models) or [name for name in (*ONE_STEP_MODELS, "F3AMD-FNO-96") if name in available_models(profile)]
     trained = _trained(prepared, profile, names)
-    batch, rounds = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS), {}
+    batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
 
     def compiled(model: TrainedModel, steps: int) -> Callable:
         sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
@@ -714,28 +692,16 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
         | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}
         for (name, steps), timing in take_turns(rounds, min_rounds=30, min_seconds=5.0).items()
     ]
-    path = _records_dir(profile) / "round_times.csv"
-    digests = {name: [digest] for name, digest in _digests(trained).items()}
-    write_table(path, pd.DataFrame(rows), _record(prepared, profile, "round_times", weights_digests=digests))
-    return path
+    return _write_anew(prepared, profile, "round_times", pd.DataFrame(rows), trained)
 
 
 MEASUREMENTS: dict[str, Callable] = {
-    "learning": measure_learning,
-    "precision": measure_precision,
-    "literal_update": measure_literal_update,
-    "posterior": measure_posterior,
-    "noise_use": measure_noise_use,
-    "gradient_norm": measure_gradient_norm,
-    "recipes": measure_recipes,
-    "quality": measure_quality,
-    "quality_by_epoch": measure_quality_by_epoch,
-    "walking": measure_walking,
-    "feet": measure_feet,
-    "trained": measure_trained,
-    "foot_spectrum": measure_foot_spectrum,
-    "sensitivity": measure_sensitivity,
-    "one_step": measure_one_step,
-    "round_times": measure_round_times,
-}
+    measure.__name__.removeprefix("measure_"): measure
+    for measure in (
+        measure_learning, measure_precision, measure_literal_update, measure_posterior, measure_noise_use,
+        measure_gradient_norm, measure_recipes, measure_quality, measure_quality_by_epoch, measure_walking,
+        measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
+        measure_round_times,
+    )
+}  # fmt: skip
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""

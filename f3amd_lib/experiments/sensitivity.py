@@ -191,8 +191,11 @@ def settling(
 # ------------------------------------------------------------------------------------ foot spectra
 
 
-def _toe_power(motion: Motion, bands: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the power of toe velocity in each band, (m/s)^2: mean over toes, sum over x, y, z."""
+def _toe_power(motion: Motion) -> dict[str, float]:
+    """Return the power of toe velocity in each of `FOOT_BANDS`, whose last frequency is not in it.
+
+    In (m/s)^2: mean over toes, sum over x, y, z.
+    """
     toes = motion.positions[:, list(motion.skeleton.toes)]
     velocity = motion.fps * np.diff(toes, axis=0)
     frequency, density = welch(velocity, motion.fps, nperseg=_SEGMENT, axis=0, detrend="constant")
@@ -200,15 +203,11 @@ def _toe_power(motion: Motion, bands: Mapping[str, tuple[float, float]]) -> dict
     width = frequency[1] - frequency[0]
     return {
         band: float(density[(frequency >= low) & (frequency < high)].sum() * width)
-        for band, (low, high) in bands.items()
+        for band, (low, high) in FOOT_BANDS.items()
     }
 
 
-def foot_spectrum(
-    systems: Mapping[tuple[str, int, int], Sequence[tuple[str, Motion]]],
-    *,
-    bands: Mapping[str, tuple[float, float]] = FOOT_BANDS,
-) -> pd.DataFrame:
+def foot_spectrum(systems: Mapping[tuple[str, int, int], Sequence[tuple[str, Motion]]]) -> pd.DataFrame:
     """Compare the power of toe motion by frequency with that of real feet (claim Q15).
 
     Power is that of the toes' velocity in the world, where a resting foot reads 0. Fine foot motion
@@ -219,7 +218,6 @@ def foot_spectrum(
       systems: (model, window_frames, steps) -> (style, motion) pairs, such as
         `zip(rollout.styles, map(rollout.motion, range(len(rollout.styles))))`. Real clips stand
         under a key whose model is "real". Motions under 65 frames are left out.
-      bands: name -> (lowest, first beyond) frequency, Hz.
 
     Returns:
       Columns model, window_frames, steps, band, metric, value, low, high, repeats. Metric
@@ -237,9 +235,7 @@ def foot_spectrum(
         raise ValueError("toe motion is compared with real clips: add a system named 'real'")
     power = {}
     for key, pairs in systems.items():
-        powers = [
-            {"style": style, **_toe_power(motion, bands)} for style, motion in pairs if motion.num_frames > _SEGMENT
-        ]
+        powers = [{"style": style, **_toe_power(motion)} for style, motion in pairs if motion.num_frames > _SEGMENT]
         if not powers:
             raise ValueError(f"{key[0]}: no motion of more than {_SEGMENT} frames")
         power[key] = pd.DataFrame(powers).groupby("style", sort=False).mean()
@@ -251,7 +247,7 @@ def foot_spectrum(
             raise ValueError(f"no real clip of style {lacking[0]!r} is long enough to compare with")
         named = dict(zip(("model", "window_frames", "steps"), key, strict=True))
         quotient = np.log(table / real.loc[table.index])
-        for band in bands:
+        for band in FOOT_BANDS:
             absolute = distributions.mean_and_interval(table[band].to_numpy())
             ratio = distributions.mean_and_interval(quotient[band].to_numpy())
             ratio |= {bound: float(np.exp(ratio[bound])) for bound in ("value", "low", "high")}
