@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.arrays import array_module, check_positive, finite_array
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
@@ -202,8 +202,7 @@ class Motion:
         lengths = {what: len(array) for what, array in self._arrays().items()}
         if len(set(lengths.values())) != 1:
             raise ValueError(f"{label}: arrays have unlike numbers of frames, {lengths}")
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"{label}: fps must be positive, got {self.fps}")
+        check_positive(f"{label}: fps", self.fps)
 
     @classmethod
     def from_positions(cls, skeleton: Skeleton, positions, fps: float = 30.0, name: str = "") -> Motion:
@@ -392,8 +391,7 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
     Returns:
       A motion at exactly `fps`. Positions are interpolated linearly, rotations on the shortest arc.
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_positive("fps", fps)
     ratio = motion.fps / fps
     if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
         every = {name: array[:: round(ratio)] for name, array in motion._arrays().items()}

@@ -27,9 +27,9 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.arrays import check_positive, finite_array
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -121,10 +121,8 @@ def style_parameters(name: str) -> StyleParameters:
     Raises:
       ValueError: for an unknown name; the message lists the nearest known ones.
     """
-    try:
-        return _STYLES[name]
-    except KeyError:
-        raise ValueError(f"unknown synthetic style {name!r}{nearest_hint(name, STYLES)}") from None
+    check_known(name, STYLES, "synthetic style")
+    return _STYLES[name]
 
 
 # ---------------------------------------------------------------------------------- small tools
@@ -562,8 +560,7 @@ def synthesize_with_contacts(
       ValueError: for an unknown style, or a length or rate that gives no frame.
     """
     parameters = style_parameters(style)
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_positive("fps", fps)
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
     return _walk(parameters, style, seed, fps, int(round(seconds * fps)))
