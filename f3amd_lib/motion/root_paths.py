@@ -228,10 +228,9 @@ def _complex_profile(seconds: float, speed: float, seed: int):
             pace, turning = 0.5 + 0.6 * pace, np.deg2rad(30.0 + 110.0 * turning) / duration
         elif kind == "stop":
             duration, pace, turning = rng.uniform(1.2, 2.0), 0.0, 0.0
-        elif kind == "sideways":
-            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, 0.5 * np.pi
         else:
-            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, np.pi
+            offset = np.pi if kind == "backwards" else 0.5 * np.pi
+            pace, turning = 0.4 + 0.3 * pace, 0.15 * turning
         facing_side = rng.choice([-1.0, 1.0])
         segments.append((duration, pace, side * turning, facing_side * offset))
     frames = [int(segment[0] * rate) for segment in segments]

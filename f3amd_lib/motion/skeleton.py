@@ -304,6 +304,12 @@ def global_rotations(skeleton: Skeleton, rotations):
     return walk_tree(skeleton, xp.zeros_like(rotations[..., 0, :, 0]), rotations)[1]
 
 
+def local_rotations(skeleton: Skeleton, turned: np.ndarray) -> np.ndarray:
+    """Turn global rotation matrices [T, J, 3, 3] into local ones: the inverse of `global_rotations` (numpy only)."""
+    above = turned[:, list(skeleton.parents[1:])]
+    return np.concatenate([turned[:, :1], np.swapaxes(above, -1, -2) @ turned[:, 1:]], axis=1)
+
+
 def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     """Return the yaw of cross(a, +Y), a = left hip - right hip.
 
@@ -371,11 +377,7 @@ def mirror(motion: Motion) -> Motion:
         return Motion.from_positions(skeleton, motion.positions[:, twin] * flip, motion.fps, name)
     turned = global_rotations(skeleton, np.asarray(motion.rotations, dtype=np.float64))
     turned = np.diag(flip) @ turned[:, twin] * skeleton.mirror_frames[None, :, None, :]
-    local = turned.copy()
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, joint]
-    local = local.astype(motion.rotations.dtype)
+    local = local_rotations(skeleton, turned).astype(motion.rotations.dtype)
     return motion.replace(root_position=motion.root_position * flip, rotations=local, name=name)
 
 
