@@ -208,7 +208,7 @@ def prepare_round(implementation: str, workload: Workload) -> Round:
       ValueError: for an unknown implementation.
       NotPossible: if it does not work for the workload or on this machine.
     """
-    check_known("implementation", implementation, IMPLEMENTATIONS)
+    check_known(implementation, IMPLEMENTATIONS, "implementation")
     try:
         return IMPLEMENTATIONS[implementation][1](workload)
     except (ImportError, ValueError, RuntimeError) as error:

@@ -221,7 +221,7 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     """
     if not isinstance(network, CAMDM):
         raise ValueError(f"only CAMDM has a form in PyTorch, got a {type(network).__name__}")
-    check_known("products", products, PRODUCTS)
+    check_known(products, PRODUCTS, "products")
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     torch.set_num_threads(usable_cores())

@@ -14,7 +14,7 @@ import numpy as np
 from f3amd_lib.diffusion.predictions import clean_estimate
 from f3amd_lib.diffusion.samplers import SAMPLERS, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 
 DORMAND_PRINCE = "dormand_prince"
 """Name of the solver that is no walk of `diffusion.samplers`: see `integrate`."""
@@ -54,8 +54,7 @@ def solve(
         if default_sampler(objective, schedule) != sampler:
             raise ValueError(f"{sampler!r} follows v on the straight path, not {objective!r} on {schedule.kind!r}")
         return integrate(predict, noise)
-    if sampler not in SAMPLERS:
-        raise ValueError(f"unknown sampler {sampler!r}{nearest_hint(sampler, [DORMAND_PRINCE, *SAMPLERS])}")
+    check_known(sampler, [DORMAND_PRINCE, *SAMPLERS], "sampler")
     (alphas, sigmas), levels = schedule.scaled_grid(num_steps), schedule.grid(num_steps)
     endless = bool(np.isinf(levels[0]))
     if endless and objective == "eps":

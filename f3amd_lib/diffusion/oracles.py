@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from scipy.special import ndtr
 
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, check_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,7 @@ class GaussianMixture:
         weights = np.ones(len(means)) if self.weights is None else np.array(self.weights, float)
         if weights.shape != (len(means),) or not np.all(weights > 0):
             raise ValueError(f"weights must be {len(means)} positive numbers, got {self.weights!r}")
-        if not (np.isfinite(self.width) and self.width > 0):
-            raise ValueError(f"width must be positive, got {self.width!r}")
+        check_positive("width", self.width)
         object.__setattr__(self, "means", means)
         object.__setattr__(self, "weights", weights / weights.sum())
 
@@ -127,8 +125,6 @@ class GaussianMixture:
         """
         if self.means.shape[1] != 1:
             raise ValueError(f"flow needs D = 1, this mixture has D = {self.means.shape[1]}")
-        if isinstance(x, jax.Array):
-            x = np.asarray(x)
         x = np.asarray(x, dtype=np.float64)
         # Of the two tails the smaller is compared: near 1 a float has no digits left.
         below, above = self._tails(x, sigma)

@@ -20,7 +20,7 @@ from f3amd_lib.diffusion.predictions import clean_estimate
 from f3amd_lib.diffusion.samplers import Visited, ddim_step, sample, walk
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 
 
 class Phases(NamedTuple):
@@ -211,8 +211,7 @@ def ddim_times(num_levels: int, num_steps: int, spacing: str = "trailing") -> np
     Raises:
       ValueError: for more steps than levels, or an unknown spacing.
     """
-    if spacing not in SPACINGS:
-        raise ValueError(f"unknown spacing {spacing!r}{nearest_hint(spacing, SPACINGS)}")
+    check_known(spacing, SPACINGS, "spacing")
     if not 1 <= num_steps <= num_levels:
         raise ValueError(f"a teacher of {num_levels} levels takes 1 to {num_levels} steps, got {num_steps}")
     if spacing == "leading":

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 
 from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 
 Denoiser = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -227,8 +227,7 @@ sampler by name; no schedule asks for it."""
 
 def _sampler(name: str) -> Sampler:
     """Return a sampler by name; ValueError names the nearest one if there is none."""
-    if name not in SAMPLERS:
-        raise ValueError(f"unknown sampler {name!r}{nearest_hint(name, SAMPLERS)}")
+    check_known(name, SAMPLERS, "sampler")
     return SAMPLERS[name]
 
 

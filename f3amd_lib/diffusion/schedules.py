@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 
 
 @dataclass(frozen=True, repr=False)
@@ -333,12 +333,10 @@ def schedule_from_dict(values: Mapping) -> NoiseSchedule:
     if "kind" not in settings:
         raise ValueError(f"a noise schedule needs a kind{nearest_hint('', SCHEDULES)}")
     kind = settings.pop("kind")
-    if kind not in SCHEDULES:
-        raise ValueError(f"unknown noise schedule {kind!r}{nearest_hint(kind, SCHEDULES)}")
+    check_known(kind, SCHEDULES, "noise schedule")
     known = inspect.signature(SCHEDULES[kind]).parameters
     for name, value in settings.items():
-        if name not in known:
-            raise ValueError(f"unknown {kind} setting {name!r}{nearest_hint(name, known)}")
+        check_known(name, known, f"{kind} setting")
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{kind} setting {name!r} must be a number, got {value!r}")
     return SCHEDULES[kind](**settings)

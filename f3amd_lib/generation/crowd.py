@@ -39,7 +39,7 @@ from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
 from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.files import locked, whole_file
-from f3amd_lib.ground.names import checked_seed, nearest_hint
+from f3amd_lib.ground.names import check_known, checked_seed
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
@@ -403,8 +403,7 @@ def _path_maker(paths) -> tuple[PathMaker, list[str] | str]:
     if not names:
         raise ValueError("a crowd needs at least one path to draw from")
     for name in names:
-        if name not in NAMES:
-            raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
+        check_known(name, NAMES, "path")
     return functools.partial(crowd_paths, names=names), names
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.arrays import check_positive, finite_array
 from f3amd_lib.motion.root_paths import tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 
@@ -93,8 +93,7 @@ def keep_apart(
     yaw = finite_array("yaw", yaw, position.shape[:2])
     if not (np.isfinite(min_distance) and min_distance > 0):
         raise ValueError(f"min_distance must be above 0 metres, got {min_distance}")
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be above 0, got {fps}")
+    check_positive("fps", fps)
     if radius is not None:
         _check_room(len(position), min_distance, radius)
     start = position[:, 0]

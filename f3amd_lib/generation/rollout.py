@@ -21,7 +21,7 @@ from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.names import checked_seed, nearest_hint
+from f3amd_lib.ground.names import check_known, checked_seed
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import cast_network
@@ -56,8 +56,7 @@ class MotionGenerator:
         self.num_steps = num_steps
         schedule = schedule or trained.diffusion
         self.sampler = sampler or schedule.sampler
-        if self.sampler not in SAMPLERS:
-            raise ValueError(f"unknown sampler {self.sampler!r}{nearest_hint(self.sampler, SAMPLERS)}")
+        check_known(self.sampler, SAMPLERS, "sampler")
         self.sigmas = schedule.grid(num_steps, spacing)
         # A walk that is told a low level from the first starts from noise alone all the same: of variance 1 in the
         # preserving state, and of 1 + sigma^2 in ours.

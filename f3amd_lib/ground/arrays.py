@@ -12,6 +12,12 @@ def array_module(*arrays):
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
+def check_positive(name: str, value) -> None:
+    """Raise ValueError unless a number is finite and above 0."""
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be positive, got {value}")
+
+
 def finite_array(name: str, value, shape: tuple, dtype=np.float64) -> np.ndarray:
     """Return a value as an array of a shape, all of it finite.
 

@@ -38,8 +38,8 @@ def nearest_hint(name, known: Iterable[str], *, most: int = 25) -> str:
     return f"{question} ({len(known)} are known, {'nearest' if near else 'such as'} {listed})"
 
 
-def check_known(what: str, name, known: Iterable[str]) -> None:
-    """Raise ValueError, with the nearest name, for a name that is not among the known ones."""
+def check_known(name, known: Iterable[str], what: str) -> None:
+    """Raise ValueError, with the nearest name, for a name that is none of those known."""
     if name not in known:
         raise ValueError(f"unknown {what} {name!r}{nearest_hint(name, known)}")
 
@@ -48,7 +48,7 @@ def refuse_unknown(values: Mapping, config_class: type, what: str) -> None:
     """Raise ValueError, with the nearest name, for a key that is no field of a config class."""
     known = [field.name for field in dataclasses.fields(config_class) if field.init]
     for key in values:
-        check_known(what, key, known)
+        check_known(key, known, what)
 
 
 def checked_seed(seed) -> int:

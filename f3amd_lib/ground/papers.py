@@ -36,7 +36,7 @@ def load_paper_file(name: str, paper: str = "f3amd") -> dict:
     Raises:
       ValueError: for an unknown paper, a missing file, or one that is no TOML.
     """
-    check_known("paper", paper, paper_folders())
+    check_known(paper, paper_folders(), "paper")
     path = _FOLDER / paper / f"{name}.toml"
     try:
         return read_toml(path)

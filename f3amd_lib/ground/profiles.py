@@ -103,7 +103,7 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
     _check_names(dataset, name)
     types = {item.name: item.type for item in dataclasses.fields(Profile) if item.name not in ("name", "dataset")}
     for key in overrides:
-        check_known("profile field", key, types)
+        check_known(key, types, "profile field")
     values = _NUMBERS["common"] | _NUMBERS[name] | _NUMBERS["on"].get(dataset, {}).get(name, {}) | overrides
     return Profile(name=name, dataset=dataset, **{key: _checked(key, values.get(key), types[key]) for key in types})
 
@@ -131,8 +131,8 @@ def _checked(key: str, value, annotation: str):
 
 
 def _check_names(dataset: str, profile: str) -> None:
-    check_known("profile", profile, PROFILES)
-    check_known("data set", dataset, DATASETS)
+    check_known(profile, PROFILES, "profile")
+    check_known(dataset, DATASETS, "data set")
 
 
 def repository_root() -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from f3amd_lib.motion.skeleton import Skeleton
 
 _ARM = ("shoulder", "elbow", "wrist")
@@ -46,6 +48,11 @@ def joint_roles(skeleton: Skeleton) -> dict[str, int]:
         if above not in roles.values():
             roles[f"{side}_collar"] = above
     return roles
+
+
+def leg_length(skeleton: Skeleton, roles: dict[str, int]) -> float:
+    """Return the length of thigh and shank, metres, of a skeleton with these `joint_roles`."""
+    return float(np.linalg.norm(skeleton.offsets[[roles["left_knee"], roles["left_ankle"]]], axis=-1).sum())
 
 
 def part_of(role: str) -> str:

@@ -17,7 +17,7 @@ from importlib import resources
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.motion.anatomy import joint_roles, part_of
+from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Skeleton, forward_kinematics, walk_tree
 
@@ -79,12 +79,13 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
     Args:
       skeleton: any. A joint whose role is not known gets a thin limb; a skeleton that cannot be mirrored, round ones.
     """
-    parts = {joint: part_of(role) for role, joint in joint_roles(skeleton).items()}
+    roles = joint_roles(skeleton)
+    parts = {joint: part_of(role) for role, joint in roles.items()}
     try:
         twins, frames = skeleton.mirror_permutation, skeleton.mirror_frames
     except ValueError:
         twins, frames = range(skeleton.num_joints), np.ones((skeleton.num_joints, 3))
-    scale = _size(skeleton)
+    scale = leg_length(skeleton, roles) / LEG if "left_ankle" in roles else 1.0
     tips = {joint: np.array(offset) for joint, offset in skeleton.end_sites if np.linalg.norm(offset) > 0.01}
     capsules = {}
     for joint in range(skeleton.num_joints):
@@ -107,14 +108,6 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
     return list(capsules.values())
 
 
-def _size(skeleton: Skeleton) -> float:
-    """Return how long the legs are, beside `LEG`; 1 where they are not known."""
-    roles = joint_roles(skeleton)
-    if "left_ankle" not in roles:
-        return 1.0
-    return np.linalg.norm(skeleton.offsets[[roles["left_knee"], roles["left_ankle"]]], axis=-1).sum() / LEG
-
-
 def _capsule(joint: int, offset, part: str, scale: float, frames) -> Capsule:
     row = _TABLE.get(part, _TABLE[""])
     limit = np.inf if part in _TABLE and part else 0.3 * np.linalg.norm(offset)
@@ -124,18 +117,15 @@ def _capsule(joint: int, offset, part: str, scale: float, frames) -> Capsule:
     return Capsule(joint, (0.0, 0.0, 0.0), tuple(np.asarray(offset, float)), radii, tuple(wide.astype(float)))
 
 
-def _any_across(axis) -> np.ndarray:
-    """Return some unit vector square to an axis."""
-    return unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
-
-
 def capsule_mesh(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [5 SIDES + 2, 3] in the joint's frame, and faces."""
     start, end = np.array(capsule.start), np.array(capsule.end)
     axis, wide = unit(end - start), np.array(capsule.wide)
     stretch = np.linalg.norm(wide) or 1.0
     across = wide - (wide @ axis) * axis
-    across = unit(across) if np.linalg.norm(across) > 1e-6 else _any_across(axis)
+    if np.linalg.norm(across) <= 1e-6:
+        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])  # any direction square to the axis
+    across = unit(across)
     other = np.cross(axis, across)
     first, last = capsule.radii
     latitude = 0.5 * np.pi * np.concatenate([_LATITUDES, [0.0], -_LATITUDES[::-1]])

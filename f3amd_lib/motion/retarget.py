@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from f3amd_lib.motion.anatomy import joint_roles
+from f3amd_lib.motion.anatomy import joint_roles, leg_length
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.rotations import shortest_turn
-from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
+from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations, local_rotations
 
 _SIDES = ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist")
 NEEDED = ("neck", "head", *(f"{side}_{part}" for side in ("left", "right") for part in _SIDES))
@@ -77,26 +77,16 @@ def retarget(motion: Motion, reference: Motion) -> Retargeted:
             turned[:, joint] = _best_turn(was, shall)
         else:
             turned[:, joint] = shortest_turn(before @ was[0], shall[:, 0]) @ before
-    whole = turned @ rest
-    local = whole.copy()
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(whole[:, parent], -1, -2) @ whole[:, joint]
-    scale = _leg(skeleton, ours) / _leg(motion.skeleton, theirs)
+    local = local_rotations(skeleton, turned @ rest)
+    scale = leg_length(skeleton, ours) / leg_length(motion.skeleton, theirs)
     made = Motion(skeleton, scale * motion.root_position, local, motion.fps, motion.name)
     floor = reference.positions[:, list(skeleton.toes), 1].min() - made.positions[:, list(skeleton.toes), 1].min()
     made = made.replace(root_position=made.root_position + [0.0, floor, 0.0])
     shared = [role for role in theirs if role in ours and "spine" not in role]
-    there, here = (
-        motion.positions[:, [theirs[role] for role in shared]],
-        made.positions[:, [ours[role] for role in shared]],
-    )
+    there = motion.positions[:, [theirs[role] for role in shared]]
+    here = made.positions[:, [ours[role] for role in shared]]
     apart = (here - here[:, :1]) - scale * (there - there[:, :1])
     return Retargeted(made, float(scale), 100.0 * np.linalg.norm(apart, axis=-1).mean(axis=-1))
-
-
-def _leg(skeleton: Skeleton, roles) -> float:
-    return float(np.linalg.norm(skeleton.offsets[[roles["left_knee"], roles["left_ankle"]]], axis=-1).sum())
 
 
 def _wanted_points(motion: Motion, theirs, skeleton: Skeleton, ours) -> dict[int, np.ndarray]:

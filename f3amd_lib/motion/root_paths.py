@@ -16,8 +16,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
 
-from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.names import checked_seed, nearest_hint
+from f3amd_lib.ground.arrays import check_positive, finite_array
+from f3amd_lib.ground.names import check_known, checked_seed
 from f3amd_lib.motion.curves import smoothstep
 from f3amd_lib.motion.skeleton import Motion
 
@@ -58,8 +58,7 @@ class RootPath:
         yaw = np.unwrap(finite_array("path yaw", self.yaw, ("frame",)))
         if len(yaw) != len(position):
             raise ValueError(f"a path's position has {len(position)} frames, its yaw {len(yaw)}")
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"a path's fps must be positive, got {self.fps}")
+        check_positive("a path's fps", self.fps)
         for name, array in (("position", position), ("yaw", yaw)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -126,12 +125,10 @@ def named_path(
 
     Source: ours; the paper does not give its test trajectory.
     """
-    if name not in NAMES:
-        raise ValueError(f"unknown path {name!r}{nearest_hint(name, NAMES)}")
+    check_known(name, NAMES, "path")
     if int(num_frames) != num_frames or num_frames < 2:
         raise ValueError(f"a path needs at least 2 whole frames, got num_frames={num_frames}")
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_positive("fps", fps)
     if not (np.isfinite(speed) and 0 < speed < MAX_STEP * 30.0):
         raise ValueError(f"speed must lie between 0 and {MAX_STEP * 30.0:g} m/s, got {speed}")
     if not (np.isfinite(ramp_seconds) and ramp_seconds >= 0):
@@ -231,10 +228,9 @@ def _complex_profile(seconds: float, speed: float, seed: int):
             pace, turning = 0.5 + 0.6 * pace, np.deg2rad(30.0 + 110.0 * turning) / duration
         elif kind == "stop":
             duration, pace, turning = rng.uniform(1.2, 2.0), 0.0, 0.0
-        elif kind == "sideways":
-            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, 0.5 * np.pi
         else:
-            pace, turning, offset = 0.4 + 0.3 * pace, 0.15 * turning, np.pi
+            offset = np.pi if kind == "backwards" else 0.5 * np.pi
+            pace, turning = 0.4 + 0.3 * pace, 0.15 * turning
         facing_side = rng.choice([-1.0, 1.0])
         segments.append((duration, pace, side * turning, facing_side * offset))
     frames = [int(segment[0] * rate) for segment in segments]

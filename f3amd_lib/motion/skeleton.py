@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.arrays import array_module, check_positive, finite_array
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
 
@@ -202,8 +202,7 @@ class Motion:
         lengths = {what: len(array) for what, array in self._arrays().items()}
         if len(set(lengths.values())) != 1:
             raise ValueError(f"{label}: arrays have unlike numbers of frames, {lengths}")
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"{label}: fps must be positive, got {self.fps}")
+        check_positive(f"{label}: fps", self.fps)
 
     @classmethod
     def from_positions(cls, skeleton: Skeleton, positions, fps: float = 30.0, name: str = "") -> Motion:
@@ -305,6 +304,12 @@ def global_rotations(skeleton: Skeleton, rotations):
     return walk_tree(skeleton, xp.zeros_like(rotations[..., 0, :, 0]), rotations)[1]
 
 
+def local_rotations(skeleton: Skeleton, turned: np.ndarray) -> np.ndarray:
+    """Turn global rotation matrices [T, J, 3, 3] into local ones: the inverse of `global_rotations` (numpy only)."""
+    above = turned[:, list(skeleton.parents[1:])]
+    return np.concatenate([turned[:, :1], np.swapaxes(above, -1, -2) @ turned[:, 1:]], axis=1)
+
+
 def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     """Return the yaw of cross(a, +Y), a = left hip - right hip.
 
@@ -372,11 +377,7 @@ def mirror(motion: Motion) -> Motion:
         return Motion.from_positions(skeleton, motion.positions[:, twin] * flip, motion.fps, name)
     turned = global_rotations(skeleton, np.asarray(motion.rotations, dtype=np.float64))
     turned = np.diag(flip) @ turned[:, twin] * skeleton.mirror_frames[None, :, None, :]
-    local = turned.copy()
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, joint]
-    local = local.astype(motion.rotations.dtype)
+    local = local_rotations(skeleton, turned).astype(motion.rotations.dtype)
     return motion.replace(root_position=motion.root_position * flip, rotations=local, name=name)
 
 
@@ -392,8 +393,7 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
     Returns:
       A motion at exactly `fps`. Positions are interpolated linearly, rotations on the shortest arc.
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_positive("fps", fps)
     ratio = motion.fps / fps
     if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
         every = {name: array[:: round(ratio)] for name, array in motion._arrays().items()}

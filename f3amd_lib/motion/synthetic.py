@@ -27,9 +27,9 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.arrays import check_positive, finite_array
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -121,10 +121,8 @@ def style_parameters(name: str) -> StyleParameters:
     Raises:
       ValueError: for an unknown name; the message lists the nearest known ones.
     """
-    try:
-        return _STYLES[name]
-    except KeyError:
-        raise ValueError(f"unknown synthetic style {name!r}{nearest_hint(name, STYLES)}") from None
+    check_known(name, STYLES, "synthetic style")
+    return _STYLES[name]
 
 
 # ---------------------------------------------------------------------------------- small tools
@@ -195,12 +193,15 @@ class _Path:
         return min(max(index, 0), len(self.time) - 1)
 
 
+_STRETCHES = read_toml(Path(__file__).with_name("stretches.toml"))
+"""What a path is strung together from; the file says what its numbers mean."""
+
+
 def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator) -> _Path:
     """String random stretches together and smooth speed, turning and heading."""
     count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
     time = np.arange(count) / _GRID_RATE - _LEAD
-    kinds = np.array(["straight", "curve", "tight", "slalom", "fast", "slow", "diagonal", "side", "back"])
-    weights = np.array([0.17, 0.24, 0.13, 0.07, 0.11, 0.07, 0.05, 0.09, 0.07])
+    kinds, weights = zip(*((name, of["weight"]) for name, of in _STRETCHES.items() if "weight" in of), strict=True)
     speed, turn, heading = np.zeros(count), np.zeros(count), np.zeros(count)
     start, forced, stood = 0, "straight", False
     # Runs bend their paths less per second of turning than walks.
@@ -210,33 +211,21 @@ def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator)
         # Stops are dealt by count: a stop lasts about two thirds of an average stretch.
         if not stood and not forced and rng.random() < 1.5 * style.stop_share:
             kind = "stop"
+        stretch = _STRETCHES[kind]
+
+        def drawn(name: str, usual: float, stretch=stretch) -> float:
+            value = stretch.get(name, usual)
+            return rng.uniform(*value) if isinstance(value, list) else value
+
         length = rng.uniform(1.8, 4.2)
-        factor, rate, offset = rng.uniform(0.85, 1.12), rng.normal(0.0, 0.08), 0.0
+        factor, rate = rng.uniform(0.85, 1.12), rng.normal(0.0, 0.08)
         sign = rng.choice([-1.0, 1.0])
-        if kind == "curve":
-            rate = sign * rng.uniform(0.25, 0.75) * pace
-        elif kind == "tight":
-            rate, length = sign * rng.uniform(0.9, 1.5) * pace, rng.uniform(1.0, 1.9)
-            factor *= 0.85
-        elif kind == "slalom":
-            length = 4.5
-        elif kind == "fast":
-            factor = rng.uniform(1.18, 1.60)
-        elif kind == "slow":
-            factor = rng.uniform(0.5, 0.7)
-        elif kind == "diagonal":
-            offset = sign * rng.uniform(25.0, 50.0)
-            factor *= 0.85
-        elif kind == "side":
-            offset = sign * 90.0
-            factor = rng.uniform(0.35, 0.70)
-        elif kind == "back":
-            offset = sign * 180.0
-            factor = rng.uniform(0.35, 0.70)
-        elif kind == "stop":
-            factor, length, rate = 0.0, rng.uniform(1.4, 3.2), 0.0
-            if rng.random() < 0.25:
-                rate = sign * rng.uniform(0.5, 0.9)  # turns on the spot
+        if "turn" in stretch:
+            rate = sign * drawn("turn", 0.0) * pace
+        length, factor = drawn("seconds", length), drawn("speed", factor) * stretch.get("slowed", 1.0)
+        offset = sign * drawn("heading", 0.0)
+        if kind == "stop":
+            rate = sign * rng.uniform(0.5, 0.9) if rng.random() < 0.25 else 0.0  # or turns on the spot
         stop = min(count, start + int(length * _GRID_RATE))
         span = slice(start, stop)
         speed[span], turn[span], heading[span] = style.speed * factor, rate, offset
@@ -562,8 +551,7 @@ def synthesize_with_contacts(
       ValueError: for an unknown style, or a length or rate that gives no frame.
     """
     parameters = style_parameters(style)
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_positive("fps", fps)
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
     return _walk(parameters, style, seed, fps, int(round(seconds * fps)))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks.attention import MultiHeadAttention, attend, check_num_heads, position_code
 from f3amd_lib.networks.config import NetworkConfig
 
@@ -254,8 +254,7 @@ def conditioning_layer(
     Raises:
       ValueError: for an unknown name, with the nearest.
     """
-    if name not in CONDITIONINGS:
-        raise ValueError(f"unknown conditioning {name!r}{nearest_hint(name, CONDITIONINGS)}")
+    check_known(name, CONDITIONINGS, "conditioning")
     if name == "concatenation":
         return Concatenation(width, zero_output=zero_output, rngs=rngs)
     if name == "adaln_zero":

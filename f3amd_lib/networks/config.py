@@ -11,7 +11,7 @@ from typing import ClassVar
 import jax
 from flax import nnx
 
-from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.names import check_known, refuse_unknown
 
 _TYPES = {"int": int, "float": float, "bool": bool, "str": str}
 
@@ -44,8 +44,8 @@ class CheckedConfig:
             object.__setattr__(self, name, value)
         if type(value) is not wanted:
             raise ValueError(f"{name} must be of type {wanted.__name__}, got {value!r}")
-        if value not in self.choices.get(name, (value,)):
-            raise ValueError(f"unknown {name} {value!r}{nearest_hint(value, self.choices[name])}")
+        if name in self.choices:
+            check_known(value, self.choices[name], name)
         if wanted in (int, float) and not (0 < value < math.inf or (value == 0 and name in self.may_be_zero)):
             raise ValueError(f"{name} must be positive and finite, got {value!r}")
 

@@ -21,7 +21,7 @@ from flax import nnx
 from f3amd_lib.diffusion.flow import default_sampler
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.ground.papers import check_entry, find_entry
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
@@ -201,8 +201,7 @@ def config_from_dict(values: Mapping) -> CheckedConfig:
       ValueError: for a family that is missing or unknown, or an unknown field.
     """
     family = values.get("family")
-    if family not in FAMILIES:
-        raise ValueError(f"unknown model family {family!r}{nearest_hint(family, FAMILIES)}")
+    check_known(family, FAMILIES, "model family")
     return FAMILIES[family][0].from_dict(dict(values))
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks.config import scaled_normal
 
 SPECTRAL_VARIANTS = ("fourier", "cosine", "reduced_rank", "weighted")
@@ -38,8 +38,7 @@ def count_modes(variant: str, num_frames: int) -> int:
     Raises:
       ValueError: for an unknown variant.
     """
-    if variant not in SPECTRAL_VARIANTS:
-        raise ValueError(f"unknown spectral variant {variant!r}{nearest_hint(variant, SPECTRAL_VARIANTS)}")
+    check_known(variant, SPECTRAL_VARIANTS, "spectral variant")
     return num_frames if variant == "cosine" else num_frames // 2 + 1
 
 

@@ -433,8 +433,8 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
       ValueError: for an unknown data set or profile; later, for a table without a run record, one
         that its record does not describe, or a record of another data set, profile or device.
     """
-    check_known("data set", dataset, DATASETS)
-    check_known("profile", profile, [name for name in PROFILES if name != "smoke"])
+    check_known(dataset, DATASETS, "data set")
+    check_known(profile, [name for name in PROFILES if name != "smoke"], "profile")
 
     def load(name: str):
         path = Path(root) / dataset / profile / "records" / f"{name}.csv"

@@ -38,7 +38,7 @@ from jax.extend.mlir.dialects import stablehlo
 from f3amd_lib.diffusion.samplers import ddpm_step
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.generation.rounds import sample_round
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
@@ -91,8 +91,7 @@ generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
 def _find_target(name: str) -> Target:
     if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
         return Target("cuda", "cuda", (f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"))
-    if name not in TARGETS:
-        raise ValueError(f"unknown target {name!r}{nearest_hint(name, [*TARGETS, 'cuda-sm_80'])}")
+    check_known(name, [*TARGETS, "cuda-sm_80"], "target")
     return TARGETS[name]
 
 

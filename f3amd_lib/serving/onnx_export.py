@@ -25,8 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks.conditioning import Condition, ConditionedConfig
 from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel, describe_skeleton
 
@@ -83,8 +83,7 @@ def onnx_program(network, evaluate, shapes: dict[str, tuple], output: str, *, we
       ImportError: if jax2onnx is not installed, saying how to install it.
       ValueError: for unknown `weights`.
     """
-    if weights not in WEIGHTS:
-        raise ValueError(f"unknown weights {weights!r}{nearest_hint(weights, WEIGHTS)}")
+    check_known(weights, WEIGHTS, "weights")
     try:
         import jax2onnx
     except ImportError as error:
@@ -223,16 +222,7 @@ def model_card(trained: TrainedModel, num_steps: int) -> dict:
         "frames_per_second": 30,
         "inputs": {name: {"shape": list(shape)} for name, shape in input_shapes(config, "B").items()},
         "output": {"x0_hat": {"shape": ["B", config.window, config.channels]}},
-        "about": {
-            "x_noisy": "clean features plus sigma times standard normal noise; at the start sigmas[0] times noise",
-            "sigma": "noise level, one a character",
-            "history": "last frames, root x and z relative to the last of them, normalised",
-            "path": "per future frame: root x and z relative to the last history frame over path_scale, then "
-            "cos(yaw), 0, -sin(yaw), 0, 1, 0",
-            "style": "one-hot in the order of `styles`, or a blend of two whose weights sum to 1",
-            "features": "root x, y, z; then per joint the first two columns of its local rotation, 6 numbers",
-            "normalised": "(features - mean) / deviation",
-        },
+        "about": read_toml(Path(__file__).with_name("onnx_card.toml")),
         "normaliser": {
             name: np.asarray(value, np.float32).tolist() for name, value in trained.normaliser._asdict().items()
         },

@@ -27,7 +27,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import html
-import json
 import re
 import string
 import zlib
@@ -45,7 +44,6 @@ from f3amd_lib.drawing.stick_figures import (
     TARGET_COLOR,
     TRAIL_COLOR,
     bones_of,
-    is_head,
     limb_side,
     path_on_ground,
 )
@@ -53,7 +51,7 @@ from f3amd_lib.drawing.style import save_figure, show_figure
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.serving.web_page import POLICY, module_scripts, read_web
+from f3amd_lib.serving.web_page import POLICY, head_and_parent, module_scripts, page_json, read_web
 
 _MILLIMETRES = 1000.0
 _FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
@@ -184,8 +182,7 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         panels="\n".join(_panel(scene, first) for scene in scenes),
         legend=_legend(described),
         credit=_element('p class="credit"', credit),
-        # "</script>" in a title would end the block that holds it.
-        data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        data=page_json(data),
         modules=module_scripts("player"),
     )
 
@@ -379,7 +376,6 @@ def describe_for_web(skeleton: Skeleton) -> dict:
 
     tips = [offset for _, offset in skeleton.end_sites]
     offsets = [*skeleton.offsets, *tips]
-    heads = [k for k, name in enumerate(skeleton.names) if is_head(name)]
     capsules = [
         [one.joint, numbers(one.start), numbers(one.end), numbers(one.radii), numbers(one.wide)]
         for one in body_capsules(skeleton)
@@ -391,7 +387,7 @@ def describe_for_web(skeleton: Skeleton) -> dict:
         "sides": [limb_side(name) for name in skeleton.names],
         "capsules": capsules,
         "bones": [[parent, numbers(offsets[child]), side] for parent, child, side in bones_of(skeleton)],
-        "head": [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None,
+        "head": head_and_parent(skeleton),
         "toes": list(_toes(skeleton) or ()) or None,
     }
 

@@ -10,46 +10,31 @@ from __future__ import annotations
 import base64
 import gzip
 import html
-import json
 import re
 import string
 from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, is_head
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
 from f3amd_lib.generation.foot_locking import leg_chains
 from f3amd_lib.generation.steering import first_pose, usual_pace
-from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.serving.npm_packages import package_credit, package_file
 from f3amd_lib.serving.onnx_export import denoiser_program, model_card
+from f3amd_lib.serving.web_page import head_and_parent, page_json
 from f3amd_lib.training.checkpoints import TrainedModel
 
 WEB = Path(__file__).parent / "web"
-MODULES = (
-    ("three.core.js", "./three.core.js", "build/three.core.js"),
-    ("three.module.js", "three", "build/three.module.js"),
-    ("motion.js", "./motion.js", None),
-    ("steer.js", "./steer.js", None),
-)
+_PAGE = read_toml(Path(__file__).with_name("steer.toml"))
+MODULES = _PAGE["modules"]
 """Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
 
-_FEET = (
-    "A foot that carries is held where it stands, by a rule of ours that looks at each frame as it comes; the network "
-    "never hears of it. Without the tick you see the feet as the network moves them. The command rollout has a better "
-    "rule, which knows the whole walk before it begins."
-)
-_NO_FEET = "Feet are not held: the legs of this skeleton are not hip, knee, ankle and toe."
+RUNTIMES = _PAGE["runtimes"]
+"""What runs the network -> the script of ONNX Runtime, and its program; the second one also runs without WebGPU."""
 
 _MARKS = {"past": "#b5651d", "taken": "#1b7f4d", "dropped": "#4f7fbf", "target": TARGET_COLOR, "seam": "#d33f3f"}
-
-
-RUNTIMES = {
-    "wasm": ("dist/ort.wasm.bundle.min.mjs", "dist/ort-wasm-simd-threaded.wasm"),
-    "webgpu": ("dist/ort.webgpu.bundle.min.mjs", "dist/ort-wasm-simd-threaded.asyncify.wasm"),
-}
-"""What runs the network -> the script of ONNX Runtime, and its program; the second one also runs without WebGPU."""
 
 
 def steer_page(
@@ -70,8 +55,7 @@ def steer_page(
       ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, an unknown runtime, or a
         model that lacks a starting pose for one of its styles.
     """
-    if runtime not in RUNTIMES:
-        raise ValueError(f"unknown runtime {runtime!r}{nearest_hint(runtime, RUNTIMES)}")
+    check_known(runtime, RUNTIMES, "runtime")
     if trained.diffusion.sampler != "ddim":
         raise ValueError(
             f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
@@ -100,7 +84,7 @@ def steer_page(
         | {"legs": legs, "webgpu": runtime == "webgpu"},
         "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
-        "head": _head(trained.skeleton),
+        "head": head_and_parent(trained.skeleton),
         "paces": paces,
         "colors": LIMB_COLORS,
         "marks": _MARKS,
@@ -125,12 +109,12 @@ def steer_page(
         licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
         steps=steps,
         feet=" checked" if legs else " disabled",
-        about_feet=_FEET if legs else _NO_FEET,
+        about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
         style=string.Template((WEB / "steer.css").read_text(encoding="utf-8")).substitute(
             marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
         ),
-        data=_json(data),
-        files=_json({name: _packed(content) for name, content in files.items()}),
+        data=page_json(data),
+        files=page_json({name: _packed(content) for name, content in files.items()}),
         loader=(WEB / "loader.js").read_text(encoding="utf-8"),
     )
 
@@ -175,20 +159,9 @@ def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
 
 
-def _json(value) -> str:
-    # "</script>" in a name would end the block that holds it.
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
 def _used(card: dict) -> dict:
     """Return a card without what the page does not read."""
     return {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
-
-
-def _head(skeleton) -> tuple[int, int] | None:
-    """Return the head joint and its parent, or None."""
-    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
-    return (heads[0], skeleton.parents[heads[0]]) if heads and skeleton.parents[heads[0]] >= 0 else None
 
 
 def _legs(skeleton) -> list[list[int]] | None:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
+
+from f3amd_lib.drawing.stick_figures import is_head
+from f3amd_lib.motion.skeleton import Skeleton
 
 FOLDER = Path(__file__).parent / "web"
 
@@ -21,26 +23,6 @@ POLICY = (
 )
 """Content security policy of a page: what it carries, and no request to anybody."""
 
-_START = """(async () => {
-const packed = JSON.parse(document.getElementById("modules").textContent);
-const imports = {};
-for (const [name, text] of Object.entries(packed.modules)) {
-const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-const script = await new Response(stream).blob();
-imports[name] = URL.createObjectURL(new Blob([script], { type: "text/javascript" }));
-}
-const map = document.createElement("script");
-map.type = "importmap";
-map.textContent = JSON.stringify({ imports });
-document.head.append(map);
-await import(packed.start);
-})().catch((error) => {
-const message = document.getElementById("message");
-message.textContent = `This page cannot start; it needs a browser of 2023 or later (${error.message}).`;
-message.hidden = false;
-});"""
-
 
 def read_web(name: str) -> str:
     """Read a file of `serving/web` without its indents and lines of comment, a sixth of its bytes."""
@@ -49,22 +31,30 @@ def read_web(name: str) -> str:
     return "\n".join(line for line in stripped if line and not line.startswith("//"))
 
 
-def module_scripts(start: str, others: Sequence[str] = ("three", "scene", "body")) -> str:
+def module_scripts(start: str) -> str:
     """Return the elements of a page that hold modules and start one.
 
     Args:
-      start: name of the module that begins; `NAME.js` in `serving/web`.
-      others: names of what it imports; "three" is `three.min.js`.
+      start: name of the module that begins; `NAME.js` in `serving/web`. It may import three, scene and body.
 
     Returns:
       Two script elements. The page has to have an element "message" (hidden) and a policy that allows `blob:` scripts
       (`POLICY`).
     """
-    files = {name: "three.min.js" if name == "three" else f"{name}.js" for name in (*others, start)}
-    texts = {
-        name: (FOLDER / file).read_text(encoding="utf-8") if name == "three" else read_web(file)
-        for name, file in files.items()
-    }
+    texts = {"three": (FOLDER / "three.min.js").read_text(encoding="utf-8")}
+    texts |= {name: read_web(f"{name}.js") for name in ("scene", "body", start)}
     packed = {name: base64.b64encode(zlib.compress(text.encode(), 9)).decode() for name, text in texts.items()}
     modules = json.dumps({"start": start, "modules": packed})
-    return f'<script type="application/json" id="modules">{modules}</script>\n<script>\n{_START}\n</script>'
+    begin = read_web("start.js")
+    return f'<script type="application/json" id="modules">{modules}</script>\n<script>\n{begin}\n</script>'
+
+
+def head_and_parent(skeleton: Skeleton) -> list[int] | None:
+    """Return the head joint and its parent, for a page; None where no joint is called head, or the root is."""
+    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
+    return [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None
+
+
+def page_json(value) -> str:
+    """Return a value as JSON that may stand in a script element: "</script>" in a name would end the element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

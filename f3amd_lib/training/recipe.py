@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import optax
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
-from f3amd_lib.ground.names import checked_seed, nearest_hint, refuse_unknown
+from f3amd_lib.ground.names import check_known, checked_seed, refuse_unknown
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.losses import LossWeights
@@ -103,9 +103,7 @@ class TrainingConfig:
 
     def __post_init__(self):
         for name, known in _CHOICES.items():
-            if getattr(self, name) not in known:
-                value = getattr(self, name)
-                raise ValueError(f"unknown {name} {value!r}{nearest_hint(value, known)}")
+            check_known(getattr(self, name), known, name)
         checked_seed(self.seed)
         for names, fits, wanted in _RANGES:
             for name in names:
