@@ -134,14 +134,7 @@ class Claim:
 
 # ------------------------------------------------------------------------------------- the paper's file
 
-_KINDS = {
-    name: kind
-    for module in (judging, theory)
-    for name, kind in inspect.getmembers(module, inspect.isfunction)
-    if kind.__annotations__.get("return") == "Finding" and not name.startswith("_")
-}
-"""Kind of judgement, as a paper's file names it -> function of the evidence and the statement's parameters."""
-
+_KINDS = judging.KINDS | theory.KINDS
 _MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
 _RANGES = {
     "within": lambda low, high: (low, high),

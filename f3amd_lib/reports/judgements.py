@@ -21,7 +21,6 @@ was known, and nothing else.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -94,18 +93,16 @@ class Family:
 
     def measured(self, look: Callable[[Setting], object]) -> list[Setting]:
         """Return those for which `look` finds all it needs; NotMeasured if a required one lacks it."""
-        for setting in self.required:
-            look(setting)
-        return [setting for setting in self.models if _is_there(look, setting)]
-
-
-def _is_there(look: Callable, *given) -> bool:
-    """Return whether `look(*given)` finds all it needs."""
-    try:
-        look(*given)
-    except NotMeasured:
-        return False
-    return True
+        kept = []
+        for setting in self.models:
+            try:
+                look(setting)
+            except NotMeasured:
+                if setting in self.required:
+                    raise
+                continue
+            kept.append(setting)
+        return kept
 
 
 # ------------------------------------------------------------------------------ verdicts and ranges
@@ -330,12 +327,16 @@ def speedup(
 
 def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds) -> Finding:
     """Judge the gain in a large crowd (device -> characters), on every device that was timed."""
-    gain = lambda device: evidence.speedup(slow, fast, device, crowds[device])
-    timed = [device for device in crowds if _is_there(gain, device)]
-    # Without any, the reason is that of the first.
-    figures = {f"{device}, {crowds[device]:,}": gain(device) for device in timed or list(crowds)[:1]}
-    verdict = every(within(figure, bounds, gain=True) for figure in figures.values())
-    return verdict, ", ".join(f"{figure_text(figure)}x ({at})" for at, figure in figures.items())
+    figures, gap = {}, None
+    for device, count in crowds.items():
+        try:
+            figures[f"{device}, {count:,}"] = evidence.speedup(slow, fast, device, count)
+        except NotMeasured as error:
+            gap = gap or error
+    if not figures:
+        raise gap
+    verdict = every(within(gain, bounds, gain=True) for gain in figures.values())
+    return verdict, ", ".join(f"{figure_text(gain)}x ({at})" for at, gain in figures.items())
 
 
 def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Finding:
@@ -490,15 +491,21 @@ def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> 
 
 
 def _has(evidence: Evidence, settings: Iterable[Setting], metric: str) -> bool:
-    return _is_there(lambda: [evidence.quality(setting, metric) for setting in settings])
+    try:
+        for setting in settings:
+            evidence.quality(setting, metric)
+    except NotMeasured:
+        return False
+    return True
 
 
 def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> list[str]:
     """Return those of the nine metrics that all settings have."""
     kept = [metric for metric in NINE_METRICS if _has(evidence, settings, metric)]
-    if len(kept) < LEAST_METRICS:  # the reason is that of the first gap
-        for setting, metric in itertools.product(settings, NINE_METRICS):
-            evidence.quality(setting, metric)
+    if len(kept) < LEAST_METRICS:
+        for setting in settings:  # the reason is that of the first gap
+            for metric in NINE_METRICS:
+                evidence.quality(setting, metric)
     return kept
 
 
@@ -650,9 +657,11 @@ def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     settings = [Setting(model.model, count) for count in steps]
     metrics = _shared_metrics(evidence, settings)
     texts = []
-    for first, second in itertools.pairwise(settings):
-        growths = [ratio(evidence.quality(second, metric), evidence.quality(first, metric)).value for metric in metrics]
-        largest = max(abs(growth - 1.0) for growth in growths)
+    for first, second in zip(settings, settings[1:], strict=False):
+        largest = max(
+            abs(evidence.quality(second, metric).value / evidence.quality(first, metric).value - 1.0)
+            for metric in metrics
+        )
         texts.append(f"{first.steps} to {second.steps} {100.0 * largest:.2g} %")
     return REMARK, ", ".join(texts)
 
@@ -770,3 +779,17 @@ def gradient_growth(evidence: Evidence, bounds) -> Finding:
     low, high = (float(np.exp(np.log(some).mean())) for some in (norms[:third], norms[-third:]))
     gain = Figure.of(high / low)
     return within(gain, bounds), f"{number_text(gain.value)}x from the lowest to the highest third of sigma"
+
+
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        figure, ranked, leads, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above,
+        saving, mean_saving,
+        jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
+        worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
+        window_gain, steady_over_steps, change_between_steps, moved_by_inputs, drift, better_graded, steady_over_noise,
+        steadier_over_noise, gradient_growth,
+    )
+}  # fmt: skip
+"""Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""

@@ -116,3 +116,9 @@ def local_cost(_) -> Finding:
     share = local / (spectral - 8 * frames * modes * width)
     text = f"two convolutions cost {share:.2f} times the spectral product (T = 32, m = 17, k = 3)"
     return HOLDS if share <= TOLERANCE else FAILS, text
+
+
+KINDS = {
+    kind.__name__: kind for kind in (ve_is_vp, ddim_is_euler, reaches_data, attention_cost, spectral_cost, local_cost)
+}
+"""Kind of judgement, as `claims.toml` names it -> function of the (unused) evidence and its parameters."""
