@@ -10,7 +10,14 @@ from builders import captioned_walks
 from test_text_models import ENCODER, PROFILE, TINY
 
 from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import PAPERS, Bench, asked_frames, measure_text_table, obtain_judge
+from f3amd_lib.experiments.text_tables import (
+    PAPERS,
+    UNCONTROLLED,
+    Bench,
+    asked_frames,
+    measure_text_table,
+    obtain_judge,
+)
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.text_judge import load_judge
@@ -26,7 +33,7 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR
 QUIET = {"progress": False}
 SHIPPED_JUDGE = PRETRAINED_DIR / "bandai" / "text" / "judge.safetensors"
 PLAIN, PREFIX = {"model": "ACMDM-S-PS22", "trained": "tiny"}, {"model": "ACMDM-S-PS2-prefix", "trained": "tiny-prefix"}
-SECTIONS = ("trained on pelvis", "trained on all joints", "noise optimisation", "upper-body edit")
+SECTIONS = ("trained on pelvis", "trained on all joints", "noise optimisation", "upper-body edit", "without control")
 ROWS = {
     "text_table1": [{"model": "ACMDM-S-PS22-raw", "trained": "tiny"}],
     "text_tableA1": [PLAIN | {"cfg": "yes"}, PLAIN | {"cfg": "no"}],
@@ -97,7 +104,10 @@ def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
     assert "text_FID" in table["upper-body edit", "pelvis and feet"].index
     # A branch that knows the pelvis alone is asked about the pelvis alone.
     assert set(table["trained on pelvis"].index.get_level_values("joint")) == {"pelvis"}
+    errors = [table[section, "average", "control_average_error"] for section in (UNCONTROLLED, "trained on all joints")]
+    assert min(errors) > 0 and errors[0] != errors[1]
     weights = tables["text_table3"].groupby("section")["weights"].first()
+    assert weights[UNCONTROLLED] == weights["noise optimisation"]
     assert weights["trained on pelvis"] != weights["trained on all joints"] == weights["upper-body edit"]
 
 

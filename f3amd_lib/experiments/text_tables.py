@@ -68,6 +68,9 @@ HELD = ("pelvis", "left_foot", "right_foot")
 BRANCHES = {"trained on pelvis": PELVIS, "trained on all joints": CONTROL, "upper-body edit": CONTROL}
 """The branch that a section of Table 3 asks; noise is optimised without one."""
 
+UNCONTROLLED = "without control"
+"""A section of ours: how far the network without a branch is from places that it was not told."""
+
 _VARIETY_DRAWS = 2
 """Of as many motions as there are clips; of each caption of the group there are several in each."""
 
@@ -248,10 +251,13 @@ def asked_frames(generator: np.random.Generator, lengths, how_many) -> np.ndarra
 
 
 def _controlled_states(bench: Bench, trained: TextModel, section: str, condition, mask) -> Callable:
-    """Return `states(noise, control)` of a section of Table 3: by the branch, or by optimised noise."""
-    schedule, steps = trained.schedule, bench.settings["num_steps"]
+    """Return `states(noise, control)` of a section of Table 3: by the branch, by optimised noise, or by neither."""
+    schedule = trained.schedule
+    how = {"sampler": schedule.sampler, "num_steps": bench.settings["num_steps"]}
+    if section == UNCONTROLLED:
+        return lambda noise, control: sample_text(trained.network(), schedule, condition, noise, **how)
     if section != "noise optimisation":
-        branch, how = trained.control_branch(), {"sampler": schedule.sampler, "num_steps": steps}
+        branch = trained.control_branch()
         return lambda noise, control: sample_control(
             trained.network(), branch, schedule, condition, control, noise, **how
         )
