@@ -175,6 +175,8 @@ def test_what_notebook_15_says_of_single_changes_follows_from_the_record():
     rows = rows.query("model == 'F3AMD-FNO-96' and seed == 0 and window_frames == 32 and steps in [0, 8]")
     table = rows.pivot(index=["recipe", "windows"], columns="metric", values="value")
     short, longer = (table.xs(windows, level="windows") for windows in (200_000, 400_000))
+    pair = short.loc["residual-prior+higher-learning-rate"]
+    short = short[~short.index.str.contains("+", regex=False)]
     users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise"}
     assert set(short.index[short["x0_error_ratio"] < 0.8]) == users
     assert short["x0_error_ratio"].drop(users).min() > 0.9 and len(short) == 12  # eleven changes and the paper's text
@@ -189,6 +191,14 @@ def test_what_notebook_15_says_of_single_changes_follows_from_the_record():
     assert short["held_out_loss"].idxmin() == "higher-learning-rate"
     assert loss["higher-learning-rate", 200_000] == pytest.approx(loss["paper", 400_000], rel=0.05)
     assert longer["x0_error_ratio"]["higher-learning-rate"] > 0.9
+    # Two changes together.
+    assert pair["held_out_loss"] == pytest.approx(loss["paper", 800_000], rel=0.03)
+    said = {"held_out_loss": 0.186, "x0_error_ratio": 0.17, "seed_spread": 1.9}
+    for name, figure in said.items():
+        assert pair[name] == pytest.approx(figure, rel=0.03), name
+    assert round(loss["paper", 800_000], 3) == 0.189 and round(short["seed_spread"]["paper"], 1) == 0.4
+    for name in ("foot_sliding", "joint_acceleration"):
+        assert pair[name] == pytest.approx(short[name]["higher-learning-rate"], rel=0.06), name
     # A loss is no walk.
     assert (loss["history-anchor"] < loss["paper"].loc[[200_000, 400_000]]).all()
     shaking = table["joint_acceleration"]["history-anchor"]
