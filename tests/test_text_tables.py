@@ -104,8 +104,9 @@ def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
     assert "text_FID" in table["upper-body edit", "pelvis and feet"].index
     # A branch that knows the pelvis alone is asked about the pelvis alone.
     assert set(table["trained on pelvis"].index.get_level_values("joint")) == {"pelvis"}
-    errors = [table[section, "average", "control_average_error"] for section in (UNCONTROLLED, "trained on all joints")]
-    assert min(errors) > 0 and errors[0] != errors[1]
+    # Without control it is the same motions, whatever joint is compared with its places.
+    free = tables["text_control"].query("section == @UNCONTROLLED and metric == 'text_FID'")
+    assert len(free) == 5 * 7 and (free.groupby("frames")["value"].agg(np.ptp) < 1e-6).all()
     weights = tables["text_table3"].groupby("section")["weights"].first()
     assert weights[UNCONTROLLED] == weights["noise optimisation"]
     assert weights["trained on pelvis"] != weights["trained on all joints"] == weights["upper-body edit"]
