@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -67,8 +67,7 @@ def find_recipe(name: str) -> Recipe:
     """
     parts = name.split("+")
     for part in parts:
-        if part not in RECIPES:
-            raise ValueError(f"unknown recipe {part!r}{nearest_hint(part, RECIPES)}")
+        check_known(part, RECIPES, "recipe")
     if len(parts) == 1:
         return RECIPES[name]
     rows = [RECIPES[part] for part in parts]
