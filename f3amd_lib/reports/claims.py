@@ -41,6 +41,7 @@ from f3amd_lib.reports.evidence import (
     check_model,
     paper_evidence,
     recorded_evidence,
+    snapshot_evidence,
 )
 from f3amd_lib.reports.gate import LEAST_SHARE, why_not_judged
 
@@ -332,7 +333,11 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
     """
     root = repository_root() / "paper_figures" if root is None else Path(root)
     datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
-    evidences = {data: [recorded_evidence(root, data, name) for name in profiles] for data in datasets}
+    folders = {data: [(root, data, name) for name in profiles] for data in datasets}
+    snapshots = lambda some: (evidence for folder in some for evidence in snapshot_evidence(*folder))
+    evidences = {
+        data: [*(recorded_evidence(*folder) for folder in some), *snapshots(some)] for data, some in folders.items()
+    }
     return [judge_claim(claim, evidences) for claim in load_claims(paper)]
 
 

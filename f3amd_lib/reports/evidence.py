@@ -20,6 +20,7 @@ from f3amd_lib.ground.names import asked_network, check_known, nearest_hint
 from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
+from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 
@@ -459,6 +460,39 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         return table, record, path.relative_to(root).as_posix()
 
     return Evidence("jax", load)
+
+
+def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
+    """Return what the long queue recorded of the paper's networks, those that saw most windows first.
+
+    Args:
+      root, dataset, profile: as for `recorded_evidence`.
+
+    Returns:
+      Evidence of `quality` for each number of windows: networks by the paper's text alone that all
+      saw so many, means over their seeds, seen through one style classifier, that of most of them.
+    """
+    path = Path(root) / dataset / profile / "records" / "campaign.csv"
+    if not path.exists():
+        return []
+    table, record = read_table(path)
+    table = table[(table["recipe"] == "paper") & (table["steps"] > 0)].fillna({"unit": ""})
+
+    def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
+        networks = rows.groupby("classifier")["run"].nunique()
+        rows = rows[rows["classifier"] == networks.idxmax()]
+        seen = rows[["model", "window_frames"]].drop_duplicates().assign(metric="windows", value=windows)
+        tables = {"quality": intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]), "trained": seen}
+        where = f"{path.relative_to(root).as_posix()} at {windows:,} windows"
+
+        def load(name: str):
+            if name not in tables:
+                raise NoTable(f"no {name}.csv of them")
+            return _checked(name, tables[name], where), record, where
+
+        return Evidence("jax", load)
+
+    return [evidence(windows, rows) for windows, rows in sorted(table.groupby("windows"), reverse=True)]
 
 
 @functools.cache
