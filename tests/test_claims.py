@@ -802,6 +802,42 @@ def test_the_gate_asks_what_a_claim_needs(tmp_path):
     assert judge(keep(tmp_path / "time", CASES["E2"][0]), "E2").verdict == HOLDS
 
 
+def snapshots(root, rows):
+    """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each."""
+    table = [
+        {
+            "run": f"{model}-{recipe}-{seed}", "model": model, "windows": windows, "recipe": recipe, "seed": seed,
+            "classifier": classifier, "window_frames": 32, "steps": 8, "metric": metric, "unit": unit, "value": worth,
+        }
+        for model, windows, recipe, seed, classifier, worth in rows
+        for metric, (unit, _) in NINE_METRICS.items()
+    ]  # fmt: skip
+    record = {"dataset": "bandai", "profile": "laptop", "seed": 0, "device_platform": "cpu", "cores": 2}
+    write_table(root / "bandai" / "laptop" / "records" / "campaign.csv", pd.DataFrame(table), record)
+    (judgement,) = (each for each in claims.judge_claims(root) if each.claim.id == "Q10")
+    return judgement
+
+
+def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_path):
+    models = [FNO, "F3AMD-DCT-96", "F3AMD-weighted-FNO-96", "F3AMD-reduced-rank-FNO-96"]
+    alike = [(model, 200_000, "paper", 0, "one", 1.0) for model in models]
+    # Other recipes, lengths and classifiers are other networks.
+    others = [(FNO, 200_000, "wide-decoder", 0, "one", 9.0), (FNO, 400_000, "paper", 0, "one", 9.0)]
+    others.append((FNO, 200_000, "paper", 2, "another", 9.0))
+    judgement = snapshots(tmp_path, [*alike, *others])
+    assert judgement.verdict == UNJUDGED and judgement.ours[0].figure == "alike in 9 of 9"
+    assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
+    assert "at 200,000 windows" in str(judgement.ours[0].sources[0])
+    # Seeds are averaged, and two that differ have a wide interval.
+    seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "one", 1.2)])
+    assert f"FID 1.1x ({FNO} over" in seeds.ours[0].figure
+    # Nonsense: one of them is twice as bad, or one of them is missing at this length.
+    apart = [*alike[:3], (models[3], 200_000, "paper", 0, "one", 2.0)]
+    assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("alike in 0 of 9")
+    missing = [*alike[:3], (models[3], 400_000, "paper", 0, "one", 1.0)]
+    assert snapshots(tmp_path / "missing", missing).verdict == UNMEASURED
+
+
 @pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])
 def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, skates, verdict):
     """Q4 says that CAMDM fails with 64 frames, and so that one need not walk."""
