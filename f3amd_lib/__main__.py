@@ -693,13 +693,12 @@ def measure(
     from f3amd_lib.experiments.measure import MEASUREMENTS
     from f3amd_lib.experiments.text_probes import TEXT_MEASUREMENTS
     from f3amd_lib.ground.files import locked
-    from f3amd_lib.ground.names import nearest_hint
+    from f3amd_lib.ground.names import check_known
     from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.networks import presets
 
     for name in names:
-        if name not in (known := [*MEASUREMENTS, *TEXT_MEASUREMENTS]):
-            raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, known)}")
+        check_known(name, [*MEASUREMENTS, *TEXT_MEASUREMENTS], "measurement")
     if of_text := [name for name in names if name in TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")

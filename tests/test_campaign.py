@@ -170,4 +170,4 @@ def test_what_is_named_is_trained_and_nothing_else(packed, tmp_path, monkeypatch
 )
 def test_a_name_that_is_not_in_the_queue_is_refused(packed, tmp_path, monkeypatch, only, nearest):
     call = lambda: run(packed, (None, None), tmp_path, [(MIXED, 4), (SEEDED, 4)], monkeypatch, only=["paper", only])
-    refused(f"the queue has no '{only}'; did you mean '{nearest}'", call)
+    refused(f"unknown name in the queue '{only}'; did you mean '{nearest}'", call)

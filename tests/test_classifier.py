@@ -421,7 +421,9 @@ def test_a_style_without_clips_long_enough_is_named():
 
 
 def test_what_cannot_be_trained_is_refused(packed):
-    refused("no style 'Zomby'; did you mean 'Zombie'", train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING)
+    refused(
+        "style of data set 'tiny': 'Zomby'; did you mean 'Zombie'", train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING
+    )
     refused("at least two styles", train_classifier, packed, styles=("Runner",), **TRAINING)
     refused("each named once", train_classifier, packed, styles=("Runner", "Runner"), **TRAINING)
     refused("at least 1 step and batches of 2", train_classifier, packed, **{**TRAINING, "batch_size": 1})
@@ -458,7 +460,7 @@ def test_windows_of_the_wrong_kind_are_refused(trained):
 
 def test_unknown_styles_and_references_are_refused(trained):
     assert trained.style_index("Runner") == 1
-    refused("not trained on style 'runer'; did you mean 'Runner'", trained.style_index, "runer")
+    refused("unknown style of the classifier 'runer'; did you mean 'Runner'", trained.style_index, "runer")
     refused("'runer'", trained.reference, "train", "runer")
     refused("unknown reference 'test'", trained.reference, "test")
 

@@ -40,7 +40,7 @@ def zip_folder(folder: Path, target: Path, prefix: str = "") -> Path:
 
 
 def test_unknown_names_are_refused():
-    refused("unknown data set 'bandia': use one of synthetic, bandai", open_dataset, "bandia")
+    refused("unknown data set 'bandia'; did you mean 'bandai'", open_dataset, "bandia")
     refused("num_styles must be at least 1", open_dataset, "synthetic", num_styles=0)
 
 

@@ -85,7 +85,7 @@ def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
         (["wolking"], [A], "walking"),
         (["recipes"], [A], "not measured by preset: f3amd measure recipes"),
         (["walking"], ["F3AMD-FNO-33"], "F3AMD-FNO-32"),
-        (["campaign"], ["CAMDM"], "the queue has no 'CAMDM'"),
+        (["campaign"], ["CAMDM"], "unknown model of the queue 'CAMDM'"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(names, models, told):

@@ -159,7 +159,7 @@ def test_stride_takes_every_third_start(packed):
 
 
 def test_unknown_splits_and_short_clips_are_refused(packed):
-    refused("'training': use one of train, validation, test", build_windows, packed, "training", **SIZES)
+    refused("unknown split 'training'; did you mean 'train'", build_windows, packed, "training", **SIZES)
     refused("'tiny' has no test clip of at least 36 frames", build_windows, packed, "test", window=32, num_history=4)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import usable_cores
 
 PRECISIONS = {
@@ -31,8 +32,7 @@ def matmul_precision(precision: str):
     Raises:
       ValueError: for an unknown precision.
     """
-    if precision not in PRECISIONS:
-        raise ValueError(f"unknown precision {precision!r}: use one of {', '.join(PRECISIONS)}")
+    check_known(precision, PRECISIONS, "precision")
     return jax.default_matmul_precision(PRECISIONS[precision][0])
 
 

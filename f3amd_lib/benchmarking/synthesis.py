@@ -27,6 +27,7 @@ from f3amd_lib.benchmarking.implementations import (
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,7 @@ def check_suites(names: Iterable[str]) -> list[str]:
     """Return the names as a list; ValueError for an unknown one."""
     names = list(names)
     for name in names:
-        if name not in suites():
-            raise ValueError(f"unknown suite {name!r}: use some of {', '.join(suites())}")
+        check_known(name, suites(), "suite")
     return names
 
 

@@ -16,6 +16,7 @@ from f3amd_lib.benchmarking.implementations import Workload, compile_round
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.f3amd import F3AMD
 from f3amd_lib.networks.spectral import FNOBlock, FrameLayer
@@ -68,8 +69,7 @@ def without(network: F3AMD, part: str) -> F3AMD:
     config = network.config
     if not isinstance(network, F3AMD) or config.base_block != "fno" or config.conditioning != "film":
         raise ValueError("parts are known of F3AMD networks of Fourier blocks with FiLM only")
-    if part not in PARTS[:-1]:
-        raise ValueError(f"unknown part {part!r}: use one of {', '.join(PARTS[:-1])}")
+    check_known(part, PARTS[:-1], "part")
     left = nnx.clone(network)
     if part == "FiLM":
         left.conditionings = nnx.List([_NoFiLM() for _ in left.conditionings])

@@ -17,7 +17,7 @@ import numpy as np
 
 from f3amd_lib.benchmarking.machine import usable_cores
 from f3amd_lib.diffusion.samplers import ddim_step, ddpm_step
-from f3amd_lib.ground.names import check_known, nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks.attention import position_code
 from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE, CAMDMConfig, step_features
 from f3amd_lib.networks.conditioning import Condition, noise_features
@@ -309,8 +309,7 @@ def torch_round(
       ValueError: for an unknown sampler or runtime, or sigmas that make no step.
     """
     for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
-        if given not in known:
-            raise ValueError(f"unknown {what} {given!r} of PyTorch{nearest_hint(given, known)}")
+        check_known(given, known, f"PyTorch {what}")
     config, device, sigmas = module.config, module.code.device, np.array(sigmas, np.float32)
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")

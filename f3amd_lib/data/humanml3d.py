@@ -27,7 +27,7 @@ from tqdm import tqdm
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
 from f3amd_lib.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, UNIT, TextMotions, text_motions
 from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
@@ -39,8 +39,7 @@ _SPLIT_FILES = dict(zip(SPLITS, ("train.txt", "val.txt", "test.txt"), strict=Tru
 
 def layout_skeleton(layout: str) -> Skeleton:
     """Return the skeleton of a published layout, bones of length 1; ValueError for another name."""
-    if layout not in LAYOUTS:
-        raise ValueError(f"unknown layout {layout!r}{nearest_hint(layout, LAYOUTS)}")
+    check_known(layout, LAYOUTS, "layout")
     described = LAYOUTS[layout]
     rest = [[(axis == way[-1:]) * (-1.0 if way[:1] == "-" else 1.0) for axis in "xyz"] for way in described["rest"]]
     return Skeleton(described["joints"], described["parents"], rest)

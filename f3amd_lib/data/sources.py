@@ -32,6 +32,7 @@ import numpy as np
 import pooch
 
 from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
@@ -119,8 +120,7 @@ def open_dataset(
       ValueError: for an unknown name, or for data that is absent, broken, truncated or altered:
         naming the file and what to do.
     """
-    if name not in NAMES:
-        raise ValueError(f"unknown data set {name!r}: use one of {', '.join(NAMES)}")
+    check_known(name, NAMES, "data set")
     if num_styles is not None and num_styles < 1:
         raise ValueError(f"num_styles must be at least 1, got {num_styles}")
     if name == "synthetic":

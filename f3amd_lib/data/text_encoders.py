@@ -29,7 +29,7 @@ import pooch
 
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 
 MOST_TOKENS = 32
 """Longer captions are refused: what was cut off could not be seen in the motion."""
@@ -263,8 +263,7 @@ def load_text_encoder(name: str = "wordllama", folder=None) -> TextEncoder:
       ValueError: for an unknown name, or weights that are not there.
       ImportError: naming the package that is missing.
     """
-    if name not in ENCODERS:
-        raise ValueError(f"unknown text encoder {name!r}{nearest_hint(name, ENCODERS)}")
+    check_known(name, ENCODERS, "text encoder")
     return load_wordllama() if name == "wordllama" else _load_transformers(name, folder)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from f3amd_lib.data.captions import CAPTIONED, compose_captions, other_side, plain_style, shown_content
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.redundant import canonical_start, essential_features, joint_features, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
@@ -128,8 +128,7 @@ class TextMotions:
 
     def members(self, split: str) -> np.ndarray:
         """Return the numbers of a split's clips; ValueError for an unknown split or an empty one."""
-        if split not in SPLITS:
-            raise ValueError(f"unknown split {split!r}{nearest_hint(split, SPLITS)}")
+        check_known(split, SPLITS, "split")
         members = np.flatnonzero(np.equal(self.splits, split))
         if not len(members):
             raise ValueError(f"data set {self.name!r} has no clip in its {split} split")

@@ -29,6 +29,7 @@ from f3amd_lib.data.features import (
 )
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Skeleton, mirror
 
@@ -138,8 +139,7 @@ def build_windows(
     names = tuple(styles) or packed.styles
     if missing := set(packed.styles) - set(names):
         raise ValueError(f"the model does not know the style {min(missing)!r} of this data set")
-    if split not in SPLITS:
-        raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
+    check_known(split, SPLITS, "split")
     mirrored = split == "train" if mirrored is None else mirrored
     frames, paths, starts, room, labels = [], [], [], [], []
     offset = 0

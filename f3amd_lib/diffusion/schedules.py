@@ -89,8 +89,7 @@ class NoiseSchedule:
         """
         if num_steps < 1:
             raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
-        if spacing not in ("endpoints", "uniform", "leading"):
-            raise ValueError(f"unknown spacing {spacing!r}: use 'endpoints', 'uniform' or 'leading'")
+        check_known(spacing, ("endpoints", "uniform", "leading"), "spacing")
         if spacing == "leading" and self.levels is None:
             raise ValueError(f"spacing 'leading' counts levels, and {self.kind} is continuous: use 'endpoints'")
         if self.levels is None:

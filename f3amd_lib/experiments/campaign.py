@@ -26,7 +26,7 @@ from f3amd_lib.experiments.recipes import find_recipe
 from f3amd_lib.experiments.runner import Records
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record
@@ -137,8 +137,7 @@ def run_campaign(
     """
     snapshots, only = queue() if snapshots is None else snapshots, list(only)
     for name in only:
-        if name not in (queued := {name for run, _ in snapshots for name in run.names}):
-            raise ValueError(f"the queue has no {name!r}{nearest_hint(name, queued)}")
+        check_known(name, {name for run, _ in snapshots for name in run.names}, "name in the queue")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     stop_at = None if budget_s is None else time.monotonic() + budget_s
     record = run_record(

@@ -39,7 +39,7 @@ from f3amd_lib.experiments.real_clips import (
 )
 from f3amd_lib.experiments.rollout_measures import by_round, motion_figures
 from f3amd_lib.generation.rollout import MotionGenerator, Rollout
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.measures import distributions
 from f3amd_lib.measures.classifier import StyleClassifier, require_telling_styles
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
@@ -396,8 +396,7 @@ def measure_real(
     Raises:
       ValueError: for an unknown model, or as `measure_model`.
     """
-    if model not in REFERENCE_MODELS:
-        raise ValueError(f"unknown reference {model!r}{nearest_hint(model, REFERENCE_MODELS)}")
+    check_known(model, REFERENCE_MODELS, "reference")
     require_telling_styles(classifier)
     clips, labels = _held_out_clips(packed, protocol.styles, window)
     motions, figures = [], []

@@ -15,6 +15,7 @@ import numpy as np
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.root_paths import RootPath, path_from_motion, tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Motion
@@ -179,8 +180,7 @@ def reference_clips(
     Raises:
       ValueError: for an unknown style or split, or if no clip is left.
     """
-    if split not in SPLITS:
-        raise ValueError(f"unknown split {split!r}: use one of {', '.join(SPLITS)}")
+    check_known(split, SPLITS, "split")
     held_out = np.asarray(packed.clip_split) == SPLITS.index(split)
     long_enough = np.diff(packed.clip_start) > window + 1
     clips = []

@@ -29,7 +29,7 @@ import pandas as pd
 from f3amd_lib.experiments.campaign import Run, run_campaign
 from f3amd_lib.experiments.measure import MEASUREMENTS, protocol_of
 from f3amd_lib.ground.files import locked, whole_file
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
 from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
 from f3amd_lib.networks import presets
@@ -134,8 +134,7 @@ def plan(
     for name in names:
         if name in NOT_BY_PRESET:
             raise ValueError(f"{name} is not measured by preset: f3amd measure {name}")
-        if name not in (known := [CAMPAIGN, *_swept()]):
-            raise ValueError(f"unknown measurement {name!r}{nearest_hint(name, known)}")
+        check_known(name, [CAMPAIGN, *_swept()], "measurement")
     asked = list(dict.fromkeys(presets.find_preset(model).name for model in models))
     # Of two measurements of a preset that train it, the training is one leg.
     legs: dict[str, Leg] = {}
@@ -169,8 +168,7 @@ def _of_preset(name: str, model: str) -> list[Leg]:
 def _of_queue(asked: Sequence[str], snapshots: Sequence[tuple[Run, int]]) -> Iterator[Leg]:
     """Yield the legs of the queue: each snapshot goes on from the one before of its run."""
     for model in asked:
-        if model not in (known := {run.preset for run, _ in snapshots}):
-            raise ValueError(f"the queue has no {model!r}{nearest_hint(model, known)}")
+        check_known(model, {run.preset for run, _ in snapshots}, "model of the queue")
     last: dict[str, str] = {}
     for run, windows in snapshots:
         if not asked or run.preset in asked:

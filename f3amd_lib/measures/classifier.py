@@ -31,7 +31,7 @@ from flax import nnx
 
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
-from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
@@ -242,10 +242,7 @@ class StyleClassifier:
 
     def style_index(self, style: str) -> int:
         """Return a style's class number; ValueError names the nearest one known."""
-        if style not in self.styles:
-            raise ValueError(
-                f"the style classifier was not trained on style {style!r}{nearest_hint(style, self.styles)}"
-            )
+        check_known(style, self.styles, "style of the classifier")
         return self.styles.index(style)
 
     def windows_of(self, positions, skeleton: Skeleton) -> np.ndarray:
@@ -324,8 +321,7 @@ class StyleClassifier:
         Raises:
           ValueError: for an unknown split or style.
         """
-        if split not in self.references:
-            raise ValueError(f"unknown reference {split!r}{nearest_hint(split, self.references)}")
+        check_known(split, self.references, "reference")
         known = self.references[split]
         if style is None:
             return known.features
@@ -537,8 +533,7 @@ def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
     """Return the classes: those asked for, or the primary ones."""
     chosen = tuple(packed.primary_styles if styles is None else styles)
     for style in chosen:
-        if style not in packed.styles:
-            raise ValueError(f"data set {packed.dataset!r} has no style {style!r}{nearest_hint(style, packed.styles)}")
+        check_known(style, packed.styles, f"style of data set {packed.dataset!r}:")
     if len(set(chosen)) != len(chosen) or len(chosen) < 2:
         raise ValueError(
             f"a style classifier needs at least two styles, each named once; got {len(chosen)} "

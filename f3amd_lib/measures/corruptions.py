@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from f3amd_lib.data.features import motion_from_frames, split_frames, world_frames
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices
 from f3amd_lib.motion.skeleton import Motion
 
@@ -147,6 +147,5 @@ def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) 
     Raises:
       ValueError: for an unknown name, and as the recipe itself.
     """
-    if name not in CORRUPTIONS:
-        raise ValueError(f"unknown corruption {name!r}{nearest_hint(name, CORRUPTIONS)}")
+    check_known(name, CORRUPTIONS, "corruption")
     return CORRUPTIONS[name](motion, strength, seed)

@@ -10,7 +10,7 @@ import dataclasses
 
 import pandas as pd
 
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
@@ -76,8 +76,7 @@ def readings_table(*topics: str, paper: str = "f3amd") -> pd.DataFrame:
     readings = load_paper_file("readings", paper)["reading"]
     known = list(dict.fromkeys(reading["topic"] for reading in readings))
     for topic in topics:
-        if topic not in known:
-            raise ValueError(f"unknown topic {topic!r}: use one of {', '.join(known)}")
+        check_known(topic, known, "topic")
     return pd.DataFrame(
         {
             "topic": reading["topic"],

@@ -24,6 +24,7 @@ from safetensors.flax import save_file
 from f3amd_lib.data.features import Normaliser, frame_positions
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.networks.presets import build_from_config, config_from_dict
@@ -234,8 +235,7 @@ class TrainedModel:
 
     def style_index(self, style: str) -> int:
         """Return a style's place in the one-hot vector; ValueError lists the styles."""
-        if style not in self.styles:
-            raise ValueError(f"unknown style {style!r}; this model knows {', '.join(self.styles)}")
+        check_known(style, self.styles, "style")
         return self.styles.index(style)
 
 

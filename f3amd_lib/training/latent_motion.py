@@ -29,7 +29,7 @@ from f3amd_lib.diffusion.phases import (
     target_end,
 )
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.networks.motionpcm import (
     DiscriminatorConfig,
@@ -98,8 +98,7 @@ class LatentMotionTraining:
     seed: int = 1234
 
     def __post_init__(self):
-        if self.consistency not in CONSISTENCIES:
-            raise ValueError(f"unknown consistency {self.consistency!r}{nearest_hint(self.consistency, CONSISTENCIES)}")
+        check_known(self.consistency, CONSISTENCIES, "consistency")
         if self.consistency == "latent" and (self.num_phases > 1 or self.adversarial_weight):
             raise ValueError(
                 "consistency 'latent' has no phases and no discriminator: num_phases 1, adversarial_weight 0"

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from f3amd_lib.data.features import frame_positions
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
 
 LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "floor", "ird")
@@ -53,8 +54,7 @@ class LossWeights:
 
 
 def _check_ird_form(ird_form: str) -> None:
-    if ird_form not in ("literal", "excess"):
-        raise ValueError(f"ird_form must be 'literal' or 'excess', got {ird_form!r}")
+    check_known(ird_form, ("literal", "excess"), "ird_form")
 
 
 def _mean(values, weights):

@@ -21,7 +21,7 @@ from f3amd_lib.data.text_motions import ClipTable, draw_clips
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import nearest_hint, refuse_unknown
+from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
@@ -84,8 +84,7 @@ class TextMotionTraining:
 
     def __post_init__(self):
         object.__setattr__(self, "drops", tuple(self.drops))
-        if self.schedule not in _SCHEDULES:
-            raise ValueError(f"unknown schedule {self.schedule!r}{nearest_hint(self.schedule, _SCHEDULES)}")
+        check_known(self.schedule, _SCHEDULES, "schedule")
         whole, shares = (
             ("num_steps", "batch_size", "warmup_steps", "unit", "window"),
             ("text_dropout", "control_dropout"),
@@ -136,8 +135,7 @@ def text_motion_recipe(part: str, num_steps: int, preset: str | None = None, **s
 def part_recipe(paper: str, training: type, part: str, num_steps: int, preset: str | None, settings: dict):
     """Return a `training` from a paper's recipe of a part, what the preset itself says, and settings, in this order."""
     recipes = load_paper_file("recipes", paper)
-    if part not in recipes:
-        raise ValueError(f"unknown recipe {part!r}{nearest_hint(part, recipes)}")
+    check_known(part, recipes, "recipe")
     own = {} if preset is None else find_preset(preset).training
     values = {**recipes[part]["training"], **own, **settings}
     refuse_unknown(values, training, "training setting")
