@@ -42,7 +42,6 @@ from f3amd_lib.networks.acmdm_control import Control
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.evaluator_task import EvaluatorTraining
 from f3amd_lib.training.latent_models import LatentModel, is_latent_preset, train_latent_model
-from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.text_models import (
     CONTROL,
     JUDGE,
@@ -50,6 +49,7 @@ from f3amd_lib.training.text_models import (
     TextModel,
     controlled_joints,
     preset_and_branch,
+    shipped_for,
     text_model_files,
     train_text_model,
 )
@@ -434,10 +434,8 @@ def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, f
     files = text_model_files(profile, JUDGE, folder=folder)
     if files.model.exists():
         return load_judge(files.model)
-    if (shipped := PRETRAINED_DIR / data.name / "text" / files.model.name).exists():
-        judge = load_judge(shipped)
-        if (judge.record["dataset_fingerprint"], judge.text_encoder) == (data.fingerprint, encoder.identity):
-            return judge
+    if shipped := shipped_for(files.model.stem, data, encoder, load_judge):
+        return shipped
     # A check of the way needs no judge that sees.
     training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
     judge = train_judge(data, encoder, training, checkpoint=files.state, **leg)

@@ -63,7 +63,8 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
 
 def _filled(name: str, path: Path, trained, params, **fields) -> str:
     """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
-    record, history = trained.record, read_table(path.with_name(f"{path.stem}.history.csv"))[0]
+    record, history = trained.record, path.with_name(f"{path.stem}.history.csv")
+    loss = read_table(history)[0]["held_out_loss"].dropna().iloc[-1] if history.exists() else None
     return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(params)),
@@ -71,7 +72,7 @@ def _filled(name: str, path: Path, trained, params, **fields) -> str:
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
         cores=counted_cores(record),
-        loss=history["held_out_loss"].dropna().iloc[-1], **fields,
+        loss=loss, **fields,
     )  # fmt: skip
 
 
@@ -230,7 +231,7 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     """
     path = Path(path)
     judge = load_judge(path)
-    record, digest, measured = judge.record, weights_digest(judge.params), "Not measured yet."
+    digest, measured = weights_digest(judge.params), "Not measured yet."
     if seen is not None and seen[1]["judge_weights"] == digest:
         table, shown = seen[0], ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
         wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), shown]
@@ -239,11 +240,7 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
             "Asked about real held-out clips and about clips that are wrong on purpose "
             f"(means of {seen[1]['settings']['repeats']} repeats):\n\n{markdown_table(wide.reset_index(), digits=3)}"
         )
-    return Path(__file__).with_name("judge_card.template").read_text(encoding="utf-8").format(
-        judge=judge, record=record, file=path.name, megabytes=path.stat().st_size / 1e6, training=record["training"],
-        count=sum(leaf.size for leaf in jax.tree.leaves(judge.params)), terms=_terms(record), digest=digest,
-        cores=counted_cores(record), date=record["date_utc"][:10], commit=record["git_commit"][:10], measured=measured,
-    )  # fmt: skip
+    return _filled("judge_card", path, judge, judge.params, digest=digest, measured=measured)
 
 
 def _terms(record: dict) -> str:

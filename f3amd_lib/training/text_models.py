@@ -401,7 +401,7 @@ def train_text_model(
         asked = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
         before = load_text_model(lies) if lies.exists() else None
         if before is None and branch:
-            before = _shipped(earlier, data, encoder)
+            before = shipped_for(earlier, data, encoder)
         before = before or train_text_model(data, encoder, profile, earlier, **asked)
         if before is None:
             return None
@@ -451,10 +451,10 @@ def train_text_model(
     return load_text_model(files.model)
 
 
-def _shipped(name: str, data: TextMotions, encoder: TextEncoder) -> TextModel | None:
+def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, load=load_text_model):
     """Return the model of this name that ships, if it was trained on these very motions with this encoder."""
     path = PRETRAINED_DIR / data.name / "text" / f"{name}.safetensors"
-    found = load_text_model(path) if path.exists() else None
+    found = load(path) if path.exists() else None
     known = found and (found.record["dataset_fingerprint"], found.text_encoder) == (data.fingerprint, encoder.identity)
     return found if known else None
 
