@@ -117,7 +117,7 @@ def test_first_step_is_adams_and_average_follows_by_formula():
 
 
 def test_what_makes_gradients_fast_changes_no_number():
-    """Weights of any rank and their gradients stay; a barrier stands at matrices and stacks of them."""
+    """Weights of any rank and their gradients stay; a barrier stands in the gradient of matrices."""
     shapes = {"scalar": (), "bias": (5,), "matrix": (3, 5), "stack": (4, 3, 5), "kernel": (2, 2, 3, 5)}
     keys = jax.random.split(jax.random.key(0), len(shapes))
     params = {name: jax.random.normal(key, shape) for key, (name, shape) in zip(keys, shapes.items(), strict=True)}
@@ -127,7 +127,7 @@ def test_what_makes_gradients_fast_changes_no_number():
     fast = jax.grad(lambda params: loss(_with_fast_gradients(params)))
     for found, wanted in zip(*map(jax.tree.leaves, (fast(params), jax.grad(loss)(params))), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
-    assert str(jax.make_jaxpr(_with_fast_gradients)(params)).count("optimization_barrier") == 2
+    assert str(jax.make_jaxpr(fast)(params)).count("optimization_barrier") == 1
 
 
 def test_without_an_average_the_weights_are_what_is_evaluated(finished):

@@ -86,6 +86,15 @@ def test_a_clip_is_followed_from_its_own_first_frames(packed):
         real_clips.follow_clip(packed, 4, num_history=5, num_frames=1000)
 
 
+def test_the_longest_held_out_clip_of_a_style_is_followed():
+    held_out = [(stiff_walk(step, frames), 0, 2) for step, frames in ((0.041, 60), (0.039, 90), (0.04, 70))]
+    packed = packed_from([(stiff_walk(0.04, 200), 0, TRAIN), (stiff_walk(0.04, 200), 1, TRAIN), *held_out])
+    found = real_clips.follow_longest(packed, "calm", num_history=5, num_frames=20)
+    wanted = real_clips.follow_clip(packed, 3, num_history=5, num_frames=20)
+    np.testing.assert_array_equal(found[0], wanted[0])
+    np.testing.assert_array_equal(found[2].positions, wanted[2].positions)
+
+
 def test_path_statistics_of_a_line_and_of_a_circle():
     line = path_statistics([named_path("straight", 300, speed=1.5, ramp_seconds=0.0)])
     assert line["speed_m_s"] == pytest.approx(1.5, rel=1e-3)

@@ -200,6 +200,15 @@ def reference_clips(
     return clips
 
 
+def follow_longest(
+    packed: PackedMotion, style: str, *, num_history: int, num_frames: int
+) -> tuple[np.ndarray, RootPath, Motion]:
+    """Return what `follow_clip` does of the longest held-out clip of a style."""
+    clips = reference_clips(packed, [style], window=num_frames)
+    longest = max(clips, key=lambda clip: packed.motion(clip).num_frames)
+    return follow_clip(packed, longest, num_history=num_history, num_frames=num_frames)
+
+
 def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
     """Describe paths, or the tracks of real clips, by how they move and turn.
 

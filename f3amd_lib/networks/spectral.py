@@ -19,7 +19,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.networks.config import scaled_normal
+from f3amd_lib.networks.config import scaled_normal, with_fast_gradient
 
 SPECTRAL_VARIANTS = ("fourier", "cosine", "reduced_rank", "weighted")
 """Spectral layers of Table 8: Eq. 2; the discrete cosine transform; factorised weights; gains."""
@@ -255,8 +255,8 @@ class TemporalConvolution(FrameLayer):
         """Map [T, B, D0] to [T, B, D1]."""
         kernel = self.kernel[...]
         taps, width_in, width_out = kernel.shape
-        one_below_the_other = jnp.swapaxes(kernel, 1, 2).reshape(taps * width_out, width_in)
-        answers = jnp.split(z @ one_below_the_other.T, taps, axis=-1)
+        side_by_side = jnp.moveaxis(kernel, 0, 1).reshape(width_in, taps * width_out)
+        answers = jnp.split(z @ with_fast_gradient(side_by_side), taps, axis=-1)
         before = (taps - 1) // 2
         beyond = ((before, taps - 1 - before), (0, 0), (0, 0))
         shifted = [jnp.pad(a, beyond)[tap : tap + len(z)] for tap, a in enumerate(answers)]

@@ -24,6 +24,7 @@ import optax
 from jax.sharding import Mesh
 from tqdm import tqdm
 
+from f3amd_lib.networks.config import with_fast_gradient
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 
@@ -113,18 +114,8 @@ def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
 
 
 def _with_fast_gradients(params):
-    """Return the same weights in such a way that a CPU multiplies fast for their gradient.
-
-    JAX writes the gradient of z W as (g^T z)^T. XLA's compiler for CPUs turns that into z^T g with a copy of g whose
-    axes are swapped, for which it has only a slow product. A barrier between that transpose and another prevents this.
-    """
-
-    def guarded(weight):
-        if jnp.ndim(weight) not in (2, 3):
-            return weight
-        return jnp.swapaxes(jax.lax.optimization_barrier(jnp.swapaxes(weight, -1, -2)), -1, -2)
-
-    return jax.tree.map(guarded, params)
+    """Return the same weights, all matrices among them `with_fast_gradient`."""
+    return jax.tree.map(lambda weight: with_fast_gradient(weight) if jnp.ndim(weight) == 2 else weight, params)
 
 
 @functools.partial(jax.jit, static_argnames=("length", "mesh"), donate_argnames="state")
