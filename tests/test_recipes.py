@@ -7,9 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_trained, wandering_motion
+from scipy import stats
 
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, recipes
+from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
@@ -203,3 +205,69 @@ def test_what_notebook_15_says_of_single_changes_follows_from_the_record():
     assert (loss["history-anchor"] < loss["paper"].loc[[200_000, 400_000]]).all()
     shaking = table["joint_acceleration"]["history-anchor"]
     assert shaking[200_000] > 5 * shaking[400_000]
+
+
+def test_what_notebook_15_says_of_length_follows_from_the_record():
+    records = repository_root() / "paper_figures/bandai/laptop/records"
+    rows, _ = read_table(records / "campaign.csv")
+    rows = rows.query("model == 'F3AMD-FNO-96' and window_frames == 32 and steps in [0, 8]")
+    of = lambda run: rows[rows["run"] == f"F3AMD-FNO-96-{run}"].pivot(index="windows", columns="metric", values="value")
+    eyes = lambda run: rows[rows["run"] == f"F3AMD-FNO-96-{run}"].groupby("windows")["classifier"].first()
+    long, thousand = of("seed0"), 1000
+    assert long.index.tolist() == [200 * thousand, 400 * thousand, 800 * thousand, 1600 * thousand]
+    least, middle, most = (long.loc[windows * thousand] for windows in (200, 800, 1600))
+    assert middle["FID"] / least["FID"] == pytest.approx(1 / 5, rel=0.1)
+    assert middle["foot_sliding"] / least["foot_sliding"] == pytest.approx(0.75, abs=0.02)
+    assert eyes("seed0").tolist()[:3] == eyes("seed0").tolist()[:1] * 3 != [eyes("seed0").iloc[3]] * 3
+    assert [round(one["x0_error_ratio"], 2) for one in (least, most)] == [0.96, 0.92]
+    leaves = (long["held_out_loss"] / long["held_out_loss"].shift())[1:]
+    assert (100 * leaves).round().tolist() == [81, 84, 86]
+    # The resting foot hardly changes.
+    real = read_table(records / "quality.csv")[0].query("model == 'real'").set_index("metric")["value"]
+    assert round(most["foot_alternation"], 2) == 0.08 and round(real["foot_alternation"], 1) == 1.9
+    # Where a power law would end at the paper's length: three times what real joints tremble, or less than they do.
+    x, y = np.log(long.index.to_numpy(float)), np.log(long["joint_acceleration"].to_numpy())
+    fit = stats.linregress(x, y)
+    end = fit.intercept + fit.slope * np.log(199_478_800)
+    scatter = np.sqrt(np.sum((y - fit.intercept - fit.slope * x) ** 2) / 2)
+    away = (np.log(199_478_800) - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2)
+    half = stats.t.ppf(0.975, 2) * scatter * np.sqrt(1 / 4 + away)
+    low, high = np.exp([end - half, end + half]) / real["joint_acceleration"]
+    assert low < 0.5 and high == pytest.approx(3, rel=0.1)
+    # Two changes, seen by the same classifier as another seed of the paper's text.
+    pair = "residual-prior+higher-learning-rate-seed0"
+    assert eyes(pair).iloc[0] == eyes("seed1").iloc[0]
+    assert [round(of(run).loc[200 * thousand, "FID"]) for run in (pair, "seed1")] == [50, 133]
+
+
+def test_what_notebook_15_says_of_ablations_follows_from_the_record():
+    rows, _ = read_table(repository_root() / "paper_figures/bandai/laptop/records/campaign.csv")
+    asked = "recipe == 'paper' and windows == 200_000 and window_frames == 32 and steps in [0, 8]"
+    rows = rows.query(asked)
+    eyes = rows["classifier"].value_counts().idxmax()
+    table = rows[rows["classifier"] == eyes].pivot(index="model", columns="metric", values="value")
+    variants, base = table.drop("F3AMD-FNO-96"), table.loc["F3AMD-FNO-96"]
+    seeds = rows[rows["model"] == "F3AMD-FNO-96"].pivot(index="run", columns="metric", values="value")
+    assert (variants["held_out_loss"] / base["held_out_loss"]).between(0.9, 1.2).all()
+    assert table["FID"].max() / table["FID"].min() == pytest.approx(5, rel=0.1)
+    said = {"F3AMD-FNO-96": 133, "F3AMD-FNO-96-linear": 269, "F3AMD-reduced-rank-FNO-96": 119, "F3AMD-FNO-96-m1": 341}
+    said |= {"F3AMD-FNO-96-m4": 284, "F3AMD-FNO-96-AdaLN-zero": 132, "F3AMD-FNO-96-cross-attention": 70}
+    assert table["FID"][list(said)].round().to_dict() == said
+    printed = pd.concat(load_paper_table(number) for number in (8, 9, 10)).query("metric == 'FID'")
+    printed = printed.set_index("model")["value"].groupby(level=0).first()
+    table_8 = ["F3AMD-FNO-96", "F3AMD-DCT-96", "F3AMD-weighted-FNO-96", "F3AMD-reduced-rank-FNO-96"]
+    assert table["FID"][table_8].idxmin() == printed[table_8].idxmin() == "F3AMD-reduced-rank-FNO-96"
+    figures = [0.189, 0.173, 0.271, 0.203, 0.181]
+    labels = ("(FNO enc/dec)", "(linear enc/dec)", ", m=1", ", m=4")
+    whole, linear, one, four = (printed[f"F3AMD-FNO-96{' ' * (label[0] == '(')}{label}"] for label in labels)
+    assert [whole, printed["F3AMD-reduced-rank-FNO-96"], linear, one, four] == figures
+    assert table["FID"].idxmin() == "F3AMD-FNO-96-cross-attention"
+    table_11 = load_paper_table(11).query("metric == 'FID'").set_index("model")["value"]
+    named = [f"F3AMD-FNO-96 ({name})" for name in ("FiLM", "AdaLN-zero", "cross-attention")]
+    assert table_11[named].tolist() == [0.189, 0.169, 0.173] and "F3AMD-FNO-96-concatenation" not in table.index
+    # The one with a way around its blocks looks at its noise.
+    ratios = variants["x0_error_ratio"]
+    assert round(ratios.pop("F3AMD-FNO-96-AdaLN-zero"), 2) == 0.71 and (ratios > 0.95).all()
+    # All slide; two seeds differ by a quarter.
+    assert (variants["foot_sliding"] > 0.8).all()
+    assert seeds["trajectory_error"].max() / seeds["trajectory_error"].min() == pytest.approx(1.27, abs=0.03)
