@@ -2,7 +2,7 @@
 
     python scripts/snapshot_walks.py runs/bandai/laptop/campaign/F3AMD-FNO-96-seed0/*.safetensors
 
-Each weights file gives one motion, `paper_figures/bandai/laptop/media/15_RUN_WINDOWS.bvh`: eight steps, from the start,
+Each weights file gives one motion, `paper_figures/bandai/laptop/media/RUN_WINDOWS.bvh`: eight steps, from the start,
 on the path and in the style of the clip that notebook 15.5 follows.
 """
 
@@ -32,7 +32,7 @@ def snapshot_walks(weights: tyro.conf.Positional[list[Path]]) -> None:
         style = next(style for style in trained.styles if style.endswith("normal"))
         history, line, _ = follow_longest(packed, style, num_history=10, num_frames=3 * 32)
         motion = MotionGenerator(trained, 8).rollout([line], [style], seed=0, history=history).motion(0)
-        write_bvh(media / f"15_{path.parent.name}_{path.stem}.bvh", motion, overwrite=True)
+        write_bvh(media / f"{path.parent.name}_{path.stem}.bvh", motion, overwrite=True)
 
 
 if __name__ == "__main__":
