@@ -253,7 +253,7 @@ def test_bad_input_is_refused():
         lambda: make(stranger): "only CAMDM",
         lambda: make(network, products="onedn"): "did you mean 'onednn'",
         lambda: prepare(module, SIGMAS, "ddmp"): "unknown PyTorch sampler 'ddmp'.*'ddpm'",
-        lambda: prepare(module, SIGMAS, runtime="onx"): "unknown runtime 'onx'.*'onnx'",
+        lambda: prepare(module, SIGMAS, runtime="onx"): "unknown PyTorch runtime 'onx'.*'onnx'",
         lambda: prepare(module, SIGMAS[:1]): r"at least one step, got shape \(1,\)",
     }.items():
         refused(message, call)
