@@ -421,7 +421,8 @@ def test_a_style_without_clips_long_enough_is_named():
 
 
 def test_what_cannot_be_trained_is_refused(packed):
-    refused("'Zomby'; did you mean 'Zombie'", train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING)
+    unknown = "unknown style of data set 'tiny': 'Zomby'; did you mean 'Zombie'"
+    refused(unknown, train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING)
     refused("at least two styles", train_classifier, packed, styles=("Runner",), **TRAINING)
     refused("each named once", train_classifier, packed, styles=("Runner", "Runner"), **TRAINING)
     refused("at least 1 step and batches of 2", train_classifier, packed, **{**TRAINING, "batch_size": 1})

@@ -333,11 +333,10 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
     """
     root = repository_root() / "paper_figures" if root is None else Path(root)
     datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
-    folders = {data: [(root, data, name) for name in profiles] for data in datasets}
-    snapshots = lambda some: (evidence for folder in some for evidence in snapshot_evidence(*folder))
-    evidences = {
-        data: [*(recorded_evidence(*folder) for folder in some), *snapshots(some)] for data, some in folders.items()
-    }
+    evidences = {}
+    for data in datasets:
+        snapshots = [late for name in profiles for late in snapshot_evidence(root, data, name)]
+        evidences[data] = [recorded_evidence(root, data, name) for name in profiles] + snapshots
     return [judge_claim(claim, evidences) for claim in load_claims(paper)]
 
 

@@ -479,16 +479,18 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     table = table[(table["recipe"] == "paper") & (table["steps"] > 0)].fillna({"unit": ""})
 
     def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
-        networks = rows.groupby("classifier")["run"].nunique()
-        rows = rows[rows["classifier"] == networks.idxmax()]
-        seen = rows[["model", "window_frames"]].drop_duplicates().assign(metric="windows", value=windows)
-        tables = {"quality": intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]), "trained": seen}
+        rows = rows[rows["classifier"] == rows.groupby("classifier")["run"].nunique().idxmax()]
+        networks = rows[["model", "window_frames"]].drop_duplicates()
+        tables = {
+            "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
+            "trained": lambda: networks.assign(metric="windows", value=windows),
+        }
         where = f"{path.relative_to(root).as_posix()} at {windows:,} windows"
 
         def load(name: str):
             if name not in tables:
                 raise NoTable(f"no {name}.csv of them")
-            return _checked(name, tables[name], where), record, where
+            return _checked(name, tables[name](), where), record, where
 
         return Evidence("jax", load)
 

@@ -63,17 +63,20 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
 
 def _filled(name: str, path: Path, trained, params, **fields) -> str:
     """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
-    record, history = trained.record, path.with_name(f"{path.stem}.history.csv")
-    loss = read_table(history)[0]["held_out_loss"].dropna().iloc[-1] if history.exists() else None
+    record = trained.record
     return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(params)),
         weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record), date=record["date_utc"][:10],
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
-        cores=counted_cores(record),
-        loss=loss, **fields,
+        cores=counted_cores(record), **fields,
     )  # fmt: skip
+
+
+def _last_loss(path: Path) -> float:
+    """Return the last held-out loss of the history beside a weights file."""
+    return read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
 
 
 def model_card(path: Path, quality: pd.DataFrame | None) -> str:
@@ -112,7 +115,8 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     if passes < 20:
         limits.append("It was trained far shorter than the paper's models.")
     return _filled(
-        "model_card", path, trained, trained.params, recipe=recipe, styles=", ".join(trained.styles), steps=steps,
+        "model_card", path, trained, trained.params,
+        recipe=recipe, loss=_last_loss(path), styles=", ".join(trained.styles), steps=steps,
         legs=f" ({legs})" if legs else "", windows=windows, passes=passes, measured=figures,
         limits="\n".join(f"- {limit}" for limit in limits),
     )  # fmt: skip
@@ -151,7 +155,8 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
         f"--steps {steps} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
     )
     return _filled(
-        "text_model_card", path, trained, (trained.params, trained.codec.params), recipe=recipe,
+        "text_model_card", path, trained, (trained.params, trained.codec.params),
+        recipe=recipe, loss=_last_loss(path),
         state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
         if trained.codec.frames_per_state > 1
         else f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
@@ -206,7 +211,8 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
         movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
     is_student = bool(trained.config.guidance_features)
     return _filled(
-        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params), recipe=recipe,
+        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params),
+        recipe=recipe, loss=_last_loss(path),
         what=f"student of {recipe['num_phases']} step{'s' * (recipe['num_phases'] > 1)}" if is_student
         else "teacher, sampled by DDIM",
         seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
