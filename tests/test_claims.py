@@ -836,6 +836,12 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("alike in 0 of 9")
     missing = [*alike[:3], (models[3], 400_000, "paper", 0, "one", 1.0)]
     assert snapshots(tmp_path / "missing", missing).verdict == UNMEASURED
+    # A classifier that saw all four decides, though another saw more networks; two that saw two each do not.
+    busier = [(model, 200_000, "paper", seed, "other", 9.0) for model in models[:2] for seed in range(3)]
+    whole = snapshots(tmp_path / "whole", [*alike, *busier])
+    assert whole.ours[0].figure == "alike in 9 of 9" and "classifier one" in str(whole.ours[0].sources[0])
+    halves = [*alike[:2], *((model, 200_000, "paper", 0, "other", 1.0) for model in models[2:])]
+    assert snapshots(tmp_path / "halves", halves).verdict == UNMEASURED
 
 
 @pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])

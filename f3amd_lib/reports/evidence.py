@@ -469,8 +469,8 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
       root, dataset, profile: as for `recorded_evidence`.
 
     Returns:
-      Evidence of `quality` for each number of windows: networks by the paper's text alone that all
-      saw so many, means over their seeds, seen through one style classifier, that of most of them.
+      Evidence of `quality` for each number of windows and each style classifier, one that saw more networks first:
+      networks by the paper's text alone, means over their seeds.
     """
     path = Path(root) / dataset / profile / "records" / "campaign.csv"
     if not path.exists():
@@ -478,14 +478,13 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     table, record = read_table(path)
     table = table[(table["recipe"] == "paper") & (table["steps"] > 0)].fillna({"unit": ""})
 
-    def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
-        rows = rows[rows["classifier"] == rows.groupby("classifier")["run"].nunique().idxmax()]
+    def evidence(windows: int, classifier: str, rows: pd.DataFrame) -> Evidence:
         networks = rows[["model", "window_frames"]].drop_duplicates()
         tables = {
             "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
             "trained": lambda: networks.assign(metric="windows", value=windows),
         }
-        where = f"{path.relative_to(root).as_posix()} at {windows:,} windows"
+        where = f"{path.relative_to(root).as_posix()} at {windows:,} windows, seen by classifier {classifier}"
 
         def load(name: str):
             if name not in tables:
@@ -494,7 +493,10 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
 
         return Evidence("jax", load)
 
-    return [evidence(windows, rows) for windows, rows in sorted(table.groupby("windows"), reverse=True)]
+    # FID compares through one classifier alone.
+    groups = list(table.groupby(["windows", "classifier"]))
+    groups.sort(key=lambda group: (group[0][0], group[1]["run"].nunique()), reverse=True)
+    return [evidence(windows, classifier, rows) for (windows, classifier), rows in groups]
 
 
 @functools.cache
