@@ -6,6 +6,7 @@ imported inside, so that `f3amd --help` is quick.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import logging
 import os
@@ -20,6 +21,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction
 
+from f3amd_lib.ground.files import locked
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
+
 log = logging.getLogger("f3amd")
 
 UNFINISHED = 3
@@ -27,6 +32,11 @@ UNFINISHED = 3
 
 Repeatable = UseAppendAction[tuple[str, ...]]
 Required = Annotated[str, tyro.conf.arg(metavar="NAME")]
+
+
+def _given(**options) -> dict:
+    """Return those options that were given: not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -45,13 +55,15 @@ class Data:
     source: str | None = None
     window: int | None = None
 
+    def numbers(self, **overrides):
+        """Return the profile with those values replaced that are given."""
+        return load_profile(self.profile, self.data, **_given(**overrides))
+
     def open(self, **overrides):
-        """Return the data set, prepared, and the profile with those values replaced that are given."""
-        from f3amd_lib.ground.profiles import load_profile
+        """Return the data set, prepared, and the profile as `numbers` does, with this window."""
         from f3amd_lib.training.pipeline import prepare
 
-        given = {name: value for name, value in (overrides | {"window": self.window}).items() if value is not None}
-        profile = load_profile(self.profile, self.data, **given)
+        profile = self.numbers(**overrides, window=self.window)
         return prepare(profile, path=self.source), profile
 
 
@@ -160,8 +172,7 @@ def presets(
     from f3amd_lib.ground.tables import markdown_table
     from f3amd_lib.networks import presets
 
-    text = {} if text_width is None else {"text_width": text_width}
-    of_data = {"channels": channels, "num_styles": styles, "num_joints": joints, **text}
+    of_data = {"channels": channels, "num_styles": styles, "num_joints": joints} | _given(text_width=text_width)
     log.info("%s", markdown_table(presets.table(paper, **of_data)))
 
 
@@ -205,14 +216,9 @@ def train(
     if cluster or named:
         parallel.join_processes(*together)
     prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
-    runs = train_family(
-        prepared,
-        profile,
-        list(preset) or [profile.preset],
-        folder=out,
-        budget_s=None if minutes is None else 60.0 * minutes,
-        mesh=parallel.all_devices() if cluster or named or all_devices else None,
-    )
+    budget = None if minutes is None else 60.0 * minutes
+    mesh = parallel.all_devices() if cluster or named or all_devices else None
+    runs = train_family(prepared, profile, list(preset) or [profile.preset], folder=out, budget_s=budget, mesh=mesh)
     status = 0
     for name, state in runs:
         files = model_files(profile, name, folder=out)
@@ -224,7 +230,6 @@ def train(
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
     """Train models of text to motion, or their judge; what is finished is left as it is."""
     from f3amd_lib.data.text_encoders import load_text_encoder
-    from f3amd_lib.ground.profiles import load_profile
     from f3amd_lib.measures.text_judge import load_judge, save_judge, train_judge
     from f3amd_lib.training import latent_models, text_models
     from f3amd_lib.training.evaluator_task import EvaluatorTraining
@@ -234,22 +239,20 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     for name in names:
         if name != text_models.JUDGE and not (is_latent(name) or text_models.is_text_preset(name)):
             raise ValueError(f"{name} needs no captions: train it by a call of its own")
-    given = lambda **asked: {key: value for key, value in asked.items() if value is not None}
-    profile = load_profile(motion.profile, motion.data, **given(train_steps=steps, batch_size=batch_size, seed=seed))
+    profile = motion.numbers(train_steps=steps, batch_size=batch_size, seed=seed)
     data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
     stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
+    how = {"batch_size": batch_size, "folder": out, "stop_at": stop_at}
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
         if is_latent(name):
-            settings = {"batch_size": batch_size, "folder": out, "teacher": teacher}
-            done = latent_models.train_latent_model(data, encoder, profile, name, stop_at=stop_at, **settings)
+            done = latent_models.train_latent_model(data, encoder, profile, name, teacher=teacher, **how)
         elif name != text_models.JUDGE:
-            settings = {"window": motion.window, "batch_size": batch_size, "folder": out}
-            done = text_models.train_text_model(data, encoder, profile, name, stop_at=stop_at, **settings)
+            done = text_models.train_text_model(data, encoder, profile, name, window=motion.window, **how)
         elif files.model.exists():
             done = load_judge(files.model)
         else:
-            training = EvaluatorTraining(**given(num_steps=steps, batch_size=batch_size, seed=seed))
+            training = EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
             done = train_judge(data, encoder, training, checkpoint=files.state, stop_at=stop_at)
             if done is not None:
                 save_judge(files.model, done)
@@ -286,10 +289,8 @@ def rollout(
     formats = _motion_formats(format)
     targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *formats)]
     model.check_free(*targets)
-    if path.lower().endswith(".csv"):
-        line = read_path_csv(path)
-    else:
-        line = named_path(path, _num_frames(seconds), speed=speed, seed=seed)
+    drawn = path.lower().endswith(".csv")
+    line = read_path_csv(path) if drawn else named_path(path, _num_frames(seconds), speed=speed, seed=seed)
     generator = model.generator()
     trained = generator.trained
     history = None
@@ -299,14 +300,8 @@ def rollout(
 
         history, note = start_history(trained, read_bvh(start), line)
         log.info("start        %s", note)
-    made = generator.rollout(
-        line,
-        style,
-        seed=seed,
-        history=history,
-        blend_frames=0 if raw else blend,
-        lock_feet=not (raw or slide) and _has_legs(trained.skeleton),
-    )
+    blend, lock = (0, False) if raw else (blend, not slide and _has_legs(trained.skeleton))
+    made = generator.rollout(line, style, seed=seed, history=history, blend_frames=blend, lock_feet=lock)
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
     motion = made.motion()
     title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
@@ -334,23 +329,11 @@ def _write_shown(targets, motion, scene, trained, *, paths=None, overwrite: bool
 
 
 def text(
-    caption: Positional[str],
-    then: Repeatable = (),
-    model: str | None = None,
-    data: str = "bandai",
-    weights: Path | None = None,
-    seconds: float = 4.0,
-    guidance: float | None = None,
-    steps: int | None = None,
-    seed: int = 0,
-    control: Path | None = None,
-    joint: str = "pelvis",
-    any_words: bool = False,
-    text_weights: Path | None = None,
-    format: str = "bvh",
-    overwrite: bool = False,
-    out: Path = Path("out"),
-) -> None:
+    caption: Positional[str], then: Repeatable = (), model: str | None = None, data: str = "bandai",
+    weights: Path | None = None, seconds: float = 4.0, guidance: float | None = None, steps: int | None = None,
+    seed: int = 0, control: Path | None = None, joint: str = "pelvis", any_words: bool = False,
+    text_weights: Path | None = None, format: str = "bvh", overwrite: bool = False, out: Path = Path("out"),
+) -> None:  # fmt: skip
     """Animate what a caption tells: motion, film strip, GIF (its first 12 s), player.
 
     Args:
@@ -446,18 +429,12 @@ def _motion_formats(given: str) -> list[str]:
 
 def _write_motion(path: Path, motion, credit: str, overwrite: bool) -> None:
     """Write a motion as .bvh, .glb or .csv."""
-    if path.suffix == ".glb":
-        from f3amd_lib.serving.gltf import write_glb
+    from f3amd_lib.motion.bvh import write_bvh
+    from f3amd_lib.motion.motion_csv import write_motion_csv
+    from f3amd_lib.serving.gltf import write_glb
 
-        write_glb(path, motion, credit=credit, overwrite=overwrite)
-    elif path.suffix == ".csv":
-        from f3amd_lib.motion.motion_csv import write_motion_csv
-
-        write_motion_csv(path, motion, overwrite=overwrite)
-    else:
-        from f3amd_lib.motion.bvh import write_bvh
-
-        write_bvh(path, motion, overwrite=overwrite)
+    writers = {".bvh": write_bvh, ".csv": write_motion_csv, ".glb": functools.partial(write_glb, credit=credit)}
+    writers[path.suffix](path, motion, overwrite=overwrite)
 
 
 def _has_legs(skeleton) -> bool:
@@ -581,12 +558,9 @@ def _crowd_pictures(crowd, shown, still: Path, page: Path) -> None:
 
 
 def export(
-    model: Model,
-    characters: int | None = None,
-    target: Repeatable = (),
-    stored: str = "float32",
+    model: Model, characters: int | None = None, target: Repeatable = (), stored: str = "float32",
     out: Path = Path("out/round"),
-) -> None:
+) -> None:  # fmt: skip
     """Make a round that runs without the model code: StableHLO, jax.export, IREE; or a denoiser for ONNX.
 
     Args:
@@ -673,13 +647,9 @@ def bench(
 
 
 def measure(
-    names: Positional[tuple[str, ...]] = (),
-    *,
-    motion: Data,
-    model: Repeatable = (),
-    published: Path | None = None,
+    names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = (), published: Path | None = None,
     minutes: float | None = None,
-) -> int:
+) -> int:  # fmt: skip
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
@@ -692,9 +662,6 @@ def measure(
     """
     from f3amd_lib.experiments.measure import MEASUREMENTS
     from f3amd_lib.experiments.text_probes import TEXT_MEASUREMENTS
-    from f3amd_lib.ground.files import locked
-    from f3amd_lib.ground.names import check_known
-    from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.networks import presets
 
     for name in names:
@@ -705,34 +672,34 @@ def measure(
         return _measure_text(of_text, motion, model, minutes)
     models = [presets.find_preset(name).name for name in model] or None
     prepared, profile = motion.open()
-    other_window = profile.window != load_profile(profile.name, profile.dataset).window
+    other_window = profile.window != motion.numbers().window
     of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
     if (other_window or published) and not (names and set(names) <= of_windows):
         raise ValueError(
             "--window is for quality, trained and walking, --published for quality alone: measure them by name"
         )
-    extra = {"published": published} if published else {}
-    records = results_dir(profile.dataset, profile.name) / "records"
     for name in names or MEASUREMENTS:
-        with locked(records / f".{name}.lock", f"measuring {name}"):
-            log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **extra))
+        with _measuring(name, profile):
+            log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **_given(published=published)))
     return 0
+
+
+def _measuring(name: str, profile):
+    """Hold the lock of a measurement's table."""
+    return locked(results_dir(profile.dataset, profile.name) / "records" / f".{name}.lock", f"measuring {name}")
 
 
 def _measure_text(names, motion: Data, models, minutes) -> int:
     """Measure text to motion; what a table's rows need is trained on the way."""
     from f3amd_lib.data.text_encoders import load_text_encoder
     from f3amd_lib.experiments.text_probes import TEXT_MEASUREMENTS
-    from f3amd_lib.ground.files import locked
-    from f3amd_lib.ground.profiles import load_profile, results_dir
     from f3amd_lib.training.text_models import open_text_motions
 
-    profile, encoder = load_profile(motion.profile, motion.data), load_text_encoder()
+    profile, encoder = motion.numbers(), load_text_encoder()
     data = open_text_motions(motion.data, motion.source)
-    records = results_dir(profile.dataset, profile.name) / "records"
     stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
     for name in names:
-        with locked(records / f".{name}.lock", f"measuring {name}"):
+        with _measuring(name, profile):
             table = TEXT_MEASUREMENTS[name](data, encoder, profile, models=models, stop_at=stop_at)
         if table is None:
             log.info("%-12s unfinished: call again to go on", name)
@@ -757,27 +724,18 @@ def campaign(
     from f3amd_lib.data.packed import load_packed
     from f3amd_lib.experiments.campaign import run_campaign
     from f3amd_lib.experiments.measure import protocol_of
-    from f3amd_lib.ground.files import locked
-    from f3amd_lib.ground.profiles import load_profile, runs_dir
     from f3amd_lib.training.pipeline import PreparedData
 
     if packed is None:
         prepared, profile = motion.open()
     else:
-        profile = load_profile(motion.profile, motion.data)
+        profile = motion.numbers()
         prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
     classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
-    legs = run_campaign(
-        prepared,
-        profile,
-        classifier,
-        protocol,
-        folder=folder,
-        batch_size=batch_size,
-        only=only,
-        budget_s=None if minutes is None else 60.0 * minutes,
-    )
+    budget = None if minutes is None else 60.0 * minutes
+    how = {"folder": folder, "batch_size": batch_size, "only": only, "budget_s": budget}
+    legs = run_campaign(prepared, profile, classifier, protocol, **how)
     with locked(folder / ".campaign.lock", "running the campaign"):
         for name, windows, state in legs:
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
@@ -807,11 +765,9 @@ def sweep(
     from f3amd_lib.experiments import sweep as engine
     from f3amd_lib.experiments.measure import protocol_of
     from f3amd_lib.experiments.runner import Records
-    from f3amd_lib.ground.files import locked
-    from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
     from f3amd_lib.ground.records import run_record
 
-    profile = load_profile(motion.profile, motion.data)
+    profile = motion.numbers()
     if motion.window not in (None, profile.window):
         raise ValueError("--window is for f3amd measure alone")
     folder = (out or runs_dir(profile.dataset, profile.name)).resolve()
@@ -852,7 +808,6 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
       set: NAME=VALUE, a parameter of every notebook that runs; repeatable.
     """
     from f3amd_lib import reproduce
-    from f3amd_lib.ground.profiles import results_dir
 
     parameters = dict(map(reproduce.parse_assignment, set))
     logging.getLogger("papermill").setLevel(logging.WARNING)  # at INFO it names each notebook twice
@@ -912,24 +867,9 @@ RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
 COMMANDS = (
-    data,
-    dataset,
-    presets,
-    train,
-    rollout,
-    text,
-    crowd,
-    export,
-    steer,
-    bench,
-    measure,
-    campaign,
-    sweep,
-    figures,
-    course,
-    claims,
-    cards,
-)
+    data, dataset, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep, figures,
+    course, claims, cards,
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

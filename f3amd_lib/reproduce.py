@@ -15,7 +15,7 @@ import collections
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import nbformat
@@ -73,16 +73,14 @@ def select_notebooks(notebooks: Iterable[Path], only: Iterable[str] = ()) -> lis
     chosen = set()
     for wanted in only:
         stem = wanted.removesuffix(".ipynb")
-        number = stem.zfill(2)
-        hits = {path for path in notebooks if path.stem == stem or path.stem[:2] == number}
+        hits = {path for path in notebooks if path.stem == stem or path.stem[:2] == stem.zfill(2)}
         if not hits:
-            hint = nearest_hint(stem, [path.stem for path in notebooks])
-            raise ValueError(f"no notebook {wanted!r}{hint}")
+            raise ValueError(f"no notebook {wanted!r}{nearest_hint(stem, [path.stem for path in notebooks])}")
         chosen |= hits
     return [path for path in notebooks if path in chosen] if chosen else notebooks
 
 
-def check_parameters(notebooks: Iterable[Path], names: Iterable[str]) -> None:
+def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
     """Refuse a parameter that a notebook does not have, before any of them runs.
 
     Papermill itself injects an unknown name, logs a line and goes on with the default.
@@ -94,7 +92,6 @@ def check_parameters(notebooks: Iterable[Path], names: Iterable[str]) -> None:
     Raises:
       ValueError: naming notebook, parameter and the nearest one that the notebook has.
     """
-    names = list(names)
     for path in notebooks:
         known = papermill.inspect_notebook(str(path))
         for name in names:
@@ -113,12 +110,9 @@ def written_since(folder: Path, start: float) -> dict[str, int]:
       "figures", "tables", ... -> number of files, only where there are some; records beside tables
       do not count.
     """
-    written = (
-        path
-        for path in Path(folder).rglob("*")
-        if path.suffix not in (".json", ".md") and path.is_file() and path.stat().st_mtime >= start
-    )
-    return dict(collections.Counter(path.relative_to(folder).parts[0] for path in written))
+    files = (path for path in Path(folder).rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
+    written = (path.relative_to(folder).parts[0] for path in files if path.stat().st_mtime >= start)
+    return dict(collections.Counter(written))
 
 
 def _news(path: Path, seconds: float, wrote: Mapping[str, int], left: float | None) -> str:
@@ -137,8 +131,7 @@ def _usual_seconds(results: Path) -> dict[str, float]:
     summary = results / "tables" / "run_summary.csv"
     if not summary.is_file():
         return {}
-    table = pd.read_csv(summary)
-    return dict(zip(table["notebook"], table["seconds"], strict=True))
+    return pd.read_csv(summary, index_col="notebook")["seconds"].to_dict()
 
 
 def what_to_open(results: Path) -> list[str]:
@@ -288,11 +281,8 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
 
 def _last_started_cell(copy: Path) -> str:
     """Find where a notebook without a traceback stopped, from papermill's start times."""
-    started = [
-        cell
-        for cell in nbformat.read(copy, as_version=4).cells
-        if cell.cell_type == "code" and cell.source.strip() and cell.metadata.papermill.start_time
-    ]
+    cells = (cell for cell in nbformat.read(copy, as_version=4).cells if cell.cell_type == "code")
+    started = [cell for cell in cells if cell.source.strip() and cell.metadata.papermill.start_time]
     return f"cell In [{len(started)}], {_first_line(started[-1].source)!r}"
 
 

@@ -48,30 +48,36 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path}: exists already; choose another name or pass overwrite=True")
+    with _unfinished(path) as temporary:
+        temporary.touch()
+        permissions = temporary.stat().st_mode
+        yield temporary
+        temporary.chmod(permissions)  # safetensors makes a new file that the owner alone may read
+
+
+@contextlib.contextmanager
+def _unfinished(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; what is there at the end becomes `path`, or is removed on an error.
+
+    Says which file could not be written, where the system's own error, such as that of a full disk, does not.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     _clear_leftovers(path.parent)
     # Unique among threads, and among machines that share the folder.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
-        temporary.touch()
-        permissions = temporary.stat().st_mode
-        with _named(path):
-            yield temporary
-        temporary.chmod(permissions)  # safetensors makes a new file that the owner alone may read
+        yield temporary
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Say which file could not be written, where the system's own error, such as that of a full disk, does not."""
-    try:
-        yield
     except OSError as error:
         if error.filename is None and str(path) not in str(error):
             raise OSError(f"{path}: cannot be written ({error})") from error
         raise
+    finally:
+        _remove(temporary)
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -87,17 +93,9 @@ def whole_folder(path) -> Iterator[Path]:
     Raises:
       OSError: if something has appeared at `path` meanwhile.
     """
-    path = Path(path).resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _clear_leftovers(path.parent)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-    try:
+    with _unfinished(Path(path).resolve()) as temporary:
         temporary.mkdir()
-        with _named(path):
-            yield temporary
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        yield temporary
 
 
 def _clear_leftovers(folder: Path) -> None:
@@ -109,7 +107,7 @@ def _clear_leftovers(folder: Path) -> None:
     for item in folder.glob(".*.part"):
         with contextlib.suppress(OSError):  # another process may be faster
             if time.time() - max(part.stat().st_mtime for part in (item, *item.rglob("*"))) > _LEFTOVER_S:
-                shutil.rmtree(item) if item.is_dir() else item.unlink()
+                _remove(item)
 
 
 @contextlib.contextmanager

@@ -69,10 +69,6 @@ def find_entry(known: Mapping, name, what: str, where: str):
     return known[name]
 
 
-PAPER_TABLES = {entry["number"]: (entry["file"], entry["title"]) for entry in load_paper_file("paper")["table"]}
-"""Table number of the F3AMD paper -> (file, title in our words)."""
-
-
 def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     """Return one table of a paper in tidy form.
 
@@ -83,25 +79,23 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     Returns:
       A new DataFrame with the column model, the settings of a row (F3AMD: window_frames, steps and either
       device, characters, for times, or none), then metric, unit, better, printed (text as printed, "" for a
-      dash), value (float, NaN for a dash) and what else the file has. `frame.attrs` has the table's number,
-      title and setting.
+      dash), value (float, NaN for a dash) and what else the file has. `frame.attrs` has the table's number, title,
+      note ("" if it needs none) and setting.
 
     Raises:
       ValueError: if there is no such table.
     """
+    return _read_table(number, paper).copy()
+
+
+@functools.cache
+def _read_table(number: int | str, paper: str) -> pd.DataFrame:
     description = load_paper_file("paper", paper)
     entries = {entry["number"]: entry for entry in description.get("table", ())}
     if number not in entries:
         known = f"Tables {next(iter(entries))} to {next(reversed(entries))}" if entries else "no tables"
         raise ValueError(f"the {description['name']} paper has {known}, not {number!r}")
-    frame = _read_table(number, paper).copy()
-    frame.attrs = {"table": number, "title": entries[number]["title"], "setting": description["setting"]}
-    return frame
-
-
-@functools.cache
-def _read_table(number: int | str, paper: str) -> pd.DataFrame:
-    entry = next(entry for entry in load_paper_file("paper", paper)["table"] if entry["number"] == number)
+    entry = entries[number]
     frame = pd.read_csv(_FOLDER / paper / "numbers" / entry["file"], dtype=str, keep_default_na=False)
     frame = frame.rename(columns={"value": "printed"})
     for column in ("window_frames", "steps", "characters"):
@@ -111,4 +105,6 @@ def _read_table(number: int | str, paper: str) -> pd.DataFrame:
         if column in entry:
             frame.insert(frame.columns.get_loc("printed"), column, entry[column])
     frame["value"] = pd.to_numeric(frame["printed"], errors="coerce")
+    about = {"title": entry["title"], "note": entry.get("note", ""), "setting": description["setting"]}
+    frame.attrs = {"table": number, **about}
     return frame

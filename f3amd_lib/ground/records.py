@@ -71,24 +71,15 @@ def run_record(*, profile, dataset, seed: int, **extra) -> dict:
 
     devices = jax.devices()
     commit, dirty = _git_state()
-    record = {
-        "profile": _name(profile, "profile"),
-        "dataset": _name(dataset, "dataset"),
-        "dataset_fingerprint": getattr(dataset, "fingerprint", None),
-        "dataset_licence": getattr(dataset, "licence", None),
-        "dataset_credit": getattr(dataset, "credit", None),
-        "seed": seed,
-        "git_commit": commit,
-        "git_dirty": dirty,
-        "library_version": f3amd_lib.__version__,
-        "versions": {"python": platform.python_version()}
-        | {package: importlib.metadata.version(package) for package in _PACKAGES},
-        "device_platform": devices[0].platform,
-        "device_kind": devices[0].device_kind,
-        "num_devices": len(devices),
-        "cores": usable_cores(),
-        "date_utc": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-    }
+    asked = {"profile": _name(profile, "profile"), "dataset": _name(dataset, "dataset")}
+    asked |= {f"dataset_{key}": getattr(dataset, key, None) for key in ("fingerprint", "licence", "credit")}
+    versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
+    code = {"git_commit": commit, "git_dirty": dirty, "library_version": f3amd_lib.__version__}
+    code["versions"] = {"python": platform.python_version(), **versions}
+    machine = {"device_platform": devices[0].platform, "device_kind": devices[0].device_kind}
+    machine |= {"num_devices": len(devices), "cores": usable_cores()}
+    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    record = asked | {"seed": seed} | code | machine | {"date_utc": now}
     taken = sorted(set(extra) & (set(record) | {"table"}))
     if taken:
         raise ValueError(f"a run record already has {taken[0]!r}; name the extra value otherwise")
@@ -276,9 +267,7 @@ def _git_state() -> tuple[str | None, bool | None]:
 
 def usable_cores() -> int:
     """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _OF_MEASURES = ("corruptions", "settling")
@@ -394,7 +383,6 @@ def kept_rows(path, record: dict) -> pd.DataFrame | None:
     Returns:
       The rows; None if there are none.
     """
-    path = Path(path)
     if (found := whole_table(path)) is None:
         return None
     rows, earlier = found

@@ -46,8 +46,7 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
     """
     found = committed_table(dataset, name) or committed_table("bandai", name)
     if found is None:
-        how = f"`make measure MEASURE={measurement} DATA=bandai`"
-        return None, f"Not measured yet: `{name}`. {how} measures it."
+        return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
     table, record = found
     table.attrs["dataset"] = record["dataset"]
     sentence = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import pandas as pd
 
@@ -54,20 +54,14 @@ def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
     """
     if len(frame.columns) == 0:
         raise ValueError("a table needs at least one column")
-    header = [_escape(str(column)) for column in frame.columns]
-    rows = [[_cell(value, digits) for value in row] for row in frame.itertuples(index=False, name=None)]
-    right = [bool(rows) and all(_looks_numeric(row[column]) for row in rows) for column in range(len(header))]
-    widths = [max([3, len(header[column]), *(len(row[column]) for row in rows)]) for column in range(len(header))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = [
-            cell.rjust(width) if flush else cell.ljust(width)
-            for cell, width, flush in zip(cells, widths, right, strict=True)
-        ]
-        return f"| {' | '.join(padded)} |"
-
-    rule = ["-" * (width - 1) + ":" if flush else "-" * width for width, flush in zip(widths, right, strict=True)]
-    return "\n".join([line(header), line(rule), *(line(row) for row in rows)]) + "\n"
+    columns = []
+    for title, values in frame.items():
+        cells, heading = [_cell(value, digits) for value in values], _escape(str(title))
+        width = max(map(len, ["---", heading, *cells]))
+        flush = bool(cells) and all(map(_looks_numeric, cells))
+        rule = "-" * (width - 1) + ":" if flush else "-" * width
+        columns.append([cell.rjust(width) if flush else cell.ljust(width) for cell in (heading, rule, *cells)])
+    return "".join(f"| {' | '.join(line)} |\n" for line in zip(*columns, strict=True))
 
 
 def compact_table(frame: pd.DataFrame) -> str:

@@ -361,21 +361,14 @@ def _row(judgement: Judgement) -> dict:
     claim = judgement.claim
     # Without a data set a remark may have looked into a table, and decided nothing.
     sources = [source for statement in judgement.ours for source in statement.sources if judgement.dataset]
-    return {
-        "id": claim.id,
-        "group": claim.group,
-        "claim": claim.text,
-        "where": claim.where,
-        "decided_by": claim.decided_by,
-        "verdict": judgement.verdict,
-        "ours": _figures(judgement.ours),
-        "paper_says": claim.paper_says,
-        "paper_verdict": judgement.paper_verdict,
-        "paper_figure": _figures(judgement.paper),
-        "dataset": _SYNTHETIC if judgement.dataset == "synthetic" else judgement.dataset,
-        "hardware": "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources)),
-        "record": "; ".join(dict.fromkeys(map(str, sources))),
-    }
+    said = {"id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where}
+    said["decided_by"] = claim.decided_by
+    judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
+    judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
+    dataset = _SYNTHETIC if judgement.dataset == "synthetic" else judgement.dataset
+    hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
+    record = "; ".join(dict.fromkeys(map(str, sources)))
+    return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}
 
 
 def ledger(judgements: Sequence[Judgement] | None = None) -> pd.DataFrame:
@@ -425,28 +418,20 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
     """
     judgements = judge_claims() if judgements is None else judgements
     frame, paper = ledger(judgements), judgements[0].claim.paper
-    whose = {"ours": "verdict", "the paper's tables": "paper_verdict"}
-    counts = pd.DataFrame(
-        {"verdict": verdict} | {name: int((frame[column] == verdict).sum()) for name, column in whose.items()}
-        for verdict in judging.VERDICTS
-    )
+    counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
+    counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
     marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
     about, words = load_paper_file("paper", paper), _TEXTS["page"] | load_paper_file("claims", paper).get("page", {})
     gpu, training = load_profile("gpu", "100style"), about.get("training", {})
     seen, whole = gpu.train_steps * gpu.batch_size, training.get("windows", {}).get("32")
-    fields = {
-        "steps": gpu.train_steps,
-        "batch": gpu.batch_size,
-        "seen": seen / 1e6,
-        "share": f", {100.0 * seen / whole:.0f} % of the paper's length" if whole else "",
-        "least": 100.0 * LEAST_SHARE,
-        "windows": training.get("says", "their number is not known"),
-    }
+    fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "least": 100.0 * LEAST_SHARE}
+    fields["share"] = f", {100.0 * seen / whole:.0f} % of the paper's length" if whole else ""
+    fields["windows"] = training.get("says", "their number is not known")
     head = _TEXTS["head"].format(
         count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks,
         **{key: text.strip().format(**fields) for key, text in words.items()},
     )  # fmt: skip
-    parts = [head, markdown_table(counts)]
+    parts = [head, markdown_table(counted.reset_index())]
     paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]
     frame["ours"] = frame["verdict"] + ": " + frame["ours"]
     frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
@@ -491,13 +476,11 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
       frame: from `ledger`.
       accepted: from `accepted_verdicts`.
     """
+    sides = (("verdict", "our records", "ours"), ("paper_verdict", "the paper's tables", "paper_figure"))
     changes = []
     for row in frame.to_dict("records"):
         before = accepted.get(row["id"], {})
-        for key, whose, figure in (
-            ("verdict", "our records", "ours"),
-            ("paper_verdict", "the paper's tables", "paper_figure"),
-        ):
+        for key, whose, figure in sides:
             if before.get(key) != row[key]:
                 was = f"{before[key]!r}" if key in before else "not accepted yet"
                 changes.append(f"{row['id']} by {whose}: was {was}, is {row[key]!r} ({row[figure]})")

@@ -80,12 +80,8 @@ def _mentions(text: str, paper: str) -> set[str]:
 
 def _numbers(text: str) -> set[int]:
     """Read "2-4" or "10, 12 and 13"."""
-    numbers = set()
-    for part in re.split(r",|and", text):
-        ends = [int(number) for number in re.findall(r"\d+", part)]
-        if ends:
-            numbers |= set(range(ends[0], ends[-1] + 1))
-    return numbers
+    parts = [[int(number) for number in re.findall(r"\d+", part)] for part in re.split(r",|and", text)]
+    return {number for ends in parts if ends for number in range(ends[0], ends[-1] + 1)}
 
 
 def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> pd.DataFrame:
@@ -123,20 +119,15 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
         # The reading guide shows this very map and explains none of it; solutions only repeat.
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
-        text = _notebook_text(path)
-        for label in mentioned_equations(text, paper) | _displayed([text], paper):
+        markdown = ("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "markdown")
+        for label in _told("\n\n".join(markdown), paper):
             places[label]["notebooks"].append(path.stem)
         for section in notebook_sections(path, paper):
             for label in section.equations if section.number else ():
                 places[label]["cells"].append(section.number)
                 places[label]["figures"] += section.figures
-    return pd.DataFrame(
-        [
-            {"equation": entry["label"], "section": entry["section"], "what": entry["what"]}
-            | {kind: ", ".join(names) for kind, names in places[entry["label"]].items()}
-            for entry in equations
-        ]
-    )
+    rows = pd.DataFrame(equations, columns=["label", "section", "what"]).rename(columns={"label": "equation"})
+    return rows.assign(**{kind: [", ".join(found[kind]) for found in places.values()] for kind in kinds})
 
 
 # Papers have sources in common: a file is parsed once for all of them.
@@ -202,7 +193,7 @@ def notebook_sections(path, paper: str = _DEFAULT) -> list[Section]:
       One entry per heading of the second level ("## ...").
     """
     texts: list[tuple[str, list[str], list[str]]] = []
-    for cell in json.loads(Path(path).read_text(encoding="utf-8"))["cells"]:
+    for cell in _cells(path):
         source = "".join(cell["source"])
         if cell["cell_type"] == "code":
             if texts:
@@ -215,18 +206,14 @@ def notebook_sections(path, paper: str = _DEFAULT) -> list[Section]:
         for heading, text in zip(parts[::2], parts[1::2], strict=True):
             texts.append((heading.strip(), [heading, text], []))
     return [
-        Section(
-            heading, frozenset(mentioned_equations("\n\n".join(text), paper) | _displayed(text, paper)), tuple(figures)
-        )
-        for heading, text, figures in texts
+        Section(heading, frozenset(_told("\n\n".join(text), paper)), tuple(figures)) for heading, text, figures in texts
     ]
 
 
-def _displayed(texts: list[str], paper: str) -> set[str]:
-    """Return the labels of displayed equations that carry the number, "\\qquad (11)$$": F3AMD's."""
-    numbers = {match for text in texts for match in _DISPLAYED.findall(text)}
-    found = {f"Eq. {part.strip()}" for number in numbers for part in number.split(",")}
-    return found & set(equation_labels(paper)) if paper == _DEFAULT else set()
+def _told(text: str, paper: str) -> set[str]:
+    """Return the labels that a notebook's text mentions or, F3AMD's, displays with the number: "\\qquad (11)$$"."""
+    numbers = ",".join(_DISPLAYED.findall(text)).split(",") if paper == _DEFAULT else ()
+    return mentioned_equations(text, paper) | {f"Eq. {one.strip()}" for one in numbers} & set(equation_labels(paper))
 
 
 @functools.cache
@@ -241,13 +228,12 @@ def _kept_figures(source: str) -> list[str]:
     return [name for _, name in sorted(names)]
 
 
-def _notebook_text(path: Path) -> str:
-    """Return the Markdown of a notebook, one cell a paragraph."""
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+def _cells(path) -> list[dict]:
+    return json.loads(Path(path).read_text(encoding="utf-8"))["cells"]
 
 
 # ------------------------------------------------------------------------------------------------------------- the page
+
 
 def equations_markdown(*, root=None) -> str:
     """Return the page docs/equations.md: for each paper a table of its equations with functions, tests and sections.
@@ -266,25 +252,16 @@ def equations_markdown(*, root=None) -> str:
 
 def _paper_markdown(root: Path, paper: str) -> str:
     about, rows = load_paper_file("paper", paper), equation_map(root=root, paper=paper, course=True)
-    reasons = [entry.get("cited_only", "") for entry in about["equation"]]
-    table = pd.DataFrame(
-        {
-            "equation": rows["equation"],
-            "section": rows["section"],
-            "what it says": rows["what"],
-            "functions": [
-                _code(names.replace(": ", ".")) or (f"*cited only:* {reason}" if reason else "–")
-                for names, reason in zip(rows["functions"], reasons, strict=True)
-            ],
-            "tests": [_first_tests(names) or "–" for names in rows["tests"]],
-            "notebooks": [_section_links(root, cells) or "–" for cells in rows["cells"]],
-        }
-    )
+    reasons = [f"*cited only:* {entry['cited_only']}" if "cited_only" in entry else "" for entry in about["equation"]]
+    functions = [_code(names) or reason for names, reason in zip(rows["functions"], reasons, strict=True)]
+    links = [_section_links(root, cells) for cells in rows["cells"]]
+    table = rows[["equation", "section", "what"]].rename(columns={"what": "what it says"})
+    table = table.assign(functions=functions, tests=rows["tests"].map(_first_tests), notebooks=links)
     return f"## {about['name']}\n\n{compact_table(table)}"
 
 
 def _code(names: str) -> str:
-    return ", ".join(f"`{name}`" for name in names.split(", ") if name)
+    return ", ".join(f"`{name}`" for name in names.replace(": ", ".").split(", ") if name)
 
 
 def _first_tests(names: str) -> str:
@@ -292,11 +269,9 @@ def _first_tests(names: str) -> str:
     files: dict[str, list[str]] = {}
     for name in filter(None, names.split(", ")):
         file, test = name.split(": ")
-        files.setdefault(file, []).append(test)
-    return "; ".join(
-        f"`tests/{file}.py`: `{tests[0]}`" + (f" and {len(tests) - 1} more" if len(tests) > 1 else "")
-        for file, tests in files.items()
-    )
+        files.setdefault(f"`tests/{file}.py`", []).append(f"`{test}`")
+    texts = (f"{file}: {first}" + (f" and {len(more)} more" if more else "") for file, (first, *more) in files.items())
+    return "; ".join(texts)
 
 
 def _section_links(root: Path, cells: str) -> str:
@@ -328,17 +303,12 @@ def running_times(*, root=None) -> pd.DataFrame:
     columns = {}
     for path in sorted((root / "paper_figures").glob("*/*/tables/run_summary.csv")):
         summary, record = read_table(path)
-        where = record["device_kind"]
-        if record["device_platform"] == "cpu":
-            where = f"{record['cores']} CPU cores"
-        finished = summary[summary["finished"]]
-        seconds = finished["seconds"].round().astype("Int64")
-        columns[f"{record['dataset']}, {record['profile']}, {where}"] = pd.Series(
-            seconds.to_numpy(), index=finished["notebook"].str.removesuffix(".ipynb")
-        ).astype("Int64")
+        where = f"{record['cores']} CPU cores" if record["device_platform"] == "cpu" else record["device_kind"]
+        finished = summary[summary["finished"]].set_index("notebook")["seconds"]
+        seconds = finished.rename(lambda name: name.removesuffix(".ipynb")).round().astype("Int64")
+        columns[f"{record['dataset']}, {record['profile']}, {where}"] = seconds
     names = [path.stem for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb"))]
-    table = pd.DataFrame(columns, index=pd.Index(names, name="notebook"))
-    return table.reset_index()
+    return pd.DataFrame(columns, index=pd.Index(names, name="notebook")).reset_index()
 
 
 if __name__ == "__main__":

@@ -33,6 +33,14 @@ class NoTable(NotMeasured):
     """The whole table is not there: the least that can be said."""
 
 
+def known(look: Callable, *arguments, **named):
+    """Return what a look into the records finds, None where it was not measured."""
+    try:
+        return look(*arguments, **named)
+    except NotMeasured:
+        return None
+
+
 # ---------------------------------------------------------------------------- figures and intervals
 
 
@@ -152,9 +160,6 @@ NINE_METRICS = {
     for row in load_paper_table(3).drop_duplicates("metric")[["metric", "unit", "better"]].itertuples(index=False)
 }
 """The metrics of Table 3, in its order -> (unit, "up" or "down")."""
-
-JUDGED_METRICS = NINE_METRICS | {"IRD_excess": ("cm", "down")}
-"""Those nine, and the excess form of IRD, which stands beside the literal one."""
 
 OF_TEXT = tuple(name for name in SCHEMAS if name.startswith("text_"))
 """Tables of text to motion. Each row also names `trained`, the model that was (a smaller one of ours may stand in for
@@ -382,10 +387,8 @@ def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] =
     for needed in (*keys, "value"):
         if needed not in table:
             raise ValueError(f"{where}: needs a column {needed!r}, it has {', '.join(map(str, table.columns))}")
-    table = table[table["value"].notna()].copy()
-    for bound in ("low", "high"):  # undefined where nothing was repeated
-        if bound not in table:
-            table[bound] = float("nan")
+    undefined = {bound: float("nan") for bound in ("low", "high") if bound not in table}  # nothing was repeated
+    table = table[table["value"].notna()].assign(**undefined)
     astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
     for fault, rows in (
         ("a figure that is infinite or outside its interval", astray),

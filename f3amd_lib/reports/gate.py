@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 
 from f3amd_lib.measures.walking import CHECKS
-from f3amd_lib.reports.evidence import Evidence, NotMeasured
+from f3amd_lib.reports.evidence import Evidence, known
 
 LEAST_SHARE = 0.05
 """Of the paper's windows. 100 passes over Bandai, the smallest data set here, are a tenth of them."""
@@ -28,33 +28,23 @@ GATE_STEPS = 8
 def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | None, walks: bool) -> Iterator[str]:
     """Yield what a network lacks, in words."""
     row = {"model": model, "window_frames": window}
-    try:
-        windows = evidence.figure("trained", **row, metric="windows").value
-    except NotMeasured:
+    windows, fall = (known(evidence.figure, "trained", **row, metric=metric) for metric in ("windows", "held_out_fall"))
+    if windows is None:
         yield "no record of training"
-    else:
-        if paper_windows and windows < LEAST_SHARE * paper_windows:
-            yield f"trained {100.0 * windows / paper_windows:.2g} % of the paper's windows"
-        try:
-            if evidence.figure("trained", **row, metric="held_out_fall").value > FLAT:
-                yield "held-out loss was still falling"
-        except NotMeasured:
-            yield "no record of its loss towards the end"
+    elif paper_windows and windows.value < LEAST_SHARE * paper_windows:
+        yield f"trained {100.0 * windows.value / paper_windows:.2g} % of the paper's windows"
+    if windows and fall is None:
+        yield "no record of its loss towards the end"
+    elif windows and fall.value > FLAT:
+        yield "held-out loss was still falling"
     if not walks:
         return
-    try:
-        figures = {
-            check: [
-                evidence.figure("walking", model=name, window_frames=window, steps=steps, metric=check).value
-                for name, steps in ((model, GATE_STEPS), ("real", 0))
-            ]
-            for check in CHECKS
-        }
-    except NotMeasured:
+    rows = (row | {"steps": GATE_STEPS}, {"model": "real", "window_frames": window, "steps": 0})
+    figures = {check: [known(evidence.figure, "walking", **one, metric=check) for one in rows] for check in CHECKS}
+    if any(None in pair for pair in figures.values()):
         yield "no record of walking"
-    else:
-        if not all(holds(*figures[check]) for check, (_, holds) in CHECKS.items()):
-            yield "does not walk"
+    elif not all(holds(*(one.value for one in figures[check])) for check, (_, holds) in CHECKS.items()):
+        yield "does not walk"
 
 
 def why_not_judged(

@@ -21,8 +21,11 @@ was known, and nothing else.
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations, pairwise
 
 import numpy as np
 import pandas as pd
@@ -30,13 +33,13 @@ import pandas as pd
 from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.reports.evidence import (
-    JUDGED_METRICS,
     NINE_METRICS,
     Evidence,
     Figure,
     NotMeasured,
     Setting,
     difference,
+    known,
     mean_figure,
     power_law,
     ratio,
@@ -93,16 +96,8 @@ class Family:
 
     def measured(self, look: Callable[[Setting], object]) -> list[Setting]:
         """Return those for which `look` finds all it needs; NotMeasured if a required one lacks it."""
-        kept = []
-        for setting in self.models:
-            try:
-                look(setting)
-            except NotMeasured:
-                if setting in self.required:
-                    raise
-                continue
-            kept.append(setting)
-        return kept
+        found = lambda setting: look(setting) if setting in self.required else known(look, setting)
+        return [setting for setting in self.models if found(setting) is not None]
 
 
 # ------------------------------------------------------------------------------ verdicts and ranges
@@ -239,6 +234,10 @@ def range_text(figures: Sequence[Figure], unit: str = "") -> str:
     return f"{number_text(min(values))} to {number_text(max(values))}{unit}"
 
 
+def _values_text(figures: Iterable[Figure]) -> str:
+    return ", ".join(number_text(figure.value) for figure in figures)
+
+
 def _list_text(items: Iterable) -> str:
     return ", ".join(f"{item:,}" if isinstance(item, int) else str(item) for item in items)
 
@@ -271,16 +270,13 @@ def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None
 # ---------------------------------------------------------------------------------- rows of a table
 
 
-def _harms(evidence: Evidence, table: str, metric: str, rows, pairs, among) -> list[Figure]:
-    """Return, for pairs (better, worse) of rows, how many times worse the second is."""
-    figures = [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
-    down = METRICS[metric].better == "down"
-    return [ratio(figures[worse], figures[better]) if down else ratio(figures[better], figures[worse])
-            for better, worse in pairs]  # fmt: skip
+def _times_worse(metric: str, figure: Figure, against: Figure) -> Figure:
+    """Return how many times worse a figure of a metric is than another; above 1 where it is the worse one."""
+    return ratio(against, figure) if METRICS[metric].better == "up" else ratio(figure, against)
 
 
-def _values(evidence: Evidence, table: str, metric: str, rows, among) -> list[str]:
-    return [number_text(evidence.figure(table, **(among or {}), **row, metric=metric).value) for row in rows]
+def _row_figures(evidence: Evidence, table: str, metric: str, rows, among) -> list[Figure]:
+    return [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
 
 
 def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
@@ -293,17 +289,16 @@ def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Fin
       rows: columns of each row.
       among: columns that all rows share.
     """
-    pairs = [(place, place + 1) for place in range(len(rows) - 1)]
-    verdict = majority(map(ordered, _harms(evidence, table, metric, rows, pairs, among)))
-    return verdict, ", ".join(_values(evidence, table, metric, rows, among))
+    figures = _row_figures(evidence, table, metric, rows, among)
+    verdict = majority(ordered(_times_worse(metric, second, first)) for first, second in pairwise(figures))
+    return verdict, _values_text(figures)
 
 
 def leads(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
     """Judge whether the first row is better than every other; arguments as of `ranked`."""
-    pairs = [(0, place) for place in range(1, len(rows))]
-    verdict = every(map(ordered, _harms(evidence, table, metric, rows, pairs, among)))
-    first, *others = _values(evidence, table, metric, rows, among)
-    return verdict, f"{first} against {', '.join(others)}"
+    first, *others = _row_figures(evidence, table, metric, rows, among)
+    verdict = every(ordered(_times_worse(metric, other, first)) for other in others)
+    return verdict, f"{number_text(first.value)} against {_values_text(others)}"
 
 
 # ------------------------------------------------------------------------------------------- times
@@ -327,14 +322,10 @@ def speedup(
 
 def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds) -> Finding:
     """Judge the gain in a large crowd (device -> characters), on every device that was timed."""
-    figures, gap = {}, None
-    for device, count in crowds.items():
-        try:
-            figures[f"{device}, {count:,}"] = evidence.speedup(slow, fast, device, count)
-        except NotMeasured as error:
-            gap = gap or error
+    times = {f"{device}, {count:,}": (slow, fast, device, count) for device, count in crowds.items()}
+    figures = {at: gain for at, timed in times.items() if (gain := known(evidence.speedup, *timed))}
     if not figures:
-        raise gap
+        evidence.speedup(slow, fast, *next(iter(crowds.items())))  # the reason is that of the first
     verdict = every(within(gain, bounds, gain=True) for gain in figures.values())
     return verdict, ", ".join(f"{figure_text(gain)}x ({at})" for at, gain in figures.items())
 
@@ -342,10 +333,9 @@ def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds)
 def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Finding:
     """Judge whether the gain of a family is larger with the second number of characters."""
     few, many = characters
-    growth = [
-        ratio(evidence.speedup(slow, model, device, many), evidence.speedup(slow, model, device, few))
-        for model in _timed(evidence, fast, device, characters)
-    ]
+    gain = lambda model, count: evidence.speedup(slow, model, device, count)
+    models = _timed(evidence, fast, device, characters)
+    growth = [ratio(gain(model, many), gain(model, few)) for model in models]
     return majority(map(ordered, growth)), f"{range_text(growth)} times the gain"
 
 
@@ -486,17 +476,11 @@ def convergence(evidence: Evidence, model, against) -> Finding:
 
 def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
     """Return how many times worse a metric is; above 1 where `model` is the worse one."""
-    found, before = evidence.quality(model, metric), evidence.quality(against, metric)
-    return ratio(before, found) if JUDGED_METRICS[metric][1] == "up" else ratio(found, before)
+    return _times_worse(metric, evidence.quality(model, metric), evidence.quality(against, metric))
 
 
 def _has(evidence: Evidence, settings: Iterable[Setting], metric: str) -> bool:
-    try:
-        for setting in settings:
-            evidence.quality(setting, metric)
-    except NotMeasured:
-        return False
-    return True
+    return all(known(evidence.quality, setting, metric) for setting in settings)
 
 
 def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> list[str]:
@@ -520,7 +504,7 @@ def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
     """Judge whether a model is worse than another in one metric, or by a factor in a range."""
     harm = _harm(evidence, model, against, metric)
     values = " against ".join(figure_text(evidence.quality(setting, metric)) for setting in (model, against))
-    text = f"{values} {JUDGED_METRICS[metric][0]}".rstrip()
+    text = f"{values} {METRICS[metric].unit}".rstrip()
     return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
 
 
@@ -543,11 +527,8 @@ def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
 
 def worst_in(evidence: Evidence, model, models) -> Finding:
     """Write in which metrics a model is the last of several (a remark)."""
-    last = [
-        metric
-        for metric in _shared_metrics(evidence, [model, *models])
-        if all(_harm(evidence, model, other, metric).value > 1.0 for other in models)
-    ]
+    metrics = _shared_metrics(evidence, [model, *models])
+    last = [one for one in metrics if all(_harm(evidence, model, other, one).value > 1.0 for other in models)]
     return REMARK, _list_text(last) if last else "in no metric"
 
 
@@ -576,9 +557,8 @@ def best_of(evidence: Evidence, model, models, metric) -> Finding:
     others = [other for other in models.measured(lambda setting: evidence.quality(setting, metric)) if other != model]
     harms = {other.model: _harm(evidence, other, model, metric) for other in others}
     nearest = min(harms, key=lambda name: harms[name].value)
-    return every(
-        map(ordered, harms.values())
-    ), f"next is {nearest} with {figure_text(harms[nearest])} times its {metric}"
+    text = f"next is {nearest} with {figure_text(harms[nearest])} times its {metric}"
+    return every(map(ordered, harms.values())), text
 
 
 def better_at_each_width(evidence: Evidence, better, worse, widths, metric, window=32) -> Finding:
@@ -636,12 +616,9 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=
     """
     fewer = [Setting(model.model, count) for count in steps]
     metrics = _shared_metrics(evidence, [model, *fewer])
-    changes = {
-        (metric, setting): ratio(evidence.quality(setting, metric), evidence.quality(model, metric))
-        for metric in metrics
-        for setting in fewer
-    }
-    verdicts = [every(within(changes[metric, setting], bounds) for setting in fewer) for metric in metrics]
+    value = evidence.quality
+    changes = {(name, one): ratio(value(one, name), value(model, name)) for name in metrics for one in fewer}
+    verdicts = [every(within(changes[name, one], bounds) for one in fewer) for name in metrics]
     metric, setting = max(changes, key=lambda key: abs(np.log(changes[key].value)))
     largest = f"{metric} {figure_text(_in_percent(changes[metric, setting]))} %"
     at = f"{setting.steps} step{'s' if setting.steps > 1 else ''}"
@@ -657,11 +634,9 @@ def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     settings = [Setting(model.model, count) for count in steps]
     metrics = _shared_metrics(evidence, settings)
     texts = []
-    for first, second in zip(settings, settings[1:], strict=False):
-        largest = max(
-            abs(evidence.quality(second, metric).value / evidence.quality(first, metric).value - 1.0)
-            for metric in metrics
-        )
+    value = lambda setting, metric: evidence.quality(setting, metric).value
+    for first, second in pairwise(settings):
+        largest = max(abs(value(second, metric) / value(first, metric) - 1.0) for metric in metrics)
         texts.append(f"{first.steps} to {second.steps} {100.0 * largest:.2g} %")
     return REMARK, ", ".join(texts)
 
@@ -703,12 +678,8 @@ def _order_score(rows: pd.DataFrame) -> float:
     """Return the share of pairs of strengths that a metric puts in order, less that reversed."""
     rows = rows.sort_values("strength")
     figures = [Figure.of(*row) for row in rows[["value", "low", "high"]].to_numpy()]
-    signs = [
-        {HOLDS: 1, FAILS: -1, OPEN: 0}[ordered(ratio(stronger, weaker))]
-        for place, weaker in enumerate(figures)
-        for stronger in figures[place + 1 :]
-    ]
-    return float(np.mean(signs))
+    found = [ordered(ratio(stronger, weaker)) for weaker, stronger in combinations(figures, 2)]
+    return float(np.mean([{HOLDS: 1, FAILS: -1, OPEN: 0}[verdict] for verdict in found]))
 
 
 def better_graded(evidence: Evidence, metric, than) -> Finding:
@@ -781,15 +752,11 @@ def gradient_growth(evidence: Evidence, bounds) -> Finding:
     return within(gain, bounds), f"{number_text(gain.value)}x from the lowest to the highest third of sigma"
 
 
-KINDS = {
-    kind.__name__: kind
-    for kind in (
-        figure, ranked, leads, speedup, speedup_on_some_device, speedup_growth, speedup_at_each, speedup_above,
-        saving, mean_saving,
-        jax_over_torch, speedup_over_torch, step_exponent, step_exponent_growth, training_ratio, convergence, worse,
-        worse_in, worse_in_every_metric, worst_in, alike, metric_spread, best_of, better_at_each_width, window_loss,
-        window_gain, steady_over_steps, change_between_steps, moved_by_inputs, drift, better_graded, steady_over_noise,
-        steadier_over_noise, gradient_growth,
-    )
-}  # fmt: skip
+def kinds_of(module: str) -> dict[str, Callable[..., Finding]]:
+    """Return the kinds of judgement that a module defines: its public functions that return a finding, by name."""
+    functions = inspect.getmembers(sys.modules[module], inspect.isfunction)
+    return {name: one for name, one in functions if one.__annotations__.get("return") == "Finding" and name[0] != "_"}
+
+
+KINDS = kinds_of(__name__)
 """Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""

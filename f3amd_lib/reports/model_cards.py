@@ -1,6 +1,6 @@
 """A card for every model that ships: what it is, its data, how well it does, its limits.
 
-    python -m f3amd_lib.reports.model_cards        # writes cards, checksums and the table of docs/results.md
+    f3amd cards        # writes cards, checksums and the table of docs/results.md
 
 Everything on a card is read from the weights file and from committed results; nothing is typed in.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -74,9 +73,27 @@ def _filled(name: str, path: Path, trained, params, **fields) -> str:
     )  # fmt: skip
 
 
-def _last_loss(path: Path) -> float:
-    """Return the last held-out loss of the history beside a weights file."""
-    return read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
+def _training(path: Path, record: Mapping, recipe: Mapping, examples: str, data: str) -> dict:
+    """Return what a card says of a training: how many examples it saw, in how many steps, and its last held-out loss.
+
+    Args:
+      path: the weights, with the history beside them.
+      record, recipe: of the run.
+      examples, data: keys of the record: examples seen, and examples in the data.
+    """
+    # A model may be trained in several legs, of which the recipe is the last's.
+    seen, legs = record.get(examples, recipe["num_steps"] * recipe["batch_size"]), record.get("schedule_note")
+    loss = read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
+    shares = {"steps": seen // recipe["batch_size"], "passes": seen / record[data]}
+    return {"recipe": recipe, "loss": loss, "seen": seen, "legs": f" ({legs})" if legs else "", **shares}
+
+
+def _text_training(path: Path, trained, recipe: Mapping, paper: str) -> dict:
+    """Return what a card of a model of text to motion says of its training, beside the paper's."""
+    about = load_paper_file("paper", paper)["training"]
+    fields = _training(path, trained.record, recipe, "motions_seen", "num_train_clips")
+    fields |= {"paper": about["says"], "share": 100 * fields["seen"] / about["windows"]["text"]}
+    return fields | {"seconds": trained.most_frames / trained.fps, "words": len(trained.words)}
 
 
 def model_card(path: Path, quality: pd.DataFrame | None) -> str:
@@ -92,13 +109,8 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    path = Path(path)
     trained = load_model(path)
-    record, recipe = trained.record, trained.record["training"]
-    # A model may be trained in several legs, of which the recipe is the last's.
-    windows = record.get("windows_seen", recipe["num_steps"] * recipe["batch_size"])
-    steps, legs = windows // recipe["batch_size"], record.get("schedule_note")
-    passes = windows / record["num_train_windows"]
+    training = _training(path, trained.record, trained.record["training"], "windows_seen", "num_train_windows")
     figures, limits = "Not measured by the protocol yet.", []
     if quality is not None:
         weights = weights_digest(trained.params)
@@ -112,13 +124,11 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
             )
             limits = _limits(measured, real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
-    if passes < 20:
+    if training["passes"] < 20:
         limits.append("It was trained far shorter than the paper's models.")
     return _filled(
-        "model_card", path, trained, trained.params,
-        recipe=recipe, loss=_last_loss(path), styles=", ".join(trained.styles), steps=steps,
-        legs=f" ({legs})" if legs else "", windows=windows, passes=passes, measured=figures,
-        limits="\n".join(f"- {limit}" for limit in limits),
+        "model_card", path, trained, trained.params, **training,
+        styles=", ".join(trained.styles), measured=figures, limits="\n".join(f"- {limit}" for limit in limits),
     )  # fmt: skip
 
 
@@ -135,13 +145,9 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    path = Path(path)
     trained = load_text_model(path)
     record, recipe = trained.record, trained.record["identity"]["training"]
-    # A model may be trained in several legs, of which the recipe is the last's.
-    motions = record.get("motions_seen", recipe["num_steps"] * recipe["batch_size"])
-    steps, legs = motions // recipe["batch_size"], record.get("schedule_note")
-    paper = load_paper_file("paper", "acmdm")["training"]
+    training, codec = _text_training(path, trained, recipe, "acmdm"), trained.codec
     measured = "Not measured yet."
     if hands is not None:
         own = hands[(hands["weights"] == weights_digest(trained.params)) | hands["model"].isin(["real clips"])]
@@ -152,22 +158,17 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
             measured = f"Which hand goes up where the caption says left or right:\n\n{markdown_table(counts)}"
     command = (
         f"f3amd train --preset {trained.name} --data {record['dataset']} --window {trained.most_frames} "
-        f"--steps {steps} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
+        f"--steps {training['steps']} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
     )
+    state = "positions of joints" + (" and redundant features" if codec.redundancy else "")
+    if codec.frames_per_state > 1:
+        state = f"latent of {codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
+    elif codec.mesh:
+        state = f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
+    guidance = f"{record['guidance']:g}" if "guidance" in record else "the paper's 3"
     return _filled(
-        "text_model_card", path, trained, (trained.params, trained.codec.params),
-        recipe=recipe, loss=_last_loss(path),
-        state=f"latent of {trained.codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
-        if trained.codec.frames_per_state > 1
-        else f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
-        if trained.codec.mesh
-        else "positions of joints" + (" and redundant features" if trained.codec.redundancy else ""),
-        seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
-        paper=paper["says"], steps=steps, legs=f" ({legs})" if legs else "",
-        guidance=f"{record['guidance']:g}" if "guidance" in record else "the paper's 3",
-        passes=motions / record["num_train_clips"],
-        measured=measured, words=len(trained.words),
-        command=command,
+        "text_model_card", path, trained, (trained.params, codec.params), **training,
+        state=state, guidance=guidance, measured=measured, command=command,
     )  # fmt: skip
 
 
@@ -184,11 +185,8 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    path = Path(path)
     trained = load_latent_model(path)
-    record, recipe = trained.record, trained.training
-    motions = recipe["num_steps"] * recipe["batch_size"]
-    paper = load_paper_file("paper", "motionpcm")["training"]
+    training, phases = _text_training(path, trained, trained.training, "motionpcm"), trained.training["num_phases"]
     shown = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance", "sampling_seconds"]
     rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
             for name, table in tables.items() if "steps" in table]  # fmt: skip
@@ -203,22 +201,16 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
             "Figures of one judge compare with each other alone."
         )
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
-    kept = None
     if (table := tables.get("text_pcm3")) is not None:
         values = table.set_index(["trained", "metric"])["value"]
-        kept = values.get((find_preset(trained.name).latent, "kept_movement"))
-    if kept is not None:
-        movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
+        if (kept := values.get((find_preset(trained.name).latent, "kept_movement"))) is not None:
+            movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
     is_student = bool(trained.config.guidance_features)
+    what = f"student of {phases} step{'s' * (phases > 1)}" if is_student else "teacher, sampled by DDIM"
     return _filled(
-        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params),
-        recipe=recipe, loss=_last_loss(path),
-        what=f"student of {recipe['num_phases']} step{'s' * (recipe['num_phases'] > 1)}" if is_student
-        else "teacher, sampled by DDIM",
-        seconds=trained.most_frames / trained.fps, motions=motions, share=100 * motions / paper["windows"]["text"],
-        paper=paper["says"], passes=motions / record["num_train_clips"],
-        measured=measured, words=len(trained.words),
-        latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}", movement=movement,
+        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params), **training,
+        what=what, measured=measured, latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}",
+        movement=movement,
     )  # fmt: skip
 
 
@@ -235,7 +227,6 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    path = Path(path)
     judge = load_judge(path)
     digest, measured = weights_digest(judge.params), "Not measured yet."
     if seen is not None and seen[1]["judge_weights"] == digest:
@@ -255,11 +246,9 @@ def _terms(record: dict) -> str:
 
 def checksums(folder: Path) -> str:
     """Return lines for `sha256sum --check` of all weights below a folder."""
-    folder = Path(folder)
     files = sorted(folder.rglob("*.safetensors"))
-    return "".join(
-        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n" for file in files
-    )
+    digest = lambda file: hashlib.sha256(file.read_bytes()).hexdigest()
+    return "".join(f"{digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files)
 
 
 def committed_quality(dataset: str) -> pd.DataFrame | None:
@@ -321,7 +310,6 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     Returns:
       The cards.
     """
-    folder = Path(folder)
     cards = []
     for path in sorted(folder.rglob("*.safetensors")):
         card = path.with_suffix(".md")
@@ -342,19 +330,13 @@ def write_measured_table(path: Path, quality: pd.DataFrame) -> None:
     Raises:
       ValueError: if the marks are not there.
     """
-    text = Path(path).read_text(encoding="utf-8")
-    page = fill_tables(text, {"measured": measured_table(quality)}, str(path))
-    Path(path).write_text(page, encoding="utf-8")
+    page = fill_tables(path.read_text(encoding="utf-8"), {"measured": measured_table(quality)}, str(path))
+    path.write_text(page, encoding="utf-8")
 
 
 def main() -> int:
     """Write all cards and the table of docs/results.md; see the module's first lines."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     for card in write_cards():
         log.info("%s", card)
     write_measured_table(repository_root() / "docs" / "results.md", committed_quality("bandai"))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

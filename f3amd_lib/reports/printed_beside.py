@@ -36,14 +36,11 @@ def beside_printed(paper: str, name: str, metrics: Sequence[str], dataset: str =
     for whose, part in parts.items():
         for metric in metrics:
             rows = part[part["metric"] == metric].set_index(keys)
-            columns.append(rows.apply(_with_interval, axis=1).rename(f"{whose}: {_heading(metric)}"))
+            heading = METRICS[metric].title + ARROWS.get(METRICS[metric].better, "")
+            columns.append(rows.apply(_with_interval, axis=1).rename(f"{whose}: {heading}"))
     if stored is not None:
         columns.append(stored.drop_duplicates(keys).set_index(keys)["trained"].rename("our network"))
     return pd.concat(columns, axis=1).fillna("–").reset_index(), sentence
-
-
-def _heading(metric: str) -> str:
-    return METRICS[metric].title + ARROWS.get(METRICS[metric].better, "")
 
 
 def _with_interval(row) -> str:

@@ -58,18 +58,10 @@ def quality_bars(
 
 def _compare(how: str, made: float, real: float, broken: pd.Series, spread: float) -> float:
     """Say how a figure of a model stands beside those of real and of broken motion."""
-    if how == "itself":
-        return made
-    if how == "percent":
-        return 100.0 * made
-    if how == "share of continuations":
-        return made / spread
-    if how == "share of real":
-        return made / real
-    distance = abs(made - real)
-    if how == "distance to real":
-        return distance
-    return distance / (real if how == "distance over real" else (made - broken).abs().min())
+    figure = abs(made - real) if how in ("distance to real", "distance over real", "nearness to real") else made
+    wholes = {"share of continuations": spread, "share of real": real, "distance over real": real}
+    wholes["nearness to real"] = (made - broken).abs().min()
+    return 100.0 * made if how == "percent" else figure / wholes.get(how, 1.0)
 
 
 def _answers(found: dict, sign: str, limit: float) -> dict:

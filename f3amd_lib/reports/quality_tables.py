@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.names import row_label
-from f3amd_lib.ground.papers import PAPER_TABLES, load_paper_table
+from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
 from f3amd_lib.measures.registry import SHOWN, Metric
 from f3amd_lib.networks import presets
@@ -35,11 +35,6 @@ NOTE = (
 )
 """What a reader of every such table must know."""
 
-_EXTRA_NOTES = {
-    6: "CAMDM-code is the network of the released code, trained here; the weights that its authors "
-    "published were not run.",
-    11: "The paper's column of times is left out.",
-}
 
 _KEYS = ["model", "window_frames", "steps", "metric"]
 
@@ -105,8 +100,7 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
     Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `presets.find_preset`'s.
     """
     if table not in QUALITY_TABLES:
-        known = ", ".join(map(str, QUALITY_TABLES))
-        raise ValueError(f"the paper's quality tables are {known}, not {table!r}")
+        raise ValueError(f"the paper's quality tables are {', '.join(map(str, QUALITY_TABLES))}, not {table!r}")
     if not dataset_label or dataset_label == PAPER_SOURCE:
         raise ValueError(f"dataset_label must say what ours were measured on, unlike {PAPER_SOURCE!r}")
     paper = load_paper_table(table)
@@ -116,12 +110,10 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
     unlike = ours[ours["unit"].fillna("") != ours["metric"].map(about["unit"])]
     if len(unlike):
         metric, unit = unlike[["metric", "unit"]].iloc[0]
-        raise ValueError(
-            f"{metric} is in {unit or 'no unit'} here and in {about['unit'][metric] or 'no unit'} in the paper"
-        )
+        theirs = about["unit"][metric]
+        raise ValueError(f"{metric} is in {unit or 'no unit'} here and in {theirs or 'no unit'} in the paper")
     measured = ours.set_index(_KEYS)[["value", "low", "high"]].to_dict("index")
     systems = {key[:3] for key in measured}
-    undefined = {"value": np.nan, "low": np.nan, "high": np.nan}
     rows: list[dict] = []
 
     def line(model: str, frames: int, steps: int, source: str, figures: Mapping[str, dict]) -> None:
@@ -130,13 +122,11 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
             rows.append({**named, "source": source, "metric": metric, **about.loc[metric], **figures[metric]})
 
     def our_line(model: str, frames: int, steps: int) -> None:
+        gap = "" if (model, frames, steps) in systems else NOT_MEASURED
         figures = {}
         for metric in FIGURES:
-            figure = measured.get((model, frames, steps, metric), undefined)
-            text = "" if np.isnan(figure["value"]) else figure_text(**figure)
-            if (model, frames, steps) not in systems:
-                text = NOT_MEASURED
-            figures[metric] = {"printed": text} | figure
+            figure = measured.get((model, frames, steps, metric), dict.fromkeys(("value", "low", "high"), np.nan))
+            figures[metric] = {"printed": gap if np.isnan(figure["value"]) else figure_text(**figure)} | figure
         line(model, frames, steps, dataset_label, figures)
 
     for frames in paper["window_frames"].unique():
@@ -165,7 +155,6 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
     made = rows[rows["steps"] > 0]
     headings = {"window_frames": "frames", "steps": "steps"}
     varied = {column: heading for column, heading in headings.items() if made[column].nunique() > 1}
-    arrows = dict(zip(rows["metric"], rows["better"].map(ARROWS), strict=True))
     lines: list[dict] = []
     for _, cells in rows.groupby("line", sort=False):
         first = cells.iloc[0]
@@ -173,12 +162,10 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
         if missing and first["steps"] > 0:
             lines[-1]["source"] += f"; ours {NOT_MEASURED}"
             continue
-        shown = {"model": first["model"]}
-        for column, heading in varied.items():
-            shown[heading] = str(first[column]) if first[column] else ""
+        shown = {"model": first["model"]} | {heading: str(first[column] or "") for column, heading in varied.items()}
         shown["source"] = first["source"] + (f": {NOT_MEASURED}" if missing else "")
-        for metric, text in zip(cells["metric"], cells["printed"], strict=True):
-            shown[FIGURES[metric] + arrows[metric]] = "" if missing else text
+        for metric, better, text in cells[["metric", "better", "printed"]].itertuples(index=False):
+            shown[FIGURES[metric] + ARROWS[better]] = "" if missing else text
         lines.append(shown)
     return pd.DataFrame(lines)
 
@@ -197,9 +184,10 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     """
     rows = beside_paper(table, quality, dataset_label)
     frames = rows.loc[rows["steps"] > 0, "window_frames"].unique()
-    title = f"**Table {table}.** {PAPER_TABLES[table][1]}"
+    about = load_paper_table(table).attrs
+    title = f"**Table {table}.** {about['title']}"
     title += f", windows of {frames[0]} frames." if len(frames) == 1 else "."
-    note = " ".join([NOTE, *([_EXTRA_NOTES[table]] if table in _EXTRA_NOTES else [])])
+    note = f"{NOTE} {about['note']}".strip()
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
 
 
@@ -268,8 +256,7 @@ def paper_rows(models: Sequence[str] = ("F3AMD-FNO-96", "CAMDM"), *, table: int 
     """
     printed = load_paper_table(table)
     kept = printed[printed["model"].isin(models) & (printed["window_frames"] == window)]
-    missing = sorted(set(models) - set(kept["model"]))
-    if missing:
+    if missing := sorted(set(models) - set(kept["model"])):
         raise ValueError(f"Table {table} has no row {missing[0]!r} for {window} frames")
     labels = [f"paper, {m}, {s} steps" for m, s in zip(kept["model"], kept["steps"], strict=True)]
     return kept.assign(label=labels)
@@ -285,15 +272,9 @@ def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.Da
     Returns:
       A DataFrame: metric (with its unit), then the labels; a figure that is not there is NaN.
     """
-    headings = {
-        metric: metric_heading(metric, unit, better)
-        for metric, unit, better in zip(ours["metric"], ours["unit"], ours["better"], strict=True)
-    }
-    table = pd.DataFrame({"metric": list(headings.values())})
-    for part in (ours, paper):
-        if part is None:
-            continue
-        for label, rows in part.groupby("label", sort=False):
-            values = dict(zip(rows["metric"], rows["value"], strict=True))
-            table[label] = [float(values.get(metric, np.nan)) for metric in headings]
-    return table
+    named = ours[["metric", "unit", "better"]].itertuples(index=False)
+    headings = {metric: metric_heading(metric, unit, better) for metric, unit, better in named}
+    both = pd.concat([ours, paper])  # which leaves out a paper that is None
+    table = both.pivot(index="metric", columns="label", values="value")
+    table = table.reindex(index=list(headings), columns=both["label"].unique()).rename(headings)
+    return table.rename_axis(columns=None).reset_index()

@@ -21,15 +21,8 @@ from f3amd_lib.training.recipe import TrainingConfig
 from f3amd_lib.training.text_motion import TextMotionTraining
 
 _CONFIGS = {
-    config.__name__: {field.name: field.default for field in dataclasses.fields(config)}
-    for config in (
-        F3AMDConfig,
-        CAMDMConfig,
-        TrainingConfig,
-        MaskedACMDMConfig,
-        TextMotionTraining,
-        LatentMotionTraining,
-    )  # fmt: skip
+    kind.__name__: {field.name: field.default for field in dataclasses.fields(kind)}
+    for kind in (F3AMDConfig, CAMDMConfig, TrainingConfig, MaskedACMDMConfig, TextMotionTraining, LatentMotionTraining)
 }
 
 
@@ -77,14 +70,7 @@ def readings_table(*topics: str, paper: str = "f3amd") -> pd.DataFrame:
     known = list(dict.fromkeys(reading["topic"] for reading in readings))
     for topic in topics:
         check_known(topic, known, "topic")
-    return pd.DataFrame(
-        {
-            "topic": reading["topic"],
-            "open point": reading["point"],
-            "the paper": reading["paper"],
-            "here": fill_reading(reading, f"{paper}/readings.toml"),
-            "why": reading["why"],
-        }
-        for reading in readings
-        if not topics or reading["topic"] in topics
-    )
+    kept = [reading for reading in readings if not topics or reading["topic"] in topics]
+    filled = [reading | {"here": fill_reading(reading, f"{paper}/readings.toml")} for reading in kept]
+    table = pd.DataFrame(filled, columns=["topic", "point", "paper", "here", "why"])
+    return table.rename(columns={"point": "open point", "paper": "the paper"})

@@ -16,7 +16,7 @@ from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.spectral import FNOBlock, SpectralConvolution, count_modes
 from f3amd_lib.reports.evidence import Figure
-from f3amd_lib.reports.judgements import FAILS, HOLDS, TOLERANCE, Finding, equal_range, within
+from f3amd_lib.reports.judgements import FAILS, HOLDS, TOLERANCE, Finding, equal_range, kinds_of, within
 
 ROUNDING = 1e-12
 """Two float64 computations of one number agree to this; 16 digits less a few."""
@@ -118,7 +118,5 @@ def local_cost(_) -> Finding:
     return HOLDS if share <= TOLERANCE else FAILS, text
 
 
-KINDS = {
-    kind.__name__: kind for kind in (ve_is_vp, ddim_is_euler, reaches_data, attention_cost, spectral_cost, local_cost)
-}
+KINDS = kinds_of(__name__)
 """Kind of judgement, as `claims.toml` names it -> function of the (unused) evidence and its parameters."""
