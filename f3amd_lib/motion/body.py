@@ -1,28 +1,28 @@
 """A procedural body for any skeleton: capsules of about 1,000 vertices, each of which moves with one joint.
 
-One capsule goes along each bone and one beyond each head, hand and toe. Its two radii come from `body.csv`, by the role
-of the joint at the bone's end, in metres for legs of `LEG` metres. `wide` stretches it from left to right, which is the
-axis that a middle joint's frame turns round in a mirror (`Skeleton.mirror_frames`). `tip` is a length, for rigs without
-end sites.
+One capsule goes along each bone and one beyond each head, hand and toe. Its two radii come from `body.toml`, by the
+role of the joint at the bone's end, in metres for legs of `LEG` metres. `wide` stretches it from left to right, which
+is the axis that a middle joint's frame turns round in a mirror (`Skeleton.mirror_frames`). `tip` is a length, for rigs
+without end sites.
 
 Source: ours.
 """
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Skeleton, forward_kinematics, walk_tree
 
 LEG = 0.85
-"""Length of thigh and shank that the radii of `body.csv` are for, metres."""
+"""Length of thigh and shank that the radii of `body.toml` are for, metres."""
 
 SIDES = 8
 """Corners of a capsule's rings."""
@@ -30,12 +30,7 @@ SIDES = 8
 _LATITUDES = np.array([-1.0, -0.5, 0.0])  # of a half sphere's pole and rings, in quarter turns
 
 
-def _read_table() -> dict[str, dict[str, float]]:
-    with (resources.files("f3amd_lib.motion") / "body.csv").open(encoding="utf-8", newline="") as file:
-        return {row.pop("part"): {k: float(v or 0) for k, v in row.items()} for row in csv.DictReader(file)}
-
-
-_TABLE = _read_table()
+_TABLE = read_toml(Path(__file__).with_name("body.toml"))
 
 
 @dataclass(frozen=True, eq=False)
