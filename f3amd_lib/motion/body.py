@@ -50,7 +50,7 @@ class Body:
     weights: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Capsule:
     """A limb: two half spheres and what lies between.
 
@@ -62,10 +62,10 @@ class Capsule:
     """
 
     joint: int
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: np.ndarray
+    end: np.ndarray
     radii: tuple[float, float]
-    wide: tuple[float, float, float]
+    wide: np.ndarray
 
 
 def body_capsules(skeleton: Skeleton) -> list[Capsule]:
@@ -97,8 +97,7 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
     for (joint, kind), one in list(capsules.items()):
         twin = twins[joint]
         if twin > joint and (twin, kind) in capsules:
-            mirrored = frames[one.joint]
-            turned = {name: tuple(mirrored * getattr(one, name)) for name in ("start", "end", "wide")}
+            turned = {name: frames[one.joint] * getattr(one, name) for name in ("start", "end", "wide")}
             capsules[twin, kind] = Capsule(twins[one.joint], radii=one.radii, **turned)
     return list(capsules.values())
 
@@ -108,14 +107,13 @@ def _capsule(joint: int, offset, part: str, scale: float, frames) -> Capsule:
     limit = np.inf if part in _TABLE and part else 0.3 * np.linalg.norm(offset)
     radii = tuple(float(min(scale * row[name], limit)) for name in ("start", "end"))
     lateral = frames[joint] < 0
-    wide = row["wide"] * lateral if lateral.sum() == 1 else np.zeros(3)
-    return Capsule(joint, (0.0, 0.0, 0.0), tuple(np.asarray(offset, float)), radii, tuple(wide.astype(float)))
+    return Capsule(joint, np.zeros(3), offset, radii, row["wide"] * lateral * (lateral.sum() == 1))
 
 
 def capsule_mesh(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [5 SIDES + 2, 3] in the joint's frame, and faces."""
-    start, end = np.array(capsule.start), np.array(capsule.end)
-    axis, wide = unit(end - start), np.array(capsule.wide)
+    start, end, wide = capsule.start, capsule.end, capsule.wide
+    axis = unit(end - start)
     stretch = np.linalg.norm(wide) or 1.0
     across = wide - (wide @ axis) * axis
     if np.linalg.norm(across) <= 1e-6:
