@@ -32,7 +32,6 @@ from f3amd_lib.data.text_motions import (
     MOST_FRAMES,
     UNIT,
     TextMotions,
-    joined_clips,
     text_motions,
 )
 from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
@@ -174,7 +173,7 @@ def read_humanml3d(
     usual = {"name": folder.name, "licence": "as its owner says", "credit": ""}
     terms = {what: described.get(what, value) for what, value in usual.items()}
     kept = np.concatenate(kept_vectors) if vectors else None
-    return joined_clips(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), vectors=kept, **terms)
+    return TextMotions.joined(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), vectors=kept, **terms)
 
 
 def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list[tuple[str, tuple, slice]]:
@@ -253,36 +252,32 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
     if len(set(data.names)) != data.num_clips:
         raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
     with whole_folder(folder) as temporary:
-        _write_clips(temporary, data)
+        for part in ("new_joints", "new_joint_vecs", "texts"):
+            (temporary / part).mkdir(parents=True, exist_ok=True)
+        training = []
+        for number, name in enumerate(data.names):
+            clip = data.clip(number)
+            vectors = redundant_from_positions(data.skeleton, clip).astype(np.float32)
+            np.save(temporary / "new_joints" / f"{name}.npy", clip[:-1])
+            np.save(temporary / "new_joint_vecs" / f"{name}.npy", vectors)
+            _write(temporary / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
+            if data.splits[number] == "train":
+                training.append(vectors)
+        mean, deviation = grouped_statistics(np.concatenate(training))
+        np.save(temporary / "Mean.npy", mean)
+        np.save(temporary / "Std.npy", deviation)
+        names = np.array(data.names)
+        members = {split: names[np.equal(data.splits, split)].tolist() for split in SPLITS}
+        for split, file in _SPLIT_FILES.items():
+            _write(temporary / file, members[split])
+        _write(temporary / "train_val.txt", members["train"] + members["validation"])
+        _write(temporary / "all.txt", data.names)
+        skeleton = data.skeleton
+        described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
+        described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
+        described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
+        _write(temporary / "skeleton.json", [json.dumps(described, indent=1)])
     return folder
-
-
-def _write_clips(folder: Path, data: TextMotions) -> None:
-    for part in ("new_joints", "new_joint_vecs", "texts"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    training = []
-    for number, name in enumerate(data.names):
-        clip = data.clip(number)
-        vectors = redundant_from_positions(data.skeleton, clip).astype(np.float32)
-        np.save(folder / "new_joints" / f"{name}.npy", clip[:-1])
-        np.save(folder / "new_joint_vecs" / f"{name}.npy", vectors)
-        _write(folder / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
-        if data.splits[number] == "train":
-            training.append(vectors)
-    mean, deviation = grouped_statistics(np.concatenate(training))
-    np.save(folder / "Mean.npy", mean)
-    np.save(folder / "Std.npy", deviation)
-    names = np.array(data.names)
-    members = {split: names[np.equal(data.splits, split)].tolist() for split in SPLITS}
-    for split, file in _SPLIT_FILES.items():
-        _write(folder / file, members[split])
-    _write(folder / "train_val.txt", members["train"] + members["validation"])
-    _write(folder / "all.txt", data.names)
-    skeleton = data.skeleton
-    described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
-    described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
-    described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
-    _write(folder / "skeleton.json", [json.dumps(described, indent=1)])
 
 
 def _write(path: Path, lines) -> None:

@@ -101,6 +101,14 @@ class TextMotions:
     skipped: tuple[tuple[str, str], ...] = ()
     vectors: np.ndarray | None = None
 
+    @classmethod
+    def joined(cls, clips, **attributes) -> TextMotions:
+        """Return a data set of (name, captions, split, pair, positions) of each clip and its other attributes."""
+        columns = dict(zip((*_LISTS, "positions"), zip(*clips, strict=True), strict=True))
+        start = np.cumsum([0, *map(len, columns["positions"])])
+        columns["positions"] = np.concatenate(columns["positions"])
+        return cls(start=start, **columns, **attributes)
+
     @property
     def num_clips(self) -> int:
         """Number of clips, K."""
@@ -188,14 +196,6 @@ def going_on(positions) -> np.ndarray:
 _LISTS = ("names", "captions", "splits", "pairs")
 
 
-def joined_clips(clips, **attributes) -> TextMotions:
-    """Put a data set together from (name, captions, split, pair, positions) of each clip and its other attributes."""
-    columns = dict(zip((*_LISTS, "positions"), zip(*clips, strict=True), strict=True))
-    start = np.cumsum([0, *map(len, columns["positions"])])
-    columns["positions"] = np.concatenate(columns["positions"])
-    return TextMotions(start=start, **columns, **attributes)
-
-
 def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
     """Put a data set together from motions, each moved to its canonical start.
 
@@ -209,7 +209,7 @@ def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
         for name, motion, captions, split, pair in clips
     )
     # The tips of limbs would need rotations.
-    return joined_clips(canonical, skeleton=dataclasses.replace(skeleton, end_sites=()), **attributes)
+    return TextMotions.joined(canonical, skeleton=dataclasses.replace(skeleton, end_sites=()), **attributes)
 
 
 def evaluation_classes(data: TextMotions, least: int = CLASS_CLIPS) -> list[str]:
