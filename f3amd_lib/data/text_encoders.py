@@ -114,12 +114,10 @@ def _words(text: str) -> list[str]:
 
 def _padded(pieces: Sequence[np.ndarray], pooled) -> TextEmbeddings:
     """Put token vectors of unlike numbers side by side."""
-    count = max(len(piece) for piece in pieces)
-    tokens = np.zeros((len(pieces), count, pieces[0].shape[-1]), np.float32)
-    for row, piece in zip(tokens, pieces, strict=True):
-        row[: len(piece)] = piece
-    mask = np.arange(count) < np.array([len(piece) for piece in pieces])[:, None]
-    return TextEmbeddings(tokens, mask, np.asarray(pooled, np.float32))
+    lengths = np.array([len(piece) for piece in pieces])
+    tokens = [np.pad(piece, ((0, lengths.max() - len(piece)), (0, 0))) for piece in pieces]
+    mask = np.arange(lengths.max()) < lengths[:, None]
+    return TextEmbeddings(np.array(tokens, np.float32), mask, np.asarray(pooled, np.float32))
 
 
 def load_wordllama() -> TextEncoder:

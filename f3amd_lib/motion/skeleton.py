@@ -114,10 +114,9 @@ class Skeleton:
     @functools.cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
         """Joints by depth: level 0 is the root. Kinematics walks levels, not joints."""
-        depth = [0] * self.num_joints
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                depth[joint] = depth[parent] + 1
+        depth = []
+        for parent in self.parents:
+            depth.append(depth[parent] + 1 if parent >= 0 else 0)
         return tuple(tuple(np.flatnonzero(np.equal(depth, level)).tolist()) for level in range(max(depth) + 1))
 
     @functools.cached_property
