@@ -113,22 +113,12 @@ def test_complex_is_chosen_by_its_seed():
     assert np.abs(one.position - other.position).max() > 0.5
 
 
-def test_ramp_starts_from_rest():
-    path = named_path("straight", 200, speed=1.2, ramp_seconds=1.0)
-    speed = 30.0 * np.diff(path.position[:, 1])
-    assert speed[0] < 0.02
-    np.testing.assert_allclose(speed[31:], 1.2, atol=1e-9)
-    assert np.all(np.diff(speed) > -1e-12)
-
-
 def test_unknown_name_names_the_nearest():
     refused("did you mean 'spiral'", named_path, "spirale", 10)
     refused("one of straight, circle", named_path, "zzz", 10)
 
 
-@pytest.mark.parametrize(
-    "bad", [{"num_frames": 1}, {"speed": 0.0}, {"speed": np.nan}, {"fps": 0}, {"ramp_seconds": -1}]
-)
+@pytest.mark.parametrize("bad", [{"num_frames": 1}, {"speed": 0.0}, {"speed": np.nan}, {"fps": 0}])
 def test_bad_numbers_are_refused(bad):
     refused(next(iter(bad)).split("_")[0], named_path, "circle", **{"num_frames": 10} | bad)
 

@@ -96,7 +96,7 @@ def test_the_longest_held_out_clip_of_a_style_is_followed():
 
 
 def test_path_statistics_of_a_line_and_of_a_circle():
-    line = path_statistics([named_path("straight", 300, speed=1.5, ramp_seconds=0.0)])
+    line = path_statistics([named_path("straight", 300, speed=1.5)])
     assert line["speed_m_s"] == pytest.approx(1.5, rel=1e-3)
     assert line["turn_deg_s"] == pytest.approx(0.0, abs=1e-6)
     assert line["standing_share"] == 0.0

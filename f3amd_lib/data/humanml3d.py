@@ -25,7 +25,15 @@ import numpy as np
 from tqdm import tqdm
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
-from f3amd_lib.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, UNIT, TextMotions, text_motions
+from f3amd_lib.data.text_motions import (
+    FEWEST_FRAMES,
+    FPS,
+    HELD_OUT_PERCENT,
+    MOST_FRAMES,
+    UNIT,
+    TextMotions,
+    text_motions,
+)
 from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
 from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
@@ -133,7 +141,7 @@ def read_humanml3d(
     skeleton, described = _skeleton_of(folder, layout, fix)
     fewest = described["fewest_frames"] if fewest_frames is None else fewest_frames
     joints, fps = skeleton.num_joints, described["fps"]
-    clips, skipped, seen = [], [], {}
+    clips, kept_vectors, skipped, seen = [], [], [], {}
     for split, file in _SPLIT_FILES.items():
         for number, name in enumerate(_lines(folder / file, fix), 1):
             name = name.strip()
@@ -157,26 +165,15 @@ def read_humanml3d(
                 if not fewest <= length <= MOST_FRAMES:
                     skipped.append((clip, f"{length} frames, not {fewest} to {MOST_FRAMES}"))
                     continue
-                clips.append((clip, captions, split, positions[part], wide[part]))
+                pair = described.get("pairs", {}).get(clip, clip)
+                clips.append((clip, captions, split, pair, positions[part]))
+                kept_vectors.append(wide[part])
     if not clips:
         raise ValueError(f"{folder}: no clip of {fewest} to {MOST_FRAMES} frames; {fix}")
-    names, captions, splits, positions, wide = zip(*clips, strict=True)
-    pairs = described.get("pairs", {})
-    return TextMotions(
-        name=described.get("name", folder.name),
-        skeleton=skeleton,
-        fps=fps,
-        positions=np.concatenate(positions),
-        start=np.cumsum([0, *map(len, positions)]),
-        names=names,
-        captions=captions,
-        splits=splits,
-        pairs=tuple(pairs.get(name, name) for name in names),
-        licence=described.get("licence", "as its owner says"),
-        credit=described.get("credit", ""),
-        skipped=tuple(skipped),
-        vectors=np.concatenate(wide) if vectors else None,
-    )
+    usual = {"name": folder.name, "licence": "as its owner says", "credit": ""}
+    terms = {what: described.get(what, value) for what, value in usual.items()}
+    kept = np.concatenate(kept_vectors) if vectors else None
+    return TextMotions.joined(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), vectors=kept, **terms)
 
 
 def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list[tuple[str, tuple, slice]]:
@@ -232,7 +229,7 @@ def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, 
 # ------------------------------------------------------------------------------------------ writing
 
 
-def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = None) -> Path:
+def write_humanml3d(folder, data: TextMotions) -> Path:
     """Write motions with captions in HumanML3D's layout.
 
     Others' text-to-motion code reads it like HumanML3D; where that names joints by number, give it
@@ -241,7 +238,6 @@ def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = N
     Args:
       folder: to write to; must be empty or not there yet.
       data: what to write.
-      contact_step: of the contacts in the vectors, if another than HumanML3D's.
 
     Returns:
       The folder.
@@ -256,37 +252,32 @@ def write_humanml3d(folder, data: TextMotions, *, contact_step: float | None = N
     if len(set(data.names)) != data.num_clips:
         raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
     with whole_folder(folder) as temporary:
-        _write_clips(temporary, data, {} if contact_step is None else {"contact_step": contact_step})
+        for part in ("new_joints", "new_joint_vecs", "texts"):
+            (temporary / part).mkdir(parents=True, exist_ok=True)
+        training = []
+        for number, name in enumerate(data.names):
+            clip = data.clip(number)
+            vectors = redundant_from_positions(data.skeleton, clip).astype(np.float32)
+            np.save(temporary / "new_joints" / f"{name}.npy", clip[:-1])
+            np.save(temporary / "new_joint_vecs" / f"{name}.npy", vectors)
+            _write(temporary / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
+            if data.splits[number] == "train":
+                training.append(vectors)
+        mean, deviation = grouped_statistics(np.concatenate(training))
+        np.save(temporary / "Mean.npy", mean)
+        np.save(temporary / "Std.npy", deviation)
+        names = np.array(data.names)
+        members = {split: names[np.equal(data.splits, split)].tolist() for split in SPLITS}
+        for split, file in _SPLIT_FILES.items():
+            _write(temporary / file, members[split])
+        _write(temporary / "train_val.txt", members["train"] + members["validation"])
+        _write(temporary / "all.txt", data.names)
+        skeleton = data.skeleton
+        described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
+        described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
+        described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
+        _write(temporary / "skeleton.json", [json.dumps(described, indent=1)])
     return folder
-
-
-def _write_clips(folder: Path, data: TextMotions, options: dict) -> None:
-    for part in ("new_joints", "new_joint_vecs", "texts"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    training = []
-    for number, name in enumerate(data.names):
-        clip = data.clip(number)
-        vectors = redundant_from_positions(data.skeleton, clip, **options).astype(np.float32)
-        np.save(folder / "new_joints" / f"{name}.npy", clip[:-1])
-        np.save(folder / "new_joint_vecs" / f"{name}.npy", vectors)
-        _write(folder / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
-        if data.splits[number] == "train":
-            training.append(vectors)
-    mean, deviation = grouped_statistics(np.concatenate(training))
-    np.save(folder / "Mean.npy", mean)
-    np.save(folder / "Std.npy", deviation)
-    members = {
-        split: [name for name, of in zip(data.names, data.splits, strict=True) if of == split] for split in SPLITS
-    }
-    for split, file in _SPLIT_FILES.items():
-        _write(folder / file, members[split])
-    _write(folder / "train_val.txt", members["train"] + members["validation"])
-    _write(folder / "all.txt", data.names)
-    skeleton = data.skeleton
-    described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
-    described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
-    described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
-    _write(folder / "skeleton.json", [json.dumps(described, indent=1)])
 
 
 def _write(path: Path, lines) -> None:
@@ -330,23 +321,17 @@ def _has_twins(skeleton: Skeleton) -> bool:
 
 
 def captioned_motions(
-    dataset: Dataset,
-    captions: Mapping[str, Sequence[str]],
-    *,
-    fps: float = 20.0,
-    fewest_frames: int = 24,
-    progress: bool = True,
+    dataset: Dataset, captions: Mapping[str, Sequence[str]], *, fps: float = FPS, progress: bool = True
 ) -> TextMotions:
     """Put the motions of a data set, such as a folder of BVH files, together with captions.
 
-    Each clip is brought to `fps`, moved to the canonical start, and cut to 199 frames; its mirror image
+    Each clip of 24 frames or more is brought to `fps`, moved to the canonical start, and cut to 199; its mirror image
     joins it where joints have twins and the captions name no side. Clips are split by their names, 80, 5 and 15 %.
 
     Args:
       dataset: from `open_dataset`.
       captions: clip name, or the last part of one -> captions.
       fps: wanted rate.
-      fewest_frames: clips with fewer are left out.
       progress: show a progress bar.
 
     Raises:
@@ -374,8 +359,8 @@ def captioned_motions(
             skeleton = motion.skeleton
         if motion.skeleton != skeleton:
             raise ValueError(f"{clip.name}: its skeleton differs from that of {clips[0][0]}; a data set needs one")
-        if motion.num_frames < fewest_frames:
-            skipped.append((clip.name, f"{motion.num_frames} frames, fewer than {fewest_frames}"))
+        if motion.num_frames < FEWEST_FRAMES:
+            skipped.append((clip.name, f"{motion.num_frames} frames, fewer than {FEWEST_FRAMES}"))
             continue
         motion = motion.slice(0, min(motion.num_frames, MOST_FRAMES + 1) // UNIT * UNIT)
         said = tuple(captions[short])
@@ -384,6 +369,6 @@ def captioned_motions(
             seen = Motion.from_positions(skeleton, motion.positions, fps)
             clips.append((f"M{short}", mirror(seen), said, splits[short], short))
     if not clips:
-        raise ValueError(f"data set {dataset.name!r}: no captioned motion has {fewest_frames} frames at {fps:g} fps")
+        raise ValueError(f"data set {dataset.name!r}: no captioned motion has {FEWEST_FRAMES} frames at {fps:g} fps")
     described = {name: getattr(dataset, name) for name in ("name", "licence", "credit")}
     return text_motions(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **described)

@@ -216,15 +216,9 @@ def save_packed(path, packed: PackedMotion, *, overwrite: bool = False) -> Path:
       ValueError: if the file exists and `overwrite` is false.
     """
     skeleton = packed.skeleton
-    text = {
-        "format": _FORMAT,
-        "joint_names": skeleton.names,
-        "joint_parents": skeleton.parents,
-        "end_sites": skeleton.end_sites,
-        **{name: getattr(packed, name) for name in _TEXTS},
-        "mirror_styles": sorted(packed.mirror_styles),
-    }
-    text = json.dumps(text, ensure_ascii=True).encode("ascii")
+    tree = {"joint_names": skeleton.names, "joint_parents": skeleton.parents, "end_sites": skeleton.end_sites}
+    texts = {name: getattr(packed, name) for name in _TEXTS} | {"mirror_styles": sorted(packed.mirror_styles)}
+    text = json.dumps({"format": _FORMAT, **tree, **texts}, ensure_ascii=True).encode("ascii")
     arrays = {name: np.asarray(getattr(packed, name), dtype) for name, dtype in _ARRAYS.items()}
     arrays["offsets"] = np.asarray(skeleton.offsets, np.float64)
     checksum = _checksum(arrays, text)
@@ -252,10 +246,8 @@ def load_packed(path) -> PackedMotion:
         return _read_packed(path)
     # What numpy, zipfile and Python's own tokenizer raise over damaged bytes is no closed list.
     except Exception as error:
-        text = (
-            f"{path}: cannot be read as a packed data set ({type(error).__name__}: {error}); delete it and pack again"
-        )
-        raise ValueError(str(error) if str(error).startswith(str(path)) else text) from error
+        text = f"cannot be read as a packed data set ({type(error).__name__}: {error}); delete it and pack again"
+        raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {text}") from error
 
 
 def _read_packed(path: Path) -> PackedMotion:
@@ -270,7 +262,7 @@ def _read_packed(path: Path) -> PackedMotion:
     description = json.loads(text)
     if description["format"] != _FORMAT:
         raise ValueError(f"{path}: is of format {description['format']}, this version reads {_FORMAT}; pack again")
-    names, parents, end_sites = (_tuples(description[name]) for name in ("joint_names", "joint_parents", "end_sites"))
+    names, parents, end_sites = (description[name] for name in ("joint_names", "joint_parents", "end_sites"))
     skeleton = Skeleton(names, parents, arrays.pop("offsets"), end_sites)
     texts = {name: _tuples(description[name]) for name in _TEXTS}
     texts["mirror_styles"] = frozenset(texts["mirror_styles"])
@@ -282,10 +274,14 @@ def _tuples(value):
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
+def cache_folder() -> Path:
+    """Return the folder of what was reckoned once (F3AMD_CACHE_DIR overrides)."""
+    return Path(os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed")
+
+
 def cache_path(dataset: Dataset) -> Path:
-    """Return where the packed form of a data set is cached (F3AMD_CACHE_DIR overrides)."""
-    folder = os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed"
-    return Path(folder) / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.npz"
+    """Return where the packed form of a data set is cached."""
+    return cache_folder() / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.npz"
 
 
 def packed_dataset(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> PackedMotion:

@@ -25,7 +25,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -128,7 +128,7 @@ def open_dataset(
     elif name == "bandai":
         dataset = _open_bandai(path, locomotion_only)
     else:
-        dataset = _open_100style(path) if name == "100style" else _open_folder(path)
+        dataset = {"100style": _open_100style, "folder": _open_folder}[name](path)
     return dataset if num_styles is None else _keep_styles(dataset, num_styles)
 
 
@@ -318,13 +318,6 @@ def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:
 # --- data sets ------------------------------------------------------------------------------------
 
 
-def _fingerprint(name: str, clips: Iterable[Clip], content) -> str:
-    """Hash what decides a data set's numbers: clips with labels and splits, and file contents."""
-    labels = [(clip.name, clip.style, clip.content, clip.split) for clip in clips]
-    text = json.dumps([name, labels, content], ensure_ascii=True)
-    return hashlib.sha256(text.encode("ascii")).hexdigest()
-
-
 def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror, notes=()) -> Dataset:
     """Put a data set together.
 
@@ -337,9 +330,11 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
     """
     clips = tuple(clips)
     styles = tuple(sorted({clip.style for clip in clips}))
+    labels = [(clip.name, clip.style, clip.content, clip.split) for clip in clips]
+    decisive = json.dumps([name, labels, content], ensure_ascii=True)
     return Dataset(
         name=name, licence=_SETS[name]["licence"], credit=_SETS[name]["credit"],
-        fingerprint=_fingerprint(name, clips, content), styles=styles, clips=clips,
+        fingerprint=hashlib.sha256(decisive.encode("ascii")).hexdigest(), styles=styles, clips=clips,
         primary_styles=styles if primary is None else tuple(filter(primary, styles)),
         mirror_styles=frozenset(filter(mirror, styles)), notes=tuple(notes),
     )  # fmt: skip
@@ -348,16 +343,10 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
 def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
     """Return the data set cut down to its first styles, primary ones before others."""
     others = [style for style in dataset.styles if style not in dataset.primary_styles]
-    kept = set([*dataset.primary_styles, *others][:num_styles])
-    clips = tuple(clip for clip in dataset.clips if clip.style in kept)
-    return replace(
-        dataset,
-        fingerprint=_fingerprint(dataset.name, clips, dataset.fingerprint),
-        styles=tuple(sorted(kept)),
-        clips=clips,
-        primary_styles=tuple(style for style in dataset.primary_styles if style in kept),
-        mirror_styles=dataset.mirror_styles & kept,
-    )
+    kept = [*dataset.primary_styles, *others][:num_styles]
+    clips = (clip for clip in dataset.clips if clip.style in kept)
+    primary, mirror = dataset.primary_styles.__contains__, dataset.mirror_styles.__contains__
+    return _dataset(dataset.name, clips, dataset.fingerprint, primary=primary, mirror=mirror, notes=dataset.notes)
 
 
 # --- loaders (plain data, so that a worker process can be handed them) ----------------------------
@@ -391,18 +380,10 @@ class _BvhFile:
         return motion.slice(self.start, self.stop)
 
 
-@dataclass(frozen=True)
-class _SyntheticTake:
-    """Makes one take of the synthetic walker and sends it through BVH text, as all data."""
-
-    style: str
-    seconds: float
-    seed: int
-
-    def __call__(self) -> Motion:
-        name = f"synthetic {self.style}, seed {self.seed}"
-        motion = synthetic.synthesize(self.style, seconds=self.seconds, seed=self.seed, fps=FPS)
-        return parse_bvh(format_bvh(motion), name)
+def _synthetic_take(style: str, seconds: float, seed: int) -> Motion:
+    """Make one take of the synthetic walker and send it through BVH text, as all data."""
+    motion = synthetic.synthesize(style, seconds=seconds, seed=seed, fps=FPS)
+    return parse_bvh(format_bvh(motion), f"synthetic {style}, seed {seed}")
 
 
 # --- the four data sets ---------------------------------------------------------------------------
@@ -421,8 +402,10 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
     styles = tuple(sorted([*SHOWN_STYLES, *others][:num_styles]))
     takes = [(f"{style}_{seed:03d}", style, seed) for style in styles for seed in range(num_takes)]
     splits = assign_splits((name, style) for name, style, _ in takes)
-    takes = [(name, style, _SyntheticTake(style, seconds, seed)) for name, style, seed in takes]
-    clips = [Clip(name, style, "mixed", splits[name], take) for name, style, take in takes]
+    clips = [
+        Clip(name, style, "mixed", splits[name], functools.partial(_synthetic_take, style, seconds, seed))
+        for name, style, seed in takes
+    ]
     symmetric = lambda style: synthetic.style_parameters(style).symmetric
     return _dataset("synthetic", clips, [seconds, _synthetic_probe(styles)], mirror=symmetric)
 

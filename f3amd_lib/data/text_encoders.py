@@ -16,18 +16,16 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import os
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-import pooch
 
-from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.data.packed import cache_folder
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.names import check_known, nearest_hint
 
@@ -49,19 +47,29 @@ class TextEmbeddings(NamedTuple):
     pooled: np.ndarray
 
 
-class TextEncoder(Protocol):
+@dataclass(frozen=True, eq=False)
+class TextEncoder:
     """What turns captions into vectors.
 
     Attributes:
       identity: name and state of the weights: embeddings of two identities do not mix.
       width: of token vectors.
+      embed: function from captions to their token vectors, [tokens, width] each, and their pooled vectors.
     """
 
     identity: str
     width: int
+    embed: Callable[[Sequence[str]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
     def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
-        """Embed captions that `check_captions` has passed."""
+        """Embed captions that `check_captions` has passed; ValueError for one that is too long."""
+        pieces, pooled = self.embed(captions)
+        for caption, piece in zip(captions, pieces, strict=True):
+            if len(piece) > MOST_TOKENS:
+                raise ValueError(
+                    f"caption {caption!r} has {len(piece)} word pieces of at most {MOST_TOKENS}; say it shorter"
+                )
+        return _padded(pieces, pooled)
 
 
 def check_captions(captions: Sequence[str]) -> None:
@@ -106,52 +114,16 @@ def _words(text: str) -> list[str]:
 
 def _padded(pieces: Sequence[np.ndarray], pooled) -> TextEmbeddings:
     """Put token vectors of unlike numbers side by side."""
-    count = max(len(piece) for piece in pieces)
-    tokens = np.zeros((len(pieces), count, pieces[0].shape[-1]), np.float32)
-    for row, piece in zip(tokens, pieces, strict=True):
-        row[: len(piece)] = piece
-    mask = np.arange(count) < np.array([len(piece) for piece in pieces])[:, None]
-    return TextEmbeddings(tokens, mask, np.asarray(pooled, np.float32))
+    lengths = np.array([len(piece) for piece in pieces])
+    tokens = [np.pad(piece, ((0, lengths.max() - len(piece)), (0, 0))) for piece in pieces]
+    mask = np.arange(lengths.max()) < lengths[:, None]
+    return TextEmbeddings(np.array(tokens, np.float32), mask, np.asarray(pooled, np.float32))
 
 
-def _refuse_long(captions, pieces) -> None:
-    for caption, piece in zip(captions, pieces, strict=True):
-        if len(piece) > MOST_TOKENS:
-            raise ValueError(
-                f"caption {caption!r} has {len(piece)} word pieces of at most {MOST_TOKENS}; say it shorter"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class WordLlama:
-    """Word-piece vectors of the package `wordllama`, read from its own files; vectors have a mean length of 1.
-
-    Attributes:
-      identity, width: as in `TextEncoder`.
-      tokenizer: of the package `tokenizers`.
-      vectors: of all pieces, [pieces, width].
-    """
-
-    identity: str
-    width: int
-    tokenizer: object
-    vectors: np.ndarray
-
-    def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
-        encoded = [self.tokenizer.encode(caption, add_special_tokens=False) for caption in captions]
-        for caption, pieces in zip(captions, encoded, strict=True):
-            # What the vocabulary does not know is spelled out in bytes.
-            if strange := [piece for piece in pieces.tokens if re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece)]:
-                raise ValueError(
-                    f"caption {caption!r} holds characters unknown to wordllama ({strange[0]}); use English"
-                )
-        pieces = [self.vectors[pieces.ids] for pieces in encoded]
-        _refuse_long(captions, pieces)
-        return _padded(pieces, [piece.mean(axis=0) for piece in pieces])
-
-
-def load_wordllama() -> WordLlama:
+def load_wordllama() -> TextEncoder:
     """Read wordllama's 32,000 vectors of 256 numbers (16 MB) from the installed package, offline.
+
+    Vectors have a mean length of 1.
 
     Raises:
       ImportError: if the package is not installed.
@@ -174,40 +146,23 @@ def load_wordllama() -> WordLlama:
             f"{folder}: wordllama's files are not those of version 0.2 ({error}); install it again"
         ) from error
     vectors = vectors / np.linalg.norm(vectors, axis=-1).mean()
-    return WordLlama("wordllama-l2-supercat-256", vectors.shape[1], tokenizer, vectors)
+
+    def embed(captions):
+        encoded = [tokenizer.encode(caption, add_special_tokens=False) for caption in captions]
+        for caption, pieces in zip(captions, encoded, strict=True):
+            # What the vocabulary does not know is spelled out in bytes.
+            if strange := [piece for piece in pieces.tokens if re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece)]:
+                raise ValueError(
+                    f"caption {caption!r} holds characters unknown to wordllama ({strange[0]}); use English"
+                )
+        pieces = [vectors[pieces.ids] for pieces in encoded]
+        return pieces, [piece.mean(axis=0) for piece in pieces]
+
+    return TextEncoder("wordllama-l2-supercat-256", vectors.shape[1], embed)
 
 
-@dataclass(frozen=True, eq=False)
-class TransformersEncoder:
-    """CLIP's or Sentence-T5's text side, by way of `transformers`, frozen.
-
-    Attributes:
-      identity, width: as in `TextEncoder`.
-      tokenizer, model: of `transformers`.
-      pool: function of the model's output and the mask that gives one vector a caption.
-    """
-
-    identity: str
-    width: int
-    tokenizer: object
-    model: object
-    pool: object
-
-    def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
-        import torch
-
-        given = self.tokenizer(list(captions), padding=True, return_tensors="pt")
-        with torch.no_grad():
-            output = self.model(**given)
-        mask = given["attention_mask"].bool()
-        tokens = output.last_hidden_state.float().numpy()
-        pieces = [row[kept] for row, kept in zip(tokens, mask.numpy(), strict=True)]
-        _refuse_long(captions, pieces)
-        return _padded(pieces, self.pool(output, mask).float().numpy())
-
-
-def _load_transformers(kind: str, folder) -> TransformersEncoder:
-    """Read a text model from a folder of the user; ValueError names what is missing."""
+def _load_transformers(kind: str, folder) -> TextEncoder:
+    """Read CLIP's or Sentence-T5's text side from a folder of the user; ValueError names what is missing."""
     folder = Path(folder or "").expanduser()
     if folder == Path() or not (folder / "config.json").is_file():
         raise ValueError(f"{kind}: {folder}/config.json is missing; give the folder of its weights (save_pretrained)")
@@ -219,18 +174,25 @@ def _load_transformers(kind: str, folder) -> TransformersEncoder:
     offline = {"local_files_only": True, "use_safetensors": True}  # never a pickle
     tokenizer = transformers.AutoTokenizer.from_pretrained(folder, local_files_only=True)
     if kind == "clip":
-        model = transformers.CLIPTextModelWithProjection.from_pretrained(folder, **offline)
-        pool = lambda output, mask: output.text_embeds
-        width = model.config.hidden_size
+        model, dense = transformers.CLIPTextModelWithProjection.from_pretrained(folder, **offline), None
     else:
         model = transformers.T5EncoderModel.from_pretrained(folder, **offline)
         dense = torch.from_numpy(_sentence_layer(folder))
-        pool = lambda output, mask: _sentence_vectors(torch, output.last_hidden_state, mask, dense)
-        width = model.config.d_model
+    model.eval()
+
+    def embed(captions):
+        given = tokenizer(list(captions), padding=True, return_tensors="pt")
+        with torch.no_grad():
+            output = model(**given)
+        mask, tokens = given["attention_mask"].bool(), output.last_hidden_state
+        pooled = output.text_embeds if dense is None else _sentence_vectors(torch, tokens, mask, dense)
+        pieces = [row[kept] for row, kept in zip(tokens.float().numpy(), mask.numpy(), strict=True)]
+        return pieces, pooled.float().numpy()
+
     digest = hashlib.sha256()
     for file in sorted(folder.glob("*.safetensors")):
         digest.update(file.read_bytes())
-    return TransformersEncoder(f"{kind}-{digest.hexdigest()[:12]}", width, tokenizer, model.eval(), pool)
+    return TextEncoder(f"{kind}-{digest.hexdigest()[:12]}", model.config.hidden_size, embed)
 
 
 def _sentence_layer(folder: Path) -> np.ndarray:
@@ -277,8 +239,7 @@ def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddi
     """
     check_captions(captions)
     key = hashlib.sha256("\n".join([encoder.identity, *captions]).encode()).hexdigest()[:16]
-    folder = Path(os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed")
-    path = folder / f"captions-{encoder.identity}-{key}.npz"
+    path = cache_folder() / f"captions-{encoder.identity}-{key}.npz"
     if path.exists():
         try:
             with np.load(path, allow_pickle=False) as file:

@@ -101,6 +101,14 @@ class TextMotions:
     skipped: tuple[tuple[str, str], ...] = ()
     vectors: np.ndarray | None = None
 
+    @classmethod
+    def joined(cls, clips, **attributes) -> TextMotions:
+        """Return a data set of (name, captions, split, pair, positions) of each clip and its other attributes."""
+        columns = dict(zip((*_LISTS, "positions"), zip(*clips, strict=True), strict=True))
+        start = np.cumsum([0, *map(len, columns["positions"])])
+        columns["positions"] = np.concatenate(columns["positions"])
+        return cls(start=start, **columns, **attributes)
+
     @property
     def num_clips(self) -> int:
         """Number of clips, K."""
@@ -134,12 +142,13 @@ class TextMotions:
             raise ValueError(f"data set {self.name!r} has no clip in its {split} split")
         return members
 
-    def select(self, clips) -> TextMotions:
-        """Return a data set of some of the clips, in the order given."""
-        rows = np.concatenate([np.arange(self.start[k], self.start[k + 1]) for k in clips])
+    def select(self, clips, most_frames: int | None = None) -> TextMotions:
+        """Return a data set of some of the clips, in the order given; of each no more than its first frames."""
+        kept = self.lengths[list(clips)] if most_frames is None else np.minimum(self.lengths[list(clips)], most_frames)
+        rows = np.concatenate([self.start[k] + np.arange(count) for k, count in zip(clips, kept, strict=True)])
         chosen = {what: tuple(getattr(self, what)[k] for k in clips) for what in _LISTS}
         vectors = None if self.vectors is None else self.vectors[rows]
-        start = np.cumsum([0, *self.lengths[list(clips)]])
+        start = np.cumsum([0, *kept])
         return dataclasses.replace(self, positions=self.positions[rows], start=start, vectors=vectors, **chosen)
 
     def cut(self, most_frames: int) -> TextMotions:
@@ -150,10 +159,7 @@ class TextMotions:
         """
         if most_frames < FEWEST_FRAMES or most_frames % UNIT:
             raise ValueError(f"clips can be cut to a multiple of {UNIT} from {FEWEST_FRAMES} on, got {most_frames}")
-        kept = np.minimum(self.lengths, most_frames)
-        rows = np.concatenate([first + np.arange(count) for first, count in zip(self.start, kept, strict=False)])
-        vectors = None if self.vectors is None else self.vectors[rows]
-        return dataclasses.replace(self, positions=self.positions[rows], start=np.cumsum([0, *kept]), vectors=vectors)
+        return self.select(range(self.num_clips), most_frames)
 
     def normaliser(self) -> AxisNormaliser:
         """Return mean and deviation of x, y and z over the training clips."""
@@ -196,21 +202,14 @@ def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
     Args:
       clips: (name, motion, captions, split, pair) of each.
       skeleton: of all of them.
-      **about: other attributes of `TextMotions`.
+      **attributes: other attributes of `TextMotions`.
     """
-    names, motions, captions, splits, pairs = zip(*clips, strict=True)
-    positions = [canonical_start(skeleton, motion.positions).astype(np.float32) for motion in motions]
-    start = np.cumsum([0, *map(len, positions)])
-    return TextMotions(
-        skeleton=dataclasses.replace(skeleton, end_sites=()),  # the tips of limbs would need rotations
-        positions=np.concatenate(positions),
-        start=start,
-        names=names,
-        captions=captions,
-        splits=splits,
-        pairs=pairs,
-        **attributes,
+    canonical = (
+        (name, captions, split, pair, canonical_start(skeleton, motion.positions).astype(np.float32))
+        for name, motion, captions, split, pair in clips
     )
+    # The tips of limbs would need rotations.
+    return TextMotions.joined(canonical, skeleton=dataclasses.replace(skeleton, end_sites=()), **attributes)
 
 
 def evaluation_classes(data: TextMotions, least: int = CLASS_CLIPS) -> list[str]:

@@ -7,9 +7,8 @@ Python loop over samples.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -40,11 +39,7 @@ _POSE_RECOVERY = 8
 """Frames over which a training target leads from a generated pose back to the captured one."""
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("frames", "paths", "starts", "room", "styles", "one_hot"),
-    meta_fields=("window", "num_history"),
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class WindowSet:
     """All windows of one split, on the device.
@@ -59,8 +54,8 @@ class WindowSet:
       one_hot: the one-hot vector of each style of the data, [S, styles that the model knows].
     """
 
-    window: int
-    num_history: int
+    window: int = field(metadata={"static": True})
+    num_history: int = field(metadata={"static": True})
     frames: jax.Array
     paths: jax.Array
     starts: jax.Array
@@ -311,26 +306,23 @@ def fit_normaliser(windows: WindowSet, key) -> Normaliser:
     return Normaliser(mean, deviation, deviation[0])
 
 
-def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8, split: str = "train") -> dict:
-    """Cut a few starting poses per style out of a packed data set.
+def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8) -> dict:
+    """Cut a few starting poses per style out of a packed data set: of its first split that has the style.
 
     Args:
       packed: the data.
       num_history: frames H of each.
       num_poses: most per style; each comes from the middle of another clip.
-      split: where to look first; a style without a clip there is looked up in the others.
 
     Returns:
       Style name -> [K, H, C] world frames, the last one at x = z = 0 and facing +Z.
     """
     starts = {}
     for style, name in enumerate(packed.styles):
-        for where in (split, *SPLITS):
-            chosen = np.flatnonzero((packed.clip_style == style) & (packed.clip_split == SPLITS.index(where)))
-            if len(chosen):
-                break
-        else:
+        known = np.flatnonzero(packed.clip_style == style)
+        if not len(known):
             continue
+        chosen = known[packed.clip_split[known] == packed.clip_split[known].min()]
         cuts = []
         spread = np.linspace(0, len(chosen) - 1, min(num_poses, len(chosen))).astype(int)
         for clip in chosen[spread]:

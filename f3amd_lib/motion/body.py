@@ -1,28 +1,28 @@
 """A procedural body for any skeleton: capsules of about 1,000 vertices, each of which moves with one joint.
 
-One capsule goes along each bone and one beyond each head, hand and toe. Its two radii come from `body.csv`, by the role
-of the joint at the bone's end, in metres for legs of `LEG` metres. `wide` stretches it from left to right, which is the
-axis that a middle joint's frame turns round in a mirror (`Skeleton.mirror_frames`). `tip` is a length, for rigs without
-end sites.
+One capsule goes along each bone and one beyond each head, hand and toe. Its two radii come from `body.toml`, by the
+role of the joint at the bone's end, in metres for legs of `LEG` metres. `wide` stretches it from left to right, which
+is the axis that a middle joint's frame turns round in a mirror (`Skeleton.mirror_frames`). `tip` is a length, for rigs
+without end sites.
 
 Source: ours.
 """
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Skeleton, forward_kinematics, walk_tree
 
 LEG = 0.85
-"""Length of thigh and shank that the radii of `body.csv` are for, metres."""
+"""Length of thigh and shank that the radii of `body.toml` are for, metres."""
 
 SIDES = 8
 """Corners of a capsule's rings."""
@@ -30,12 +30,7 @@ SIDES = 8
 _LATITUDES = np.array([-1.0, -0.5, 0.0])  # of a half sphere's pole and rings, in quarter turns
 
 
-def _read_table() -> dict[str, dict[str, float]]:
-    with (resources.files("f3amd_lib.motion") / "body.csv").open(encoding="utf-8", newline="") as file:
-        return {row.pop("part"): {k: float(v or 0) for k, v in row.items()} for row in csv.DictReader(file)}
-
-
-_TABLE = _read_table()
+_TABLE = read_toml(Path(__file__).with_name("body.toml"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +50,7 @@ class Body:
     weights: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Capsule:
     """A limb: two half spheres and what lies between.
 
@@ -67,10 +62,10 @@ class Capsule:
     """
 
     joint: int
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: np.ndarray
+    end: np.ndarray
     radii: tuple[float, float]
-    wide: tuple[float, float, float]
+    wide: np.ndarray
 
 
 def body_capsules(skeleton: Skeleton) -> list[Capsule]:
@@ -102,8 +97,7 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
     for (joint, kind), one in list(capsules.items()):
         twin = twins[joint]
         if twin > joint and (twin, kind) in capsules:
-            mirrored = frames[one.joint]
-            turned = {name: tuple(mirrored * getattr(one, name)) for name in ("start", "end", "wide")}
+            turned = {name: frames[one.joint] * getattr(one, name) for name in ("start", "end", "wide")}
             capsules[twin, kind] = Capsule(twins[one.joint], radii=one.radii, **turned)
     return list(capsules.values())
 
@@ -113,14 +107,13 @@ def _capsule(joint: int, offset, part: str, scale: float, frames) -> Capsule:
     limit = np.inf if part in _TABLE and part else 0.3 * np.linalg.norm(offset)
     radii = tuple(float(min(scale * row[name], limit)) for name in ("start", "end"))
     lateral = frames[joint] < 0
-    wide = row["wide"] * lateral if lateral.sum() == 1 else np.zeros(3)
-    return Capsule(joint, (0.0, 0.0, 0.0), tuple(np.asarray(offset, float)), radii, tuple(wide.astype(float)))
+    return Capsule(joint, np.zeros(3), offset, radii, row["wide"] * lateral * (lateral.sum() == 1))
 
 
 def capsule_mesh(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [5 SIDES + 2, 3] in the joint's frame, and faces."""
-    start, end = np.array(capsule.start), np.array(capsule.end)
-    axis, wide = unit(end - start), np.array(capsule.wide)
+    start, end, wide = capsule.start, capsule.end, capsule.wide
+    axis = unit(end - start)
     stretch = np.linalg.norm(wide) or 1.0
     across = wide - (wide @ axis) * axis
     if np.linalg.norm(across) <= 1e-6:

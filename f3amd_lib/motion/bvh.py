@@ -8,6 +8,7 @@ metres and rotation matrices.
 
 from __future__ import annotations
 
+import collections
 import io
 import re
 import warnings
@@ -152,41 +153,29 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
     rotations = motion.needed_rotations("a BVH file")
     skeleton, lines, depth_first = motion.skeleton, ["HIERARCHY"], []
-
-    def add_offset(indent, offset):
-        lines.append(f"{indent}OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset))
-
-    def add_joint(joint, depth):
-        """Add all of a joint but its children and the brace that closes it."""
-        depth_first.append(joint)
-        outer, inner = "\t" * depth, "\t" * (depth + 1)
-        lines.extend([f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"])
-        add_offset(inner, skeleton.offsets[joint])
-        channels = [f"{axis}rotation" for axis in order]
-        if depth == 0:
-            channels = ["Xposition", "Yposition", "Zposition", *channels]
-        lines.append(f"{inner}CHANNELS {len(channels)} {' '.join(channels)}")
-
-    def end_joint(joint, depth):
-        outer, inner = "\t" * depth, "\t" * (depth + 1)
-        tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
-        # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
-        for tip in tips or ([] if children[joint] else [(0.0, 0.0, 0.0)]):
-            lines.extend([f"{inner}End Site", f"{inner}{{"])
-            add_offset(inner + "\t", tip)
-            lines.append(f"{inner}}}")
-        lines.append(f"{outer}}}")
-
     children = [[] for _ in skeleton.names]
     for child, parent in enumerate(skeleton.parents[1:], 1):
         children[parent].append(child)
-    steps = [(add_joint, 0, 0)]  # a stack, not a recursion: chains of thousands of joints can be written
+    offset_line = lambda offset: "OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset)
+    steps = [(0, 0, False)]  # a stack, not a recursion: chains of thousands of joints can be written
     while steps:
-        step, joint, depth = steps.pop()
-        step(joint, depth)
-        if step is add_joint:
-            steps.append((end_joint, joint, depth))
-            steps += [(add_joint, child, depth + 1) for child in reversed(children[joint])]
+        joint, depth, closes = steps.pop()
+        outer, inner = "\t" * depth, "\t" * (depth + 1)
+        if closes:
+            tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
+            # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
+            for tip in tips or ([] if children[joint] else [(0.0, 0.0, 0.0)]):
+                lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\t{offset_line(tip)}", f"{inner}}}"]
+            lines.append(f"{outer}}}")
+            continue
+        depth_first.append(joint)
+        channels = [f"{axis}position" for axis in "XYZ" if depth == 0] + [f"{axis}rotation" for axis in order]
+        lines += [f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"]
+        lines += [
+            f"{inner}{offset_line(skeleton.offsets[joint])}",
+            f"{inner}CHANNELS {len(channels)} {' '.join(channels)}",
+        ]
+        steps += [(joint, depth, True), *((child, depth + 1, False) for child in reversed(children[joint]))]
     lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
     with warnings.catch_warnings():
         # At gimbal lock any of the equal answers will do: the matrix is the same.
@@ -234,10 +223,10 @@ def _clean(text: str | bytes, name: str) -> bytes:
     return data if b"\n" in data else data.replace(b"\r", b"\n")
 
 
-def _finite_number(word: str) -> float | None:
-    """Return a word as a float, or None if it is no finite decimal number."""
+def finite_number(word: str, largest: float = LARGEST_NUMBER) -> float | None:
+    """Return a word as a float, or None if it is no decimal number of at most the largest, either way."""
     value = float(word) if len(word) <= _LONGEST_WORD and _NUMBER.fullmatch(word) else np.nan
-    return value if abs(value) <= LARGEST_NUMBER else None
+    return value if abs(value) <= largest else None
 
 
 def _count(word: str) -> int | None:
@@ -245,15 +234,12 @@ def _count(word: str) -> int | None:
     return int(word) if len(word) <= 9 and word.isdecimal() else None
 
 
-class _Tokens:
-    """Words of the HIERARCHY with their line numbers; braces stand alone."""
+class _Tokens(collections.deque):
+    """(word, line) of the HIERARCHY; braces stand alone, and the word after the last one is ""."""
 
     def __init__(self, data: bytes):
-        self.items: list[tuple[str, int]] = []
-        self.position = 0
-        lines = data.split(b"\n")
-        self.last_line = len(lines)
-        for line, raw in enumerate(lines, start=1):
+        super().__init__()
+        for line, raw in enumerate(data.split(b"\n"), start=1):
             try:
                 words = raw.decode("utf-8")
             except UnicodeDecodeError:
@@ -262,23 +248,19 @@ class _Tokens:
             if max(map(len, words), default=0) > _LONGEST_WORD:
                 what = f"holds a word of {max(map(len, words))} characters"
                 raise _Broken(line, f"{what}, longer than {_LONGEST_WORD}; is it a BVH file?")
-            self.items += [(word, line) for word in words]
-
-    def peek(self) -> tuple[str, int]:
-        """Return the next word, "" at the end, and its line."""
-        return self.items[self.position] if self.position < len(self.items) else ("", self.last_line)
+            self.extend((word, line) for word in words)
+        self.append(("", line))
 
     def take(self, expected: str) -> tuple[str, int]:
-        word, line = self.peek()
+        word, line = self[0]
         if not word:
             raise _Broken(line, f"expected {expected}, but MOTION starts here; {_BRACES}")
-        self.position += 1
-        return word, line
+        return self.popleft()
 
     def rest_of_line(self, line: int) -> str:
         """Take the words left on a line, up to a brace: a joint's name may hold blanks."""
         words = []
-        while self.peek()[1] == line and self.peek()[0] not in ("{", "}", ""):
+        while self[0][1] == line and self[0][0] not in ("{", "}", ""):
             words.append(self.take("a name")[0])
         return " ".join(words)
 
@@ -292,7 +274,7 @@ class _Tokens:
         values = []
         for _ in range(3):
             word, line = self.take("a number of OFFSET")
-            values.append(_finite_number(word))
+            values.append(finite_number(word))
             if values[-1] is None:
                 raise _Broken(line, f"OFFSET needs 3 finite numbers, found {word!r} among them")
         return tuple(values)
@@ -301,7 +283,7 @@ class _Tokens:
 def _parse_hierarchy(data: bytes):
     """Return the joints in file order and the End Sites as (joint, offset) in file units."""
     tokens = _Tokens(data)
-    word, line = tokens.peek()
+    word, line = tokens[0]
     if word.upper() != "HIERARCHY":
         raise _Broken(line, f"a BVH file starts with HIERARCHY, this one with {word!r}")
     tokens.take("HIERARCHY")
@@ -309,7 +291,7 @@ def _parse_hierarchy(data: bytes):
     end_sites: list[tuple[int, tuple[float, ...]]] = []
     open_blocks: list[int] = []  # joints whose braces are open, innermost last
     column = 0
-    while tokens.peek()[0]:
+    while tokens[0][0]:
         word, line = tokens.take("a keyword")
         keyword = word.upper()
         current = joints[open_blocks[-1]] if open_blocks else None
@@ -357,11 +339,11 @@ def _parse_hierarchy(data: bytes):
     if open_blocks:
         unclosed = joints[open_blocks[-1]]
         what = f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open; {_BRACES}"
-        raise _Broken(tokens.last_line, what)
+        raise _Broken(tokens[0][1], what)
     if not joints:
-        raise _Broken(tokens.last_line, "MOTION starts, but there is no ROOT")
+        raise _Broken(tokens[0][1], "MOTION starts, but there is no ROOT")
     if column == 0:
-        raise _Broken(tokens.last_line, "no joint has a channel, so there is no motion to read")
+        raise _Broken(tokens[0][1], "no joint has a channel, so there is no motion to read")
     return joints, end_sites
 
 
@@ -380,7 +362,7 @@ def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, s
         if channel in channels:
             raise _Broken(label_line, f"joint {joint!r} has the channel {label!r} twice; remove one")
         channels.append(channel)
-    extra, extra_line = tokens.peek()
+    extra, extra_line = tokens[0]
     if extra.lower() in _CHANNELS:
         raise _Broken(extra_line, f"joint {joint!r} says it has {count} channels, but lists {extra!r} too")
     return channels
@@ -403,7 +385,7 @@ def _parse_motion_head(data: bytes, line: int):
     (count, count_line), (seconds, _) = answers
     if not _count(count):
         raise _Broken(count_line, f"Frames: must be a whole number above 0, found {count[:40]!r}")
-    frame_time = _finite_number(seconds)
+    frame_time = finite_number(seconds)
     if frame_time is None or not FRAME_TIMES[0] <= frame_time <= FRAME_TIMES[1]:
         what = f"Frame Time: must be a positive number of seconds, at most {FRAME_TIMES[1]:g}, found {seconds[:40]!r}"
         raise _Broken(line, f"{what}; 30 frames per second are 0.0333333")
@@ -445,7 +427,7 @@ def _explain_rows(rows: bytes, first_line: int, joints, columns: int):
     labels = [f"{axis}{kind} of {joint.name}" for joint in joints for axis, kind in joint.channels]
     for frame, (line, words) in enumerate(_rows_with_lines(rows, first_line)):
         for column, word in enumerate(words[: columns + 1]):
-            if _finite_number(word) is None:
+            if finite_number(word) is None:
                 what = labels[column] if column < columns else "beyond the last channel"
                 place = f"number {column + 1} of frame {frame}, {what}"
                 how = f"is not a finite number of at most {LARGEST_NUMBER:g}"

@@ -18,6 +18,7 @@ from scipy.special import jn_zeros
 
 from f3amd_lib.ground.arrays import check_positive, finite_array
 from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.motion.bvh import finite_number
 from f3amd_lib.motion.curves import smoothstep
 from f3amd_lib.motion.skeleton import Motion
 
@@ -86,9 +87,7 @@ class RootPath:
         return dataclasses.replace(self, position=turned + np.asarray(position, dtype=np.float64), yaw=self.yaw + angle)
 
 
-def named_path(
-    name: str, num_frames: int, *, speed: float = 1.2, seed: int = 0, fps: float = 30.0, ramp_seconds: float = 0.0
-) -> RootPath:
+def named_path(name: str, num_frames: int, *, speed: float = 1.2, seed: int = 0, fps: float = 30.0) -> RootPath:
     """Build one of the named paths.
 
     Every path starts at the origin, moves and faces along +Z there, and has a continuous heading.
@@ -114,14 +113,13 @@ def named_path(
         (0.4 to 1.6 times this, and 0 in stops).
       seed: chooses the "complex" path; the others ignore it.
       fps: frames per second.
-      ramp_seconds: time in which the speed rises smoothly from 0; 0 starts at full speed.
 
     Returns:
       The path, [T = num_frames].
 
     Raises:
-      ValueError: for an unknown name (with the nearest ones), fewer than 2 frames, or a speed, fps
-        or ramp out of range.
+      ValueError: for an unknown name (with the nearest ones), fewer than 2 frames, or a speed or fps
+        out of range.
 
     Source: ours; the paper does not give its test trajectory.
     """
@@ -131,24 +129,16 @@ def named_path(
     check_positive("fps", fps)
     if not (np.isfinite(speed) and 0 < speed < MAX_STEP * 30.0):
         raise ValueError(f"speed must lie between 0 and {MAX_STEP * 30.0:g} m/s, got {speed}")
-    if not (np.isfinite(ramp_seconds) and ramp_seconds >= 0):
-        raise ValueError(f"ramp_seconds must be 0 or more, got {ramp_seconds}")
     num_frames, seed = int(num_frames), checked_seed(seed)
 
     fine_time = np.arange((num_frames - 1) * _SUBSTEPS + 1) / (_SUBSTEPS * fps)
     if name == "complex":
-        pace, turn_rate, offset = _complex_profile(fine_time[-1], speed, seed)
-        fine_speed = np.interp(fine_time, *pace)
-        heading = _integrate(np.interp(fine_time, *turn_rate), fine_time)
-        facing_offset = np.interp(fine_time, *offset)
+        profile = _complex_profile(fine_time[-1], speed, seed)
+        fine_speed, turn_rate, facing_offset = (np.interp(fine_time, *signal) for signal in profile)
+        distance, heading = _integrate(fine_speed, fine_time), _integrate(turn_rate, fine_time)
     else:
-        fine_speed = np.full_like(fine_time, speed)
-        heading, facing_offset = None, 0.0
-    if ramp_seconds > 0:
-        fine_speed = fine_speed * smoothstep(fine_time / ramp_seconds)
-    distance = _integrate(fine_speed, fine_time)
-    if heading is None:
-        heading = _HEADINGS[name](distance)
+        distance = _integrate(np.full_like(fine_time, speed), fine_time)
+        heading, facing_offset = _HEADINGS[name](distance), 0.0
 
     # Midpoint rule: each small step goes along the mean of the headings at its two ends.
     middle = 0.5 * (heading[1:] + heading[:-1])
@@ -173,10 +163,6 @@ def _heading_figure_eight(distance: np.ndarray) -> np.ndarray:
     return amplitude * (1.0 - np.cos(2.0 * np.pi * distance / lap))
 
 
-def _heading_slalom(distance: np.ndarray) -> np.ndarray:
-    return np.deg2rad(50.0) * np.sin(2.0 * np.pi * distance / 8.0)
-
-
 def _heading_square(distance: np.ndarray) -> np.ndarray:
     straight, corner = 3.0, 3.0  # a corner of 3 m of arc turns with a tightest radius of 1.3 m
     along = (distance + straight / 2.0) / (straight + corner)
@@ -195,7 +181,7 @@ _HEADINGS = {
     "straight": np.zeros_like,
     "circle": lambda distance: distance / 2.5,
     "figure-eight": _heading_figure_eight,
-    "slalom": _heading_slalom,
+    "slalom": lambda distance: np.deg2rad(50.0) * np.sin(2.0 * np.pi * distance / 8.0),
     "square": _heading_square,
     "spiral": _heading_spiral,
 }
@@ -283,16 +269,11 @@ def read_path_csv(path) -> RootPath:
         where = f"{path}: line {reader.line_num}:"
         if len(cells) != len(header):
             raise ValueError(f"{where} {len(cells)} cells where the header has {len(header)}")
-        row = {}
+        row = {column: finite_number(cell.strip(), MAX_DISTANCE) for column, cell in zip(header, cells, strict=True)}
         for column, cell in zip(header, cells, strict=True):
-            try:
-                row[column] = float(cell)
-            except ValueError:
-                row[column] = np.nan
-            if not np.isfinite(row[column]):
-                raise ValueError(f"{where} {column} is {cell.strip()!r}, not a finite number")
-            if abs(row[column]) > MAX_DISTANCE:
-                raise ValueError(f"{where} {column} is {cell.strip()!r}: at most {MAX_DISTANCE:g} either way")
+            if row[column] is None:
+                what = f"not a finite number of at most {MAX_DISTANCE:g} either way"
+                raise ValueError(f"{where} {column} is {cell.strip()!r}, {what}")
         jump = np.hypot(row["x"] - rows[-1]["x"], row["z"] - rows[-1]["z"]) if rows else 0.0
         if jump > MAX_STEP:
             limit = f"at most {MAX_STEP} m at 30 fps"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,16 +25,13 @@ CONTACT_SPEED = 0.01
 _ROLE_NAMES = read_toml(Path(__file__).with_name("joint_roles.toml"))
 
 
-def _other_side(name: str) -> str | None:
-    """Return the name of the joint on the other side of the body, or None for a middle joint."""
-    for left, right in (("Left", "Right"), ("left", "right")):
-        for own, other in ((left, right), (right, left)):
-            if own in name:
-                return name.replace(own, other)
-    for own, other in (("_L", "_R"), ("_R", "_L"), ("_l", "_r"), ("_r", "_l")):
-        if name.endswith(own):
-            return name.removesuffix(own) + other
-    return None
+_SIDES = ("Left", "Right"), ("left", "right"), ("_L", "_R"), ("_l", "_r")
+_TWINS = {own: other for pair in _SIDES for own, other in (pair, pair[::-1])}
+
+
+def _other_side(name: str) -> str:
+    """Return the name of the joint on the other side of the body; a middle joint's own."""
+    return re.sub("Left|Right|left|right|_[LRlr]$", lambda found: _TWINS[found[0]], name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +60,7 @@ class Skeleton:
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "parents", tuple(int(parent) for parent in self.parents))
         object.__setattr__(self, "offsets", offsets)
+        object.__setattr__(self, "end_sites", tuple((joint, tuple(tip)) for joint, tip in self.end_sites))
         count = len(self.names)
         if count == 0 or len(self.parents) != count or offsets.shape != (count, 3):
             there = f"{count} names, {len(self.parents)} parents and offsets of shape {offsets.shape}"
@@ -98,9 +97,8 @@ class Skeleton:
 
     def role(self, role: str) -> int:
         """Return the joint that plays a role: head, or left_ or right_ hip, toe, clavicle, shoulder or wrist."""
-        for name in _ROLE_NAMES[role]:
-            if name in self.names:
-                return self.names.index(name)
+        if found := [name for name in _ROLE_NAMES[role] if name in self.names]:
+            return self.names.index(found[0])
         wanted = ", ".join(_ROLE_NAMES[role])
         raise ValueError(f"no joint is known as its {role}; looked for {wanted} among {', '.join(self.names)}")
 
@@ -116,22 +114,19 @@ class Skeleton:
     @functools.cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
         """Joints by depth: level 0 is the root. Kinematics walks levels, not joints."""
-        depth = [0] * self.num_joints
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                depth[joint] = depth[parent] + 1
+        depth = []
+        for parent in self.parents:
+            depth.append(depth[parent] + 1 if parent >= 0 else 0)
         return tuple(tuple(np.flatnonzero(np.equal(depth, level)).tolist()) for level in range(max(depth) + 1))
 
     @functools.cached_property
     def mirror_permutation(self) -> tuple[int, ...]:
         """For each joint the index of its left-right twin (itself for middle joints)."""
-        permutation = []
-        for joint, name in enumerate(self.names):
-            twin = _other_side(name)
-            if twin is not None and twin not in self.names:
+        twins = [_other_side(name) for name in self.names]
+        for name, twin in zip(self.names, twins, strict=True):
+            if twin not in self.names:
                 raise ValueError(f"joint {name!r} has no twin {twin!r}: it cannot be mirrored")
-            permutation.append(joint if twin is None else self.names.index(twin))
-        return tuple(permutation)
+        return tuple(map(self.names.index, twins))
 
     @functools.cached_property
     def mirror_frames(self) -> np.ndarray:

@@ -17,10 +17,10 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 
 from __future__ import annotations
 
-import csv
 import hashlib
-from dataclasses import dataclass, make_dataclass
+from dataclasses import make_dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -37,20 +37,7 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton
 # ------------------------------------------------------------------------------------ skeleton
 
 
-def _read_skeleton() -> Skeleton:
-    """Read `walker_skeleton.csv`: a T-pose that faces +Z with the left at +X; rows without a name are tips."""
-    with Path(__file__).with_name("walker_skeleton.csv").open(encoding="utf-8", newline="") as file:
-        rows = [(row["joint"], row["parent"], [float(row[axis]) for axis in "xyz"]) for row in csv.DictReader(file)]
-    names = [joint for joint, _, _ in rows if joint]
-    return Skeleton(
-        names=tuple(names),
-        parents=tuple(names.index(parent) if parent else -1 for joint, parent, _ in rows if joint),
-        offsets=np.array([offset for joint, _, offset in rows if joint]),
-        end_sites=tuple((names.index(parent), tuple(offset)) for joint, parent, offset in rows if not joint),
-    )
-
-
-SYNTHETIC_SKELETON = _read_skeleton()
+SYNTHETIC_SKELETON = Skeleton(**read_toml(Path(__file__).with_name("walker_skeleton.toml")))
 """23 joints with 100STYLE's names and axis-aligned T-pose (zero rotations), own proportions."""
 
 _SPINE = ("Chest", "Chest2", "Chest3", "Chest4")
@@ -157,15 +144,8 @@ def _wander(rng: np.random.Generator, count: int, sigma: float, channels: int) -
 
 def _about(axis: int, degrees) -> np.ndarray:
     """Return rotations about one coordinate axis, [..., 3, 3]; degrees in."""
-    angle = np.radians(np.asarray(degrees, dtype=np.float64))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    matrix = np.zeros((*angle.shape, 3, 3))
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix[..., axis, axis] = 1.0
-    matrix[..., first, first] = matrix[..., second, second] = cosine
-    matrix[..., first, second] = -sine
-    matrix[..., second, first] = sine
-    return matrix
+    about_y = matrix_from_yaw(np.radians(np.asarray(degrees, dtype=np.float64)))
+    return np.roll(about_y, (axis - 1, axis - 1), axis=(-2, -1))
 
 
 def _yaw_pitch_roll(yaw_deg, pitch_deg, left_roll_deg) -> np.ndarray:
@@ -176,8 +156,7 @@ def _yaw_pitch_roll(yaw_deg, pitch_deg, left_roll_deg) -> np.ndarray:
 # ------------------------------------------------------------------------------- 1. root path
 
 
-@dataclass(frozen=True)
-class _Path:
+class _Path(NamedTuple):
     """A root path on the planning grid: times [N], position [N, 2] (x, z), yaw, speed, turn."""
 
     time: np.ndarray
@@ -278,16 +257,6 @@ def _given_path(position: np.ndarray, yaw: np.ndarray, fps: float) -> _Path:
 # ------------------------------------------------------------------------------- 2. footfalls
 
 
-@dataclass(frozen=True)
-class _Plants:
-    """Where one toe stands, in order: landing and lifting times [K], (x, z) [K, 2], yaw [K]."""
-
-    land: np.ndarray
-    lift: np.ndarray
-    position: np.ndarray
-    yaw: np.ndarray
-
-
 def _home(style: StyleParameters, path: _Path, time: float, side: float, width: float):
     """Return where a toe wants to stand (x, z) and its yaw, for the body's place at a time."""
     index = path.at(time)
@@ -307,8 +276,9 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
     """Walk along the path, one footfall after the other.
 
     Returns:
-      Two `_Plants` (left, right), and the gait phase as knots: times [K] and strides [K], whole
-      numbers at left footfalls and (in a walk) halves at right ones.
+      For each toe (left, right) where it stands, in order: landing and lifting times [K], (x, z) [K, 2], yaw [K];
+      and the gait phase as knots: times [K] and strides [K], whole numbers at left footfalls and (in a walk) halves
+      at right ones.
     """
     sides = (1.0, -1.0)
     step_time = style.step_length / style.speed
@@ -317,12 +287,9 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
     share = 0.5 if abs(style.rhythm - 0.5) < 0.15 else style.rhythm
     stretch = max(0.36, 1.12 * style.duty * style.step_length)
     begin, end = path.time[0], path.time[-1]
-    land, lift, place, yaw = ([], []), ([], []), ([], []), ([], [])
-    for foot in (0, 1):
-        position, angle, _ = _home(style, path, begin, sides[foot], style.step_width)
-        land[foot].append(begin - 1.0)
-        place[foot].append(position)
-        yaw[foot].append(angle)
+    homes = [_home(style, path, begin, side, style.step_width) for side in sides]
+    land, lift = ([begin - 1.0], [begin - 1.0]), ([], [])
+    place, yaw = ([[home[which]] for home in homes] for which in (0, 1))
     knots, strides = [begin], [share]
     now, foot, standing = begin, int(rng.integers(2)), True
     while now < end:
@@ -393,40 +360,40 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
         strides.append(np.ceil(step) if foot == 0 else np.ceil(step - share) + share)
         knots.append(landed)
         now, foot, standing = landed, 1 - foot, False
-    plants = []
-    for foot in (0, 1):
-        lift[foot].append(end + 10.0)
-        plants.append(_Plants(np.array(land[foot]), np.array(lift[foot]), np.array(place[foot]), np.array(yaw[foot])))
+    for lifts in lift:
+        lifts.append(end + 10.0)
+    plants = [tuple(map(np.array, columns)) for columns in zip(land, lift, place, yaw, strict=True)]
     return plants, np.array(knots), np.array(strides)
 
 
 # ------------------------------------------------------------------------------------ 3. feet
 
 
-def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: float, fps: float):
-    """Turn plants into a toe path.
+def _move_foot(style: StyleParameters, plants, time: np.ndarray, side: float, fps: float):
+    """Turn where a toe stands, from `_plan_footfalls`, into a path of the foot.
 
     Returns:
-      toe position [T, 3], foot yaw [T] (radians), foot pitch [T] (degrees, heel up positive),
-      toe bend [T] (degrees), planted [T] of bool.
+      ankle [T, 3], foot yaw [T] (radians), global rotation of the foot and local one of its toe, [T, 3, 3] each,
+      planted [T] of bool.
     """
-    index = np.clip(np.searchsorted(plants.land, time, side="right") - 1, 0, None)
-    after = np.minimum(index + 1, len(plants.land) - 1)
-    planted = time <= plants.lift[index]
-    duration = np.maximum(plants.land[after] - plants.lift[index], 1e-6)
-    progress = np.where(planted, 0.0, np.clip((time - plants.lift[index]) / duration, 0.0, 1.0))
-    travel = plants.position[after] - plants.position[index]
+    land, lift, place, plant_yaw = plants
+    index = np.clip(np.searchsorted(land, time, side="right") - 1, 0, None)
+    after = np.minimum(index + 1, len(land) - 1)
+    planted = time <= lift[index]
+    duration = np.maximum(land[after] - lift[index], 1e-6)
+    progress = np.where(planted, 0.0, np.clip((time - lift[index]) / duration, 0.0, 1.0))
+    travel = place[after] - place[index]
     # Between minimum jerk and a cubic: soft ends, and a foot that does not lag behind.
     quintic = progress**3 * (10.0 - 15.0 * progress + 6.0 * progress**2)
     share = 0.3 * quintic + 0.7 * smoothstep(progress)
-    flat = plants.position[index] + share[:, None] * travel
-    yaw = plants.yaw[index] + share * (plants.yaw[after] - plants.yaw[index])
+    flat = place[index] + share[:, None] * travel
+    yaw = plant_yaw[index] + share * (plant_yaw[after] - plant_yaw[index])
     # Short steps (settling, turning on the spot) lift and roll less.
-    reach = np.linalg.norm(np.diff(plants.position, axis=0), axis=-1)
+    reach = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     reach = np.append(reach, 0.0) / (2.0 * style.step_length)
     effort = np.clip(0.30 + 0.70 * reach, 0.30, 1.15)
-    facing = np.stack([np.sin(plants.yaw), np.cos(plants.yaw)], axis=-1)
-    forward = np.append(np.sum(np.diff(plants.position, axis=0) * facing[:-1], -1), 0.0)
+    facing = np.stack([np.sin(plant_yaw), np.cos(plant_yaw)], axis=-1)
+    forward = np.append(np.sum(np.diff(place, axis=0) * facing[:-1], -1), 0.0)
     forward = np.clip(forward / (2.0 * style.step_length), -1.0, 1.15)
     scale = style.left_lift_scale if side > 0 else style.right_lift_scale
     arc = progress**2 * (1.0 - progress) ** 2.5 * 26.0
@@ -436,15 +403,15 @@ def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: 
 
     keys, values = [], []
     raised = style.heel_raise_deg
-    for k in range(len(plants.land)):
-        stance = plants.lift[k] - plants.land[k]
+    for k in range(len(land)):
+        stance = lift[k] - land[k]
         roll = np.clip(forward[k], 0.12, 1.0) if forward[k] > 0 else 0.15
         peak = max(style.heel_off_deg * roll * (0.4 + 0.6 * min(scale, 1.0)), raised)
-        keys += [plants.land[k], plants.lift[k] - min(0.48 * stance, 0.36), plants.lift[k]]
+        keys += [land[k], lift[k] - min(0.48 * stance, 0.36), lift[k]]
         values += [raised, raised, raised + 0.78 * (peak - raised)]
-        if k + 1 < len(plants.land):
-            swing = plants.land[k + 1] - plants.lift[k]
-            keys += [plants.lift[k] + 0.14 * swing, plants.lift[k] + 0.80 * swing]
+        if k + 1 < len(land):
+            swing = land[k + 1] - lift[k]
+            keys += [lift[k] + 0.14 * swing, lift[k] + 0.80 * swing]
             values += [peak, raised - style.toe_up_deg * max(forward[k], 0.0)]
     pitch = PchipInterpolator(np.array(keys), np.array(values))(time)
     pitch = _smooth(pitch, 0.025, fps)
@@ -453,7 +420,8 @@ def _move_foot(style: StyleParameters, plants: _Plants, time: np.ndarray, side: 
     toe = np.stack([flat[:, 0], _TOE_HEIGHT + height, flat[:, 1]], axis=-1)
     # On the ground toes stay flat while the heel rises; in the air they follow the foot.
     flex = np.where(planted, 1.0, 1.0 - 0.85 * smoothstep(progress / 0.3) * smoothstep((1 - progress) / 0.2))
-    return toe, yaw, pitch, -np.maximum(pitch, 0.0) * flex, planted
+    frame = matrix_from_yaw(yaw) @ _about(0, pitch)
+    return toe - frame @ _TOE_OFFSET, yaw, frame, _about(0, -np.maximum(pitch, 0.0) * flex), planted
 
 
 # ---------------------------------------------------------------------------- 4 and 5. the legs
@@ -580,7 +548,8 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     stepping = np.gradient(phase, time) * 2.0 * parameters.step_length / parameters.speed
     effort = _smooth(np.clip(1.3 * stepping, 0.0, 1.0) * np.clip(speed / parameters.speed, 0.25, 1.1), 0.16, fps)
 
-    feet = [_move_foot(parameters, plants[foot], time, side, fps) for foot, side in enumerate((1.0, -1.0))]
+    feet = [_move_foot(parameters, of_toe, time, side, fps) for of_toe, side in zip(plants, (1.0, -1.0), strict=True)]
+    ankles, _, _, _, planted = zip(*feet, strict=True)
 
     # Pelvis: sway, twist, roll and bounce ride on the gait phase (left footfall at whole strides).
     accelerate = np.gradient(speed, time)
@@ -606,12 +575,6 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     flight = np.pi * (parameters.rhythm + parameters.duty + 1.0)
     height = height + effort * parameters.hop * np.cos(cycle - flight)
     height = height - 0.035 * spared + 0.002 * drift[:, 4]
-    ankles, foot_frames, toe_frames = [], [], []
-    for toe, foot_yaw, pitch, bend, _ in feet:
-        frame = matrix_from_yaw(foot_yaw) @ _about(0, pitch)
-        foot_frames.append(frame)
-        toe_frames.append(_about(0, bend))
-        ankles.append(toe - frame @ _TOE_OFFSET)
     height = _lower_pelvis(height, root_flat, pelvis, ankles, 0.990 * leg, fps)
     root = np.stack([root_flat[:, 0], height, root_flat[:, 1]], axis=-1)
 
@@ -620,16 +583,15 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     joint = SYNTHETIC_SKELETON.index
     local[:, 0] = pelvis
     transpose = np.swapaxes(pelvis, -1, -2)
-    for foot, (name, side) in enumerate((("Left", 1.0), ("Right", -1.0))):
+    for name, side, (ankle, foot_yaw, foot, toe, _) in zip(("Left", "Right"), (1.0, -1.0), feet, strict=True):
         hip = root + pelvis @ (_HIP_OFFSET * [side, 1.0, 1.0])
-        foot_yaw = feet[foot][1]
         bearing = 0.5 * (foot_yaw + np.radians(pelvis_yaw)) + side * np.radians(parameters.knee_out_deg)
         pole = np.stack([np.sin(bearing), np.zeros(count), np.cos(bearing)], axis=-1)
-        thigh, shank = _bend_leg(hip, ankles[foot], pole)
+        thigh, shank = _bend_leg(hip, ankle, pole)
         local[:, joint(f"{name}Hip")] = transpose @ thigh
         local[:, joint(f"{name}Knee")] = np.swapaxes(thigh, -1, -2) @ shank
-        local[:, joint(f"{name}Ankle")] = np.swapaxes(shank, -1, -2) @ foot_frames[foot]
-        local[:, joint(f"{name}Toe")] = toe_frames[foot]
+        local[:, joint(f"{name}Ankle")] = np.swapaxes(shank, -1, -2) @ foot
+        local[:, joint(f"{name}Toe")] = toe
 
     # Spine: posture, shoulders against hips, and a trunk that stays upright over a rolling pelvis.
     twist = parameters.hip_twist_deg + parameters.chest_twist_deg
@@ -670,7 +632,7 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
         local[:, joint(f"{name}Collar")] = _about(2, side * lift)
 
     keep = slice(margin, margin + frames)
-    planted = np.stack([foot[4] for foot in feet], axis=-1)
+    planted = np.stack(planted, axis=-1)
     contacts = (planted & np.roll(planted, -1, axis=0))[keep]
     return Motion(SYNTHETIC_SKELETON, root[keep], local[keep], float(fps), f"{style}_{int(seed)}"), contacts
 
