@@ -26,12 +26,13 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.experiments import denoising, literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
-from f3amd_lib.experiments.posterior import measure_posterior
+from f3amd_lib.experiments.posterior import POSTERIOR, posterior_table
 from f3amd_lib.experiments.protocol import (
     REFERENCE_MODELS,
     Protocol,
@@ -258,14 +259,15 @@ def measure_quality(
     return records.measure(_with_weights(rows, trained, other=record["classifier_weights"]), score)
 
 
-def _on_short_paths(prepared: PreparedData, profile: Profile) -> tuple[dict, dict[str, float], dict[int, list]]:
-    """Return settings, the floor of each style, and by seed the paths of `measure_walking` and `measure_feet`."""
-    packed, styles = prepared.packed, _styles(prepared, profile)
-    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
-    made = packed.dataset == "synthetic"  # its floor is at 0
-    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
-    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
-    return {"num_frames": num_frames, "num_seeds": WALKING_SEEDS, "styles": styles}, floors, paths
+TREATMENTS: dict[str, tuple[int, Callable | None]] = {
+    "as made": (0, None),
+    "blended": (4, None),
+    "feet locked": (0, lock_rollout),
+    "blended, feet locked": (4, lock_rollout),
+    "blended, feet locked online": (4, lock_rollout_online),
+}
+"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
+is the steer page's: it sees no frame ahead."""
 
 
 def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -279,47 +281,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    packed = prepared.packed
-    settings, floors, paths = _on_short_paths(prepared, profile)
-    styles, record = settings["styles"], _record(prepared, profile, "walking", **settings)
-    asked, trained = _asked(prepared, profile, models)
-
-    def motions(row: Mapping):
-        """Yield (seed, style, motion)."""
-        if row["steps"]:
-            generator = MotionGenerator(trained[row["model"]], row["steps"])
-            for seed, lines in paths.items():
-                rollout = generator.rollout(lines, styles, seed=seed)
-                yield from ((seed, style, rollout.motion(place)) for place, style in enumerate(styles))
-        elif packed.dataset == "synthetic":  # its source walks any path
-            for seed, lines in paths.items():
-                for style, line in zip(styles, lines, strict=True):
-                    yield seed, style, walk_along(style, line.position, line.yaw)
-        else:
-            yield from ((0, style, motion) for style, motion in _real_walks(packed, profile, styles))
-
-    def walk(row: Mapping) -> dict:
-        rows = [
-            {**row, "seed": seed, "style": style} | walking_figures(motion, profile.window, floors[style])
-            for seed, style, motion in motions(row)
-        ]
-        return {"walking": pd.DataFrame(rows)}
-
-    rows = [("real", 0), *itertools.product(trained, (8, 1))]
-    todo = [{"model": name, "window_frames": profile.window, "steps": steps} for name, steps in rows]
-    records = Records(_records_dir(profile), record, {"walking": ["model", "window_frames", "steps"]}, again=asked)
-    return records.measure(_with_weights(todo, trained), walk)
-
-
-TREATMENTS: dict[str, tuple[int, Callable | None]] = {
-    "as made": (0, None),
-    "blended": (4, None),
-    "feet locked": (0, lock_rollout),
-    "blended, feet locked": (4, lock_rollout),
-    "blended, feet locked online": (4, lock_rollout_online),
-}
-"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
-is the steer page's: it sees no frame ahead."""
+    return _measure_walks(prepared, profile, models, "walking", ["model", "window_frames", "steps"], ["as made"])
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -328,33 +290,55 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
     Never a row of the paper's: what is treated is not what the network made.
 
     Returns:
-      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" as there.
+      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
+      clips.
     """
-    settings, floors, paths = _on_short_paths(prepared, profile)
-    styles, record = settings["styles"], _record(prepared, profile, "feet", **settings)
+    return _measure_walks(prepared, profile, models, "feet", ["model", "steps"], TREATMENTS)
+
+
+def _measure_walks(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, keys: list[str],
+    treatments: Iterable[str],
+) -> Path:  # fmt: skip
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
+    packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
+    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
+    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
+    record = _record(prepared, profile, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
     asked, trained = _asked(prepared, profile, models)
 
-    def treat(row: Mapping) -> dict:
-        if not row["steps"]:
-            walks = [("as made", 0, *walk) for walk in _real_walks(prepared.packed, profile, styles)]
-        else:
-            generator, walks = MotionGenerator(trained[row["model"]], row["steps"]), []
+    def walks(row: Mapping):
+        """Yield (treatment, seed, style, motion)."""
+        if row["steps"]:
+            generator = MotionGenerator(trained[row["model"]], row["steps"])
             for seed, lines in paths.items():
-                made = generator.rollout(lines, styles, seed=seed)
-                for treatment, (blend_frames, lock) in TREATMENTS.items():
-                    treated = blend_rollout(made, blend_frames)
+                rollout = generator.rollout(lines, styles, seed=seed)
+                for treatment in treatments:
+                    blend_frames, lock = TREATMENTS[treatment]
+                    treated = blend_rollout(rollout, blend_frames)
                     treated = lock(treated) if lock else treated
-                    walks += [(treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles)]
-        figures = [
-            {"treatment": treatment, "seed": seed, "style": style}
-            | walking_figures(motion, profile.window, floors[style])
-            for treatment, seed, style, motion in walks
-        ]
-        return {"feet": pd.DataFrame(figures)}
+                    yield from ((treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles))
+        elif made and name == "walking":  # its source walks any path
+            for seed, lines in paths.items():
+                for style, line in zip(styles, lines, strict=True):
+                    yield "as made", seed, style, walk_along(style, line.position, line.yaw)
+        else:
+            yield from (("as made", 0, style, motion) for style, motion in _real_walks(packed, profile, styles))
 
-    todo = [{"model": name, "steps": steps} for name, steps in [("real", 0), *itertools.product(trained, (8, 1))]]
-    records = Records(_records_dir(profile), record, {"feet": ["model", "steps"]}, again=asked)
-    return records.measure(_with_weights(todo, trained), treat)
+    def measured(row: Mapping) -> dict:
+        rows = [
+            (row if name == "walking" else {"treatment": treatment}) | {"seed": seed, "style": style}
+            | walking_figures(motion, profile.window, floors[style])
+            for treatment, seed, style, motion in walks(row)
+        ]  # fmt: skip
+        return {name: pd.DataFrame(rows)}
+
+    known = {"window_frames": profile.window} if "window_frames" in keys else {}
+    rows = [("real", 0), *itertools.product(trained, (8, 1))]
+    todo = [{"model": model, **known, "steps": steps} for model, steps in rows]
+    records = Records(_records_dir(profile), record, {name: keys}, again=asked)
+    return records.measure(_with_weights(todo, trained), measured)
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -424,6 +408,24 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
         feet[name, profile.window, profile.num_steps] = walks
     settings = {"num_frames": profile.rollout_frames, "styles": styles}
     return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
+
+
+def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure what history, path and style leave open, on real motion and by trained models.
+
+    Some minutes in all.
+
+    Returns:
+      The table `records/posterior.csv` (see `posterior.posterior_table`), measured anew.
+    """
+    settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
+    _, trained = _asked(prepared, profile, models)
+    table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
+    record = _record(
+        prepared, profile, "posterior", held_out_split=prepared.held_out_split, settings=settings,
+        numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
+    )  # fmt: skip
+    return write_table(_records_dir(profile) / "posterior.csv", table, record)
 
 
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:

@@ -249,6 +249,7 @@ def _notebook_text(path: Path) -> str:
 
 # ------------------------------------------------------------------------------------------------------------- the page
 
+
 def equations_markdown(*, root=None) -> str:
     """Return the page docs/equations.md: for each paper a table of its equations with functions, tests and sections.
 
