@@ -25,7 +25,6 @@ from f3amd_lib.generation.captioned_motion import draw_motions
 from f3amd_lib.generation.latent_motion import latent_walk, steps_of
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
-from f3amd_lib.measures.text_judge import judge_motions
 from f3amd_lib.measures.text_metrics import RAISED, raised_hands
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.training.checkpoints import network_with, weights_digest
@@ -105,11 +104,7 @@ def measure_judge(
         return None
     others = data.cut(bench.settings["most_frames"])
     others = others.select(others.members("train"))
-    probes = probes_of(bench.real, others, bench.seed)
-    table = judge_motions(
-        bench.judge, encoder, bench.real, probes, repeats=bench.settings["repeats"], seed=bench.seed,
-        group=bench.settings["group"], bar=bench.settings["sight"],
-    )  # fmt: skip
+    table = bench.judged(probes_of(bench.real, others, bench.seed), bench.settings["repeats"])
     record = bench.record(profile, data, "text_judge", tremble=TREMBLE)
     return write_table(results_dir(profile.dataset, profile.name) / "records" / "text_judge.csv", table, record)
 
