@@ -30,13 +30,8 @@ from f3amd_lib.training.denoising_task import network_inputs
 UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
 """Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""
 
-WINDOW_METRICS = {
-    "joint_error": "cm",
-    "joint_acceleration": "cm/frame^2",
-    "seed_spread": "cm",
-    "from_rescaled": "cm",
-    "from_half_the_steps": "cm",
-}
+WINDOW_METRICS = dict.fromkeys(("joint_error", "seed_spread", "from_rescaled", "from_half_the_steps"), "cm")
+WINDOW_METRICS["joint_acceleration"] = "cm/frame^2"
 """Metric of `window_figures` -> unit."""
 
 CM = 100.0

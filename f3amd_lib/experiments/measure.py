@@ -119,20 +119,14 @@ def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
         raise ValueError(f"{reason}: leave --model out")
 
 
-def _models_with_weights(profile: Profile) -> list[str]:
-    """List the presets that have weights; ValueError, with what to do, if there are none."""
-    names = available_models(profile)
-    if not names:
-        raise ValueError(
-            f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one "
-            f"(`f3amd train --data {profile.dataset} --profile {profile.name}`) or "
-            "name one with --model"
-        )
-    return names
-
-
-def _trained(prepared: PreparedData, profile: Profile, names: Iterable[str]) -> dict[str, TrainedModel]:
-    return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+def models_with_weights(profile: Profile, option: str = "--model") -> list[str]:
+    """List the presets that have weights; ValueError, with what to do (name one with `option`), if there are none."""
+    if names := available_models(profile):
+        return names
+    raise ValueError(
+        f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one (`f3amd train --data "
+        f"{profile.dataset} --profile {profile.name}`) or name one with {option}"
+    )
 
 
 def _record(prepared: PreparedData, profile: Profile, measurement: str, **settings) -> dict:
@@ -140,11 +134,15 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
 
 
 def _asked(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False
-) -> tuple[list[str], dict[str, TrainedModel]]:
-    """Return the presets that were asked for by name, and the models: theirs, or all that have weights."""
-    asked, known = _names(models), _models_with_weights if at_least_one else available_models
-    return asked, _trained(prepared, profile, asked or known(profile))
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False,
+    among: Iterable[str] = (),
+) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
+    """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
+    names = asked = _names(models)
+    if not asked:
+        known = (models_with_weights if at_least_one else available_models)(profile)
+        names = [name for name in among if name in known] if among else known
+    return asked, {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
@@ -532,11 +530,10 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     Raises:
       ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
     """
-    names = _names(models) or ["F3AMD-FNO-96"]
-    if len(names) > 1:
-        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(names)}: name one with --model")
-    by_name = _trained(prepared, profile, names)
-    trained = by_name[names[0]]
+    asked, by_name = _asked(prepared, profile, models or ["F3AMD-FNO-96"])
+    if len(asked) > 1:
+        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(asked)}: name one with --model")
+    (trained,) = by_name.values()
     task = prepared.task(trained.name, profile_recipe(profile, trained.name))
     held_out = prepared.windows(prepared.held_out_split)
     table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
@@ -635,11 +632,10 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
       The table `records/one_step.csv`; beside it `one_step_by_seed.csv`, and `one_step_input_use.csv`, how far the
       students' estimates move with noisy input and noise level (see `denoising.input_use`).
     """
-    packed, asked = prepared.packed, _names(models)
+    packed, num_steps = prepared.packed, STUDENT_STEPS[profile.name]
+    held_out = prepared.windows(prepared.held_out_split)
     classifier, protocol, record = protocol_of(prepared, profile, "one_step")
-    held_out, num_steps = prepared.windows(prepared.held_out_split), STUDENT_STEPS[profile.name]
-    known = available_models(profile)
-    trained = _trained(prepared, profile, asked or [name for name in ONE_STEP_MODELS if name in known])
+    asked, trained = _asked(prepared, profile, models, among=ONE_STEP_MODELS)
     folder = runs_dir(profile.dataset, profile.name) / "one_step"
     record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
     keys = ["model", "window_frames", "steps"]
@@ -674,8 +670,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     Returns:
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
-    names = _names(models) or [name for name in (*ONE_STEP_MODELS, "F3AMD-FNO-96") if name in available_models(profile)]
-    trained = _trained(prepared, profile, names)
+    _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
     batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
 
     def compiled(model: TrainedModel, steps: int) -> Callable:
