@@ -169,10 +169,9 @@ def continuation_spread(
     rows = []
     for name, of_windows in neighbours.items():
         # Of the same length for all, so that there is one compilation; copies are cut off again.
-        padded = np.stack([np.resize(near, num_neighbours) for near, _ in of_windows])
         variances = [
-            diversity_variance(np.asarray(continuations(pool, index))[: len(near)])
-            for index, (near, _) in zip(padded, of_windows, strict=True)
+            diversity_variance(np.asarray(continuations(pool, np.resize(near, num_neighbours)))[: len(near)])
+            for near, _ in of_windows
         ]
         row = {"given": name, **root_mean_square(variances)}
         row["neighbours"] = float(np.mean([len(near) for near, _ in of_windows]))

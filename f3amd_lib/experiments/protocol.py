@@ -20,6 +20,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -137,8 +138,7 @@ def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
     return pd.DataFrame(figures).groupby(np.asarray(styles)).mean().mean().to_dict()
 
 
-@dataclass(frozen=True)
-class ClassifiedWindows:
+class ClassifiedWindows(NamedTuple):
     """What the classifier says of the windows of some motions.
 
     Attributes:
@@ -156,7 +156,7 @@ class ClassifiedWindows:
     def of(self, sources: Iterable[int]) -> ClassifiedWindows:
         """Return the windows of some of the motions, motion by motion in that order."""
         order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
-        return ClassifiedWindows(*(part[order] for part in (self.features, self.predicted, self.style, self.source)))
+        return ClassifiedWindows(*(part[order] for part in self))
 
 
 def classify_windows(
@@ -172,20 +172,20 @@ def classify_windows(
     Raises:
       ValueError: if no motion is long enough, or for an unknown style.
     """
-    windows, asked, source = [], [], []
-    for number, (motion, style) in enumerate(zip(motions, styles, strict=True)):
-        if motion.num_frames >= classifier.config.window:
-            cut = classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
-            windows.append(cut)
-            asked += [classifier.style_index(style)] * len(cut)
-            source += [number] * len(cut)
+    windows = {
+        number: classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
+        for number, motion in enumerate(motions)
+        if motion.num_frames >= classifier.config.window
+    }
     if not windows:
         raise ValueError(
             f"no motion of {', '.join(dict.fromkeys(styles))} has the {classifier.config.window} "
             "frames that the style classifier looks at"
         )
-    features, predicted = classifier.features_and_classes(np.concatenate(windows))
-    return ClassifiedWindows(features, predicted, np.array(asked), np.array(source))
+    features, predicted = classifier.features_and_classes(np.concatenate(list(windows.values())))
+    source = np.repeat(list(windows), [len(cut) for cut in windows.values()])
+    asked = np.array([classifier.style_index(style) for style in styles])
+    return ClassifiedWindows(features, predicted, asked[source], source)
 
 
 def real_features(
@@ -321,13 +321,11 @@ def measure_model(
     rows = []
     for seed in seeds:
         motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
-        figures = _style_means(
-            [
-                _figures_without_classifier(motion, path, rollout.window, floors[style])
-                for motion, path, style in zip(motions, paths[seed], styles, strict=True)
-            ],
-            styles,
-        )
+        walked = zip(motions, paths[seed], styles, strict=True)
+        each = [
+            _figures_without_classifier(motion, path, rollout.window, floors[style]) for motion, path, style in walked
+        ]
+        figures = _style_means(each, styles)
         rng = np.random.default_rng([protocol.path_seed, seed])
         seen = classify_windows(classifier, motions, styles)
         figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)

@@ -143,18 +143,13 @@ def plan(
         if name == CAMPAIGN:
             wanted = list(_of_queue(asked, snapshots))
         else:
-            known = asked or models_with_weights(profile, "--preset")
-            wanted = [leg for model in known for leg in _of_preset(name, model)]
+            wanted = []
+            for model in asked or models_with_weights(profile, "--preset"):
+                training = Leg(TRAIN, model)
+                alone = name in _TRAIN_THEMSELVES
+                wanted += [Leg(name, model)] if alone else [training, Leg(name, model, after=training.name)]
         legs |= {leg.name: leg for leg in wanted}
     return list(legs.values())
-
-
-def _of_preset(name: str, model: str) -> list[Leg]:
-    """Return the legs of a measurement of one preset, and before it of its training."""
-    if name in _TRAIN_THEMSELVES:
-        return [Leg(name, model)]
-    training = Leg(TRAIN, model)
-    return [training, Leg(name, model, after=training.name)]
 
 
 def _of_queue(asked: Sequence[str], snapshots: Sequence[tuple[Run, int]]) -> Iterator[Leg]:
