@@ -30,16 +30,9 @@ from f3amd_lib.data.text_motions import (
 )
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures import text_metrics
 from f3amd_lib.measures.distributions import frechet_distance, intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.measures.text_metrics import (
-    GROUP,
-    clip_score,
-    embedding_diversity,
-    groups_of_unlike_pairs,
-    matching_distance,
-    r_precision,
-)
 from f3amd_lib.motion.redundant import canonical_start, essential_features
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.text_motion import TextMotionConfig
@@ -218,7 +211,7 @@ def judged_clips(data: TextMotions, split: str = "test") -> TextMotions:
 
 
 def text_figures(
-    text, motion, reference, pairs, generator: np.random.Generator, group: int = GROUP
+    text, motion, reference, pairs, generator: np.random.Generator, group: int = text_metrics.GROUP
 ) -> dict[str, float]:
     """Return the figures of one repeat, by names of the registry.
 
@@ -229,23 +222,23 @@ def text_figures(
       generator: what draws groups and pairs.
       group: texts that are ranked together.
     """
-    groups = groups_of_unlike_pairs(pairs, generator, group)
-    first, second, third = r_precision(text[groups], motion[groups])
+    groups = text_metrics.groups_of_unlike_pairs(pairs, generator, group)
+    first, second, third = text_metrics.r_precision(text[groups], motion[groups])
     return {
         "text_FID": frechet_distance(motion, reference),
         "R_precision_1": first,
         "R_precision_2": second,
         "R_precision_3": third,
-        "matching_distance": matching_distance(text[groups], motion[groups]),
-        "embedding_diversity": embedding_diversity(motion, generator),
-        "CLIP_score": clip_score(text, motion),
+        "matching_distance": text_metrics.matching_distance(text[groups], motion[groups]),
+        "embedding_diversity": text_metrics.embedding_diversity(motion, generator),
+        "CLIP_score": text_metrics.clip_score(text, motion),
     }
 
 
 def judge_motions(
     judge: TextJudge, encoder: TextEncoder, real: TextMotions,
     systems: dict[str, Callable[[int], tuple[Sequence[np.ndarray], Sequence[str]]]],
-    *, repeats: int = REPEATS, seed: int = 0, group: int = GROUP, bar: float = SIGHT,
+    *, repeats: int = REPEATS, seed: int = 0, group: int = text_metrics.GROUP, bar: float = SIGHT,
 ) -> pd.DataFrame:  # fmt: skip
     """Measure systems beside real motion, with intervals over repeats.
 
