@@ -235,13 +235,8 @@ def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol
 
 def _held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) -> tuple[np.ndarray, np.ndarray]:
     """Return clips of both held-out splits at the speeds that are asked for, and their styles."""
-    present = set(np.asarray(packed.clip_split).tolist())
-    clips = [
-        clip
-        for split in ("test", "validation")
-        if SPLITS.index(split) in present
-        for clip in real_clips.reference_clips(packed, styles, window=window, split=split)
-    ]
+    splits = [split for split in ("test", "validation") if SPLITS.index(split) in np.asarray(packed.clip_split)]
+    clips = sum((real_clips.reference_clips(packed, styles, window=window, split=split) for split in splits), [])
     return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
 
 

@@ -153,13 +153,8 @@ def follow_clip(
             f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for at most "
             f"{max(0, whole.num_frames - num_history)} frames after the history"
         )
-    line = own_path(whole)
-    part = slice(num_history, end)
-    return (
-        world_frames(whole)[None, :num_history].astype(np.float32),
-        RootPath(line.position[part], line.yaw[part], line.fps),
-        whole.slice(num_history, end),
-    )
+    history = world_frames(whole)[None, :num_history].astype(np.float32)
+    return history, own_path(whole).slice(num_history, end), whole.slice(num_history, end)
 
 
 def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test") -> list[int]:

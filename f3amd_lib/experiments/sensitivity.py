@@ -68,15 +68,11 @@ def graded_corruptions(
     perceived motion quality than FID in our experiments").
     """
     require_telling_styles(classifier)
-
-    clips = [
-        clip
-        for split in splits
-        for clip in reference_clips(packed, protocol.styles, window=classifier.config.window, split=split)
-    ]
+    window = classifier.config.window
+    clips = [clip for split in splits for clip in reference_clips(packed, protocol.styles, window=window, split=split)]
     motions = [packed.motion(clip) for clip in clips]
     names = [packed.styles[packed.clip_style[clip]] for clip in clips]
-    by_class = real_features(packed, classifier, protocol.styles, classifier.config.window)
+    by_class = real_features(packed, classifier, protocol.styles, window)
     real = {classifier.styles[number]: cloud for number, cloud in by_class.items()}
     todo = list(itertools.product(corruptions, strengths, range(protocol.num_seeds)))
     rows = []
