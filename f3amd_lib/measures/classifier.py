@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -49,6 +49,9 @@ ACCURACY_BAR = 0.8
 
 _SPLITS = {"train": ("train",), "held_out": ("validation", "test")}
 """Splits whose clips are trained on, and whose clips say how well."""
+
+_STATIC = {"static": True}
+"""Marks fields that JAX compiles for, as against arrays that it is given."""
 
 _BATCH = 256
 """Windows that are evaluated at once; fixed, so that a window's features depend on it alone."""
@@ -428,11 +431,7 @@ def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: Classi
     }
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("frames", "starts", "first", "count", "mirrored"),
-    meta_fields=("dataset_fingerprint", "styles", "network", "config"),
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class StyleTask:
     """A style classifier to train (a `training.optimise.Task`).
@@ -447,10 +446,10 @@ class StyleTask:
 
     name: ClassVar[str] = "style classifier"
 
-    dataset_fingerprint: str
-    styles: tuple[str, ...]
-    network: ClassifierConfig
-    config: ClassifierTraining
+    dataset_fingerprint: str = field(metadata=_STATIC)
+    styles: tuple[str, ...] = field(metadata=_STATIC)
+    network: ClassifierConfig = field(metadata=_STATIC)
+    config: ClassifierTraining = field(metadata=_STATIC)
     frames: jax.Array
     starts: jax.Array
     first: jax.Array
