@@ -368,8 +368,9 @@ def test_a_windows_features_depend_on_nothing_else(trained, monkeypatch):
 
 def test_primary_styles_are_the_classes_unless_others_are_asked_for(packed):
     fewer = dataclasses.replace(packed, primary_styles=("Runner", "Zombie"))
-    assert module._chosen_styles(fewer, None) == ("Runner", "Zombie")
-    asked = module._chosen_styles(fewer, ["Zombie", "ArmsOverhead"])
+    how = {"num_steps": 1, "batch_size": 2, "seed": 0}
+    assert module._asked_for(fewer, **how)[0] == ("Runner", "Zombie")
+    asked, *_ = module._asked_for(fewer, **how, styles=["Zombie", "ArmsOverhead"])
     assert asked == ("Zombie", "ArmsOverhead")
     takes = module._collect(fewer, asked, ("train",), WINDOW)
     assert takes.styles.tolist() == [0, 0, 1, 1]

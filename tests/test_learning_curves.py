@@ -197,4 +197,4 @@ def test_processes_that_do_not_say_enough_train_nothing(words, message, capsys):
 def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
     monkeypatch.setattr(measure, "available_models", lambda profile: [])
     with pytest.raises(ValueError, match="no trained model for 'synthetic' at profile 'smoke'"):
-        measure._models_with_weights(load_profile("smoke", "synthetic"))
+        measure.models_with_weights(load_profile("smoke", "synthetic"))

@@ -195,12 +195,12 @@ def test_one_draw_has_no_spread():
 def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeypatch, tmp_path):
     monkeypatch.setenv(RESULTS_DIR_VARIABLE, str(tmp_path))
     trained = model_that(lambda x_noisy, sigma: 0.5 * x_noisy)
-    monkeypatch.setattr(posterior, "available_models", lambda profile: ["F3AMD-FNO-32"])
-    monkeypatch.setattr(posterior, "obtain_model", lambda *a, **k: (trained, None, "shipped"))
+    monkeypatch.setattr(measure, "available_models", lambda profile: ["F3AMD-FNO-32"])
+    monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "shipped"))
     packed = dataclasses.replace(tiny_packed(), dataset="synthetic")
     prepared = PreparedData(packed, WINDOW, HISTORY)
     profile = load_profile("smoke", "synthetic", window=WINDOW, num_history=HISTORY)
-    path = posterior.measure_posterior(prepared, profile)
+    path = measure.measure_posterior(prepared, profile)
     assert path == tmp_path / "synthetic" / "smoke" / "records" / "posterior.csv"
     table, record = read_table(path)
     assert record["measurement"] == "posterior" and record["settings"] == posterior.POSTERIOR["smoke"]
@@ -212,9 +212,9 @@ def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeyp
     levels = posterior.POSTERIOR["smoke"]["num_levels"]
     assert len(mine) == 3 * levels and mine["sigma"].max() == pytest.approx(128.0)
     assert mine["weights"].str.fullmatch("[0-9a-f]{12}").all()
-    again, _ = read_table(posterior.measure_posterior(prepared, profile))
+    again, _ = read_table(measure.measure_posterior(prepared, profile))
     assert again.equals(table)
 
 
 def test_the_measurement_has_a_name_on_the_command_line():
-    assert measure.MEASUREMENTS["posterior"] is posterior.measure_posterior
+    assert measure.MEASUREMENTS["posterior"] is measure.measure_posterior

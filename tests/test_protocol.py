@@ -143,7 +143,7 @@ def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, generator
         return types.SimpleNamespace(window=32, motion=motion)
 
     walker = types.SimpleNamespace(trained=generator.trained, num_steps=1, rollout=rollout)
-    monkeypatch.setattr(module, "style_floor", lambda packed, style: float(STYLES.index(style)))
+    monkeypatch.setattr(module.real_clips, "style_floor", lambda packed, style: float(STYLES.index(style)))
     monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {})
     monkeypatch.setattr(module, "_style_means", lambda figures, styles: {})
     monkeypatch.setattr(module, "classify_windows", lambda classifier, motions, styles: told.append((motions, styles)))

@@ -93,7 +93,7 @@ def test_what_cannot_be_swept_is_refused(names, models, told):
 
 
 def test_nothing_with_weights_and_nothing_named_is_refused(monkeypatch):
-    monkeypatch.setattr(sweep, "available_models", lambda profile: [])
+    monkeypatch.setattr(measure, "available_models", lambda profile: [])
     refused("--preset", plan, ["walking"], [], PROFILE, QUEUE)
 
 

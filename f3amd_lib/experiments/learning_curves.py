@@ -59,10 +59,8 @@ def train_family(
         if stop_at is not None and parallel.first_says(time.monotonic() >= stop_at):
             yield preset, "unfinished"
             return
-        trained, _ = train(
-            prepared, profile, preset=preset, folder=folder, mesh=mesh, stop_at=stop_at,
-            progress=progress,
-        )  # fmt: skip
+        how = {"folder": folder, "mesh": mesh, "stop_at": stop_at, "progress": progress}
+        trained, _ = train(prepared, profile, preset=preset, **how)
         yield preset, "unfinished" if trained is None else "finished"
         if trained is None:
             return
@@ -148,18 +146,10 @@ def learning_table(curves: pd.DataFrame) -> pd.DataFrame:
       Columns model, steps, first_loss and last_loss (mean training loss of the first and the last
       tenth of the run), held_out_before, held_out_after, and falls: whether both fell.
     """
-    rows = []
-    for model, curve in curves.groupby("model", sort=False):
-        curve = curve.sort_values("step")
-        losses, held_out = curve["loss"].dropna(), curve["held_out_loss"]
-        row = {
-            "model": model,
-            "steps": int(curve["step"].iloc[-1]),
-            "first_loss": losses.iloc[0],
-            "last_loss": losses.iloc[-1],
-            "held_out_before": held_out.iloc[0],
-            "held_out_after": held_out.iloc[-1],
-        }
-        fell = row["last_loss"] < row["first_loss"]
-        rows.append({**row, "falls": bool(fell and row["held_out_after"] < held_out.iloc[0])})
-    return pd.DataFrame(rows)
+    # "first" and "last" leave out what is not known: no training loss is before the first step.
+    table = curves.sort_values("step", kind="stable").groupby("model", sort=False).agg(
+        steps=("step", "last"), first_loss=("loss", "first"), last_loss=("loss", "last"),
+        held_out_before=("held_out_loss", "first"), held_out_after=("held_out_loss", "last"),
+    ).reset_index()  # fmt: skip
+    falls = (table["last_loss"] < table["first_loss"]) & (table["held_out_after"] < table["held_out_before"])
+    return table.assign(falls=falls)

@@ -30,13 +30,8 @@ from f3amd_lib.training.denoising_task import network_inputs
 UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
 """Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""
 
-WINDOW_METRICS = {
-    "joint_error": "cm",
-    "joint_acceleration": "cm/frame^2",
-    "seed_spread": "cm",
-    "from_rescaled": "cm",
-    "from_half_the_steps": "cm",
-}
+WINDOW_METRICS = dict.fromkeys(("joint_error", "seed_spread", "from_rescaled", "from_half_the_steps"), "cm")
+WINDOW_METRICS["joint_acceleration"] = "cm/frame^2"
 """Metric of `window_figures` -> unit."""
 
 CM = 100.0
@@ -137,8 +132,7 @@ def window_figures(walks: WindowWalks) -> pd.DataFrame:
     """
     rows = []
     if walks.real is not None:
-        lively = float(np.mean(joint_acceleration(walks.real)))
-        rows.append(("real", 0, "joint_acceleration", lively))
+        rows.append(("real", 0, "joint_acceleration", float(np.mean(joint_acceleration(walks.real)))))
     for (update, number), joints in walks.made.items():
         figures = {} if walks.real is None else {"joint_error": _distance(joints, walks.real)}
         figures |= {
@@ -146,9 +140,8 @@ def window_figures(walks: WindowWalks) -> pd.DataFrame:
             "seed_spread": diversity(np.swapaxes(joints, 0, 1)),
             "from_rescaled": _distance(joints, walks.made["rescaled", number]),
         }
-        half = walks.made.get((update, number // 2)) if number % 2 == 0 else None
-        if half is not None:
-            figures["from_half_the_steps"] = _distance(joints, half)
+        if number % 2 == 0 and (update, number // 2) in walks.made:
+            figures["from_half_the_steps"] = _distance(joints, walks.made[update, number // 2])
         rows += [(update, number, name, value) for name, value in figures.items()]
     table = pd.DataFrame(rows, columns=["update", "steps", "metric", "value"])
     table.insert(3, "unit", table["metric"].map(WINDOW_METRICS))

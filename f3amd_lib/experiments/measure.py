@@ -26,12 +26,13 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.experiments import denoising, literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
-from f3amd_lib.experiments.posterior import measure_posterior
+from f3amd_lib.experiments.posterior import POSTERIOR, posterior_table
 from f3amd_lib.experiments.protocol import (
     REFERENCE_MODELS,
     Protocol,
@@ -118,20 +119,14 @@ def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
         raise ValueError(f"{reason}: leave --model out")
 
 
-def _models_with_weights(profile: Profile) -> list[str]:
-    """List the presets that have weights; ValueError, with what to do, if there are none."""
-    names = available_models(profile)
-    if not names:
-        raise ValueError(
-            f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one "
-            f"(`f3amd train --data {profile.dataset} --profile {profile.name}`) or "
-            "name one with --model"
-        )
-    return names
-
-
-def _trained(prepared: PreparedData, profile: Profile, names: Iterable[str]) -> dict[str, TrainedModel]:
-    return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+def models_with_weights(profile: Profile, option: str = "--model") -> list[str]:
+    """List the presets that have weights; ValueError, with what to do (name one with `option`), if there are none."""
+    if names := available_models(profile):
+        return names
+    raise ValueError(
+        f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one (`f3amd train --data "
+        f"{profile.dataset} --profile {profile.name}`) or name one with {option}"
+    )
 
 
 def _record(prepared: PreparedData, profile: Profile, measurement: str, **settings) -> dict:
@@ -139,11 +134,15 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
 
 
 def _asked(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False
-) -> tuple[list[str], dict[str, TrainedModel]]:
-    """Return the presets that were asked for by name, and the models: theirs, or all that have weights."""
-    asked, known = _names(models), _models_with_weights if at_least_one else available_models
-    return asked, _trained(prepared, profile, asked or known(profile))
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False,
+    among: Iterable[str] = (),
+) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
+    """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
+    names = asked = _names(models)
+    if not asked:
+        known = (models_with_weights if at_least_one else available_models)(profile)
+        names = [name for name in among if name in known] if among else known
+    return asked, {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
@@ -258,14 +257,15 @@ def measure_quality(
     return records.measure(_with_weights(rows, trained, other=record["classifier_weights"]), score)
 
 
-def _on_short_paths(prepared: PreparedData, profile: Profile) -> tuple[dict, dict[str, float], dict[int, list]]:
-    """Return settings, the floor of each style, and by seed the paths of `measure_walking` and `measure_feet`."""
-    packed, styles = prepared.packed, _styles(prepared, profile)
-    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
-    made = packed.dataset == "synthetic"  # its floor is at 0
-    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
-    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
-    return {"num_frames": num_frames, "num_seeds": WALKING_SEEDS, "styles": styles}, floors, paths
+TREATMENTS: dict[str, tuple[int, Callable | None]] = {
+    "as made": (0, None),
+    "blended": (4, None),
+    "feet locked": (0, lock_rollout),
+    "blended, feet locked": (4, lock_rollout),
+    "blended, feet locked online": (4, lock_rollout_online),
+}
+"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
+is the steer page's: it sees no frame ahead."""
 
 
 def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -279,47 +279,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    packed = prepared.packed
-    settings, floors, paths = _on_short_paths(prepared, profile)
-    styles, record = settings["styles"], _record(prepared, profile, "walking", **settings)
-    asked, trained = _asked(prepared, profile, models)
-
-    def motions(row: Mapping):
-        """Yield (seed, style, motion)."""
-        if row["steps"]:
-            generator = MotionGenerator(trained[row["model"]], row["steps"])
-            for seed, lines in paths.items():
-                rollout = generator.rollout(lines, styles, seed=seed)
-                yield from ((seed, style, rollout.motion(place)) for place, style in enumerate(styles))
-        elif packed.dataset == "synthetic":  # its source walks any path
-            for seed, lines in paths.items():
-                for style, line in zip(styles, lines, strict=True):
-                    yield seed, style, walk_along(style, line.position, line.yaw)
-        else:
-            yield from ((0, style, motion) for style, motion in _real_walks(packed, profile, styles))
-
-    def walk(row: Mapping) -> dict:
-        rows = [
-            {**row, "seed": seed, "style": style} | walking_figures(motion, profile.window, floors[style])
-            for seed, style, motion in motions(row)
-        ]
-        return {"walking": pd.DataFrame(rows)}
-
-    rows = [("real", 0), *itertools.product(trained, (8, 1))]
-    todo = [{"model": name, "window_frames": profile.window, "steps": steps} for name, steps in rows]
-    records = Records(_records_dir(profile), record, {"walking": ["model", "window_frames", "steps"]}, again=asked)
-    return records.measure(_with_weights(todo, trained), walk)
-
-
-TREATMENTS: dict[str, tuple[int, Callable | None]] = {
-    "as made": (0, None),
-    "blended": (4, None),
-    "feet locked": (0, lock_rollout),
-    "blended, feet locked": (4, lock_rollout),
-    "blended, feet locked online": (4, lock_rollout_online),
-}
-"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
-is the steer page's: it sees no frame ahead."""
+    return _measure_walks(prepared, profile, models, "walking", ["model", "window_frames", "steps"], ["as made"])
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -328,33 +288,55 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
     Never a row of the paper's: what is treated is not what the network made.
 
     Returns:
-      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" as there.
+      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
+      clips.
     """
-    settings, floors, paths = _on_short_paths(prepared, profile)
-    styles, record = settings["styles"], _record(prepared, profile, "feet", **settings)
+    return _measure_walks(prepared, profile, models, "feet", ["model", "steps"], TREATMENTS)
+
+
+def _measure_walks(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, keys: list[str],
+    treatments: Iterable[str],
+) -> Path:  # fmt: skip
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
+    packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
+    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
+    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
+    record = _record(prepared, profile, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
     asked, trained = _asked(prepared, profile, models)
 
-    def treat(row: Mapping) -> dict:
-        if not row["steps"]:
-            walks = [("as made", 0, *walk) for walk in _real_walks(prepared.packed, profile, styles)]
-        else:
-            generator, walks = MotionGenerator(trained[row["model"]], row["steps"]), []
+    def walks(row: Mapping):
+        """Yield (treatment, seed, style, motion)."""
+        if row["steps"]:
+            generator = MotionGenerator(trained[row["model"]], row["steps"])
             for seed, lines in paths.items():
-                made = generator.rollout(lines, styles, seed=seed)
-                for treatment, (blend_frames, lock) in TREATMENTS.items():
-                    treated = blend_rollout(made, blend_frames)
+                rollout = generator.rollout(lines, styles, seed=seed)
+                for treatment in treatments:
+                    blend_frames, lock = TREATMENTS[treatment]
+                    treated = blend_rollout(rollout, blend_frames)
                     treated = lock(treated) if lock else treated
-                    walks += [(treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles)]
-        figures = [
-            {"treatment": treatment, "seed": seed, "style": style}
-            | walking_figures(motion, profile.window, floors[style])
-            for treatment, seed, style, motion in walks
-        ]
-        return {"feet": pd.DataFrame(figures)}
+                    yield from ((treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles))
+        elif made and name == "walking":  # its source walks any path
+            for seed, lines in paths.items():
+                for style, line in zip(styles, lines, strict=True):
+                    yield "as made", seed, style, walk_along(style, line.position, line.yaw)
+        else:
+            yield from (("as made", 0, style, motion) for style, motion in _real_walks(packed, profile, styles))
 
-    todo = [{"model": name, "steps": steps} for name, steps in [("real", 0), *itertools.product(trained, (8, 1))]]
-    records = Records(_records_dir(profile), record, {"feet": ["model", "steps"]}, again=asked)
-    return records.measure(_with_weights(todo, trained), treat)
+    def measured(row: Mapping) -> dict:
+        rows = [
+            (row if name == "walking" else {"treatment": treatment}) | {"seed": seed, "style": style}
+            | walking_figures(motion, profile.window, floors[style])
+            for treatment, seed, style, motion in walks(row)
+        ]  # fmt: skip
+        return {name: pd.DataFrame(rows)}
+
+    known = {"window_frames": profile.window} if "window_frames" in keys else {}
+    rows = [("real", 0), *itertools.product(trained, (8, 1))]
+    todo = [{"model": model, **known, "steps": steps} for model, steps in rows]
+    records = Records(_records_dir(profile), record, {name: keys}, again=asked)
+    return records.measure(_with_weights(todo, trained), measured)
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -424,6 +406,24 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
         feet[name, profile.window, profile.num_steps] = walks
     settings = {"num_frames": profile.rollout_frames, "styles": styles}
     return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
+
+
+def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure what history, path and style leave open, on real motion and by trained models.
+
+    Some minutes in all.
+
+    Returns:
+      The table `records/posterior.csv` (see `posterior.posterior_table`), measured anew.
+    """
+    settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
+    _, trained = _asked(prepared, profile, models)
+    table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
+    record = _record(
+        prepared, profile, "posterior", held_out_split=prepared.held_out_split, settings=settings,
+        numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
+    )  # fmt: skip
+    return write_table(_records_dir(profile) / "posterior.csv", table, record)
 
 
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -530,11 +530,10 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     Raises:
       ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
     """
-    names = _names(models) or ["F3AMD-FNO-96"]
-    if len(names) > 1:
-        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(names)}: name one with --model")
-    by_name = _trained(prepared, profile, names)
-    trained = by_name[names[0]]
+    asked, by_name = _asked(prepared, profile, models or ["F3AMD-FNO-96"])
+    if len(asked) > 1:
+        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(asked)}: name one with --model")
+    (trained,) = by_name.values()
     task = prepared.task(trained.name, profile_recipe(profile, trained.name))
     held_out = prepared.windows(prepared.held_out_split)
     table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
@@ -633,11 +632,10 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
       The table `records/one_step.csv`; beside it `one_step_by_seed.csv`, and `one_step_input_use.csv`, how far the
       students' estimates move with noisy input and noise level (see `denoising.input_use`).
     """
-    packed, asked = prepared.packed, _names(models)
+    packed, num_steps = prepared.packed, STUDENT_STEPS[profile.name]
+    held_out = prepared.windows(prepared.held_out_split)
     classifier, protocol, record = protocol_of(prepared, profile, "one_step")
-    held_out, num_steps = prepared.windows(prepared.held_out_split), STUDENT_STEPS[profile.name]
-    known = available_models(profile)
-    trained = _trained(prepared, profile, asked or [name for name in ONE_STEP_MODELS if name in known])
+    asked, trained = _asked(prepared, profile, models, among=ONE_STEP_MODELS)
     folder = runs_dir(profile.dataset, profile.name) / "one_step"
     record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
     keys = ["model", "window_frames", "steps"]
@@ -672,8 +670,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     Returns:
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
-    names = _names(models) or [name for name in (*ONE_STEP_MODELS, "F3AMD-FNO-96") if name in available_models(profile)]
-    trained = _trained(prepared, profile, names)
+    _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
     batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
 
     def compiled(model: TrainedModel, steps: int) -> Callable:

@@ -16,8 +16,7 @@ bound what is left open at the highest noise level from above.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -26,18 +25,16 @@ import pandas as pd
 from scipy.spatial.distance import cdist
 from tqdm import tqdm
 
-from f3amd_lib.data.features import frame_positions, frame_yaw, num_channels
+from f3amd_lib.data.features import frame_positions, frame_yaw
 from f3amd_lib.data.windows import WindowSet, gather_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.experiments.denoising import CM, held_out_batch, root_mean_square
-from f3amd_lib.ground.profiles import Profile, results_dir
-from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.measures.distributions import diversity_variance
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 from f3amd_lib.training.denoising_task import network_inputs
-from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
+from f3amd_lib.training.pipeline import PreparedData
 
 GIVEN = {"style": (), "style, path": ("path",), "style, path, history": ("path", "history")}
 """What continuations have in common -> what is compared to find them, beside the style."""
@@ -79,13 +76,7 @@ def _conditions(skeleton: Skeleton, windows: WindowSet, index) -> dict[str, np.n
             "path": path.reshape(len(index), -1) / jnp.sqrt(path.shape[1]),
         }
 
-    parts = []
-    for first in range(0, len(index), _CHUNK):
-        part = index[first : first + _CHUNK]
-        # One length for all parts, so that there is one compilation.
-        filled = np.resize(part, min(_CHUNK, len(index)))
-        parts.append({k: np.asarray(v)[: len(part)] for k, v in cut(windows, filled).items()})
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return in_batches(lambda rows: cut(windows, index[rows]), len(index), min(_CHUNK, len(index)))
 
 
 def _apart(order: np.ndarray, starts: np.ndarray, gap: int, most: int) -> list[int]:
@@ -178,22 +169,15 @@ def continuation_spread(
     rows = []
     for name, of_windows in neighbours.items():
         # Of the same length for all, so that there is one compilation; copies are cut off again.
-        padded = np.stack([np.resize(near, num_neighbours) for near, _ in of_windows])
         variances = [
-            diversity_variance(np.asarray(continuations(pool, index))[: len(near)])
-            for index, (near, _) in zip(padded, of_windows, strict=True)
+            diversity_variance(np.asarray(continuations(pool, np.resize(near, num_neighbours)))[: len(near)])
+            for near, _ in of_windows
         ]
-        rows.append(
-            {
-                "given": name,
-                **root_mean_square(np.array(variances)),
-                "neighbours": float(np.mean([len(near) for near, _ in of_windows])),
-                **{
-                    f"{part}_apart": CM * float(np.sqrt(np.mean([a[part] for _, a in of_windows])))
-                    for part in ("history", "path")
-                },
-            }
-        )
+        row = {"given": name, **root_mean_square(variances)}
+        row["neighbours"] = float(np.mean([len(near) for near, _ in of_windows]))
+        for part in ("history", "path"):
+            row[f"{part}_apart"] = CM * float(np.sqrt(np.mean([apart[part] for _, apart in of_windows])))
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -258,14 +242,10 @@ def answer_spread(
     keys = jax.random.split(jax.random.key(seed), num_draws)
     rows = []
     for sigma in _levels_of(trained, sigmas):
-        made, *errors = measure(jnp.float32(sigma), keys)
+        made, error, x0_error = measure(jnp.float32(sigma), keys)
         spread = [diversity_variance(draws) for draws in np.moveaxis(np.asarray(made), 0, 1)]
-        error, x0_error = (np.asarray(values, np.float64) for values in errors)
-        for quantity, unit, scale, squares in (
-            ("answer spread", "cm", CM, np.array(spread)),
-            ("error", "cm", CM, error),
-            ("x0 error", "network units", 1.0, x0_error),
-        ):
+        for quantity, squares in (("answer spread", spread), ("error", error), ("x0 error", x0_error)):
+            unit, scale = ("network units", 1.0) if quantity == "x0 error" else ("cm", CM)
             interval = root_mean_square(squares, scale)
             rows.append({"quantity": quantity, "unit": unit, "sigma": sigma, **interval})
     return pd.DataFrame(rows).sort_values(["quantity", "sigma"], ignore_index=True)
@@ -275,13 +255,10 @@ def _levels_of(trained: TrainedModel, sigmas) -> list[float]:
     """Return the noise levels that a network can be asked at."""
     sigmas = [float(sigma) for sigma in sigmas]
     known = getattr(trained.config, "noise_levels", ())
-    if not known:
-        return sigmas
-    lowest, highest = min(sigmas), max(sigmas)
-    return [level for level in known if lowest <= level <= highest] or [max(known)]
+    return [level for level in known if min(sigmas) <= level <= max(sigmas)] or [max(known)] if known else sigmas
 
 
-# ------------------------------------------------------------------------------------ measurement
+# ------------------------------------------------------------------------------------ both in one table
 
 
 def posterior_table(
@@ -311,37 +288,8 @@ def posterior_table(
     sigmas = np.geomspace(0.01, 128.0, num_levels)
     for name, trained in tqdm(models.items(), unit="model", disable=not progress):
         rows = answer_spread(trained, held_out, sigmas, num_windows=num_windows, num_draws=num_draws, seed=seed)
-        weights = weights_digest(trained.params)
-        given = list(GIVEN)[-1]
-        tables.append(rows.assign(model=name, given=given, weights=weights))
+        tables.append(rows.assign(model=name, given=list(GIVEN)[-1], weights=weights_digest(trained.params)))
     columns = ["model", "quantity", "unit", "given", "sigma", "value", "low", "high", "repeats"]
     columns += ["neighbours", "history_apart", "path_apart", "weights"]
     table = pd.concat(tables, ignore_index=True).reindex(columns=columns)
     return table.assign(weights=table["weights"].fillna(""))
-
-
-def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Measure what history, path and style leave open, on real motion and by trained models.
-
-    Some minutes in all.
-
-    Args:
-      prepared: the data.
-      profile: says how much, and where models and results lie.
-      models: presets; by default all that have weights for this data set and window, shipped or in
-        `runs/`. One that is asked for by name is trained if it has none.
-
-    Returns:
-      The table `records/posterior.csv` (see `posterior_table`), measured anew.
-    """
-    names = [presets.find_preset(name).name for name in models or available_models(profile)]
-    settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
-    trained = {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
-    table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="posterior",
-        held_out_split=prepared.held_out_split, settings=settings,
-        numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
-    )  # fmt: skip
-    path = results_dir(profile.dataset, profile.name) / "records" / "posterior.csv"
-    return write_table(path, table, record)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,16 +28,8 @@ import pandas as pd
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.experiments import real_clips
 from f3amd_lib.experiments.denoising import noise_use
-from f3amd_lib.experiments.real_clips import (
-    facing_ahead,
-    own_path,
-    reference_clips,
-    sideways_share,
-    style_floor,
-    style_pace,
-    training_clips,
-)
 from f3amd_lib.experiments.rollout_measures import by_round, motion_figures
 from f3amd_lib.generation.rollout import MotionGenerator, Rollout
 from f3amd_lib.ground.names import check_known
@@ -112,17 +105,19 @@ def evaluation_paths(packed: PackedMotion, styles: Sequence[str], num_frames: in
 
     Source: paper section 4.4, which describes the trajectory but does not print it; ours.
     """
-    paths = [named_path("complex", num_frames, speed=style_pace(packed, style), seed=seed) for style in styles]
+    paths = [
+        named_path("complex", num_frames, speed=real_clips.style_pace(packed, style), seed=seed) for style in styles
+    ]
     known = _sideways_in_training(packed, tuple(styles))
-    asked = np.mean([sideways_share(path) for path in paths])
-    return [facing_ahead(path) for path in paths] if known < 0.02 < asked else paths
+    asked = np.mean([real_clips.sideways_share(path) for path in paths])
+    return [real_clips.facing_ahead(path) for path in paths] if known < 0.02 < asked else paths
 
 
 @functools.lru_cache(maxsize=8)
 def _sideways_in_training(packed: PackedMotion, styles: tuple[str, ...]) -> float:
     """Return the share of sideways steps in the training clips; every seed's paths ask for it."""
-    clips = [clip for style in styles for clip in training_clips(packed, style)]
-    return float(np.mean([sideways_share(path_from_motion(packed.motion(clip))) for clip in clips]))
+    clips = [clip for style in styles for clip in real_clips.training_clips(packed, style)]
+    return float(np.mean([real_clips.sideways_share(path_from_motion(packed.motion(clip))) for clip in clips]))
 
 
 def _figures_without_classifier(motion: Motion, path: RootPath, window: int, floor: float) -> dict[str, float]:
@@ -137,8 +132,7 @@ def _style_means(figures: list[dict], styles: Sequence[str]) -> dict:
     return pd.DataFrame(figures).groupby(np.asarray(styles)).mean().mean().to_dict()
 
 
-@dataclass(frozen=True)
-class ClassifiedWindows:
+class ClassifiedWindows(NamedTuple):
     """What the classifier says of the windows of some motions.
 
     Attributes:
@@ -156,7 +150,7 @@ class ClassifiedWindows:
     def of(self, sources: Iterable[int]) -> ClassifiedWindows:
         """Return the windows of some of the motions, motion by motion in that order."""
         order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
-        return ClassifiedWindows(*(part[order] for part in (self.features, self.predicted, self.style, self.source)))
+        return ClassifiedWindows(*(part[order] for part in self))
 
 
 def classify_windows(
@@ -172,20 +166,20 @@ def classify_windows(
     Raises:
       ValueError: if no motion is long enough, or for an unknown style.
     """
-    windows, asked, source = [], [], []
-    for number, (motion, style) in enumerate(zip(motions, styles, strict=True)):
-        if motion.num_frames >= classifier.config.window:
-            cut = classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
-            windows.append(cut)
-            asked += [classifier.style_index(style)] * len(cut)
-            source += [number] * len(cut)
+    windows = {
+        number: classifier.windows_of(np.asarray(motion.positions), motion.skeleton)
+        for number, motion in enumerate(motions)
+        if motion.num_frames >= classifier.config.window
+    }
     if not windows:
         raise ValueError(
             f"no motion of {', '.join(dict.fromkeys(styles))} has the {classifier.config.window} "
             "frames that the style classifier looks at"
         )
-    features, predicted = classifier.features_and_classes(np.concatenate(windows))
-    return ClassifiedWindows(features, predicted, np.array(asked), np.array(source))
+    features, predicted = classifier.features_and_classes(np.concatenate(list(windows.values())))
+    source = np.repeat(list(windows), [len(cut) for cut in windows.values()])
+    asked = np.array([classifier.style_index(style) for style in styles])
+    return ClassifiedWindows(features, predicted, asked[source], source)
 
 
 def real_features(
@@ -202,7 +196,7 @@ def real_features(
     Returns:
       Class number -> [N, D], in the order of `styles`.
     """
-    clips = reference_clips(packed, styles, window=window, split="train")
+    clips = real_clips.reference_clips(packed, styles, window=window, split="train")
     known = classifier.references["train"]
     wanted = np.isin(known.clips, clips)
     return {number: known.features[wanted & (known.styles == number)] for number in map(classifier.style_index, styles)}
@@ -241,13 +235,8 @@ def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol
 
 def _held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) -> tuple[np.ndarray, np.ndarray]:
     """Return clips of both held-out splits at the speeds that are asked for, and their styles."""
-    present = set(np.asarray(packed.clip_split).tolist())
-    clips = [
-        clip
-        for split in ("test", "validation")
-        if SPLITS.index(split) in present
-        for clip in reference_clips(packed, styles, window=window, split=split)
-    ]
+    splits = [split for split in ("test", "validation") if SPLITS.index(split) in np.asarray(packed.clip_split)]
+    clips = sum((real_clips.reference_clips(packed, styles, window=window, split=split) for split in splits), [])
     return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
 
 
@@ -314,20 +303,18 @@ def measure_model(
     styles = list(protocol.styles)
     real = real_features(packed, classifier, styles, trained.config.window)
     paths = [evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed) for seed in seeds]
-    floors = {style: style_floor(packed, style) for style in styles}
+    floors = {style: real_clips.style_floor(packed, style) for style in styles}
     rollout = generator.rollout(
         [path for walk in paths for path in walk], styles * protocol.num_seeds, seed=protocol.path_seed
     )
     rows = []
     for seed in seeds:
         motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
-        figures = _style_means(
-            [
-                _figures_without_classifier(motion, path, rollout.window, floors[style])
-                for motion, path, style in zip(motions, paths[seed], styles, strict=True)
-            ],
-            styles,
-        )
+        walked = zip(motions, paths[seed], styles, strict=True)
+        each = [
+            _figures_without_classifier(motion, path, rollout.window, floors[style]) for motion, path, style in walked
+        ]
+        figures = _style_means(each, styles)
         rng = np.random.default_rng([protocol.path_seed, seed])
         seen = classify_windows(classifier, motions, styles)
         figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
@@ -405,7 +392,7 @@ def measure_real(
         motion = whole if model == "real" else corrupt(model, whole, seed=int(clip))
         motions.append(motion)
         floor = float(packed.floor_shift[clip])
-        values = _figures_without_classifier(motion, own_path(whole), window, floor)
+        values = _figures_without_classifier(motion, real_clips.own_path(whole), window, floor)
         figures.append({name: value for name, value in values.items() if name not in _GROWS_WITH_LENGTH})
     seen = classify_windows(classifier, motions, labels)
     real = real_features(packed, classifier, protocol.styles, window)

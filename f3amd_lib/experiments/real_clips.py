@@ -22,6 +22,10 @@ from f3amd_lib.motion.skeleton import Motion
 
 _STANDING = 0.1  # m/s
 
+_SPEEDS = (0.4, 1.6)
+"""Mean speeds of `reference_clips` in units of `style_pace`: those between which `named_path("complex", speed=pace)`
+varies. A run would be no yardstick for a walk."""
+
 
 def training_clips(packed: PackedMotion, style: str) -> np.ndarray:
     """Return the clip numbers of a style's training split, or of all splits if that has none.
@@ -29,8 +33,7 @@ def training_clips(packed: PackedMotion, style: str) -> np.ndarray:
     Raises:
       ValueError: for an unknown style.
     """
-    if style not in packed.styles:
-        raise ValueError(f"unknown style {style!r}; this data has {', '.join(packed.styles)}")
+    check_known(style, packed.styles, f"style of data set {packed.dataset!r}:")
     of_style = np.asarray(packed.clip_style) == packed.styles.index(style)
     training = of_style & (np.asarray(packed.clip_split) == SPLITS.index("train"))
     return np.flatnonzero(training if training.any() else of_style)
@@ -150,19 +153,11 @@ def follow_clip(
             f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for at most "
             f"{max(0, whole.num_frames - num_history)} frames after the history"
         )
-    line = own_path(whole)
-    part = slice(num_history, end)
-    return (
-        world_frames(whole)[None, :num_history].astype(np.float32),
-        RootPath(line.position[part], line.yaw[part], line.fps),
-        whole.slice(num_history, end),
-    )
+    history = world_frames(whole)[None, :num_history].astype(np.float32)
+    return history, own_path(whole).slice(num_history, end), whole.slice(num_history, end)
 
 
-def reference_clips(
-    packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test", slowest: float = 0.4,
-    fastest: float = 1.6,
-) -> list[int]:  # fmt: skip
+def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test") -> list[int]:
     """List the real clips that stand beside a rollout: held out, same styles, same speeds.
 
     Args:
@@ -170,12 +165,10 @@ def reference_clips(
       styles: labels to take.
       window: clips that hold no boundary between windows of this many frames are left out.
       split: "test", or another.
-      slowest, fastest: mean speeds to take, in units of `style_pace`; by default those between
-        which `named_path("complex", speed=pace)` varies. A run would be no yardstick for a walk. A
-        style with no clip in between gives the one that comes nearest.
 
     Returns:
-      Clip numbers, by style and then in the order of the data.
+      Clip numbers, by style and then in the order of the data. A style with no clip of such speeds
+      (`_SPEEDS`) gives the one that comes nearest.
 
     Raises:
       ValueError: for an unknown style or split, or if no clip is left.
@@ -189,7 +182,7 @@ def reference_clips(
         of_style = np.asarray(packed.clip_style) == packed.styles.index(style)
         available = np.flatnonzero(of_style & held_out & long_enough)
         ratio = np.array([_speeds(packed, clip).mean() / pace for clip in available])
-        fitting = available[(slowest <= ratio) & (ratio <= fastest)]
+        fitting = available[(_SPEEDS[0] <= ratio) & (ratio <= _SPEEDS[1])]
         if len(available) and not len(fitting):
             fitting = available[[np.argmin(np.abs(ratio - 1.0))]]
         clips += fitting.tolist()
@@ -209,28 +202,28 @@ def follow_longest(
     return follow_clip(packed, longest, num_history=num_history, num_frames=num_frames)
 
 
-def path_statistics(paths: Iterable[RootPath], *, seconds: float = 1.0) -> dict:
+def path_statistics(paths: Iterable[RootPath]) -> dict:
     """Describe paths, or the tracks of real clips, by how they move and turn.
 
     Args:
       paths: any number of them.
-      seconds: span over which a turn is counted, so that the sway of a stride is not.
 
     Returns:
-      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel)
-      and its 95th percentile, sideways_share, standing_share; over all moving frames of all paths.
+      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel,
+      counted over a second, so that the sway of a stride is not) and its 95th percentile,
+      sideways_share, standing_share; over all moving frames of all paths.
     """
     speeds, turns, shares = [], [], []
     for path in paths:
         speed = np.linalg.norm(np.diff(path.position, axis=0) * path.fps, axis=-1)
         speeds.append(speed)
         shares.append(sideways_share(path))
-        span = max(1, round(seconds * path.fps))
+        span = max(1, round(path.fps))
         if path.num_frames > 2 * span:
             legs = path.position[span:] - path.position[:-span]
-            moved = np.linalg.norm(legs, axis=-1) > _STANDING * seconds
+            moved = np.linalg.norm(legs, axis=-1) > _STANDING
             heading = np.unwrap(np.arctan2(legs[:, 0], legs[:, 1]))
-            turn = np.abs(heading[span:] - heading[:-span]) / seconds
+            turn = np.abs(heading[span:] - heading[:-span])
             turns.append(np.rad2deg(turn[moved[span:] & moved[:-span]]))
     sideways = np.average(shares, weights=[len(speed) for speed in speeds])
     speeds = np.concatenate(speeds)

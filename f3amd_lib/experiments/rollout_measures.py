@@ -36,11 +36,8 @@ def measure_clips(packed: PackedMotion, clips: Sequence[int], *, window: int) ->
     Returns:
       A row a clip, with the columns of `motion_figures`.
     """
-    motions = [packed.motion(clip) for clip in clips]
-    floors = [float(packed.floor_shift[clip]) for clip in clips]
-    return pd.DataFrame(
-        [motion_figures(motion, own_path(motion), window, floor) for motion, floor in zip(motions, floors, strict=True)]
-    )
+    motions = [(packed.motion(clip), float(packed.floor_shift[clip])) for clip in clips]
+    return pd.DataFrame([motion_figures(motion, own_path(motion), window, floor) for motion, floor in motions])
 
 
 def measure_rollout(rollout: Rollout, floor_shift) -> pd.DataFrame:
@@ -54,12 +51,8 @@ def measure_rollout(rollout: Rollout, floor_shift) -> pd.DataFrame:
       A row a character, with the columns of `motion_figures`.
     """
     floors = np.broadcast_to(np.asarray(floor_shift, np.float64), (len(rollout.styles),))
-    return pd.DataFrame(
-        [
-            motion_figures(rollout.motion(character), path, rollout.window, float(floors[character]))
-            for character, path in enumerate(rollout.paths)
-        ]
-    )
+    walks = [(rollout.motion(place), path, float(floors[place])) for place, path in enumerate(rollout.paths)]
+    return pd.DataFrame([motion_figures(motion, path, rollout.window, floor) for motion, path, floor in walks])
 
 
 def by_round(rollout: Rollout) -> pd.DataFrame:
@@ -83,14 +76,8 @@ def by_round(rollout: Rollout) -> pd.DataFrame:
         each = positions.reshape(rounds, window, *positions.shape[1:])
         accelerations.append(joint_acceleration(each))
     gaps = np.stack(gaps)
-    return pd.DataFrame(
-        {
-            "round": np.arange(1, rounds + 1),
-            "gap_m": gaps.mean(axis=0),
-            "worst_gap_m": gaps.max(axis=0),
-            "acceleration_cm": np.mean(accelerations, axis=0),
-        }
-    )
+    table = {"round": np.arange(1, rounds + 1), "gap_m": gaps.mean(axis=0), "worst_gap_m": gaps.max(axis=0)}
+    return pd.DataFrame(table | {"acceleration_cm": np.mean(accelerations, axis=0)})
 
 
 def blending_table(rollout: Rollout, floor_shift, blend_frames: Sequence[int]) -> pd.DataFrame:

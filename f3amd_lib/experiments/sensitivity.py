@@ -7,6 +7,7 @@ people would prefer; it says whether a distance knows the order in which we brok
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -67,19 +68,13 @@ def graded_corruptions(
     perceived motion quality than FID in our experiments").
     """
     require_telling_styles(classifier)
-
-    clips = [
-        clip
-        for split in splits
-        for clip in reference_clips(packed, protocol.styles, window=classifier.config.window, split=split)
-    ]
+    window = classifier.config.window
+    clips = [clip for split in splits for clip in reference_clips(packed, protocol.styles, window=window, split=split)]
     motions = [packed.motion(clip) for clip in clips]
     names = [packed.styles[packed.clip_style[clip]] for clip in clips]
-    by_class = real_features(packed, classifier, protocol.styles, classifier.config.window)
+    by_class = real_features(packed, classifier, protocol.styles, window)
     real = {classifier.styles[number]: cloud for number, cloud in by_class.items()}
-    todo = [
-        (name, strength, seed) for name in corruptions for strength in strengths for seed in range(protocol.num_seeds)
-    ]
+    todo = list(itertools.product(corruptions, strengths, range(protocol.num_seeds)))
     rows = []
     for name, strength, seed in tqdm(todo, unit="set", disable=not progress):
         rng = np.random.default_rng([protocol.path_seed, seed, round(1e6 * strength)])

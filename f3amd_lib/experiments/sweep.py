@@ -27,14 +27,14 @@ import jax
 import pandas as pd
 
 from f3amd_lib.experiments.campaign import Run, run_campaign
-from f3amd_lib.experiments.measure import MEASUREMENTS, protocol_of
+from f3amd_lib.experiments.measure import MEASUREMENTS, models_with_weights, protocol_of
 from f3amd_lib.ground.files import locked, whole_file
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
 from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import weights_digest
-from f3amd_lib.training.pipeline import PreparedData, available_models, model_files, obtain_model, prepare
+from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model, prepare
 
 log = logging.getLogger("f3amd")
 
@@ -129,12 +129,13 @@ def plan(
     Raises:
       ValueError: for an unknown name or preset, a measurement that is not by preset, or nothing to do.
     """
+    swept = [name for name in MEASUREMENTS if name not in NOT_BY_PRESET]
     if not names:
-        raise ValueError(f"name what to sweep: {CAMPAIGN}, {', '.join(_swept())}")
+        raise ValueError(f"name what to sweep: {CAMPAIGN}, {', '.join(swept)}")
     for name in names:
         if name in NOT_BY_PRESET:
             raise ValueError(f"{name} is not measured by preset: f3amd measure {name}")
-        check_known(name, [CAMPAIGN, *_swept()], "measurement")
+        check_known(name, [CAMPAIGN, *swept], "measurement")
     asked = list(dict.fromkeys(presets.find_preset(model).name for model in models))
     # Of two measurements of a preset that train it, the training is one leg.
     legs: dict[str, Leg] = {}
@@ -142,27 +143,13 @@ def plan(
         if name == CAMPAIGN:
             wanted = list(_of_queue(asked, snapshots))
         else:
-            wanted = [leg for model in asked or _with_weights(profile) for leg in _of_preset(name, model)]
+            wanted = []
+            for model in asked or models_with_weights(profile, "--preset"):
+                training = Leg(TRAIN, model)
+                alone = name in _TRAIN_THEMSELVES
+                wanted += [Leg(name, model)] if alone else [training, Leg(name, model, after=training.name)]
         legs |= {leg.name: leg for leg in wanted}
     return list(legs.values())
-
-
-def _swept() -> list[str]:
-    return [name for name in MEASUREMENTS if name not in NOT_BY_PRESET]
-
-
-def _with_weights(profile: Profile) -> list[str]:
-    if names := available_models(profile):
-        return names
-    raise ValueError(f"no trained model of {profile.dataset!r} at {profile.name!r}: name presets with --preset")
-
-
-def _of_preset(name: str, model: str) -> list[Leg]:
-    """Return the legs of a measurement of one preset, and before it of its training."""
-    if name in _TRAIN_THEMSELVES:
-        return [Leg(name, model)]
-    training = Leg(TRAIN, model)
-    return [training, Leg(name, model, after=training.name)]
 
 
 def _of_queue(asked: Sequence[str], snapshots: Sequence[tuple[Run, int]]) -> Iterator[Leg]:

@@ -7,6 +7,7 @@ of one caption.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,6 @@ from f3amd_lib.generation.captioned_motion import draw_motions
 from f3amd_lib.generation.latent_motion import latent_walk, steps_of
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
-from f3amd_lib.measures.text_judge import judge_motions
 from f3amd_lib.measures.text_metrics import RAISED, raised_hands
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.training.checkpoints import network_with, weights_digest
@@ -41,8 +41,8 @@ SEEDS = {"smoke": 2}
 HAND_FRAMES, EULER_STEPS = 80, 20
 """Length of the motions in `measure_hands`, four seconds, and the steps in which a flow makes them."""
 
-HAND_CONTENTS = ("raise-up-{}-hand", "wave-{}-hand")
-"""What is told of the left and the right hand."""
+HAND_CONTENTS = [(f"{what}-{side}-hand", side) for what in ("raise-up", "wave") for side in ("left", "right")]
+"""What is told of a hand, and of which."""
 
 
 def mirrored_positions(skeleton: Skeleton, positions) -> np.ndarray:
@@ -105,11 +105,7 @@ def measure_judge(
         return None
     others = data.cut(bench.settings["most_frames"])
     others = others.select(others.members("train"))
-    probes = probes_of(bench.real, others, bench.seed)
-    table = judge_motions(
-        bench.judge, encoder, bench.real, probes, repeats=bench.settings["repeats"], seed=bench.seed,
-        group=bench.settings["group"], bar=bench.settings["sight"],
-    )  # fmt: skip
+    table = bench.judged(probes_of(bench.real, others, bench.seed), bench.settings["repeats"])
     record = bench.record(profile, data, "text_judge", tremble=TREMBLE)
     return write_table(results_dir(profile.dataset, profile.name) / "records" / "text_judge.csv", table, record)
 
@@ -135,15 +131,13 @@ def counted_hands(skeleton: Skeleton, motions, side: str) -> dict[str, int]:
 def _clip_rows(data: TextMotions, mirrored: bool) -> pd.DataFrame:
     """Count the hands of held-out clips; of their mirror images, by what the clips themselves show, if asked."""
     rows = []
-    for content in HAND_CONTENTS:
-        for side in ("left", "right"):
-            shown = content.format(side)
-            of_content = [k for k in data.members("test") if data.pairs[k].partition(",")[0] == shown]
-            clips = [data.clip(k)[:HAND_FRAMES] for k in of_content]
-            if mirrored:
-                clips = [mirrored_positions(data.skeleton, clip) for clip in clips]
-            rows.append({"content": shown, "side": side, "wording": "", "caption": ""}
-                        | counted_hands(data.skeleton, clips, side))  # fmt: skip
+    for content, side in HAND_CONTENTS:
+        of_content = [k for k in data.members("test") if data.pairs[k].partition(",")[0] == content]
+        clips = [data.clip(k)[:HAND_FRAMES] for k in of_content]
+        if mirrored:
+            clips = [mirrored_positions(data.skeleton, clip) for clip in clips]
+        told = {"content": content, "side": side, "wording": "", "caption": ""}
+        rows.append(told | counted_hands(data.skeleton, clips, side))
     return pd.DataFrame(rows)
 
 
@@ -151,15 +145,12 @@ def _told_rows(trained, encoder: TextEncoder, profile: Profile) -> pd.DataFrame:
     """Count the hands of motions that a model makes of captions with training's wordings and with others."""
     rows, count = [], SEEDS.get(profile.name, 50)
     steps = EULER_STEPS if trained.schedule.kind == "straight" else None
-    for content in HAND_CONTENTS:
-        for side in ("left", "right"):
-            for wording in ("training", "held out"):
-                for action in caption_wordings(content.format(side), held_out=wording == "held out"):
-                    caption = f"a person {action}"
-                    pooled = np.repeat(embed_captions([caption], encoder).pooled, count, axis=0)
-                    made = draw_motions(trained, pooled, HAND_FRAMES, jax.random.key(profile.seed), num_steps=steps)
-                    rows.append({"content": content.format(side), "side": side, "wording": wording, "caption": caption}
-                                | counted_hands(trained.skeleton, made, side))  # fmt: skip
+    for (content, side), wording in itertools.product(HAND_CONTENTS, ("training", "held out")):
+        for action in caption_wordings(content, held_out=wording == "held out"):
+            told = {"content": content, "side": side, "wording": wording, "caption": f"a person {action}"}
+            pooled = np.repeat(embed_captions([told["caption"]], encoder).pooled, count, axis=0)
+            made = draw_motions(trained, pooled, HAND_FRAMES, jax.random.key(profile.seed), num_steps=steps)
+            rows.append(told | counted_hands(trained.skeleton, made, side))
     return pd.DataFrame(rows)
 
 
@@ -220,13 +211,12 @@ def measure_one_caption(
     for name in models or ["MotionLCM-V2-small"]:
         path = find_latent_model(profile.dataset, name) if folder is None else Path(folder) / f"{name}.safetensors"
         trained = load_latent_model(path)
-        noise = jax.random.normal(jax.random.key(profile.seed), trained.config.state_shape(1))
         network, key = network_with(trained.config, trained.params), jax.random.key(profile.seed)
-        steps = steps_of(trained)
+        noise = jax.random.normal(key, trained.config.state_shape(1))
         latent = latent_walk(trained)(network, text, noise, key)
         table = pd.DataFrame(np.asarray(latent[0]), columns=[f"channel_{n}" for n in range(latent.shape[-1])])
         digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
-        rows.append(table.assign(model=trained.name, steps=steps, token=range(len(table)), **digests))
+        rows.append(table.assign(model=trained.name, steps=steps_of(trained), token=range(len(table)), **digests))
     path = results_dir(profile.dataset, profile.name) / "records" / "text_one_caption.csv"
     return write_table(path, pd.concat(rows), record)
 

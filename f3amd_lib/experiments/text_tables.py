@@ -106,7 +106,7 @@ class Bench:
 
         None makes the real clips themselves.
         """
-        skating, lengths = [], self.real.lengths
+        lengths = self.real.lengths
 
         def system(repeat: int):
             told, pooled = self.captions(repeat)
@@ -114,17 +114,30 @@ class Bench:
                 made = [self.real.clip(number) for number in range(len(lengths))]
             else:
                 made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
-            motions = [motion[:length] for motion, length in zip(made, lengths, strict=True)]
+            return [motion[:length] for motion, length in zip(made, lengths, strict=True)], told
+
+        return self._seen(system, self.settings["repeats"])
+
+    def _seen(self, system: Callable, repeats: int) -> pd.DataFrame:
+        """Return metric, value, low and high of a system as `judge_motions` knows it, foot skating among them."""
+        skating = []
+
+        def watched(repeat: int):
+            motions, told = system(repeat)
             share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
             skating.append({"metric": "foot_skating", "value": share})
             return motions, told
 
-        table = judge_motions(
-            self.judge, self.encoder, self.real, {"made": system}, repeats=self.settings["repeats"], seed=self.seed,
-            group=self.settings["group"], bar=self.settings["sight"],
-        )  # fmt: skip
+        table = self.judged({"made": watched}, repeats)
         table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
         return table[["metric", "value", "low", "high"]]
+
+    def judged(self, systems: dict, repeats: int) -> pd.DataFrame:
+        """Return what `judge_motions` says of systems beside real motion."""
+        return judge_motions(
+            self.judge, self.encoder, self.real, systems, repeats=repeats, seed=self.seed,
+            group=self.settings["group"], bar=self.settings["sight"],
+        )  # fmt: skip
 
     def variety(self, make: Callable) -> pd.DataFrame:
         """Return how far motions of one caption lie from each other before the judge, over one group of captions.
@@ -144,12 +157,7 @@ class Bench:
 
     def look(self, motions, told) -> dict[str, float]:
         """Return the figures of one motion [L, J, 3] for each clip, made of the captions `told`."""
-        table = judge_motions(
-            self.judge, self.encoder, self.real, {"made": lambda repeat: (motions, told)}, repeats=1, seed=self.seed,
-            group=self.settings["group"], bar=self.settings["sight"],
-        )  # fmt: skip
-        share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
-        return {**table[table["system"] == "made"].set_index("metric")["value"], "foot_skating": share}
+        return dict(self._seen(lambda repeat: (motions, told), 1).set_index("metric")["value"])
 
     def record(self, profile: Profile, data: TextMotions, measurement: str, **extra) -> dict:
         """Return the record of a measurement with this judge."""
@@ -407,9 +415,7 @@ def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about:
         np.linalg.norm(local(motion) - local(real.clip(number)), axis=-1).mean(axis=-1)
         for number, motion in enumerate(motions)
     ]
-    made = np.zeros((len(motions), most, *real.positions.shape[1:]), np.float32)
-    for room, motion in zip(made, motions, strict=True):
-        room[: len(motion)] = motion
+    made = np.asarray(pad_motions(motions, most).motion)
     own = pd.DataFrame([
         {"metric": "reconstruction_error", "value": 1000.0 * float(np.concatenate(errors).mean())},
         {"metric": "feature_error", "value": float(np.sum(apart) / real.lengths.sum())},

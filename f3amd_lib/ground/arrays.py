@@ -18,6 +18,24 @@ def check_positive(name: str, value) -> None:
         raise ValueError(f"{name} must be positive, got {value}")
 
 
+def in_batches(function, count: int, size: int):
+    """Return what a function makes of many rows, asked for a fixed number at a time.
+
+    So there is one compilation, and a row depends on itself alone.
+
+    Args:
+      function: of row numbers [size], the last batch filled up with others; returns arrays [size, ...], or a tree.
+      count: rows in all, at least one.
+      size: rows at a time.
+
+    Returns:
+      Numpy arrays [count, ...], or a tree of them.
+    """
+    batches = (np.arange(first, first + size) % count for first in range(0, count, size))
+    parts = [jax.tree.map(np.asarray, function(rows)) for rows in batches]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+
+
 def finite_array(name: str, value, shape: tuple, dtype=np.float64) -> np.ndarray:
     """Return a value as an array of a shape, all of it finite.
 

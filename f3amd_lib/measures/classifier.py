@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -31,6 +32,7 @@ from flax import nnx
 
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
@@ -39,14 +41,7 @@ from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.attention import dropout
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.spectral import TemporalConvolution
-from f3amd_lib.training.checkpoints import (
-    check_kind,
-    describe_skeleton,
-    described_skeleton,
-    errors_name,
-    load_tree,
-    save_tree,
-)
+from f3amd_lib.training import checkpoints
 from f3amd_lib.training.optimise import TrainingState, optimise
 
 ACCURACY_BAR = 0.8
@@ -54,6 +49,9 @@ ACCURACY_BAR = 0.8
 
 _SPLITS = {"train": ("train",), "held_out": ("validation", "test")}
 """Splits whose clips are trained on, and whose clips say how well."""
+
+_STATIC = {"static": True}
+"""Marks fields that JAX compiles for, as against arrays that it is given."""
 
 _BATCH = 256
 """Windows that are evaluated at once; fixed, so that a window's features depend on it alone."""
@@ -129,12 +127,7 @@ class StyleNetwork(nnx.Module):
     def __init__(self, config: ClassifierConfig, *, rngs: nnx.Rngs):
         self.dropout = config.dropout
         widths = (NUM_CHANNELS, *config.widths)
-        self.blocks = nnx.List(
-            [
-                _ConvolutionBlock(width_in, width_out, rngs=rngs)
-                for width_in, width_out in zip(widths[:-1], widths[1:], strict=True)
-            ]
-        )
+        self.blocks = nnx.List(_ConvolutionBlock(*pair, rngs=rngs) for pair in itertools.pairwise(widths))
         self.hidden = nnx.Linear(config.window * widths[-1], config.hidden_width, rngs=rngs)
         self.hidden_norm = _batch_norm(config.hidden_width, rngs)
         self.feature = nnx.Linear(config.hidden_width, config.feature_width, rngs=rngs)
@@ -183,14 +176,7 @@ def _evaluate(config: ClassifierConfig, params, statistics, windows):
 
 def _answers(config, params, statistics, windows) -> tuple[np.ndarray, np.ndarray]:
     """Return (features, scores) of windows [N, window, 45], a fixed number at a time."""
-    features, scores = [], []
-    for start in range(0, len(windows), _BATCH):
-        part = windows[start : start + _BATCH]
-        padded = np.pad(part, ((0, _BATCH - len(part)), (0, 0), (0, 0)))
-        answer = _evaluate(config, params, statistics, padded)
-        features.append(np.asarray(answer[0])[: len(part)])
-        scores.append(np.asarray(answer[1])[: len(part)])
-    return np.concatenate(features), np.concatenate(scores)
+    return in_batches(lambda rows: _evaluate(config, params, statistics, windows[rows]), len(windows), _BATCH)
 
 
 # ----------------------------------------------------------------------------------- the classifier
@@ -389,7 +375,7 @@ class _Takes(NamedTuple):
 
 def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, ...], window: int) -> _Takes:
     """Collect the clips of styles and splits; one shorter than a window holds none to give."""
-    frames, labels, clips = [], [], []
+    chosen = []
     for number, style in enumerate(styles):
         usable = np.asarray(packed.clip_style) == packed.styles.index(style)
         usable &= np.isin(packed.clip_split, [SPLITS.index(split) for split in splits])
@@ -399,16 +385,12 @@ def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, .
                 f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip "
                 f"of at least {window} frames; add clips, or leave the style out with `styles`"
             )
-        for clip in np.flatnonzero(usable):
-            positions = packed.motion(int(clip)).positions
-            frames.append(classifier_frames(positions, packed.skeleton).astype(np.float32))
-            labels.append(number)
-            clips.append(clip)
+        chosen += [(number, clip) for clip in np.flatnonzero(usable)]
+    labels, clips = np.array(chosen, np.int32).T
+    positions = (packed.motion(int(clip)).positions for clip in clips)
+    frames = [classifier_frames(each, packed.skeleton).astype(np.float32) for each in positions]
     length = np.array([len(part) for part in frames])
-    return _Takes(
-        window=window, frames=np.concatenate(frames), first=np.cumsum(length) - length, length=length,
-        styles=np.array(labels, np.int32), clips=np.array(clips, np.int32),
-    )  # fmt: skip
+    return _Takes(window, np.concatenate(frames), np.cumsum(length) - length, length, labels, clips)
 
 
 @dataclass(frozen=True)
@@ -449,11 +431,7 @@ def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: Classi
     }
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("frames", "starts", "first", "count", "mirrored"),
-    meta_fields=("dataset_fingerprint", "styles", "network", "config"),
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class StyleTask:
     """A style classifier to train (a `training.optimise.Task`).
@@ -468,10 +446,10 @@ class StyleTask:
 
     name: ClassVar[str] = "style classifier"
 
-    dataset_fingerprint: str
-    styles: tuple[str, ...]
-    network: ClassifierConfig
-    config: ClassifierTraining
+    dataset_fingerprint: str = field(metadata=_STATIC)
+    styles: tuple[str, ...] = field(metadata=_STATIC)
+    network: ClassifierConfig = field(metadata=_STATIC)
+    config: ClassifierTraining = field(metadata=_STATIC)
     frames: jax.Array
     starts: jax.Array
     first: jax.Array
@@ -529,8 +507,10 @@ def _style_task(
     )  # fmt: skip
 
 
-def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
-    """Return the classes: those asked for, or the primary ones."""
+def _asked_for(
+    packed: PackedMotion, *, num_steps: int, batch_size: int, seed: int, styles=None, **sizes
+) -> tuple[tuple[str, ...], ClassifierConfig, ClassifierTraining]:
+    """Return the classes, those asked for or the primary ones, the network's sizes and its training."""
     chosen = tuple(packed.primary_styles if styles is None else styles)
     for style in chosen:
         check_known(style, packed.styles, f"style of data set {packed.dataset!r}:")
@@ -539,7 +519,8 @@ def _chosen_styles(packed: PackedMotion, styles) -> tuple[str, ...]:
             f"a style classifier needs at least two styles, each named once; got {len(chosen)} "
             f"({', '.join(chosen[:5])})"
         )
-    return chosen
+    config = ClassifierConfig.from_dict({"num_styles": len(chosen), **sizes})
+    return chosen, config, ClassifierTraining(num_steps, batch_size, seed)
 
 
 def train_classifier(
@@ -578,9 +559,8 @@ def train_classifier(
 
     Source: CAMDM's evaluation code (its classifier).
     """
-    training = ClassifierTraining(num_steps, batch_size, seed)
-    styles = _chosen_styles(packed, styles)
-    config = ClassifierConfig.from_dict({"num_styles": len(styles), **sizes})
+    asked = {"num_steps": num_steps, "batch_size": batch_size, "seed": seed, "styles": styles}
+    styles, config, training = _asked_for(packed, **asked, **sizes)
     takes = {split: _collect(packed, styles, members, config.window) for split, members in _SPLITS.items()}
     task = _style_task(packed, styles, config, training, takes["train"])
     state, _ = optimise(task, chunk=max(1, min(20, num_steps // 10)), progress=progress)
@@ -591,23 +571,12 @@ def train_classifier(
         features, scores = _answers(config, params, state.statistics, windows)
         references[split] = ReferenceFeatures(features.astype(np.float16).astype(np.float32), labels, clips)
     right = np.argmax(scores, axis=-1) == labels  # of the last split, held out
-    return StyleClassifier(
-        config=config,
-        params=params,
-        statistics=state.statistics,
-        skeleton=packed.skeleton,
-        styles=styles,
-        held_out_accuracy={style: float(right[labels == number].mean()) for number, style in enumerate(styles)},
-        references=references,
-        record=run_record(
-            profile=profile,
-            dataset=packed,
-            seed=seed,
-            num_train_windows=len(task.starts),
-            num_held_out_windows=len(labels),
-            **_settings(styles, config, training),
-        ),
-    )
+    accuracy = {style: float(right[labels == number].mean()) for number, style in enumerate(styles)}
+    record = run_record(
+        profile=profile, dataset=packed, seed=seed, num_train_windows=len(task.starts),
+        num_held_out_windows=len(labels), **_settings(styles, config, training),
+    )  # fmt: skip
+    return StyleClassifier(config, params, state.statistics, packed.skeleton, styles, accuracy, references, record)
 
 
 _PROFILE_TRAINING = {
@@ -641,12 +610,8 @@ def obtain_classifier(
     Raises:
       ValueError: as `train_classifier`, or naming a file that is broken.
     """
-    settings = {"seed": 0, "styles": None} | _PROFILE_TRAINING[profile.name] | changes
-    training = ClassifierTraining(*(settings[name] for name in ("num_steps", "batch_size", "seed")))
-    styles = _chosen_styles(packed, settings["styles"])
-    known = ("num_steps", "batch_size", "seed", "styles")
-    sizes = {name: value for name, value in settings.items() if name not in known}
-    config = ClassifierConfig.from_dict({"num_styles": len(styles), **sizes})
+    settings = {"seed": 0} | _PROFILE_TRAINING[profile.name] | changes
+    styles, config, training = _asked_for(packed, **settings)
     identity = {"dataset_fingerprint": packed.fingerprint, **_settings(styles, config, training)}
     folder = runs_dir(profile.dataset, profile.name) / "classifier"
     path = folder / f"style-classifier-{record_hash(identity)[:12]}.safetensors"
@@ -676,12 +641,12 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "kind": "style classifier",
         "classifier": classifier.config.to_dict(),
         "styles": list(classifier.styles),
-        **describe_skeleton(skeleton),
+        **checkpoints.describe_skeleton(skeleton),
         "held_out_accuracy": classifier.held_out_accuracy,
         "reference_windows": {split: len(reference.features) for split, reference in classifier.references.items()},
         "record": classifier.record,
     }
-    save_tree(path, tree, metadata)
+    checkpoints.save_tree(path, tree, metadata)
 
 
 def load_classifier(path: Path) -> StyleClassifier:
@@ -690,25 +655,21 @@ def load_classifier(path: Path) -> StyleClassifier:
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    with errors_name(path):
-        tree, metadata = load_tree(path, _template)
+    with checkpoints.errors_name(path):
+        tree, metadata = checkpoints.load_tree(path, _template)
+        found = {name: metadata[name] for name in ("held_out_accuracy", "record")}
+        references = jax.tree.map(np.asarray, tree["references"])
         return StyleClassifier(
+            **found, params=tree["params"], statistics=tree["statistics"], styles=tuple(metadata["styles"]),
             config=ClassifierConfig.from_dict(metadata["classifier"]),
-            params=tree["params"],
-            statistics=tree["statistics"],
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            styles=tuple(metadata["styles"]),
-            held_out_accuracy=metadata["held_out_accuracy"],
-            references={
-                split: ReferenceFeatures(**jax.tree.map(np.asarray, part)) for split, part in tree["references"].items()
-            },
-            record=metadata["record"],
-        )
+            skeleton=checkpoints.described_skeleton(metadata, tree["offsets"]),
+            references={split: ReferenceFeatures(**part) for split, part in references.items()},
+        )  # fmt: skip
 
 
 def _template(metadata: dict) -> dict:
     """Return the shapes that a classifier's description speaks of."""
-    check_kind(metadata, "style classifier")
+    checkpoints.check_kind(metadata, "style classifier")
     config = ClassifierConfig.from_dict(metadata["classifier"])
     _, params, statistics = _blank(config)
     shape = jax.ShapeDtypeStruct
@@ -716,11 +677,8 @@ def _template(metadata: dict) -> dict:
         "params": params,
         "statistics": statistics,
         "references": {
-            split: {
-                "features": shape((count, config.feature_width), jnp.float32),
-                "styles": shape((count,), jnp.int32),
-                "clips": shape((count,), jnp.int32),
-            }
+            split: {"features": shape((count, config.feature_width), jnp.float32)}
+            | dict.fromkeys(("styles", "clips"), shape((count,), jnp.int32))
             for split, count in metadata["reference_windows"].items()
         },
         "offsets": shape((len(metadata["joints"]), 3), jnp.float32),

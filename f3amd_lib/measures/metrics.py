@@ -46,19 +46,14 @@ def _checked_window(window: int, least: int = 1) -> int:
     return int(window)
 
 
-def _by_window(signal: np.ndarray, window: int) -> np.ndarray:
-    """Cut [..., T, C] into whole windows, [..., K, window, C]; the remainder is left out."""
+def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
+    """Return the change of [..., T, C] since each whole window's first frame, [..., K, window, C]."""
     window = _checked_window(window)
     count = signal.shape[-2] // window
     if count < 1:
         raise ValueError(f"{signal.shape[-2]} frames do not fill a window of {window}")
     whole = signal[..., : count * window, :]
-    return whole.reshape(*whole.shape[:-2], count, window, whole.shape[-1])
-
-
-def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
-    """Return the change of [..., T, C] since each window's first frame, [..., K, window, C]."""
-    windows = _by_window(signal, window)
+    windows = whole.reshape(*whole.shape[:-2], count, window, whole.shape[-1])
     return windows - windows[..., :1, :]
 
 

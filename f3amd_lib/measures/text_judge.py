@@ -28,28 +28,15 @@ from f3amd_lib.data.text_motions import (
     going_on,
     pad_motions,
 )
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures import text_metrics
 from f3amd_lib.measures.distributions import frechet_distance, intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.measures.text_metrics import (
-    GROUP,
-    clip_score,
-    embedding_diversity,
-    groups_of_unlike_pairs,
-    matching_distance,
-    r_precision,
-)
 from f3amd_lib.motion.redundant import canonical_start, essential_features
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.text_motion import TextMotionConfig
-from f3amd_lib.training.checkpoints import (
-    check_kind,
-    describe_skeleton,
-    described_skeleton,
-    errors_name,
-    load_tree,
-    save_tree,
-)
+from f3amd_lib.training import checkpoints
 from f3amd_lib.training.evaluator_task import (
     EvaluatorTask,
     EvaluatorTraining,
@@ -103,26 +90,17 @@ class TextJudge:
                 raise ValueError(f"motion {number} has {len(motion)} frames; the judge needs {UNIT} or more")
         canonical = (going_on(canonical_start(self.skeleton, motion)) for motion in motions)
         features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
-        return self._in_batches(lambda part: _embed_motion(self.config, self.params, *pad_motions(part)[:2]), features)
+        return in_batches(
+            lambda rows: _embed_motion(self.config, self.params, *pad_motions([features[row] for row in rows])[:2]),
+            len(features), _BATCH,
+        ).astype(np.float64)  # fmt: skip
 
     def embed_texts(self, embedded: TextEmbeddings) -> np.ndarray:
         """Return embedded captions as vectors, [N, D]."""
-        rows = list(zip(embedded.tokens, embedded.mask, strict=True))
-
-        def embed(part):
-            tokens, mask = (jnp.stack(column) for column in zip(*part, strict=True))
-            return _embed_text(self.config, self.params, tokens, mask)
-
-        return self._in_batches(embed, rows)
-
-    def _in_batches(self, embed, items) -> np.ndarray:
-        """Embed a fixed number at a time, so that a row depends on itself alone."""
-        parts = []
-        for first in range(0, len(items), _BATCH):
-            part = items[first : first + _BATCH]
-            full = [*part, *[part[0]] * (_BATCH - len(part))]
-            parts.append(np.asarray(embed(full), np.float64)[: len(part)])
-        return np.concatenate(parts)
+        tokens, mask = embedded.tokens, embedded.mask
+        return in_batches(
+            lambda rows: _embed_text(self.config, self.params, tokens[rows], mask[rows]), len(tokens), _BATCH
+        ).astype(np.float64)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -171,15 +149,9 @@ def judge_task(
 
 
 def train_judge(
-    data: TextMotions,
-    encoder: TextEncoder,
-    training: EvaluatorTraining | None = None,
-    *,
-    checkpoint: Path | None = None,
-    progress: bool = True,
-    stop_at: float | None = None,
-    **sizes,
-) -> TextJudge | None:
+    data: TextMotions, encoder: TextEncoder, training: EvaluatorTraining | None = None, *,
+    checkpoint: Path | None = None, progress: bool = True, stop_at: float | None = None, **sizes,
+) -> TextJudge | None:  # fmt: skip
     """Train a judge; with a checkpoint a killed training goes on where it was.
 
     Args:
@@ -203,30 +175,27 @@ def save_judge(path: Path, judge: TextJudge) -> None:
     offsets = np.asarray(judge.skeleton.offsets, np.float32)
     tree = {"params": judge.params, "normaliser": judge.normaliser._asdict(), "offsets": offsets}
     about = {"network": dataclasses.asdict(judge.config), "text_encoder": judge.text_encoder, "record": judge.record}
-    save_tree(path, tree, {"kind": "text-to-motion judge", **about, **describe_skeleton(judge.skeleton)})
+    skeleton = checkpoints.describe_skeleton(judge.skeleton)
+    checkpoints.save_tree(path, tree, {"kind": "text-to-motion judge", **about, **skeleton})
 
 
 def load_judge(path: Path) -> TextJudge:
     """Read a judge written by `save_judge`; ValueError names a file that is missing, damaged or of another kind."""
 
     def template(metadata: dict) -> dict:
-        check_kind(metadata, "text-to-motion judge")
+        checkpoints.check_kind(metadata, "text-to-motion judge")
         config = TextMotionConfig(**metadata["network"])
         numbers = jax.ShapeDtypeStruct((config.features,), jnp.float32)
         offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)
         normaliser = {"mean": numbers, "deviation": numbers}
         return {"params": blank_evaluator(config)[1], "normaliser": normaliser, "offsets": offsets}
 
-    with errors_name(path):
-        tree, metadata = load_tree(path, template)
-        return TextJudge(
-            config=TextMotionConfig(**metadata["network"]),
-            params=tree["params"],
-            normaliser=AxisNormaliser(**jax.tree.map(np.asarray, tree["normaliser"])),
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            text_encoder=metadata["text_encoder"],
-            record=metadata["record"],
-        )
+    with checkpoints.errors_name(path):
+        tree, metadata = checkpoints.load_tree(path, template)
+        normaliser = AxisNormaliser(**jax.tree.map(np.asarray, tree["normaliser"]))
+        skeleton = checkpoints.described_skeleton(metadata, tree["offsets"])
+        about = (metadata[name] for name in ("text_encoder", "record"))
+        return TextJudge(TextMotionConfig(**metadata["network"]), tree["params"], normaliser, skeleton, *about)
 
 
 # ------------------------------------------------------------------------------------------ verdicts
@@ -242,7 +211,7 @@ def judged_clips(data: TextMotions, split: str = "test") -> TextMotions:
 
 
 def text_figures(
-    text, motion, reference, pairs, generator: np.random.Generator, group: int = GROUP
+    text, motion, reference, pairs, generator: np.random.Generator, group: int = text_metrics.GROUP
 ) -> dict[str, float]:
     """Return the figures of one repeat, by names of the registry.
 
@@ -253,30 +222,24 @@ def text_figures(
       generator: what draws groups and pairs.
       group: texts that are ranked together.
     """
-    groups = groups_of_unlike_pairs(pairs, generator, group)
-    first, second, third = r_precision(text[groups], motion[groups])
+    groups = text_metrics.groups_of_unlike_pairs(pairs, generator, group)
+    first, second, third = text_metrics.r_precision(text[groups], motion[groups])
     return {
         "text_FID": frechet_distance(motion, reference),
         "R_precision_1": first,
         "R_precision_2": second,
         "R_precision_3": third,
-        "matching_distance": matching_distance(text[groups], motion[groups]),
-        "embedding_diversity": embedding_diversity(motion, generator),
-        "CLIP_score": clip_score(text, motion),
+        "matching_distance": text_metrics.matching_distance(text[groups], motion[groups]),
+        "embedding_diversity": text_metrics.embedding_diversity(motion, generator),
+        "CLIP_score": text_metrics.clip_score(text, motion),
     }
 
 
 def judge_motions(
-    judge: TextJudge,
-    encoder: TextEncoder,
-    real: TextMotions,
+    judge: TextJudge, encoder: TextEncoder, real: TextMotions,
     systems: dict[str, Callable[[int], tuple[Sequence[np.ndarray], Sequence[str]]]],
-    *,
-    repeats: int = REPEATS,
-    seed: int = 0,
-    group: int = GROUP,
-    bar: float = SIGHT,
-) -> pd.DataFrame:
+    *, repeats: int = REPEATS, seed: int = 0, group: int = text_metrics.GROUP, bar: float = SIGHT,
+) -> pd.DataFrame:  # fmt: skip
     """Measure systems beside real motion, with intervals over repeats.
 
     Args:

@@ -44,14 +44,6 @@ def groups_of_unlike_pairs(pairs, generator: np.random.Generator, size: int = GR
     return np.array(groups)
 
 
-def _distances(text, motion) -> np.ndarray:
-    """Return [G, texts, motions] of Euclidean distances within groups [G, size, D]."""
-    text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
-    if text.shape != motion.shape or text.ndim != 3:
-        raise ValueError(f"texts {text.shape} and motions {motion.shape} must both be [groups, size, D]")
-    return np.linalg.norm(text[:, :, None] - motion[:, None], axis=-1)
-
-
 def r_precision(text, motion, most: int = 3) -> np.ndarray:
     """Share of texts whose own motion is among the k nearest of its group, for k = 1 to `most`.
 
@@ -62,7 +54,10 @@ def r_precision(text, motion, most: int = 3) -> np.ndarray:
       [most]; guessing gives k / size. A motion as near as the right one counts as nearer, so that
       a judge that sees nothing scores 0.
     """
-    distance = _distances(text, motion)
+    text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
+    if text.shape != motion.shape or text.ndim != 3:
+        raise ValueError(f"texts {text.shape} and motions {motion.shape} must both be [groups, size, D]")
+    distance = np.linalg.norm(text[:, :, None] - motion[:, None], axis=-1)
     own = np.diagonal(distance, axis1=1, axis2=2)
     rank = np.sum(distance <= own[..., None], axis=-1) - 1
     return np.array([np.mean(rank < k) for k in range(1, most + 1)])
