@@ -30,11 +30,11 @@ from f3amd_lib.training.latent_motion import (
     TeacherTask,
     clip_error,
     draw_latent,
-    latent_motion_recipe,
     latent_table,
     reconstruction_terms,
 )
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.tasks import part_recipe
 
 SCHEDULE = variance_preserving_betas()
 SMALL = {"latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32, "dropout": 0.0}
@@ -89,16 +89,16 @@ def batch(start):
 
 
 def test_recipes_are_the_papers_and_the_presets():
-    student = latent_motion_recipe("student", 384_000, "MotionPCM-M4")
+    student = part_recipe(LatentMotionTraining, "student", 384_000, "MotionPCM-M4")
     assert (student.batch_size, student.learning_rate, student.ema_decay, student.num_phases) == (128, 2e-4, 0.95, 4)
     assert (student.skip, student.adversarial_weight, student.huber_width) == (100, 0.1, 0.5)
     assert (student.least_guidance, student.most_guidance) == (5.0, 15.0)
-    assert latent_motion_recipe("teacher", 10).learning_rate == 1e-4
-    assert latent_motion_recipe("student", 10, "MotionPCM-M1-mu0").ema_decay == 0.0
-    lcm = latent_motion_recipe("student", 10, "MotionLCM-V2")
+    assert part_recipe(LatentMotionTraining, "teacher", 10).learning_rate == 1e-4
+    assert part_recipe(LatentMotionTraining, "student", 10, "MotionPCM-M1-mu0").ema_decay == 0.0
+    lcm = part_recipe(LatentMotionTraining, "student", 10, "MotionLCM-V2")
     assert (lcm.consistency, lcm.adversarial_weight) == ("latent", 0.0)
     with pytest.raises(ValueError, match="did you mean 'student'"):
-        latent_motion_recipe("studnt", 10)
+        part_recipe(LatentMotionTraining, "studnt", 10)
     for settings, message in (
         ({"consistency": "phase"}, "did you mean 'phased'"),
         ({"consistency": "latent"}, "no phases and no discriminator"),
