@@ -254,15 +254,13 @@ def _in_eight_bits(leaf) -> dict | jax.Array:
     return {"eight_bits": eight_bits, "scale": scale.astype(jnp.float16)}
 
 
-def _from_eight_bits(leaf):
-    """Return the array that `_in_eight_bits` wrote."""
-    if not isinstance(leaf, dict):
-        return leaf
-    return leaf["eight_bits"].astype(jnp.float32) * leaf["scale"]
-
-
 def _is_packed(leaf) -> bool:
     return isinstance(leaf, dict) and "eight_bits" in leaf
+
+
+def _from_eight_bits(leaf):
+    """Return the array that `_in_eight_bits` wrote, or one that is whole."""
+    return leaf["eight_bits"].astype(jnp.float32) * leaf["scale"] if _is_packed(leaf) else leaf
 
 
 def packed_weights(params: Any, dtype) -> Any:

@@ -119,22 +119,6 @@ def _with_fast_gradients(params):
 
 
 @functools.partial(jax.jit, static_argnames=("length", "mesh"), donate_argnames="state")
-def _advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None):
-    decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
-
-    def one_step(state: TrainingState, _):
-        batch, key = task.draw(state, jax.random.fold_in(base, state.step))
-        batch = parallel.spread(batch, mesh)
-        loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
-        gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
-        updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
-        params = optax.apply_updates(state.params, updates)
-        ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
-        return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
-
-    return parallel.everywhere(jax.lax.scan(one_step, state, None, length=length), mesh)
-
-
 def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = None) -> tuple[TrainingState, dict]:
     """Train some steps in one program, without checkpoints or checks (see `optimise`).
 
@@ -147,7 +131,19 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
     Returns:
       (state, every loss term of every step, [length] each).
     """
-    return _advance(task, state, length, mesh)
+    decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
+
+    def one_step(state: TrainingState, _):
+        batch, key = task.draw(state, jax.random.fold_in(base, state.step))
+        batch = parallel.laid(batch, mesh, parallel.SPREAD)
+        loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
+        gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
+        updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
+        params = optax.apply_updates(state.params, updates)
+        ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
+        return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
+
+    return parallel.laid(jax.lax.scan(one_step, state, None, length=length), mesh, parallel.EVERYWHERE)
 
 
 def plan_memory(task: Task, length: int = 1) -> int:
@@ -157,7 +153,7 @@ def plan_memory(task: Task, length: int = 1) -> int:
       task: what to train.
       length: steps in one program.
     """
-    plan = _advance.lower(task, jax.eval_shape(initial_state, task), length, None).compile().memory_analysis()
+    plan = advance.lower(task, jax.eval_shape(initial_state, task), length).compile().memory_analysis()
     shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
     return int(plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - shared)
 

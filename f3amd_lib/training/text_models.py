@@ -311,8 +311,7 @@ def control_task(
 
 def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
     """Return where a model of a data set and profile lies: `runs/<data set>/<profile>/text` or a folder of yours."""
-    folder = Path(folder or runs_dir(profile.dataset, profile.name) / "text")
-    return ModelFiles(*(folder / f"{name}.{what}" for what in ("safetensors", "state.safetensors", "history.csv")))
+    return ModelFiles.of(folder or runs_dir(profile.dataset, profile.name) / "text", name)
 
 
 def of_this_training(found, task: Task, files: ModelFiles):
