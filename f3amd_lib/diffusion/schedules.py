@@ -307,13 +307,9 @@ def _rank(t, num_levels: int):
 SCHEDULES: dict[str, Callable[..., NoiseSchedule]] = {
     make.__name__: make
     for make in (
-        variance_exploding,
-        straight,
-        variance_preserving_cosine,
-        variance_preserving_linear,
-        variance_preserving_betas,
+        variance_exploding, straight, variance_preserving_cosine, variance_preserving_linear, variance_preserving_betas,
     )
-}
+}  # fmt: skip
 """Constructors of noise schedules by the name that they have in a file."""
 
 

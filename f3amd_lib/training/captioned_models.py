@@ -97,17 +97,12 @@ def save_captioned_model(
     tree = {name: checkpoints.packed_weights(params, dtype) for name, params in weights.items() if params is not None}
     described = {"model": trained.config, "autoencoder": autoencoder, "diffusion": trained.schedule}
     metadata = {
-        "kind": kind,
-        "name": trained.name,
+        "kind": kind, "name": trained.name,
         **{name: None if value is None else value.to_dict() for name, value in described.items()},
-        "weights": jnp.dtype(dtype).name,
-        "fps": trained.fps,
-        "text_encoder": trained.text_encoder,
-        "words": list(trained.words),
-        **extra,
-        **checkpoints.describe_skeleton(trained.skeleton),
+        "weights": jnp.dtype(dtype).name, "fps": trained.fps, "text_encoder": trained.text_encoder,
+        "words": list(trained.words), **extra, **checkpoints.describe_skeleton(trained.skeleton),
         "record": trained.record,
-    }
+    }  # fmt: skip
     offsets = jnp.asarray(trained.skeleton.offsets, jnp.float32)
     checkpoints.save_tree(path, tree | arrays | {"offsets": offsets}, metadata)
 
@@ -143,17 +138,11 @@ def load_captioned_model(
 
     tree, metadata = checkpoints.load_tree(path, template)
     tree |= {name: checkpoints.unpacked_weights(tree[name]) for name in _WEIGHTS if name in tree}
-    common = {
-        "name": metadata["name"],
-        "config": _config(metadata, "model"),
-        "params": tree.get("params"),
+    common = {name: metadata[name] for name in ("name", "fps", "text_encoder", "record")} | {
+        "config": _config(metadata, "model"), "params": tree.get("params"), "words": tuple(metadata["words"]),
         "schedule": None if metadata["diffusion"] is None else schedule_from_dict(metadata["diffusion"]),
         "skeleton": checkpoints.described_skeleton(metadata, tree["offsets"]),
-        "fps": metadata["fps"],
-        "text_encoder": metadata["text_encoder"],
-        "words": tuple(metadata["words"]),
-        "record": metadata["record"],
-    }
+    }  # fmt: skip
     return common, _config(metadata, "autoencoder"), tree, metadata
 
 

@@ -309,16 +309,12 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "offsets": jnp.asarray(trained.skeleton.offsets, jnp.float32),
     }
     metadata = {
-        "kind": "trained model",
-        "name": trained.name,
-        "model": trained.config.to_dict(),
-        "weights": jnp.dtype(dtype).name,
-        "styles": list(trained.styles),
-        "diffusion": trained.diffusion.to_dict(),
+        "kind": "trained model", "name": trained.name, "model": trained.config.to_dict(),
+        "weights": jnp.dtype(dtype).name, "styles": list(trained.styles), "diffusion": trained.diffusion.to_dict(),
         **describe_skeleton(trained.skeleton),
         "seed_shapes": {name: list(np.shape(poses)) for name, poses in trained.start_poses.items()},
         "record": trained.record,
-    }
+    }  # fmt: skip
     save_tree(path, tree, metadata)
 
 
@@ -331,16 +327,11 @@ def load_model(path: Path) -> TrainedModel:
     with errors_name(path):
         tree, metadata = load_tree(path, _model_template)
         return TrainedModel(
-            name=metadata["name"],
-            config=config_from_dict(metadata["model"]),
-            params=unpacked_weights(tree["params"]),
-            normaliser=Normaliser(**tree["normaliser"]),
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            styles=tuple(metadata["styles"]),
-            diffusion=schedule_from_dict(metadata["diffusion"]),
-            start_poses={name: np.asarray(poses) for name, poses in tree["seeds"].items()},
-            record=metadata["record"],
-        )
+            name=metadata["name"], config=config_from_dict(metadata["model"]), params=unpacked_weights(tree["params"]),
+            normaliser=Normaliser(**tree["normaliser"]), skeleton=described_skeleton(metadata, tree["offsets"]),
+            styles=tuple(metadata["styles"]), diffusion=schedule_from_dict(metadata["diffusion"]),
+            start_poses={name: np.asarray(poses) for name, poses in tree["seeds"].items()}, record=metadata["record"],
+        )  # fmt: skip
 
 
 def _model_template(metadata: dict) -> dict:
@@ -350,11 +341,8 @@ def _model_template(metadata: dict) -> dict:
     config = config_from_dict(metadata["model"])
     return {
         "params": packed_shapes(weights_shapes(config), metadata.get("weights")),
-        "normaliser": {
-            "mean": single((config.channels,), jnp.float32),
-            "deviation": single((config.channels,), jnp.float32),
-            "path_scale": single((), jnp.float32),
-        },
+        "normaliser": dict.fromkeys(("mean", "deviation"), single((config.channels,), jnp.float32))
+        | {"path_scale": single((), jnp.float32)},
         "seeds": {name: single(tuple(shape), jnp.float32) for name, shape in metadata["seed_shapes"].items()},
         "offsets": single((len(metadata["joints"]), 3), jnp.float32),
     }

@@ -138,14 +138,9 @@ def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
     Args:
       preset, num_steps, **settings: as for `paper_recipe`.
     """
-    short = {
-        "batch_size": 128,
-        "learning_rate": 2e-3,
-        "schedule": "warmup_cosine",
-        "warmup_steps": max(1, min(200, num_steps // 10)),
-        "gradient_clip": 1.0,
-    }
-    return paper_recipe(preset, num_steps, **{**short, **settings})
+    short = {"batch_size": 128, "learning_rate": 2e-3, "schedule": "warmup_cosine", "gradient_clip": 1.0}
+    warm_up = {"warmup_steps": max(1, min(200, num_steps // 10))}
+    return paper_recipe(preset, num_steps, **{**short, **warm_up, **settings})
 
 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
@@ -158,24 +153,14 @@ def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfi
     preset = find_preset(preset or profile.preset).name
     as_printed = profile.name == "gpu" and not preset.endswith(("-plus", "-steady"))
     recipe = paper_recipe if as_printed else short_recipe
-    return recipe(
-        preset,
-        profile.train_steps,
-        learning_rate=profile.learning_rate,
-        batch_size=profile.batch_size,
-        seed=profile.seed,
-    )
+    own = {name: getattr(profile, name) for name in ("learning_rate", "batch_size", "seed")}
+    return recipe(preset, profile.train_steps, **own)
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     """Return learning rate against step (section 4.5: "inverse-square")."""
     if config.schedule == "warmup_cosine":
-        return optax.warmup_cosine_decay_schedule(
-            0.0,
-            config.learning_rate,
-            min(config.warmup_steps, config.num_steps - 1),
-            config.num_steps,
-            0.01 * config.learning_rate,
-        )
+        warm, peak = min(config.warmup_steps, config.num_steps - 1), config.learning_rate
+        return optax.warmup_cosine_decay_schedule(0.0, peak, warm, config.num_steps, 0.01 * peak)
     power = {"inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
     return lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
