@@ -197,12 +197,9 @@ def variance_preserving_cosine(num_levels: int = 8, offset: float = 0.008, max_b
         return np.cumprod(np.maximum(wanted[1:] / wanted[:-1], 1.0 - max_beta))
 
     return _variance_preserving(
-        "variance_preserving_cosine",
-        {"num_levels": num_levels, "offset": offset, "max_beta": max_beta},
-        alpha_bars,
-        ("a finite offset of at least 0", 0.0 <= offset < np.inf),
-        ("0 < max_beta < 1", 0.0 < max_beta < 1.0),
-    )
+        "variance_preserving_cosine", {"num_levels": num_levels, "offset": offset, "max_beta": max_beta}, alpha_bars,
+        ("a finite offset of at least 0", 0.0 <= offset < np.inf), ("0 < max_beta < 1", 0.0 < max_beta < 1.0),
+    )  # fmt: skip
 
 
 def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, beta_max: float = 20.0) -> NoiseSchedule:
@@ -225,11 +222,9 @@ def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, be
         return np.exp(-beta_min * s - 0.5 * (beta_max - beta_min) * s**2)
 
     return _variance_preserving(
-        "variance_preserving_linear",
-        {"num_levels": num_levels, "beta_min": beta_min, "beta_max": beta_max},
-        alpha_bars,
-        ("0 < beta_min <= beta_max, finite", 0.0 < beta_min <= beta_max < np.inf),
-    )
+        "variance_preserving_linear", {"num_levels": num_levels, "beta_min": beta_min, "beta_max": beta_max},
+        alpha_bars, ("0 < beta_min <= beta_max, finite", 0.0 < beta_min <= beta_max < np.inf),
+    )  # fmt: skip
 
 
 def variance_preserving_betas(
@@ -253,12 +248,10 @@ def variance_preserving_betas(
         return np.cumprod(1.0 - np.linspace(first ** (1.0 / power), last ** (1.0 / power), num_levels) ** power)
 
     return _variance_preserving(
-        "variance_preserving_betas",
-        {"num_levels": num_levels, "first": first, "last": last, "power": power},
-        alpha_bars,
-        ("0 < first <= last < 1", 0.0 < first <= last < 1.0),
+        "variance_preserving_betas", {"num_levels": num_levels, "first": first, "last": last, "power": power},
+        alpha_bars, ("0 < first <= last < 1", 0.0 < first <= last < 1.0),
         ("a positive finite power", 0.0 < power < np.inf),
-    )
+    )  # fmt: skip
 
 
 def _variance_preserving(

@@ -165,12 +165,8 @@ def describe_skeleton(skeleton: Skeleton) -> dict:
 
 def described_skeleton(metadata: dict, offsets) -> Skeleton:
     """Return the skeleton that `describe_skeleton` described, with its offsets [J, 3]."""
-    return Skeleton(
-        tuple(metadata["joints"]),
-        tuple(metadata["parents"]),
-        np.asarray(offsets, np.float64),
-        tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
-    )
+    end_sites = tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"])
+    return Skeleton(tuple(metadata["joints"]), tuple(metadata["parents"]), np.asarray(offsets, np.float64), end_sites)
 
 
 @functools.lru_cache(maxsize=32)

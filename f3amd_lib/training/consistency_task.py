@@ -20,12 +20,11 @@ from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.phases import consistency_answer
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import run_record
-from f3amd_lib.training.checkpoints import TrainedModel, load_model, network_with, save_model, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
 from f3amd_lib.training.losses import loss_terms, total_loss
 from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.pipeline import PreparedData, alone_with, as_trained, model_files, train_in_legs
+from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep
 from f3amd_lib.training.recipe import paper_recipe
 from f3amd_lib.training.tasks import NetworkTask, frozen_tree
 
@@ -150,14 +149,5 @@ def distil(
     config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
     task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params, num_phases=num_phases)
     files = model_files(profile, teacher.name, folder=Path(folder))
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=config.seed, model=teacher.name, training=config.to_dict(),
-        held_out_split=prepared.held_out_split, num_train_windows=int(task.denoising.windows.num_windows),
-        distilled_from=weights_digest(teacher.params), num_phases=num_phases,
-    )  # fmt: skip
-    with alone_with(files):
-        state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)
-    if int(state.step) < num_steps:
-        return None, history
-    save_model(files.model, as_trained(prepared, task.denoising, teacher.name, state.params, record))
-    return load_model(files.model), history
+    about = {"distilled_from": weights_digest(teacher.params), "num_phases": num_phases}
+    return train_and_keep(prepared, profile, teacher.name, task, files, about, **leg)

@@ -150,8 +150,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
 
 def train(
     prepared: PreparedData, profile: Profile, *, preset: str | None = None, config: TrainingConfig | None = None,
-    network: Mapping | None = None, folder=None, mesh: Mesh | None = None, stop_at: float | None = None,
-    progress: bool = True,
+    network: Mapping | None = None, folder=None, mesh: Mesh | None = None, **leg,
 ) -> tuple[TrainedModel | None, pd.DataFrame]:  # fmt: skip
     """Train a preset to the end, going on from its training state if there is one.
 
@@ -163,8 +162,7 @@ def train(
       network: fields of the preset's network to change.
       folder: where files go instead of `runs/`; several processes must see the same one.
       mesh: devices that share each batch (`parallel.all_devices`); by default one.
-      stop_at: see `optimise`.
-      progress: show a progress bar.
+      **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       (model, history): the history has a row per 50 steps or fewer, with held-out losses
@@ -182,19 +180,36 @@ def train(
     task = prepared.task(preset, config, network=network)
     if prepared.held_out_split == "train":
         log.warning("no clip is held out: 'held-out' losses are of clips that the model was trained on")
+    devices = {} if mesh is None else {"training_devices": mesh.size}
+    return train_and_keep(prepared, profile, preset, task, files, devices, mesh=mesh, **leg)
+
+
+def train_and_keep(
+    prepared: PreparedData, profile: Profile, preset: str, task: Task, files: ModelFiles, about: dict, **leg
+) -> tuple[TrainedModel | None, pd.DataFrame]:
+    """Train a task on windows of a data set to the end, and keep the model.
+
+    Args:
+      prepared, profile, preset: as for `train`.
+      task: a denoiser's, or the distillation of one (`denoising`): the student's moving average is its target.
+      files: of the run.
+      about: what else its record says.
+      **leg: mesh, stop_at and progress, as for `train`.
+
+    Returns:
+      (model, history), as for `train`.
+    """
+    denoising, config = getattr(task, "denoising", task), task.config
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=config.seed, model=preset, training=config.to_dict(),
-        held_out_split=prepared.held_out_split, num_train_windows=int(task.windows.num_windows),
-        **({} if mesh is None else {"training_devices": mesh.size}),
+        held_out_split=prepared.held_out_split, num_train_windows=int(denoising.windows.num_windows), **about,
     )  # fmt: skip
-    held_out = prepared.windows(prepared.held_out_split)
     with alone_with(files):
-        state, history = train_in_legs(
-            task, files, record, held_out=held_out, mesh=mesh, stop_at=stop_at, progress=progress
-        )
+        state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)
         if int(state.step) < config.num_steps:
             return None, history
-        trained = as_trained(prepared, task, preset, state.averaged, record)
+        weights = state.averaged if denoising is task else state.params
+        trained = as_trained(prepared, denoising, preset, weights, record)
         if parallel.is_first_process():
             save_model(files.model, trained)
             trained = load_model(files.model)  # in the precision of the file
