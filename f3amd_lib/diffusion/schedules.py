@@ -337,17 +337,14 @@ def alpha_bar_from_sigma(sigma):
 
 def sigma_from_alpha_bar(alpha_bar):
     """Return sigma = sqrt((1 - alpha_bar) / alpha_bar), any shape (Appendix F, inverted)."""
-    xp = array_module(alpha_bar)
-    return xp.sqrt((1.0 - alpha_bar) / alpha_bar)
+    return array_module(alpha_bar).sqrt((1.0 - alpha_bar) / alpha_bar)
 
 
 def log_snr_from_sigma(sigma):
     """Return the log signal-to-noise ratio, -2 log sigma, any shape."""
-    xp = array_module(sigma)
-    return -2.0 * xp.log(sigma)
+    return -2.0 * array_module(sigma).log(sigma)
 
 
 def sigma_from_log_snr(log_snr):
     """Return sigma = exp(-log_snr / 2), any shape."""
-    xp = array_module(log_snr)
-    return xp.exp(-0.5 * log_snr)
+    return array_module(log_snr).exp(-0.5 * log_snr)

@@ -304,6 +304,14 @@ class Trunk(nnx.Module):
             mask = mask & block_causal(num_tokens, mask.shape[-1], config.block_frames * config.num_patches)
         return mask
 
+    def through(self, x, time, context: TextContext):
+        """Yield what each block makes of tokens of all frames, [B, T, d]; time [B]."""
+        time, text = self.conditioned(time, context)
+        angles, mask = self.angles(0, x.shape[1]), self.seen(context, x.shape[1])
+        for block in self.blocks:
+            x, _ = block(x, time + text, angles, mask)
+            yield x
+
     def angles(self, first: int, num_tokens: int):
         """Return the rotary angles of tokens first ... first + num_tokens - 1; frames begin at 0."""
         config = self.config

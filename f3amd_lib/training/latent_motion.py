@@ -368,10 +368,8 @@ class DistillationTask(NetworkTask):
         if config.adversarial_weight:
             parts["discriminator"] = config.optimiser(config.discriminator_rate, first_moment=0.0)
         if config.alternate:
-            turn = {"student": 1, "discriminator": 0}
             parts = {
-                name: optax.conditionally_mask(part, functools.partial(_is_turn, turn[name]))
-                for name, part in parts.items()
+                name: optax.conditionally_mask(part, functools.partial(_is_turn, name)) for name, part in parts.items()
             }
         branch = lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params)
         return optax.partition(parts, branch)
@@ -463,5 +461,5 @@ class DistillationTask(NetworkTask):
         return critic(teacher.features(state, batch.critic_time, teacher.encode(batch.text)))
 
 
-def _is_turn(parity: int, step):
-    return step % 2 == parity
+def _is_turn(player: str, step):
+    return step % 2 == (1 if player == "student" else 0)

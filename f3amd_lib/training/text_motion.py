@@ -140,12 +140,10 @@ class AutoencoderTask(NetworkTask):
             latent_mask = mask[:, :: self.model_config.frames_per_latent]
             loss = smooth_l1(model.decode(model.latent_of(positions, mask), latent_mask), positions, mask)
             return {"loss": loss, "smooth_l1": loss}
-        key_latent, encoded = jax.random.fold_in(key, 1), model.encode(batch, key=jax.random.fold_in(key, 2))
+        latent = model.encode(batch, key=jax.random.fold_in(key, 2))
         if self.model_config.variational:
-            mean, log_variance = model.moments(encoded)
-            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key_latent, mean.shape)
-        else:
-            latent = encoded
+            mean, log_variance = model.moments(latent)
+            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
         positions_hat = model.decode(latent, key=jax.random.fold_in(key, 3))
         loss = error = smooth_l1(positions_hat, batch)
         if self.model_config.variational:
