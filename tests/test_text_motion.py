@@ -20,7 +20,7 @@ from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
-from f3amd_lib.training.tasks import part_recipe
+from f3amd_lib.training.settings import part_recipe
 from f3amd_lib.training.text_motion import (
     AutoencoderTask,
     ControlTask,

@@ -23,10 +23,9 @@ from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
 from f3amd_lib.training.losses import loss_terms, total_loss
-from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep
 from f3amd_lib.training.recipe import paper_recipe
-from f3amd_lib.training.tasks import NetworkTask, frozen_tree
 
 TEACHER_STEPS = 8
 """Levels of the teacher's walk: the steps that F3AMD's tables count as many."""
@@ -38,8 +37,8 @@ _HELD_OUT_WINDOWS = 128
 
 
 @frozen_tree("denoising", "teacher")
-class ConsistencyTask(NetworkTask):
-    """A student of one step a phase, to distil from a frozen denoiser (a `training.optimise.Task`).
+class ConsistencyTask(Task):
+    """A student of one step a phase, to distil from a frozen denoiser.
 
     Attributes:
       denoising: the teacher's own training: network, windows, disturbances, loss. Its moving average is the target.

@@ -31,9 +31,8 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.losses import loss_terms, total_loss
-from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 from f3amd_lib.training.recipe import TrainingConfig
-from f3amd_lib.training.tasks import NetworkTask, frozen_tree
 
 LOG_NORMAL_SIGMA = (-1.2 + math.log(2.0), 1.2)
 """Mean and deviation of ln sigma: Karras et al. 2022, Table 1, for features of deviation 1 where
@@ -106,8 +105,8 @@ class Constants:
 
 
 @frozen_tree("windows")
-class DenoisingTask(NetworkTask):
-    """A denoiser to train on one window set (a `training.optimise.Task`); see `denoising_task`.
+class DenoisingTask(Task):
+    """A denoiser to train on one window set; see `denoising_task`.
 
     Attributes:
       model_config: the network.

@@ -17,8 +17,7 @@ from f3amd_lib.data.text_encoders import TextEmbeddings
 from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, ClipTable, MotionBatch, draw_clips
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.tasks import NetworkTask, frozen_tree
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,8 @@ def evaluator_network(config: TextMotionConfig, params) -> TextMotionNetwork:
 
 
 @frozen_tree("clips", "captions")
-class EvaluatorTask(NetworkTask):
-    """A judge to train (a `training.optimise.Task`).
+class EvaluatorTask(Task):
+    """A judge to train.
 
     Attributes:
       dataset_fingerprint, text_encoder, network, config: what decides the weights.

@@ -24,7 +24,7 @@ from f3amd_lib.networks.presets import Preset
 from f3amd_lib.training import latent_motion
 from f3amd_lib.training.captioned_models import CaptionedModel, load_captioned_model, save_captioned_model, train_part
 from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
-from f3amd_lib.training.tasks import profile_part_recipe
+from f3amd_lib.training.settings import profile_part_recipe
 from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files, text_model_folders
 
 KIND = "latent motion model"

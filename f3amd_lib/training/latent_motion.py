@@ -21,8 +21,8 @@ from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redund
 from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.tasks import NetworkTask, check_settings, frozen_tree
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,8 @@ def draw_latent(key, mean, log_variance):
 
 
 @frozen_tree("clips", "statistics")
-class LatentAutoencoderTask(NetworkTask):
-    """An autoencoder to train on whole clips (MotionPCM section 4.1; a `training.optimise.Task`).
+class LatentAutoencoderTask(Task):
+    """An autoencoder to train on whole clips (MotionPCM section 4.1).
 
     Attributes:
       model_config: the autoencoder.
@@ -250,8 +250,8 @@ def latent_table(
 
 
 @frozen_tree("clips")
-class TeacherTask(NetworkTask):
-    """A teacher to train: the noise of latents under a caption, or none (a `training.optimise.Task`).
+class TeacherTask(Task):
+    """A teacher to train: the noise of latents under a caption, or none.
 
     Attributes:
       model_config: the denoiser.
@@ -317,8 +317,8 @@ class DistillationBatch(NamedTuple):
 
 
 @frozen_tree("teacher", "clips")
-class DistillationTask(NetworkTask):
-    """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1; a `training.optimise.Task`).
+class DistillationTask(Task):
+    """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1).
 
     Weights have the branches "student" and, with a discriminator, "discriminator". The loop's moving average of the
     student is the target network. Both losses are taken at the weights before a step, as in Algorithm 1, whose line 15

@@ -16,7 +16,7 @@ from f3amd_lib.motion.body_mesh import BodyMesh
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.tasks import frozen_tree
+from f3amd_lib.training.optimise import frozen_tree
 
 
 @frozen_tree("axes", "params", "latent", "redundancy")

@@ -16,7 +16,7 @@ from f3amd_lib.ground.names import checked_seed, refuse_unknown
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.losses import LossWeights
-from f3amd_lib.training.tasks import check_settings
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)

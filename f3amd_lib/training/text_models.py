@@ -43,7 +43,7 @@ from f3amd_lib.training.checkpoints import errors_name, network_with, weights_di
 from f3amd_lib.training.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.optimise import Task, differences
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
-from f3amd_lib.training.tasks import profile_part_recipe
+from f3amd_lib.training.settings import profile_part_recipe
 
 CONTROL = "+control"
 """Behind a preset's name: the model with its control branch."""

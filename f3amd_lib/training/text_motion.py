@@ -26,8 +26,8 @@ from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, smooth_l1, variational_loss
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.motion_codec import MotionCodec
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.tasks import NetworkTask, check_settings, frozen_tree
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class TextMotionTraining:
 
 
 @frozen_tree("clips")
-class AutoencoderTask(NetworkTask):
-    """A motion autoencoder to train on windows of clips that are long enough (a `training.optimise.Task`).
+class AutoencoderTask(Task):
+    """A motion autoencoder to train on windows of clips that are long enough.
 
     Attributes:
       model_config: the autoencoder.
@@ -153,7 +153,7 @@ class AutoencoderTask(NetworkTask):
 
 @frozen_tree("clips", "codec")
 class MeshAutoencoderTask(AutoencoderTask):
-    """A mesh autoencoder to train on frames, one of each clip that is drawn (a `training.optimise.Task`).
+    """A mesh autoencoder to train on frames, one of each clip that is drawn.
 
     Attributes:
       codec: of positions, with the mesh whose vertices they move.
@@ -253,8 +253,8 @@ def draw_captioned(key, clips: ClipTable, pooled, config: TextMotionTraining, wi
 
 
 @frozen_tree("clips", "pooled")
-class TextMotionTask(NetworkTask):
-    """A denoiser of text and motion to train (a `training.optimise.Task`).
+class TextMotionTask(Task):
+    """A denoiser of text and motion to train.
 
     Attributes:
       model_config: an `ACMDMConfig` or `MaskedACMDMConfig`.
@@ -337,8 +337,8 @@ def control_loss(
 
 
 @frozen_tree("clips", "pooled", "base", "codec")
-class ControlTask(NetworkTask):
-    """A control branch to train beside a frozen denoiser (a `training.optimise.Task`).
+class ControlTask(Task):
+    """A control branch to train beside a frozen denoiser.
 
     Attributes:
       model_config: of the denoiser, which is that of the branch.

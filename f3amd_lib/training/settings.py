@@ -1,73 +1,15 @@
-"""What trainings have in common: a task of one network, its settings and the recipe that says them."""
+"""What the settings of a training may be, and the recipes that choose them."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
-from typing import ClassVar
-
-import jax
-import optax
-from flax import nnx
 
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.networks.presets import build_from_config, find_preset
-
-
-def frozen_tree(*data: str):
-    """Make a class a frozen dataclass and a JAX tree: the fields of these names are leaves, all else is static."""
-
-    def as_tree(cls: type) -> type:
-        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-        static = [field.name for field in dataclasses.fields(cls) if field.name not in data]
-        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
-
-    return as_tree
-
-
-class NetworkTask:
-    """A training of one network (a `training.optimise.Task`): all but what is drawn and how an answer is judged.
-
-    A subclass has `model_config`, `config` with an `optimiser()`, `dataset_fingerprint`, perhaps `schedule`, and
-    `terms(params, batch, key, training=True)`: loss terms by name, "loss" among them, of what `draw` drew or, out of
-    training, of held-out data.
-    """
-
-    name: ClassVar[str]
-    part: ClassVar[str]
-    """What the task's identity calls its network."""
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """As the config says."""
-        return self.config.optimiser()
-
-    def identity(self) -> dict:
-        """Return all that decides the weights, as JSON has it."""
-        models = {self.part: self.model_config.to_dict()}
-        if hasattr(self, "schedule"):
-            models["diffusion"] = self.schedule.to_dict()
-        training = dataclasses.asdict(self.config)
-        fingerprint = self.dataset_fingerprint
-        return {"part": self.name, "model": models, "training": training, "dataset_fingerprint": fingerprint}
-
-    def init(self, key):
-        """Return initial weights; no network here keeps statistics."""
-        return nnx.state(build_from_config(self.model_config, key)), None
-
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)) of what `draw` drew."""
-        terms = self.terms(params, batch, key)
-        return terms["loss"], (terms, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the terms on held-out data, without what only training does."""
-        return self.terms(params, held_out, key, training=False)
-
+from f3amd_lib.networks.presets import find_preset
 
 _SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
 
