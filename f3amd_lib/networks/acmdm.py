@@ -289,9 +289,8 @@ class Trunk(nnx.Module):
     def conditioned(self, time, context: TextContext):
         """Return (time, text) in network width: [B, 1, d] each, or [B, tokens, d] for a time of its own a frame."""
         time = self.time_second(jax.nn.silu(self.time_first(time_features(time))))
-        if time.ndim == 2:
-            return time[:, None], context.text[:, None]
-        return jnp.repeat(time, self.config.num_patches, axis=1), context.text[:, None]
+        time = time[:, None] if time.ndim == 2 else jnp.repeat(time, self.config.num_patches, axis=1)
+        return time, context.text[:, None]
 
     def seen(self, context: TextContext, num_tokens: int):
         """Return which keys each token of the last frames may see, broadcasting to [B, heads, T, keys]."""

@@ -124,11 +124,8 @@ def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
       dtype: of the weights, as for `checkpoints.save_model`.
     """
     codec = trained.codec
-    arrays = {"axes": codec.axes._asdict()}
-    if codec.autoencoder is not None:
-        arrays["latent"] = codec.latent._asdict()
-    if codec.redundancy is not None:
-        arrays["redundancy"] = codec.redundancy._asdict()
+    normalisers = {"axes": codec.axes, "latent": codec.latent, "redundancy": codec.redundancy}
+    arrays = {what: normaliser._asdict() for what, normaliser in normalisers.items() if normaliser is not None}
     if codec.mesh is not None:
         arrays["rest"] = jnp.asarray(codec.mesh.skeleton.offsets, jnp.float32)
     arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}

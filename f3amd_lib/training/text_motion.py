@@ -326,10 +326,7 @@ def control_loss(
     state, t, alpha, sigma = noisy_state(key_time, schedule, x0, noise)
     prediction = controlled(base, branch, condition, control)(state, network_time(schedule, t))
     denoising = frame_error(prediction, prediction_target(objective, x0, noise), condition.mask)
-    if objective == "v":
-        x0_hat = noise + prediction
-    else:
-        x0_hat = clean_estimate(objective, prediction, state, alpha, sigma)
+    x0_hat = noise + prediction if objective == "v" else clean_estimate(objective, prediction, state, alpha, sigma)
     motion_mask = jnp.repeat(condition.mask, codec.frames_per_state, axis=1)
     distance = codec.axes.restore(codec.decode(x0_hat, motion_mask)) - codec.axes.restore(positions)
     square = jnp.sum(distance**2 * control.asked[..., None])
