@@ -42,7 +42,7 @@ from f3amd_lib.training.latent_models import (
     stands_on,
     train_latent_model,
 )
-from f3amd_lib.training.latent_motion import FrameStatistics
+from f3amd_lib.training.latent_motion import frame_statistics
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.text_models import text_model_files
 
@@ -215,7 +215,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
     assert watched == [[1]] * 3
     assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 20, 3]
     assert student.words == ("a", "person", "walks")
-    statistics = FrameStatistics.of(data)
+    statistics = frame_statistics(data)
     for kept in (student.statistics, teacher.statistics):
         np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
 

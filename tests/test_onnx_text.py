@@ -29,7 +29,6 @@ from f3amd_lib.serving.onnx_text import (
 )
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
 from f3amd_lib.training.latent_models import LatentModel, save_latent_model
-from f3amd_lib.training.latent_motion import FrameStatistics
 from f3amd_lib.training.motion_codec import MotionCodec
 from f3amd_lib.training.text_models import TextModel, save_text_model
 
@@ -72,7 +71,7 @@ def motionpcm(guidance_features: int) -> LatentModel:
     record = RECORD | {"identity": {"training": {"num_phases": 2, "skip": 50}}}
     return LatentModel(
         name="tiny-PCM", autoencoder=autoencoder, autoencoder_params=zeros, record=record, config=config,
-        statistics=FrameStatistics(jnp.zeros(7), jnp.ones(7)),
+        statistics=AxisNormaliser(jnp.zeros(7), jnp.ones(7)),
         params=weights_of(LatentDenoiser(config, rngs=nnx.Rngs(0))), schedule=variance_preserving_betas(), **ABOUT,
     )  # fmt: skip
 

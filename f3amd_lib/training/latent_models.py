@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from f3amd_lib.data.text_encoders import TextEncoder, words_of
-from f3amd_lib.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips
+from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, clip_table, draw_clips
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
@@ -45,7 +45,7 @@ class LatentModel(CaptionedModel):
 
     autoencoder: LatentAutoencoderConfig
     autoencoder_params: Any
-    statistics: latent_motion.FrameStatistics
+    statistics: AxisNormaliser
 
     @property
     def training(self) -> dict:
@@ -81,7 +81,7 @@ def load_latent_model(path: Path) -> LatentModel:
     """
     with errors_name(path):
         common, autoencoder, tree, _ = load_captioned_model(path, KIND, _shapes)
-        statistics = latent_motion.FrameStatistics(tree["mean"], tree["deviation"])
+        statistics = AxisNormaliser(tree["mean"], tree["deviation"])
         return LatentModel(
             autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **common
         )
@@ -253,7 +253,7 @@ def train_latent_model(
     task = _task(preset, config, data, encoder, before)
     if files.model.exists():
         return of_this_training(load_latent_model(files.model), task, files)
-    statistics = latent_motion.FrameStatistics.of(data) if before is None else before.statistics
+    statistics = latent_motion.frame_statistics(data) if before is None else before.statistics
     clips, watched = (_clips(data.select(data.members(split)), encoder, before, statistics, config)
                       for split in ("train", "validation"))  # fmt: skip
     task = dataclasses.replace(task, clips=clips, **({"statistics": statistics} if before is None else {}))

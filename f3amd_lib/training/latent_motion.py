@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from f3amd_lib.data.text_motions import ClipTable, TextMotions, draw_clips, pad_motions
+from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, draw_clips, pad_motions
 from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
@@ -99,25 +99,10 @@ class LatentMotionTraining:
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
-class FrameStatistics(NamedTuple):
-    """Mean and deviation of each number of a frame, [features]."""
-
-    mean: jax.Array
-    deviation: jax.Array
-
-    @classmethod
-    def of(cls, data: TextMotions) -> FrameStatistics:
-        """Return those of the training clips' redundant vectors, as HumanML3D has them."""
-        mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
-        return cls(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
-
-    def normalise(self, vectors):
-        """Map redundant vectors to network units, [..., features]."""
-        return (vectors - self.mean) / self.deviation
-
-    def restore(self, features):
-        """Map network units to redundant vectors, [..., features]."""
-        return features * self.deviation + self.mean
+def frame_statistics(data: TextMotions) -> AxisNormaliser:
+    """Return mean and deviation of the training clips' redundant vectors, as HumanML3D has them, [features]."""
+    mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
+    return AxisNormaliser(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
 
 
 def clip_error(numbers_hat, numbers, mask):
@@ -131,7 +116,7 @@ def clip_error(numbers_hat, numbers, mask):
     return jnp.mean(jnp.sum(loss * mask, axis=1) / jnp.sum(mask, axis=1))
 
 
-def reconstruction_terms(model, statistics: FrameStatistics, features, mask, keys=(None, None, None)) -> dict:
+def reconstruction_terms(model, statistics: AxisNormaliser, features, mask, keys=(None, None, None)) -> dict:
     """Return {"features", "joints", "divergence"} of an autoencoder; without keys, of the mean and without dropout.
 
     Args:
@@ -174,7 +159,7 @@ class LatentAutoencoderTask(Task):
     model_config: motionpcm.LatentAutoencoderConfig
     config: LatentMotionTraining
     clips: ClipTable
-    statistics: FrameStatistics
+    statistics: AxisNormaliser
     dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
@@ -222,7 +207,7 @@ class LatentTable(NamedTuple):
 
 
 def latent_table(
-    model, statistics: FrameStatistics, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
+    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
 ) -> LatentTable:
     """Return the latents of a data set's clips.
 
