@@ -236,9 +236,10 @@ def test_dropout_has_four_places_in_a_block(monkeypatch):
         places.append((x.shape, rate, tuple(np.asarray(jax.random.key_data(key)))))
         return x
 
-    monkeypatch.setattr(attention_module, "dropout", record)
     block, z = make_block(dropout=0.3), draw(2, 5, WIDTH)
-    np.testing.assert_allclose(block(z, key=jax.random.key(0)), block(z), atol=1e-5)
+    without = block(z)
+    monkeypatch.setattr(attention_module, "dropout", record)
+    np.testing.assert_allclose(block(z, key=jax.random.key(0)), without, atol=1e-5)
     weights, frames, hidden = (2, HEADS, 5, 5), (2, 5, WIDTH), (2, 5, HIDDEN)
     assert [shape for shape, _, _ in places] == [weights, frames, hidden, frames]
     assert {rate for _, rate, _ in places} == {0.3}

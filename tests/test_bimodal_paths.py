@@ -10,7 +10,7 @@ from helpers.bimodal_paths import BimodalPaths
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.training.optimise import _advance as advance_program
+from f3amd_lib.training.optimise import advance as advance_program
 
 DATA = BimodalPaths()
 SMALL = BimodalPaths(num_frames=8, num_modes=4)

@@ -44,7 +44,7 @@ def test_one_that_agrees_with_itself_everywhere_has_no_loss_and_another_has(task
     blank = jax.tree.map(jnp.zeros_like, task.teacher)
     silent = dataclasses.replace(task, teacher=blank)
     batch, key = jax.jit(task.denoising.draw)(initial_state(task), jax.random.key(0))
-    sample = jax.jit(lambda student: silent._terms(student, blank, batch[0], key, training=False)["sample"])
+    sample = jax.jit(lambda student: silent.terms(student, (batch[0], blank), key)["sample"])
     assert float(sample(blank)) == pytest.approx(0.0, abs=1e-9)
     assert float(sample(task.teacher)) > 1e-3
 
@@ -72,7 +72,7 @@ def test_a_question_ends_where_its_phase_does_and_the_sampler_asks_there(task, n
     monkeypatch.setattr(consistency_task, "consistency_answer", answer)
     (batch, target), key = student.draw(initial_state(student), jax.random.key(0))
     for number in range(6):
-        student._terms(student.teacher, target, batch, jax.random.fold_in(key, number), training=False)
+        student.terms(student.teacher, (batch, target), jax.random.fold_in(key, number))
     sigma, sigma_next, sigma_edge = np.concatenate(asked, axis=1)
     grid = levels.grid(8).astype(np.float32)
     place = np.searchsorted(-grid, -sigma)

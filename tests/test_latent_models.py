@@ -32,7 +32,7 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
-from f3amd_lib.training import latent_models, text_models
+from f3amd_lib.training import captioned_models, latent_models, text_models
 from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.latent_models import (
     is_latent_preset,
@@ -42,7 +42,7 @@ from f3amd_lib.training.latent_models import (
     stands_on,
     train_latent_model,
 )
-from f3amd_lib.training.latent_motion import FrameStatistics
+from f3amd_lib.training.latent_motion import frame_statistics
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.text_models import text_model_files
 
@@ -196,7 +196,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
-    monkeypatch.setattr(latent_models, "train_in_legs", loop)
+    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
     watched = []
     monkeypatch.setattr(latent_models, "held_out_clips", lambda clips, config: watched.append(clips.count.tolist()))
     student = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
@@ -215,7 +215,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
     assert watched == [[1]] * 3
     assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 20, 3]
     assert student.words == ("a", "person", "walks")
-    statistics = FrameStatistics.of(data)
+    statistics = frame_statistics(data)
     for kept in (student.statistics, teacher.statistics):
         np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.data.text_motions import ClipTable, text_motions
+from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, text_motions
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
@@ -23,18 +23,18 @@ from f3amd_lib.training import latent_motion
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.latent_motion import (
     DistillationTask,
-    FrameStatistics,
     LatentAutoencoderTask,
     LatentMotionTraining,
     LatentTable,
     TeacherTask,
     clip_error,
     draw_latent,
-    latent_motion_recipe,
+    frame_statistics,
     latent_table,
     reconstruction_terms,
 )
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.settings import part_recipe
 
 SCHEDULE = variance_preserving_betas()
 SMALL = {"latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32, "dropout": 0.0}
@@ -89,16 +89,16 @@ def batch(start):
 
 
 def test_recipes_are_the_papers_and_the_presets():
-    student = latent_motion_recipe("student", 384_000, "MotionPCM-M4")
+    student = part_recipe(LatentMotionTraining, "student", 384_000, "MotionPCM-M4")
     assert (student.batch_size, student.learning_rate, student.ema_decay, student.num_phases) == (128, 2e-4, 0.95, 4)
     assert (student.skip, student.adversarial_weight, student.huber_width) == (100, 0.1, 0.5)
     assert (student.least_guidance, student.most_guidance) == (5.0, 15.0)
-    assert latent_motion_recipe("teacher", 10).learning_rate == 1e-4
-    assert latent_motion_recipe("student", 10, "MotionPCM-M1-mu0").ema_decay == 0.0
-    lcm = latent_motion_recipe("student", 10, "MotionLCM-V2")
+    assert part_recipe(LatentMotionTraining, "teacher", 10).learning_rate == 1e-4
+    assert part_recipe(LatentMotionTraining, "student", 10, "MotionPCM-M1-mu0").ema_decay == 0.0
+    lcm = part_recipe(LatentMotionTraining, "student", 10, "MotionLCM-V2")
     assert (lcm.consistency, lcm.adversarial_weight) == ("latent", 0.0)
     with pytest.raises(ValueError, match="did you mean 'student'"):
-        latent_motion_recipe("studnt", 10)
+        part_recipe(LatentMotionTraining, "studnt", 10)
     for settings, message in (
         ({"consistency": "phase"}, "did you mean 'phased'"),
         ({"consistency": "latent"}, "no phases and no discriminator"),
@@ -134,7 +134,7 @@ def test_a_latent_is_drawn_from_its_gaussian_and_diverges_from_the_standard_one(
         def decode(self, latent, mask, key=None):
             return jnp.zeros((*mask.shape, 12 * joints - 1))
 
-    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
     clips = normal(0, 2, frames, 12 * joints - 1), jnp.ones((2, frames), bool)
     terms = reconstruction_terms(Coder(), statistics, *clips)
     # KL(N(1, 4) | N(0, 1)) of each number.
@@ -153,7 +153,7 @@ def test_an_autoencoder_rehearses_and_hears_of_joints():
         normal(3, 3 * frames, 23), jnp.arange(3) * frames, jnp.full(3, frames), jnp.arange(3), jnp.ones(3, jnp.int32)
     )
     config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=12 * joints - 1, num_positions=40)
-    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
     task = LatentAutoencoderTask(config, recipe(num_frames=16, learning_rate=1e-2, num_steps=60), clips, statistics)
     state, history = optimise(task, chunk=30, progress=False)
     assert history[1]["features"] < history[0]["features"] and history[1]["joints"] > 0
@@ -178,7 +178,7 @@ def test_with_spans_a_short_training_keeps_movement():
             position_start="waves",
         )  # fmt: skip
         settings = recipe(num_frames=frames, learning_rate=3e-3, num_steps=200, batch_size=16, joints_weight=0.0)
-        task = LatentAutoencoderTask(config, settings, table, FrameStatistics(jnp.zeros(width), jnp.ones(width)))
+        task = LatentAutoencoderTask(config, settings, table, AxisNormaliser(jnp.zeros(width), jnp.ones(width)))
         state, _ = optimise(task, chunk=200, progress=False)
         model, mask = network_with(config, state.params), jnp.ones((count, frames), bool)
         made = model.decode(model.encode(clips, mask)[0], mask)
@@ -189,7 +189,7 @@ def test_with_spans_a_short_training_keeps_movement():
 @pytest.mark.parametrize("weight", [0.0, 0.5])
 def test_joints_count_in_the_loss_as_much_as_is_said(weight):
     config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=23, num_positions=40)
-    statistics = FrameStatistics(jnp.zeros(23), jnp.full(23, 0.1))
+    statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
     task = LatentAutoencoderTask(config, recipe(joints_weight=weight), None, statistics)
     clips = normal(4, 2, 8, 23), jnp.ones((2, 8), bool)
     terms = task.held_out_terms(task.init(jax.random.key(0))[0], None, clips, None)
@@ -255,7 +255,7 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
         clips.append((f"clip {number}", motion, tuple(f"{number} {k}" for k in range(said)), split, "walk"))
     data = text_motions(clips, skeleton=motion.skeleton, name="three", fps=20.0, licence="", credit="")
     # Of the training clips alone, however the other one moves.
-    statistics = FrameStatistics.of(data)
+    statistics = frame_statistics(data)
     known = np.concatenate([data.select([number]).redundant_vectors() for number in (0, 2)])
     np.testing.assert_allclose(statistics.mean, grouped_statistics(known)[0], atol=1e-6)
     assert np.abs(statistics.mean - grouped_statistics(data.redundant_vectors())[0]).max() > 1e-3

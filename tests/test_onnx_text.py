@@ -29,7 +29,6 @@ from f3amd_lib.serving.onnx_text import (
 )
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
 from f3amd_lib.training.latent_models import LatentModel, save_latent_model
-from f3amd_lib.training.latent_motion import FrameStatistics
 from f3amd_lib.training.motion_codec import MotionCodec
 from f3amd_lib.training.text_models import TextModel, save_text_model
 
@@ -55,7 +54,13 @@ def acmdm(**changes) -> TextModel:
     axes = AxisNormaliser(np.arange(3, dtype=np.float32), np.full(3, 2.0, np.float32))
     params = weights_of(ACMDM(config, rngs=nnx.Rngs(0)))
     return TextModel(
-        "tiny-ACMDM", MotionCodec(axes), record=RECORD, config=config, params=params, schedule=straight(), **ABOUT
+        name="tiny-ACMDM",
+        codec=MotionCodec(axes),
+        record=RECORD,
+        config=config,
+        params=params,
+        schedule=straight(),
+        **ABOUT,
     )
 
 
@@ -65,7 +70,8 @@ def motionpcm(guidance_features: int) -> LatentModel:
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), weights_shapes(autoencoder))
     record = RECORD | {"identity": {"training": {"num_phases": 2, "skip": 50}}}
     return LatentModel(
-        "tiny-PCM", autoencoder, zeros, FrameStatistics(jnp.zeros(7), jnp.ones(7)), record=record, config=config,
+        name="tiny-PCM", autoencoder=autoencoder, autoencoder_params=zeros, record=record, config=config,
+        statistics=AxisNormaliser(jnp.zeros(7), jnp.ones(7)),
         params=weights_of(LatentDenoiser(config, rngs=nnx.Rngs(0))), schedule=variance_preserving_betas(), **ABOUT,
     )  # fmt: skip
 

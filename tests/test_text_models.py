@@ -19,7 +19,7 @@ from f3amd_lib.motion import body, synthetic
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
-from f3amd_lib.training import text_models
+from f3amd_lib.training import captioned_models, text_models
 from f3amd_lib.training.checkpoints import describe
 from f3amd_lib.training.text_models import (
     controlled_joints,
@@ -179,7 +179,7 @@ def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_pa
         average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
-    monkeypatch.setattr(text_models, "train_in_legs", loop)
+    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
     monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
     made = train_text_model(data, ENCODER, PROFILE, "tiny+control", folder=tmp_path, **QUIET)
     for weights in (made.params, made.branch, given["control branch"][0].base):
@@ -205,7 +205,7 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
         given.update(task=task, record=record)
         return types.SimpleNamespace(step=0), []
 
-    monkeypatch.setattr(text_models, "train_in_legs", loop)
+    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
     monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
     assert train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, window=32, **QUIET) is None
     cut, task = data.cut(32), given["task"]

@@ -20,6 +20,7 @@ from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.settings import part_recipe
 from f3amd_lib.training.text_motion import (
     AutoencoderTask,
     ControlTask,
@@ -32,7 +33,6 @@ from f3amd_lib.training.text_motion import (
     draw_control,
     frame_error,
     noisy_state,
-    text_motion_recipe,
 )
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
@@ -87,26 +87,26 @@ def recipe(**settings):
 
 
 def test_recipes_are_the_papers_and_the_presets():
-    paper = text_motion_recipe("denoiser", 1000)
+    paper = part_recipe(TextMotionTraining, "denoiser", 1000)
     assert (paper.batch_size, paper.learning_rate, paper.warmup_steps, paper.drops) == (64, 2e-4, 2000, (50_000,))
     assert (paper.weight_decay, paper.ema_decay, paper.text_dropout, paper.seed) == (1e-5, 0.9999, 0.1, 3407)
-    auto = text_motion_recipe("autoencoder", 1000)
+    auto = part_recipe(TextMotionTraining, "autoencoder", 1000)
     assert (auto.batch_size, auto.window, auto.weight_decay, auto.drop_factor) == (256, 64, 0.0, 0.05)
-    assert text_motion_recipe("control", 10).control_weight == 1.0
-    assert text_motion_recipe("short-denoiser", 10, "ACMDM-n4-PS22-prefix").prefix_frames == 5
-    assert text_motion_recipe("denoiser", 10, learning_rate=1.0).learning_rate == 1.0
+    assert part_recipe(TextMotionTraining, "control", 10).control_weight == 1.0
+    assert part_recipe(TextMotionTraining, "short-denoiser", 10, "ACMDM-n4-PS22-prefix").prefix_frames == 5
+    assert part_recipe(TextMotionTraining, "denoiser", 10, learning_rate=1.0).learning_rate == 1.0
     for part, settings, message in (
         ("denoser", {}, "did you mean 'denoiser'"), ("denoiser", {"bach_size": 2}, "'batch_size'"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
-            text_motion_recipe(part, 10, **settings)
+            part_recipe(TextMotionTraining, part, 10, **settings)
     for broken in ({"schedule": "step"}, {"batch_size": 0}, {"text_dropout": 2.0}, {"ema_decay": 1.0}):
         with pytest.raises(ValueError):
             recipe(**broken)
 
 
 def test_the_rate_warms_up_and_drops_as_told():
-    paper = dataclasses.replace(text_motion_recipe("denoiser", 100_000), drops=(50_000, 70_000))
+    paper = dataclasses.replace(part_recipe(TextMotionTraining, "denoiser", 100_000), drops=(50_000, 70_000))
     steps = (0, 999, 1999, 49_999, 50_000, 70_000)
     rates = [float(paper.rate(jnp.asarray(step))) for step in steps]
     np.testing.assert_allclose(rates, 2e-4 * np.array([1 / 2000, 0.5, 1, 1, 0.1, 0.01]), rtol=1e-5)

@@ -74,9 +74,8 @@ class GaussianMixture:
 
     def score(self, x, sigma):
         """Return the gradient of `log_density` by x, [..., D]; arguments as there."""
-        difference, share, variance = self._shares(x, sigma)
-        xp = array_module(x, sigma)
-        return xp.sum(share[..., None] * difference, axis=-2) / variance
+        pull, variance = self._pull(x, sigma)
+        return pull / variance
 
     def denoise(self, x, sigma):
         """Return the exact clean estimate E[x0 | x, sigma], which a square loss teaches a network.
@@ -88,17 +87,17 @@ class GaussianMixture:
         Returns:
           [..., D]. By Tweedie's formula it equals x + sigma^2 score(x, sigma).
         """
-        difference, share, variance = self._shares(x, sigma)
-        xp = array_module(x, sigma)
+        pull, variance = self._pull(x, sigma)
         # The posterior of one Gaussian lies between its mean and x, by the ratio of variances.
-        towards = (variance - self.width**2) / variance
-        return x + towards * xp.sum(share[..., None] * difference, axis=-2)
+        return x + (variance - self.width**2) / variance * pull
 
-    def _shares(self, x, sigma):
+    def _pull(self, x, sigma):
+        """Return the mean of the modes' differences m_k - x, each by how likely it is, [..., D], and the variance."""
         xp = array_module(x, sigma)
         difference, log_joint, variance = self._responsibilities(x, sigma)
         share = xp.exp(log_joint - xp.max(log_joint, axis=-1, keepdims=True))
-        return difference, share / xp.sum(share, axis=-1, keepdims=True), variance
+        share = share / xp.sum(share, axis=-1, keepdims=True)
+        return xp.sum(share[..., None] * difference, axis=-2), variance
 
     def sample(self, rng: np.random.Generator, num_samples: int) -> np.ndarray:
         """Draw clean samples, [num_samples, D], float64."""
@@ -141,7 +140,4 @@ class GaussianMixture:
     def _tails(self, x, sigma):
         """Return the probability below and above x, [..., 1] each."""
         z = (x - self.means[:, 0]) / np.hypot(self.width, sigma)
-        return (
-            np.sum(self.weights * ndtr(z), axis=-1, keepdims=True),
-            np.sum(self.weights * ndtr(-z), axis=-1, keepdims=True),
-        )
+        return [np.sum(self.weights * ndtr(side), axis=-1, keepdims=True) for side in (z, -z)]

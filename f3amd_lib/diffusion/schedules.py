@@ -197,12 +197,9 @@ def variance_preserving_cosine(num_levels: int = 8, offset: float = 0.008, max_b
         return np.cumprod(np.maximum(wanted[1:] / wanted[:-1], 1.0 - max_beta))
 
     return _variance_preserving(
-        "variance_preserving_cosine",
-        {"num_levels": num_levels, "offset": offset, "max_beta": max_beta},
-        alpha_bars,
-        ("a finite offset of at least 0", 0.0 <= offset < np.inf),
-        ("0 < max_beta < 1", 0.0 < max_beta < 1.0),
-    )
+        "variance_preserving_cosine", {"num_levels": num_levels, "offset": offset, "max_beta": max_beta}, alpha_bars,
+        ("a finite offset of at least 0", 0.0 <= offset < np.inf), ("0 < max_beta < 1", 0.0 < max_beta < 1.0),
+    )  # fmt: skip
 
 
 def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, beta_max: float = 20.0) -> NoiseSchedule:
@@ -225,11 +222,9 @@ def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, be
         return np.exp(-beta_min * s - 0.5 * (beta_max - beta_min) * s**2)
 
     return _variance_preserving(
-        "variance_preserving_linear",
-        {"num_levels": num_levels, "beta_min": beta_min, "beta_max": beta_max},
-        alpha_bars,
-        ("0 < beta_min <= beta_max, finite", 0.0 < beta_min <= beta_max < np.inf),
-    )
+        "variance_preserving_linear", {"num_levels": num_levels, "beta_min": beta_min, "beta_max": beta_max},
+        alpha_bars, ("0 < beta_min <= beta_max, finite", 0.0 < beta_min <= beta_max < np.inf),
+    )  # fmt: skip
 
 
 def variance_preserving_betas(
@@ -253,12 +248,10 @@ def variance_preserving_betas(
         return np.cumprod(1.0 - np.linspace(first ** (1.0 / power), last ** (1.0 / power), num_levels) ** power)
 
     return _variance_preserving(
-        "variance_preserving_betas",
-        {"num_levels": num_levels, "first": first, "last": last, "power": power},
-        alpha_bars,
-        ("0 < first <= last < 1", 0.0 < first <= last < 1.0),
+        "variance_preserving_betas", {"num_levels": num_levels, "first": first, "last": last, "power": power},
+        alpha_bars, ("0 < first <= last < 1", 0.0 < first <= last < 1.0),
         ("a positive finite power", 0.0 < power < np.inf),
-    )
+    )  # fmt: skip
 
 
 def _variance_preserving(
@@ -307,13 +300,9 @@ def _rank(t, num_levels: int):
 SCHEDULES: dict[str, Callable[..., NoiseSchedule]] = {
     make.__name__: make
     for make in (
-        variance_exploding,
-        straight,
-        variance_preserving_cosine,
-        variance_preserving_linear,
-        variance_preserving_betas,
+        variance_exploding, straight, variance_preserving_cosine, variance_preserving_linear, variance_preserving_betas,
     )
-}
+}  # fmt: skip
 """Constructors of noise schedules by the name that they have in a file."""
 
 
@@ -348,17 +337,14 @@ def alpha_bar_from_sigma(sigma):
 
 def sigma_from_alpha_bar(alpha_bar):
     """Return sigma = sqrt((1 - alpha_bar) / alpha_bar), any shape (Appendix F, inverted)."""
-    xp = array_module(alpha_bar)
-    return xp.sqrt((1.0 - alpha_bar) / alpha_bar)
+    return array_module(alpha_bar).sqrt((1.0 - alpha_bar) / alpha_bar)
 
 
 def log_snr_from_sigma(sigma):
     """Return the log signal-to-noise ratio, -2 log sigma, any shape."""
-    xp = array_module(sigma)
-    return -2.0 * xp.log(sigma)
+    return -2.0 * array_module(sigma).log(sigma)
 
 
 def sigma_from_log_snr(log_snr):
     """Return sigma = exp(-log_snr / 2), any shape."""
-    xp = array_module(log_snr)
-    return xp.exp(-0.5 * log_snr)
+    return array_module(log_snr).exp(-0.5 * log_snr)

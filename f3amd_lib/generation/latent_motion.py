@@ -102,7 +102,7 @@ def decode_latent(autoencoder: LatentAutoencoder, statistics, latent, mask):
 
     Args:
       autoencoder: whose latents they are.
-      statistics: `training.latent_motion.FrameStatistics` of its features.
+      statistics: `training.latent_motion.frame_statistics` of its features.
       latent: [B, window, channels].
       mask: frames to make, [B, L].
     """

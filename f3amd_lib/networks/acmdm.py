@@ -289,9 +289,8 @@ class Trunk(nnx.Module):
     def conditioned(self, time, context: TextContext):
         """Return (time, text) in network width: [B, 1, d] each, or [B, tokens, d] for a time of its own a frame."""
         time = self.time_second(jax.nn.silu(self.time_first(time_features(time))))
-        if time.ndim == 2:
-            return time[:, None], context.text[:, None]
-        return jnp.repeat(time, self.config.num_patches, axis=1), context.text[:, None]
+        time = time[:, None] if time.ndim == 2 else jnp.repeat(time, self.config.num_patches, axis=1)
+        return time, context.text[:, None]
 
     def seen(self, context: TextContext, num_tokens: int):
         """Return which keys each token of the last frames may see, broadcasting to [B, heads, T, keys]."""
@@ -303,6 +302,14 @@ class Trunk(nnx.Module):
         if config.block_frames:
             mask = mask & block_causal(num_tokens, mask.shape[-1], config.block_frames * config.num_patches)
         return mask
+
+    def through(self, x, time, context: TextContext):
+        """Yield what each block makes of tokens of all frames, [B, T, d]; time [B]."""
+        time, text = self.conditioned(time, context)
+        angles, mask = self.angles(0, x.shape[1]), self.seen(context, x.shape[1])
+        for block in self.blocks:
+            x, _ = block(x, time + text, angles, mask)
+            yield x
 
     def angles(self, first: int, num_tokens: int):
         """Return the rotary angles of tokens first ... first + num_tokens - 1; frames begin at 0."""

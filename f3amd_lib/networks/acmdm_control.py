@@ -82,15 +82,10 @@ class ControlBranch(Trunk):
           condition: text and mask; the branch has a text layer of its own.
           control: where joints should be.
         """
-        context = self.encode(condition)
         x = self.patch(self.tokens(state)) + self.control_tokens(control)
         time = jnp.broadcast_to(jnp.asarray(time, x.dtype), state.shape[:1])
-        time, text = self.conditioned(time, context)
-        angles, mask, added = self.angles(0, x.shape[1]), self.seen(context, x.shape[1]), []
-        for block, layer in zip(self.blocks, self.added, strict=True):
-            x, _ = block(x, time + text, angles, mask)
-            added.append(layer(x))
-        return added
+        made = self.through(x, time, self.encode(condition))
+        return [layer(x) for x, layer in zip(made, self.added, strict=True)]
 
 
 def control_branch(base: ACMDM, frames_per_state: int, key) -> ControlBranch:

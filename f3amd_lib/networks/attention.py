@@ -41,7 +41,7 @@ def dropout(x, rate: float, key):
     Args:
       x: any shape.
       rate: the share, 0 <= rate < 1.
-      key: random key.
+      key: random key, in training; without one nothing is dropped.
 
     Returns:
       Like x.
@@ -51,7 +51,7 @@ def dropout(x, rate: float, key):
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"dropout rate must be at least 0 and below 1, got {rate}")
-    if rate == 0.0:
+    if key is None or rate == 0.0:
         return x
     kept = jax.random.bernoulli(key, 1.0 - rate, x.shape)
     return jnp.where(kept, x / (1.0 - rate), 0.0)
@@ -196,16 +196,12 @@ class TransformerBlock(nnx.Module):
           memory: the sequence that a crossing block asks, [B, S, D].
         """
         keys = [None] * 4 if key is None else jax.random.split(key, 4)
-
-        def drop(x, place: int):
-            return x if key is None else dropout(x, self.dropout, keys[place])
-
         answer = self.attention(z, mask=mask, dropout_rate=self.dropout, dropout_key=keys[0])
-        z = self.attention_norm(z + drop(answer, 1))
+        z = self.attention_norm(z + dropout(answer, self.dropout, keys[1]))
         if memory is not None:
             inside, after = [None] * 2 if key is None else jax.random.split(jax.random.fold_in(key, 4))
             answer = self.crossing(z, memory, dropout_rate=self.dropout, dropout_key=inside)
-            z = self.crossing_norm(z + (answer if key is None else dropout(answer, self.dropout, after)))
+            z = self.crossing_norm(z + dropout(answer, self.dropout, after))
         # PyTorch's GELU is the exact one; JAX's default is an approximation by tanh.
-        hidden = drop(jax.nn.gelu(self.hidden(z), approximate=False), 2)
-        return self.output_norm(z + drop(self.output(hidden), 3))
+        hidden = dropout(jax.nn.gelu(self.hidden(z), approximate=False), self.dropout, keys[2])
+        return self.output_norm(z + dropout(self.output(hidden), self.dropout, keys[3]))

@@ -153,8 +153,7 @@ class CAMDM(DenoisingNetwork):
         noise = self._noise_token(sigma, x_noisy.dtype)[:, None, :] + code[:1]
         future = self.future(scaled_input(config, x_noisy, sigma)) + code[-config.window :]
         z = jnp.concatenate([noise, context, future], axis=1)
-        if key is not None:
-            z = dropout(z, config.dropout, jax.random.fold_in(key, config.depth))
+        z = dropout(z, config.dropout, None if key is None else jax.random.fold_in(key, config.depth))
         yield "tokens", z
         for number, block in enumerate(self.blocks):
             z = block(z, key=None if key is None else jax.random.fold_in(key, number))

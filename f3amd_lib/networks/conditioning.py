@@ -120,12 +120,9 @@ class ConditionEncoder(nnx.Module):
         self.history = nnx.Linear(config.channels, width, rngs=rngs)
         self.path = nnx.Linear(PATH_CHANNELS, width, rngs=rngs)
         self.style = nnx.Linear(config.num_styles, width, rngs=rngs)
-        self.noise_first = nnx.Linear(width, width, rngs=rngs)
-        self.noise_second = nnx.Linear(width, width, rngs=rngs)
-        self.query = nnx.Linear(width, width, rngs=rngs)
-        self.key = nnx.Linear(width, width, rngs=rngs)
-        self.value = nnx.Linear(width, width, rngs=rngs)
-        self.output = nnx.Linear(width, width, rngs=rngs)
+        self.noise_first, self.noise_second, self.query, self.key, self.value, self.output = (
+            nnx.Linear(width, width, rngs=rngs) for _ in range(6)
+        )
 
     def encode(self, condition: Condition) -> Context:
         """Turn a condition into keys and values; once a round."""

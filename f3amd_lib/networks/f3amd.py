@@ -104,7 +104,7 @@ class F3AMDConfig(ConditionedConfig):
         super().__post_init__()
         if self.history_input and self.conditioning == "concatenation":
             raise ValueError("concatenation lays c before the features: leave history_input off")
-        modes = self.count_block_modes()
+        modes = count_modes(self.spectral_variant, self.block_frames)
         if self.num_kept_modes == 0:
             object.__setattr__(self, "num_kept_modes", modes)
         if self.num_kept_modes > modes:
@@ -117,18 +117,12 @@ class F3AMDConfig(ConditionedConfig):
     @property
     def block_frames(self) -> int:
         """Frames that a backbone block sees: concatenation lays c before the features."""
-        if self.conditioning == "concatenation":
-            return 2 * self.window
-        return self.window + self.frames_before
+        return self.window + (self.window if self.conditioning == "concatenation" else self.frames_before)
 
     @property
     def frames_before(self) -> int:
         """Frames that encoder, blocks and decoder see before the window."""
         return self.num_history if self.history_input else 0
-
-    def count_block_modes(self) -> int:
-        """Return how many modes the backbone's transform has; as many can be kept."""
-        return count_modes(self.spectral_variant, self.block_frames)
 
 
 def _turned(vectors, matrix):

@@ -76,10 +76,7 @@ class MaskedACMDM(Trunk):
         hidden = jnp.repeat(hidden, self.config.num_patches, axis=1)[..., None]
         x = jnp.where(hidden, self.hidden_token[...], x)
         # What it looks at is clean: time 1.
-        time, text = self.conditioned(jnp.ones(len(state), x.dtype), context)
-        angles, mask = self.angles(0, x.shape[1]), self.seen(context, x.shape[1])
-        for block in self.blocks:
-            x, _ = block(x, time + text, angles, mask)
+        *_, x = self.through(x, jnp.ones(len(state), x.dtype), context)
         return x
 
     def __call__(self, state, time, context):

@@ -103,7 +103,7 @@ class ResidualBlock(nnx.Module):
 
     def __call__(self, x, mask=None, key=None):
         update = self.narrow(jax.nn.silu(self.wide(jax.nn.silu(x), mask)))
-        return x + (update if key is None else dropout(update, self.dropout, key))
+        return x + dropout(update, self.dropout, key)
 
 
 class _Half(nnx.Module):

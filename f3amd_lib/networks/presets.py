@@ -23,6 +23,7 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.ground.papers import check_entry, find_entry
+from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
 from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
@@ -31,22 +32,15 @@ from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
-from f3amd_lib.networks.motionpcm import (
-    Discriminator,
-    DiscriminatorConfig,
-    LatentAutoencoder,
-    LatentAutoencoderConfig,
-    LatentDenoiser,
-    LatentDenoiserConfig,
-)
 
 FAMILIES = {
     config.family: (config, network)
     for config, network in (
         (F3AMDConfig, F3AMD), (CAMDMConfig, CAMDM), (ACMDMConfig, ACMDM), (MaskedACMDMConfig, MaskedACMDM),
         (AutoencoderConfig, MotionAutoencoder), (MeshAutoencoderConfig, MeshAutoencoder),
-        (LatentAutoencoderConfig, LatentAutoencoder),
-        (LatentDenoiserConfig, LatentDenoiser), (DiscriminatorConfig, Discriminator),
+        (motionpcm.LatentAutoencoderConfig, motionpcm.LatentAutoencoder),
+        (motionpcm.LatentDenoiserConfig, motionpcm.LatentDenoiser),
+        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator),
     )
 }  # fmt: skip
 """Config and network of each family."""

@@ -102,9 +102,8 @@ class TextMotionNetwork(nnx.Module):
         """
         z = features
         for layer, convolution in enumerate(self.movement, 1):
-            z = nnx.leaky_relu(convolution(z), 0.2)
-            if key is not None:
-                z = dropout(z, self.dropout, jax.random.fold_in(key, layer))
+            key_layer = None if key is None else jax.random.fold_in(key, layer)
+            z = dropout(nnx.leaky_relu(convolution(z), 0.2), self.dropout, key_layer)
             left = -(-length // 2**layer)
             z = jnp.where((jnp.arange(z.shape[1]) < left[:, None])[..., None], z, 0.0)
         return self.motion(self.movement_output(z), length // 4)

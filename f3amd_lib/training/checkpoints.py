@@ -165,12 +165,8 @@ def describe_skeleton(skeleton: Skeleton) -> dict:
 
 def described_skeleton(metadata: dict, offsets) -> Skeleton:
     """Return the skeleton that `describe_skeleton` described, with its offsets [J, 3]."""
-    return Skeleton(
-        tuple(metadata["joints"]),
-        tuple(metadata["parents"]),
-        np.asarray(offsets, np.float64),
-        tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"]),
-    )
+    end_sites = tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"])
+    return Skeleton(tuple(metadata["joints"]), tuple(metadata["parents"]), np.asarray(offsets, np.float64), end_sites)
 
 
 @functools.lru_cache(maxsize=32)
@@ -254,15 +250,13 @@ def _in_eight_bits(leaf) -> dict | jax.Array:
     return {"eight_bits": eight_bits, "scale": scale.astype(jnp.float16)}
 
 
-def _from_eight_bits(leaf):
-    """Return the array that `_in_eight_bits` wrote."""
-    if not isinstance(leaf, dict):
-        return leaf
-    return leaf["eight_bits"].astype(jnp.float32) * leaf["scale"]
-
-
 def _is_packed(leaf) -> bool:
     return isinstance(leaf, dict) and "eight_bits" in leaf
+
+
+def _from_eight_bits(leaf):
+    """Return the array that `_in_eight_bits` wrote, or one that is whole."""
+    return leaf["eight_bits"].astype(jnp.float32) * leaf["scale"] if _is_packed(leaf) else leaf
 
 
 def packed_weights(params: Any, dtype) -> Any:
@@ -311,16 +305,12 @@ def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
         "offsets": jnp.asarray(trained.skeleton.offsets, jnp.float32),
     }
     metadata = {
-        "kind": "trained model",
-        "name": trained.name,
-        "model": trained.config.to_dict(),
-        "weights": jnp.dtype(dtype).name,
-        "styles": list(trained.styles),
-        "diffusion": trained.diffusion.to_dict(),
+        "kind": "trained model", "name": trained.name, "model": trained.config.to_dict(),
+        "weights": jnp.dtype(dtype).name, "styles": list(trained.styles), "diffusion": trained.diffusion.to_dict(),
         **describe_skeleton(trained.skeleton),
         "seed_shapes": {name: list(np.shape(poses)) for name, poses in trained.start_poses.items()},
         "record": trained.record,
-    }
+    }  # fmt: skip
     save_tree(path, tree, metadata)
 
 
@@ -333,16 +323,11 @@ def load_model(path: Path) -> TrainedModel:
     with errors_name(path):
         tree, metadata = load_tree(path, _model_template)
         return TrainedModel(
-            name=metadata["name"],
-            config=config_from_dict(metadata["model"]),
-            params=unpacked_weights(tree["params"]),
-            normaliser=Normaliser(**tree["normaliser"]),
-            skeleton=described_skeleton(metadata, tree["offsets"]),
-            styles=tuple(metadata["styles"]),
-            diffusion=schedule_from_dict(metadata["diffusion"]),
-            start_poses={name: np.asarray(poses) for name, poses in tree["seeds"].items()},
-            record=metadata["record"],
-        )
+            name=metadata["name"], config=config_from_dict(metadata["model"]), params=unpacked_weights(tree["params"]),
+            normaliser=Normaliser(**tree["normaliser"]), skeleton=described_skeleton(metadata, tree["offsets"]),
+            styles=tuple(metadata["styles"]), diffusion=schedule_from_dict(metadata["diffusion"]),
+            start_poses={name: np.asarray(poses) for name, poses in tree["seeds"].items()}, record=metadata["record"],
+        )  # fmt: skip
 
 
 def _model_template(metadata: dict) -> dict:
@@ -352,11 +337,8 @@ def _model_template(metadata: dict) -> dict:
     config = config_from_dict(metadata["model"])
     return {
         "params": packed_shapes(weights_shapes(config), metadata.get("weights")),
-        "normaliser": {
-            "mean": single((config.channels,), jnp.float32),
-            "deviation": single((config.channels,), jnp.float32),
-            "path_scale": single((), jnp.float32),
-        },
+        "normaliser": dict.fromkeys(("mean", "deviation"), single((config.channels,), jnp.float32))
+        | {"path_scale": single((), jnp.float32)},
         "seeds": {name: single(tuple(shape), jnp.float32) for name, shape in metadata["seed_shapes"].items()},
         "offsets": single((len(metadata["joints"]), 3), jnp.float32),
     }

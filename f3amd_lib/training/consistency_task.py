@@ -8,27 +8,23 @@ are apart, the teacher's own training loss says, with the answer in the data's p
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pandas as pd
 
-from f3amd_lib.data.windows import WindowSet, spread_windows
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.phases import consistency_answer
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import run_record
-from f3amd_lib.training.checkpoints import TrainedModel, load_model, network_with, save_model, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
 from f3amd_lib.training.losses import loss_terms, total_loss
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.pipeline import PreparedData, alone_with, as_trained, model_files, train_in_legs
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep
 from f3amd_lib.training.recipe import paper_recipe
 
 TEACHER_STEPS = 8
@@ -40,14 +36,9 @@ STUDENT_SPACING = "uniform"
 _HELD_OUT_WINDOWS = 128
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("denoising", "teacher"),
-    meta_fields=("num_teacher_steps", "num_phases"),
-)
-@dataclass(frozen=True, eq=False)
-class ConsistencyTask:
-    """A student of one step a phase, to distil from a frozen denoiser (a `training.optimise.Task`).
+@frozen_tree("denoising", "teacher")
+class ConsistencyTask(Task):
+    """A student of one step a phase, to distil from a frozen denoiser.
 
     Attributes:
       denoising: the teacher's own training: network, windows, disturbances, loss. Its moving average is the target.
@@ -61,7 +52,7 @@ class ConsistencyTask:
     Source: MotionPCM section 4.2 without a discriminator, in the variance-exploding state.
     """
 
-    name: ClassVar[str] = "student of few steps"
+    name = "student of few steps"
 
     denoising: DenoisingTask
     teacher: Any
@@ -84,11 +75,6 @@ class ConsistencyTask:
         """How it is trained; the loop reads steps, seed and moving average."""
         return self.denoising.config
 
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """As the config says."""
-        return self.denoising.optimiser
-
     def identity(self) -> dict:
         """Return all that decides the weights."""
         walk = {"num_teacher_steps": self.num_teacher_steps, "num_phases": self.num_phases}
@@ -103,17 +89,16 @@ class ConsistencyTask:
         (batch, _), key_loss = self.denoising.draw(state, key)
         return (batch, state.ema), key_loss
 
-    def loss(self, params, statistics, drawn, key):
-        """Return (loss, (terms, statistics)) of what `draw` drew."""
-        batch, target = drawn
-        terms = self._terms(params, target, batch, key, training=True)
-        return terms["loss"], (terms, statistics)
+    def terms(self, params, drawn, key, training=True) -> dict:
+        """Return the mean loss terms.
 
-    def held_out_terms(self, params, statistics, windows: WindowSet, key) -> dict:
-        """Return the mean loss terms on windows of another split, of weights against themselves."""
-        return self._terms(params, params, spread_windows(windows, _HELD_OUT_WINDOWS), key, training=False)
-
-    def _terms(self, params, target, batch, key, *, training: bool) -> dict:
+        Args:
+          params: weights.
+          drawn: what `draw` drew; out of training windows of another split, on which weights answer against themselves.
+          key: of levels, noise and disturbances.
+          training: whether this is a step of training.
+        """
+        batch, target = drawn if training else (spread_windows(drawn, _HELD_OUT_WINDOWS), params)
         task, config = self.denoising, self.denoising.config
         key_point, key_noise, key_history = jax.random.split(key, 3)
         x0, condition = network_inputs(batch, task.normaliser)
@@ -163,14 +148,5 @@ def distil(
     config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
     task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params, num_phases=num_phases)
     files = model_files(profile, teacher.name, folder=Path(folder))
-    record = run_record(
-        profile=profile, dataset=prepared.packed, seed=config.seed, model=teacher.name, training=config.to_dict(),
-        held_out_split=prepared.held_out_split, num_train_windows=int(task.denoising.windows.num_windows),
-        distilled_from=weights_digest(teacher.params), num_phases=num_phases,
-    )  # fmt: skip
-    with alone_with(files):
-        state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)
-    if int(state.step) < num_steps:
-        return None, history
-    save_model(files.model, as_trained(prepared, task.denoising, teacher.name, state.params, record))
-    return load_model(files.model), history
+    about = {"distilled_from": weights_digest(teacher.params), "num_phases": num_phases}
+    return train_and_keep(prepared, profile, teacher.name, task, files, about, **leg)

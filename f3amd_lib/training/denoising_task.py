@@ -10,13 +10,10 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from flax import nnx
 
 from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
 from f3amd_lib.data.windows import (
@@ -32,11 +29,10 @@ from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.losses import loss_terms, total_loss
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.recipe import TrainingConfig, make_optimiser
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.recipe import TrainingConfig
 
 LOG_NORMAL_SIGMA = (-1.2 + math.log(2.0), 1.2)
 """Mean and deviation of ln sigma: Karras et al. 2022, Table 1, for features of deviation 1 where
@@ -108,14 +104,9 @@ class Constants:
         return hash(self._bytes)
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("windows",),
-    meta_fields=("model_config", "config", "skeleton", "constants", "dataset_fingerprint"),
-)
-@dataclass(frozen=True, eq=False)
-class DenoisingTask:
-    """A denoiser to train on one window set (a `training.optimise.Task`); see `denoising_task`.
+@frozen_tree("windows")
+class DenoisingTask(Task):
+    """A denoiser to train on one window set; see `denoising_task`.
 
     Attributes:
       model_config: the network.
@@ -126,7 +117,7 @@ class DenoisingTask:
       dataset_fingerprint: of the data they come from; a state of other data is not resumed.
     """
 
-    name: ClassVar[str] = "denoiser"
+    name = "denoiser"
 
     model_config: NetworkConfig
     config: TrainingConfig
@@ -140,18 +131,9 @@ class DenoisingTask:
         """Of the training windows; the identity where the network wants none."""
         return self.constants.normaliser
 
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """Adam, as the config says."""
-        return make_optimiser(self.config)
-
     def identity(self) -> dict:
         """See `weights_identity`."""
         return weights_identity(self.model_config, self.config, self.dataset_fingerprint)
-
-    def init(self, key):
-        """Return initial weights; no network here keeps statistics."""
-        return nnx.state(build_from_config(self.model_config, key)), None
 
     def draw(self, state: TrainingState, key):
         """Draw windows and noise levels; return ((batch, sigma [B]), key of the loss).
@@ -208,21 +190,21 @@ class DenoisingTask:
         pose = history[..., 9:] + amount * (mean - history[..., 9:])
         return orthonormalise(jnp.concatenate([history[..., :9], pose], axis=-1))
 
-    def loss(self, params, statistics, drawn, key):
-        """Return (loss, (terms, statistics)) of what `draw` drew."""
-        batch, sigma = drawn
-        terms = self._terms(params, batch, sigma, key, training=True)
-        return terms["loss"], (terms, statistics)
+    def terms(self, params, drawn, key, training=True) -> dict:
+        """Add noise, ask for the clean window and compare; "loss" is the weighted sum (Eq. 14).
 
-    def held_out_terms(self, params, statistics, windows: WindowSet, key) -> dict:
-        """Return the mean loss terms on windows of another split, without any disturbance."""
-        batch = spread_windows(windows, _HELD_OUT_WINDOWS)
-        key_sigma, key_loss = jax.random.split(key)
-        sigma = self.config.diffusion.draw(key_sigma, (batch.future.shape[0],))
-        return self._terms(params, batch, sigma, key_loss, training=False)
-
-    def _terms(self, params, batch: Batch, sigma, key, *, training: bool) -> dict:
-        """Add noise, ask for the clean window and compare; "loss" is the weighted sum (Eq. 14)."""
+        Args:
+          params: weights.
+          drawn: what `draw` drew; out of training the windows of another split, which nothing disturbs.
+          key: of noise, disturbances and dropout.
+          training: whether this is a step of training.
+        """
+        if training:
+            batch, sigma = drawn
+        else:
+            batch = spread_windows(drawn, _HELD_OUT_WINDOWS)
+            key_sigma, key = jax.random.split(key)
+            sigma = self.config.diffusion.draw(key_sigma, (batch.future.shape[0],))
         key_noise, key_history, key_dropout = jax.random.split(key, 3)
         x0, condition = network_inputs(batch, self.normaliser)
         if training:

@@ -17,7 +17,7 @@ from f3amd_lib.data.text_encoders import TextEmbeddings
 from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, ClipTable, MotionBatch, draw_clips
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
-from f3amd_lib.training.optimise import TrainingState
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,12 @@ class EvaluatorTraining:
     def __post_init__(self):
         if self.num_steps < 1 or self.batch_size < 2:
             raise ValueError(f"a judge needs at least 1 step and batches of 2, got {self}")
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """Return Adam with a warm-up, gradients clipped."""
+        warm, steps = min(100, self.num_steps // 5 + 1), self.num_steps + 1
+        rate = optax.warmup_cosine_decay_schedule(0.0, self.learning_rate, warm, steps)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
 
 
 class Captions(NamedTuple):
@@ -100,14 +106,9 @@ def evaluator_network(config: TextMotionConfig, params) -> TextMotionNetwork:
     return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, params), rest)
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("clips", "captions"),
-    meta_fields=("dataset_fingerprint", "text_encoder", "network", "config"),
-)
-@dataclass(frozen=True, eq=False)
-class EvaluatorTask:
-    """A judge to train (a `training.optimise.Task`).
+@frozen_tree("clips", "captions")
+class EvaluatorTask(Task):
+    """A judge to train.
 
     Attributes:
       dataset_fingerprint, text_encoder, network, config: what decides the weights.
@@ -115,7 +116,7 @@ class EvaluatorTask:
       captions: of these clips.
     """
 
-    name: ClassVar[str] = "text-to-motion judge"
+    name = "text-to-motion judge"
 
     dataset_fingerprint: str
     text_encoder: str
@@ -123,13 +124,6 @@ class EvaluatorTask:
     config: EvaluatorTraining
     clips: ClipTable
     captions: Captions
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """Adam with a warm-up, gradients clipped."""
-        steps = self.config.num_steps
-        rate = optax.warmup_cosine_decay_schedule(0.0, self.config.learning_rate, min(100, steps // 5 + 1), steps + 1)
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
 
     def identity(self) -> dict:
         """Return all that decides the weights."""
@@ -146,17 +140,13 @@ class EvaluatorTask:
         motion = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
         return EvaluatorBatch(motion, jax.tree.map(lambda rows: rows[motion.caption], self.captions)), key_dropout
 
-    def loss(self, params, statistics, batch: EvaluatorBatch, key):
-        """Return (loss, (loss and in-batch accuracy, None))."""
+    def terms(self, params, batch: EvaluatorBatch, key, training=True) -> dict:
+        """Return loss and in-batch accuracy; out of training without dropout."""
         network = evaluator_network(self.network, params)
         text = network.embed_text(batch.captions.tokens, batch.captions.mask)
-        motion = network.embed_motion(batch.motion.motion, batch.motion.length, key)
+        motion = network.embed_motion(batch.motion.motion, batch.motion.length, key if training else None)
         loss, accuracy = contrastive_loss(text, motion, batch.captions.pair)
-        return loss, ({"loss": loss, "accuracy": accuracy}, None)
-
-    def held_out_terms(self, params, statistics, held_out: EvaluatorBatch, key) -> dict:
-        """Return the terms on a batch of another split, without dropout."""
-        return self.loss(params, statistics, held_out, None)[1][0]
+        return {"loss": loss, "accuracy": accuracy}
 
 
 def embedded_captions(embedded: TextEmbeddings, pairs) -> Captions:

@@ -16,62 +16,36 @@ import jax
 import jax.numpy as jnp
 
 from f3amd_lib.data.text_encoders import TextEncoder, words_of
-from f3amd_lib.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips
-from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, clip_table, draw_clips
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import run_record
-from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
 from f3amd_lib.networks.presets import Preset
-from f3amd_lib.training.captioned_models import load_captioned_model, save_captioned_model
+from f3amd_lib.training import latent_motion
+from f3amd_lib.training.captioned_models import CaptionedModel, load_captioned_model, save_captioned_model, train_part
 from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
-from f3amd_lib.training.latent_motion import (
-    DistillationTask,
-    FrameStatistics,
-    LatentAutoencoderTask,
-    LatentMotionTraining,
-    LatentTable,
-    TeacherTask,
-    latent_motion_recipe,
-    latent_table,
-)
-from f3amd_lib.training.pipeline import alone_with, train_in_legs
+from f3amd_lib.training.settings import profile_part_recipe
 from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files, text_model_folders
 
 KIND = "latent motion model"
 """What a file of this module says that it holds."""
 
 
-@dataclass(frozen=True, eq=False)
-class LatentModel:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LatentModel(CaptionedModel):
     """A trained model of MotionPCM: an autoencoder, with a teacher or a student or alone.
 
+    Its weights are a teacher's moving average, or a student's own. For the text encoder zeros stand for no caption. The
+    identity of its task, in the record, says M and k of a student.
+
     Attributes:
-      name: preset.
       autoencoder, autoencoder_params: config and weights.
       statistics: of its features.
-      skeleton, fps: of the motion it was trained on.
-      record: how it was trained, on what, under what terms; the identity of its task says M and k of a student.
-      config, params: of teacher (the moving average) or student; None for an autoencoder alone.
-      schedule: the noise schedule it was trained with.
-      text_encoder: identity of the encoder whose pooled vectors it reads; zeros stand for no caption.
-      words: of all captions that it was trained with.
     """
 
-    name: str
     autoencoder: LatentAutoencoderConfig
     autoencoder_params: Any
-    statistics: FrameStatistics
-    skeleton: Skeleton
-    fps: float
-    record: dict
-    config: LatentDenoiserConfig | None = None
-    params: Any = None
-    schedule: NoiseSchedule | None = None
-    text_encoder: str = ""
-    words: tuple[str, ...] = ()
+    statistics: AxisNormaliser
 
     @property
     def training(self) -> dict:
@@ -107,7 +81,7 @@ def load_latent_model(path: Path) -> LatentModel:
     """
     with errors_name(path):
         common, autoencoder, tree, _ = load_captioned_model(path, KIND, _shapes)
-        statistics = FrameStatistics(tree["mean"], tree["deviation"])
+        statistics = AxisNormaliser(tree["mean"], tree["deviation"])
         return LatentModel(
             autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **common
         )
@@ -188,12 +162,12 @@ def find_latent_model(dataset: str, name: str, num_steps: int | None = None) -> 
     )
 
 
-def captioned_latents(before: LatentModel, data: TextMotions, encoder: TextEncoder, num_frames: int) -> LatentTable:
-    """Return the latents of clips with their captions' embeddings; the zero vector stands for no caption."""
+def captioned_latents(before: LatentModel, data: TextMotions, encoder: TextEncoder, num_frames: int):
+    """Return a `LatentTable` of clips with their captions' embeddings; the zero vector stands for no caption."""
     captions = [caption for several in data.captions for caption in several]
     pooled = pooled_captions(captions, encoder)
     model = network_with(before.autoencoder, before.autoencoder_params)
-    return latent_table(model, before.statistics, data, pooled, jnp.zeros_like(pooled[0]), num_frames)
+    return latent_motion.latent_table(model, before.statistics, data, pooled, jnp.zeros_like(pooled[0]), num_frames)
 
 
 def _clips(part: TextMotions, encoder: TextEncoder, before: LatentModel | None, statistics, config):
@@ -203,28 +177,28 @@ def _clips(part: TextMotions, encoder: TextEncoder, before: LatentModel | None, 
     return captioned_latents(before, part, encoder, config.num_frames)
 
 
-def held_out_clips(clips: ClipTable | LatentTable, config: LatentMotionTraining):
+def held_out_clips(clips: ClipTable | latent_motion.LatentTable, config: latent_motion.LatentMotionTraining):
     """Return a batch of other clips for the losses on them: (features, mask), or (latents, captions)."""
-    if isinstance(clips, LatentTable):
+    if isinstance(clips, latent_motion.LatentTable):
         return clips.draw(jax.random.key(0), config.batch_size)
     batch = draw_clips(jax.random.key(0), clips, config.batch_size, config.num_frames)
     return batch.motion, batch.mask
 
 
-def _task(preset: Preset, config: LatentMotionTraining, data: TextMotions, encoder, before: LatentModel | None):
+def _task(preset: Preset, config, data: TextMotions, encoder: TextEncoder, before: LatentModel | None):
     """Return the training of a preset's stage, still without clips; `before` is what it stands on, or None."""
     stage = stage_of(preset)
     if stage == "autoencoder":
         model = presets.build_config(preset.name, features=12 * data.skeleton.num_joints - 1)
-        return LatentAutoencoderTask(model, config, None, None, data.fingerprint)
+        return latent_motion.LatentAutoencoderTask(model, config, None, None, data.fingerprint)
     fingerprint = f"{data.fingerprint} on "
     if stage == "teacher":
         width = pooled_captions(["a person walks"], encoder).shape[-1]
         model = presets.build_config(preset.name, text_width=width)
         fingerprint += weights_digest(before.autoencoder_params)
-        return TeacherTask(model, config, preset.diffusion, None, fingerprint)
+        return latent_motion.TeacherTask(model, config, preset.diffusion, None, fingerprint)
     fingerprint += weights_digest(before.params)
-    return DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
+    return latent_motion.DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
 
 
 def _named_teacher(path, preset: Preset, data: TextMotions) -> LatentModel:
@@ -274,37 +248,30 @@ def train_latent_model(
         before = train_latent_model(data, encoder, profile, earlier, batch_size=batch_size, folder=folder, **leg)
         if before is None:
             return None
-    settings = {"seed": profile.seed} | ({} if batch_size is None else {"batch_size": batch_size})
-    recipe = stage if profile.name == "gpu" else f"short-{stage}"
-    share = load_paper_file("recipes", "motionpcm")[recipe].get("share", 1.0)
-    config = latent_motion_recipe(recipe, max(1, round(share * profile.train_steps)), preset.name, **settings)
+    config = profile_part_recipe(latent_motion.LatentMotionTraining, stage, profile, preset.name, batch_size)
     # A finished model is only read, and its clips need not be encoded for that.
     task = _task(preset, config, data, encoder, before)
     if files.model.exists():
         return of_this_training(load_latent_model(files.model), task, files)
-    statistics = FrameStatistics.of(data) if before is None else before.statistics
+    statistics = latent_motion.frame_statistics(data) if before is None else before.statistics
     clips, watched = (_clips(data.select(data.members(split)), encoder, before, statistics, config)
                       for split in ("train", "validation"))  # fmt: skip
     task = dataclasses.replace(task, clips=clips, **({"statistics": statistics} if before is None else {}))
-    record = run_record(
-        profile=profile, dataset=data, seed=config.seed, model=preset.name, identity=task.identity(),
-        num_train_clips=len(data.members("train")),
-    )  # fmt: skip
-    with alone_with(files):
-        state, _ = train_in_legs(task, files, record, held_out=held_out_clips(watched, config), **leg)
-    if int(state.step) < config.num_steps:
+    state, about = train_part(task, files, data, profile, preset.name, held_out_clips(watched, config), **leg)
+    if state is None:
         return None
-    about = {"skeleton": data.skeleton, "fps": data.fps, "record": record, "statistics": statistics}
     if stage == "autoencoder":
-        made = LatentModel(preset.name, task.model_config, state.averaged, **about)
+        made = LatentModel(
+            autoencoder=task.model_config, autoencoder_params=state.averaged, statistics=statistics, **about
+        )
     else:
         # A student's moving average is its target; what is used is the student.
         student = stage == "student"
         said = [caption for clip in data.members("train") for caption in data.captions[clip]]
-        made = LatentModel(
-            preset.name, before.autoencoder, before.autoencoder_params, **about, schedule=task.schedule,
-            config=task.student_config if student else task.model_config, text_encoder=encoder.identity,
-            params=state.params["student"] if student else state.averaged, words=words_of(said),
+        made = dataclasses.replace(
+            before, **about, schedule=task.schedule, text_encoder=encoder.identity, words=words_of(said),
+            config=task.student_config if student else task.model_config,
+            params=state.params["student"] if student else state.averaged,
         )  # fmt: skip
     save_latent_model(files.model, made)
     return load_latent_model(files.model)

@@ -14,36 +14,15 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from f3amd_lib.data.text_motions import ClipTable, TextMotions, draw_clips, pad_motions
-from f3amd_lib.diffusion.phases import (
-    Phases,
-    beside,
-    cut_phases,
-    guided_noise,
-    hinge,
-    jump,
-    latent_consistency_end,
-    noise_travel,
-    pseudo_huber,
-    shares,
-    target_end,
-)
+from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, draw_clips, pad_motions
+from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
-from f3amd_lib.networks.motionpcm import (
-    DiscriminatorConfig,
-    LatentAutoencoderConfig,
-    LatentDenoiserConfig,
-    student_config,
-    student_of,
-)
+from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import TrainingState
-from f3amd_lib.training.text_motion import part_identity, part_recipe, task_tree
-
-CONSISTENCIES = ("phased", "latent")
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -76,6 +55,8 @@ class LatentMotionTraining:
       ValueError: for a number out of its range or an unknown consistency.
     """
 
+    paper: ClassVar[str] = "motionpcm"
+
     num_steps: int
     batch_size: int = 64
     learning_rate: float = 2e-4
@@ -98,70 +79,30 @@ class LatentMotionTraining:
     seed: int = 1234
 
     def __post_init__(self):
-        check_known(self.consistency, CONSISTENCIES, "consistency")
+        check_settings(self)
         if self.consistency == "latent" and (self.num_phases > 1 or self.adversarial_weight):
             raise ValueError(
                 "consistency 'latent' has no phases and no discriminator: num_phases 1, adversarial_weight 0"
             )
-        whole = ("num_steps", "batch_size", "skip", "num_phases", "num_frames")
-        free = ("warmup_steps", "kl_weight", "joints_weight", "adversarial_weight")
-        positive = ("learning_rate", "gradient_clip", "huber_width", "discriminator_rate")
-        for names, low in ((whole, 1), (positive, 1e-12), (free, 0)):
-            for name in names:
-                if not low <= getattr(self, name) < float("inf"):
-                    raise ValueError(f"{name} must be at least {low:g} and finite, got {getattr(self, name)!r}")
-        if not 0 <= self.text_dropout <= 1 or not self.least_guidance <= self.most_guidance:
-            raise ValueError("text_dropout must be in [0, 1], and least_guidance no more than most_guidance")
+        if not self.least_guidance <= self.most_guidance:
+            raise ValueError("least_guidance must be no more than most_guidance")
 
-    def adamw(self, learning_rate: float, first_moment: float = 0.9) -> optax.GradientTransformation:
-        """Return AdamW without decay after clipping, with a warm-up and a cosine."""
+    def optimiser(self, learning_rate: float | None = None, first_moment=0.9) -> optax.GradientTransformation:
+        """Return AdamW without decay after clipping, with a warm-up and a cosine, at `learning_rate` or another."""
+        learning_rate = learning_rate or self.learning_rate
         warm = min(self.warmup_steps, self.num_steps - 1)
         rate = optax.warmup_cosine_decay_schedule(learning_rate / (warm + 1), learning_rate, warm, self.num_steps)
         adam = optax.adamw(rate, b1=first_moment, b2=0.999, weight_decay=0.0)
         return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam)
 
 
-def latent_motion_recipe(part: str, num_steps: int, preset: str | None = None, **settings) -> LatentMotionTraining:
-    """Return how a part is trained.
-
-    Args:
-      part: a name of `papers/motionpcm/recipes.toml`, "student" or "short-student" for instance.
-      num_steps: optimiser steps.
-      preset: adds what its own training says (`presets.find_preset`).
-      **settings: fields of `LatentMotionTraining` to change.
-
-    Raises:
-      ValueError: for an unknown part, preset or field, with the nearest name.
-    """
-    return part_recipe("motionpcm", LatentMotionTraining, part, num_steps, preset, settings)
-
-
-def _identity(task, **models) -> dict:
-    return part_identity(task.name, models, task.config, task.dataset_fingerprint)
-
-
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
-class FrameStatistics(NamedTuple):
-    """Mean and deviation of each number of a frame, [features]."""
-
-    mean: jax.Array
-    deviation: jax.Array
-
-    @classmethod
-    def of(cls, data: TextMotions) -> FrameStatistics:
-        """Return those of the training clips' redundant vectors, as HumanML3D has them."""
-        mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
-        return cls(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
-
-    def normalise(self, vectors):
-        """Map redundant vectors to network units, [..., features]."""
-        return (vectors - self.mean) / self.deviation
-
-    def restore(self, features):
-        """Map network units to redundant vectors, [..., features]."""
-        return features * self.deviation + self.mean
+def frame_statistics(data: TextMotions) -> AxisNormaliser:
+    """Return mean and deviation of the training clips' redundant vectors, as HumanML3D has them, [features]."""
+    mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
+    return AxisNormaliser(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
 
 
 def clip_error(numbers_hat, numbers, mask):
@@ -175,7 +116,7 @@ def clip_error(numbers_hat, numbers, mask):
     return jnp.mean(jnp.sum(loss * mask, axis=1) / jnp.sum(mask, axis=1))
 
 
-def reconstruction_terms(model, statistics: FrameStatistics, features, mask, keys=(None, None, None)) -> dict:
+def reconstruction_terms(model, statistics: AxisNormaliser, features, mask, keys=(None, None, None)) -> dict:
     """Return {"features", "joints", "divergence"} of an autoencoder; without keys, of the mean and without dropout.
 
     Args:
@@ -201,10 +142,9 @@ def draw_latent(key, mean, log_variance):
     return mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
 
 
-@task_tree(("clips", "statistics"), ("model_config",))
-@dataclass(frozen=True, eq=False)
-class LatentAutoencoderTask:
-    """An autoencoder to train on whole clips (MotionPCM section 4.1; a `training.optimise.Task`).
+@frozen_tree("clips", "statistics")
+class LatentAutoencoderTask(Task):
+    """An autoencoder to train on whole clips (MotionPCM section 4.1).
 
     Attributes:
       model_config: the autoencoder.
@@ -214,26 +154,13 @@ class LatentAutoencoderTask:
       dataset_fingerprint: of the data they come from.
     """
 
-    name: ClassVar[str] = "latent autoencoder"
+    name, part = "latent autoencoder", "autoencoder"
 
-    model_config: LatentAutoencoderConfig
+    model_config: motionpcm.LatentAutoencoderConfig
     config: LatentMotionTraining
     clips: ClipTable
-    statistics: FrameStatistics
+    statistics: AxisNormaliser
     dataset_fingerprint: str = ""
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """AdamW, as the config says."""
-        return self.config.adamw(self.config.learning_rate)
-
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        return _identity(self, autoencoder=self.model_config)
-
-    def init(self, key):
-        """Return initial weights."""
-        return nnx.state(build_from_config(self.model_config, key)), None
 
     def draw(self, state: TrainingState, key):
         """Draw (features, mask) and the key of the loss."""
@@ -241,16 +168,9 @@ class LatentAutoencoderTask:
         batch = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
         return (batch.motion, batch.mask), key_loss
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)): smooth L1 of features and of joints, and the divergence."""
-        terms = self._terms(params, batch, jax.random.split(key, 3))
-        return terms["loss"], (terms, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the terms on other clips, (features, mask), of the latent's mean."""
-        return self._terms(params, held_out, (None, None, None))
-
-    def _terms(self, params, batch, keys) -> dict:
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return smooth L1 of features and of joints, and the divergence; out of training of the latent's mean."""
+        keys = jax.random.split(key, 3) if training else (None, None, None)
         terms = reconstruction_terms(network_with(self.model_config, params), self.statistics, *batch, keys)
         config = self.config
         loss = terms["features"] + config.joints_weight * terms["joints"] + config.kl_weight * terms["divergence"]
@@ -287,7 +207,7 @@ class LatentTable(NamedTuple):
 
 
 def latent_table(
-    model, statistics: FrameStatistics, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
+    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
 ) -> LatentTable:
     """Return the latents of a data set's clips.
 
@@ -314,10 +234,9 @@ def latent_table(
     return LatentTable(mean, log_variance, first, count, jnp.asarray(pooled), jnp.asarray(empty))
 
 
-@task_tree(("clips",), ("model_config", "schedule"))
-@dataclass(frozen=True, eq=False)
-class TeacherTask:
-    """A teacher to train: the noise of latents under a caption, or none (a `training.optimise.Task`).
+@frozen_tree("clips")
+class TeacherTask(Task):
+    """A teacher to train: the noise of latents under a caption, or none.
 
     Attributes:
       model_config: the denoiser.
@@ -327,26 +246,13 @@ class TeacherTask:
       dataset_fingerprint: of the data, and of the autoencoder.
     """
 
-    name: ClassVar[str] = "latent teacher"
+    name, part = "latent teacher", "teacher"
 
-    model_config: LatentDenoiserConfig
+    model_config: motionpcm.LatentDenoiserConfig
     config: LatentMotionTraining
     schedule: NoiseSchedule
     clips: LatentTable
     dataset_fingerprint: str = ""
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """AdamW, as the config says."""
-        return self.config.adamw(self.config.learning_rate)
-
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        return _identity(self, teacher=self.model_config, diffusion=self.schedule)
-
-    def init(self, key):
-        """Return initial weights."""
-        return nnx.state(build_from_config(self.model_config, key)), None
 
     def draw(self, state: TrainingState, key):
         """Draw (latents, captions) and the key of the loss; a share of the captions is the empty one."""
@@ -355,24 +261,16 @@ class TeacherTask:
         told = jax.random.bernoulli(key_told, 1.0 - self.config.text_dropout, (len(text), 1))
         return (latent, jnp.where(told, text, self.clips.empty)), key_loss
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)): the squared error of the noise."""
-        key_time, key_noise, key_dropout = jax.random.split(key, 3)
-        loss = self._error(params, batch, key_time, key_noise, key_dropout)
-        return loss, ({"loss": loss}, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the loss on (latents, captions) of other clips, without dropout."""
-        return {"loss": self._error(params, held_out, *jax.random.split(key), None)}
-
-    def _error(self, params, batch, key_time, key_noise, key_dropout):
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the squared error of the noise; out of training without dropout."""
+        key_time, key_noise, key_dropout = jax.random.split(key, 3) if training else (*jax.random.split(key), None)
         latent, text = batch
         network = network_with(self.model_config, params)
         time = jax.random.randint(key_time, (len(latent),), 0, len(self.schedule.levels))
         noise = jax.random.normal(key_noise, latent.shape)
-        alpha, sigma = (beside(share, latent) for share in shares(self.schedule, time))
+        alpha, sigma = (phases.beside(share, latent) for share in phases.shares(self.schedule, time))
         eps = network(alpha * latent + sigma * noise, time, network.encode(text), key=key_dropout)
-        return jnp.mean((eps - noise) ** 2)
+        return {"loss": jnp.mean((eps - noise) ** 2)}
 
 
 # -------------------------------------------------------------------------------------------------------- distillation
@@ -403,26 +301,25 @@ class DistillationBatch(NamedTuple):
     real: jax.Array
 
 
-@task_tree(("teacher", "clips"), ("teacher_config", "schedule"))
-@dataclass(frozen=True, eq=False)
-class DistillationTask:
-    """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1; a `training.optimise.Task`).
+@frozen_tree("teacher", "clips")
+class DistillationTask(Task):
+    """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1).
 
     Weights have the branches "student" and, with a discriminator, "discriminator". The loop's moving average of the
     student is the target network. Both losses are taken at the weights before a step, as in Algorithm 1, whose line 15
     looks at what the student of line 10 said; one step for both is therefore that algorithm's three updates.
 
     Attributes:
-      teacher_config, teacher: config and frozen weights.
+      model_config, teacher: config and frozen weights of the teacher.
       config: how to distil.
       schedule: the teacher's noise schedule.
       clips: latents and captions.
       dataset_fingerprint: of the data, the autoencoder and the teacher.
     """
 
-    name: ClassVar[str] = "student"
+    name, part = "student", "teacher"
 
-    teacher_config: LatentDenoiserConfig
+    model_config: motionpcm.LatentDenoiserConfig
     teacher: Any
     config: LatentMotionTraining
     schedule: NoiseSchedule
@@ -434,45 +331,39 @@ class DistillationTask:
             raise ValueError("a student's target is its moving average: set ema_decay, 0 for the student itself")
 
     @property
-    def student_config(self) -> LatentDenoiserConfig:
+    def student_config(self) -> motionpcm.LatentDenoiserConfig:
         """The student's network: the teacher's, told the guidance."""
-        return student_config(self.teacher_config)
+        return motionpcm.student_config(self.model_config)
 
     @property
-    def critic_config(self) -> DiscriminatorConfig:
+    def critic_config(self) -> motionpcm.DiscriminatorConfig:
         """The discriminator's heads."""
-        return DiscriminatorConfig(latent_width=self.teacher_config.latent_width, depth=self.teacher_config.depth)
+        return motionpcm.DiscriminatorConfig(latent_width=self.model_config.latent_width, depth=self.model_config.depth)
 
     @property
-    def phases(self) -> Phases:
+    def phases(self) -> phases.Phases:
         """Solver points and phases."""
-        return cut_phases(len(self.schedule.levels), self.config.skip, self.config.num_phases)
+        return phases.cut_phases(len(self.schedule.levels), self.config.skip, self.config.num_phases)
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
         """AdamW for the student and another one for the heads, in every step or by turns: even steps are the heads'."""
         config = self.config
-        parts = {"student": config.adamw(config.learning_rate)}
+        parts = {"student": config.optimiser()}
         if config.adversarial_weight:
-            parts["discriminator"] = config.adamw(config.discriminator_rate, first_moment=0.0)
+            parts["discriminator"] = config.optimiser(config.discriminator_rate, first_moment=0.0)
         if config.alternate:
-            turn = {"student": 1, "discriminator": 0}
             parts = {
-                name: optax.conditionally_mask(part, functools.partial(_is_turn, turn[name]))
-                for name, part in parts.items()
+                name: optax.conditionally_mask(part, functools.partial(_is_turn, name)) for name, part in parts.items()
             }
         branch = lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params)
         return optax.partition(parts, branch)
 
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        return _identity(self, teacher=self.teacher_config, diffusion=self.schedule)
-
     def init(self, key):
         """Return the teacher's weights as the student's, and fresh heads."""
         key_student, key_critic = jax.random.split(key)
-        teacher = network_with(self.teacher_config, self.teacher)
-        params = {"student": nnx.state(student_of(teacher, key_student))}
+        teacher = network_with(self.model_config, self.teacher)
+        params = {"student": nnx.state(motionpcm.student_of(teacher, key_student))}
         if self.config.adversarial_weight:
             params["discriminator"] = nnx.state(build_from_config(self.critic_config, key_critic))
         return params, None
@@ -485,68 +376,75 @@ class DistillationTask:
 
     def questions(self, target_params, latent, text, key) -> DistillationBatch:
         """Return what a student is asked about clean latents, with the target's answers (Algorithm 1, lines 5-11)."""
-        config, phases, schedule = self.config, jax.tree.map(jnp.asarray, self.phases), self.schedule
+        config, cut, schedule = self.config, jax.tree.map(jnp.asarray, self.phases), self.schedule
         key_point, key_noise, key_guidance, key_critic, key_real, key_fresh = jax.random.split(key, 6)
         size = len(latent)
-        point = jax.random.randint(key_point, (size,), 0, len(phases.times))
-        time, before, phase = phases.times[point], phases.before[point], phases.phase[point]
-        edge = phases.edges[phase]
+        point = jax.random.randint(key_point, (size,), 0, len(cut.times))
+        time, before, phase = cut.times[point], cut.before[point], cut.phase[point]
+        edge = cut.edges[phase]
         noise = jax.random.normal(key_noise, latent.shape)
         noised = lambda t, noise: sum(
-            beside(share, latent) * part for share, part in zip(shares(schedule, t), (latent, noise), strict=True)
+            phases.beside(share, latent) * part
+            for share, part in zip(phases.shares(schedule, t), (latent, noise), strict=True)
         )
         state = noised(time, noise)
         limits = {"minval": config.least_guidance, "maxval": config.most_guidance}
         guidance = jax.random.uniform(key_guidance, (size,), **limits)
 
-        teacher = network_with(self.teacher_config, self.teacher)
+        teacher = network_with(self.model_config, self.teacher)
         empty = jnp.broadcast_to(self.clips.empty, text.shape)
         conditional, unconditional = (teacher(state, time, teacher.encode(told)) for told in (text, empty))
-        solved = jump(schedule, state, guided_noise(conditional, unconditional, guidance), time, before)
+        solved = phases.jump(schedule, state, phases.guided_noise(conditional, unconditional, guidance), time, before)
         target = network_with(self.student_config, target_params)
         eps = target(solved, before, target.encode(text), guidance)
         if config.consistency == "latent":
-            end = latent_consistency_end(schedule, solved, eps, before)
+            end = phases.latent_consistency_end(schedule, solved, eps, before)
         else:
-            end = target_end(schedule, solved, eps, before, edge)
-        critic_time = jax.random.randint(key_critic, (size,), edge, phases.edges[phase + 1] + 1)
+            end = phases.target_end(schedule, solved, eps, before, edge)
+        critic_time = jax.random.randint(key_critic, (size,), edge, cut.edges[phase + 1] + 1)
         real = noised(critic_time, jax.random.normal(key_real, latent.shape))
         fresh = jax.random.normal(key_fresh, latent.shape)
         return DistillationBatch(state, time, edge, guidance, text, end, critic_time, fresh, real)
 
-    def loss(self, params, statistics, batch: DistillationBatch, key):
-        """Return (loss, (terms, statistics)): the student's (MotionPCM Eq. 14) and the heads', for a branch each."""
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the student's loss (MotionPCM Eq. 14) and the heads', for a branch each.
+
+        Args:
+          params: weights by branch.
+          batch: a `DistillationBatch`; out of training (latents, captions) of other clips, and the weights, which are
+            the moving average, answer against themselves.
+          key: of what such clips are asked.
+          training: whether this is a step of training.
+        """
         config, schedule = self.config, self.schedule
+        if not training:
+            batch = self.questions(params["student"], *batch, key)
         student = network_with(self.student_config, params["student"])
         eps = student(batch.state, batch.time, student.encode(batch.text), batch.guidance)
         if config.consistency == "latent":
-            end = latent_consistency_end(schedule, batch.state, eps, batch.time)
+            end = phases.latent_consistency_end(schedule, batch.state, eps, batch.time)
         else:
-            end = jump(schedule, batch.state, eps, batch.time, batch.edge)
-        loss = jnp.mean(pseudo_huber(end - jax.lax.stop_gradient(batch.target), config.huber_width))
+            end = phases.jump(schedule, batch.state, eps, batch.time, batch.edge)
+        loss = jnp.mean(phases.pseudo_huber(end - jax.lax.stop_gradient(batch.target), config.huber_width))
         terms = {"consistency": loss}
         if config.adversarial_weight:
-            fake = noise_travel(schedule, end, batch.edge, batch.critic_time, batch.fresh)
+            fake = phases.noise_travel(schedule, end, batch.edge, batch.critic_time, batch.fresh)
             frozen = jax.lax.stop_gradient(params["discriminator"])
             adversarial = jnp.mean(jax.nn.relu(1.0 - self.scores(frozen, fake, batch)))
             real, made = (
                 self.scores(params["discriminator"], jax.lax.stop_gradient(seen), batch) for seen in (batch.real, fake)
             )
-            terms |= {"adversarial": adversarial, "discriminator": hinge(real, made)}
+            terms |= {"adversarial": adversarial, "discriminator": phases.hinge(real, made)}
             # The heads' own loss has no weight: each branch is moved by its own optimiser.
             loss = loss + config.adversarial_weight * adversarial + terms["discriminator"]
-        return loss, ({"loss": loss, **terms}, statistics)
+        return {"loss": loss, **terms}
 
     def scores(self, heads, state, batch: DistillationBatch):
         """Return the discriminator's scores of states at `critic_time` under the captions, high for data."""
-        teacher = network_with(self.teacher_config, self.teacher)
+        teacher = network_with(self.model_config, self.teacher)
         critic = network_with(self.critic_config, heads)
         return critic(teacher.features(state, batch.critic_time, teacher.encode(batch.text)))
 
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the terms on (latents, captions) of other clips, of the moving average against itself."""
-        return self.loss(params, statistics, self.questions(params["student"], *held_out, key), key)[1][0]
 
-
-def _is_turn(parity: int, step):
-    return step % 2 == parity
+def _is_turn(player: str, step):
+    return step % 2 == (1 if player == "student" else 0)

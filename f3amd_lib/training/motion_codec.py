@@ -6,8 +6,6 @@ A latent is of positions or, by a mesh autoencoder, of the body's vertices.
 from __future__ import annotations
 
 import dataclasses
-import functools
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -18,14 +16,10 @@ from f3amd_lib.motion.body_mesh import BodyMesh
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import frozen_tree
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("axes", "params", "latent", "redundancy"),
-    meta_fields=("autoencoder", "mesh"),
-)
-@dataclass(frozen=True, eq=False)
+@frozen_tree("axes", "params", "latent", "redundancy")
 class MotionCodec:
     """How a state stands for motion.
 

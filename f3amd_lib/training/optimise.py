@@ -10,21 +10,24 @@ weights as one that was not.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
 from f3amd_lib.networks.config import with_fast_gradient
+from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
 
@@ -56,51 +59,66 @@ class TrainingState(NamedTuple):
         return self.params if self.ema is None else self.ema
 
 
-class Settings(Protocol):
-    """What the loop asks of a task's `config`.
-
-    Attributes:
-      num_steps: optimiser steps in all.
-      ema_decay: of the moving average of the weights; None keeps none.
-      seed: of initial weights and batches.
-    """
-
-    num_steps: int
-    ema_decay: float | None
-    seed: int
-
-
-class Task(Protocol):
+class Task:
     """One training, as a JAX tree: its data are leaves, all else is static and compared by value.
 
     Weights are any tree, and so are several players: one branch each, with a loss that stops the
     gradient where it should not flow, and an optimiser that treats branches differently
     (`optax.partition`; `optax.set_to_zero` freezes one).
 
+    Here is what trainings of one network share. Such a one has `model_config`, `dataset_fingerprint`, perhaps
+    `schedule`, and says what is drawn and how it is judged:
+      draw(state, key): (batch, key of the loss); arrays of a batch have the samples first.
+      terms(params, batch, key, training=True): loss terms by name, "loss" among them, of what `draw` drew or, out of
+        training, of held-out data.
+    Any other class that has a name, a config and these methods is a task as well.
+
     Attributes:
       name: of what is trained, for progress bars and errors.
-      config: how long and from which seed.
-      optimiser: turns gradients into updates.
+      part: what its identity calls its network.
+      config: settings: `num_steps` in all, `ema_decay` of the moving average of the weights (None keeps none), `seed`
+        of initial weights and batches, and `optimiser()`.
     """
 
-    name: str
-    config: Settings
-    optimiser: optax.GradientTransformation
+    name: ClassVar[str]
+    part: ClassVar[str]
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """What turns gradients into updates, as the config says."""
+        return self.config.optimiser()
 
     def identity(self) -> dict:
         """Return all that decides the weights, JSON-ready, so that a state is resumed only where it belongs."""
+        models = {self.part: self.model_config.to_dict()}
+        if hasattr(self, "schedule"):
+            models["diffusion"] = self.schedule.to_dict()
+        training, fingerprint = dataclasses.asdict(self.config), self.dataset_fingerprint
+        return {"part": self.name, "model": models, "training": training, "dataset_fingerprint": fingerprint}
 
     def init(self, key) -> tuple[Any, Any]:
-        """Return (weights, statistics) before the first step."""
-
-    def draw(self, state: TrainingState, key) -> tuple[Any, jax.Array]:
-        """Return (batch, key of the loss); arrays of a batch have the samples first."""
+        """Return (weights, statistics) before the first step; no network here keeps statistics."""
+        return nnx.state(build_from_config(self.model_config, key)), None
 
     def loss(self, params, statistics, batch, key) -> tuple[jax.Array, tuple[dict, Any]]:
-        """Return (loss, (terms by name with "loss" among them, statistics after the step))."""
+        """Return (loss, (terms by name with "loss" among them, statistics after the step)) of what `draw` drew."""
+        terms = self.terms(params, batch, key)
+        return terms["loss"], (terms, statistics)
 
     def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return terms by name on held-out data; only asked where such data are given."""
+        """Return terms by name on held-out data, without what only training does; asked where such data are given."""
+        return self.terms(params, held_out, key, training=False)
+
+
+def frozen_tree(*data: str):
+    """Make a class a frozen dataclass and a JAX tree: the fields of these names are leaves, all else is static."""
+
+    def as_tree(cls: type) -> type:
+        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+        static = [field.name for field in dataclasses.fields(cls) if field.name not in data]
+        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
+
+    return as_tree
 
 
 def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
@@ -119,22 +137,6 @@ def _with_fast_gradients(params):
 
 
 @functools.partial(jax.jit, static_argnames=("length", "mesh"), donate_argnames="state")
-def _advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None):
-    decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
-
-    def one_step(state: TrainingState, _):
-        batch, key = task.draw(state, jax.random.fold_in(base, state.step))
-        batch = parallel.spread(batch, mesh)
-        loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
-        gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
-        updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
-        params = optax.apply_updates(state.params, updates)
-        ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
-        return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
-
-    return parallel.everywhere(jax.lax.scan(one_step, state, None, length=length), mesh)
-
-
 def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = None) -> tuple[TrainingState, dict]:
     """Train some steps in one program, without checkpoints or checks (see `optimise`).
 
@@ -147,7 +149,19 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
     Returns:
       (state, every loss term of every step, [length] each).
     """
-    return _advance(task, state, length, mesh)
+    decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
+
+    def one_step(state: TrainingState, _):
+        batch, key = task.draw(state, jax.random.fold_in(base, state.step))
+        batch = parallel.laid(batch, mesh, parallel.SPREAD)
+        loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
+        gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
+        updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
+        params = optax.apply_updates(state.params, updates)
+        ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
+        return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
+
+    return parallel.laid(jax.lax.scan(one_step, state, None, length=length), mesh, parallel.EVERYWHERE)
 
 
 def plan_memory(task: Task, length: int = 1) -> int:
@@ -157,7 +171,7 @@ def plan_memory(task: Task, length: int = 1) -> int:
       task: what to train.
       length: steps in one program.
     """
-    plan = _advance.lower(task, jax.eval_shape(initial_state, task), length, None).compile().memory_analysis()
+    plan = advance.lower(task, jax.eval_shape(initial_state, task), length).compile().memory_analysis()
     shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
     return int(plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - shared)
 

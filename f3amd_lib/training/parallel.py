@@ -16,6 +16,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 AXIS = "batch"
 """Name of the mesh axis that a batch is spread over."""
 
+SPREAD, EVERYWHERE = PartitionSpec(AXIS), PartitionSpec()
+"""How arrays lie: over the devices along their first axis, or as a whole on each of them."""
+
 
 def join_processes(coordinator: str | None = None, count: int | None = None, number: int | None = None) -> None:
     """Make this process one of several that train together; before anything else touches JAX.
@@ -71,7 +74,7 @@ def replicate(tree, mesh: Mesh | None):
     """
     if mesh is None:
         return tree
-    whole = NamedSharding(mesh, PartitionSpec())
+    whole = NamedSharding(mesh, EVERYWHERE)
 
     def place(leaf):
         if getattr(leaf, "sharding", None) == whole:
@@ -82,20 +85,9 @@ def replicate(tree, mesh: Mesh | None):
     return jax.tree.map(place, tree)
 
 
-def _lying(tree, mesh: Mesh | None, places: PartitionSpec):
-    if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, places))
-
-
-def spread(tree, mesh: Mesh | None):
-    """Ask, inside jit, that arrays are spread over the devices along their first axis."""
-    return _lying(tree, mesh, PartitionSpec(AXIS))
-
-
-def everywhere(tree, mesh: Mesh | None):
-    """Ask, inside jit, that every device has arrays as a whole."""
-    return _lying(tree, mesh, PartitionSpec())
+def laid(tree, mesh: Mesh | None, places: PartitionSpec):
+    """Ask, inside jit, that arrays lie on the devices of a mesh as `SPREAD` or `EVERYWHERE` says."""
+    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, places))
 
 
 def is_first_process() -> bool:

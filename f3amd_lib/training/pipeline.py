@@ -128,10 +128,10 @@ class ModelFiles:
     state: Path
     history: Path
 
-
-def _preset_name(profile: Profile, preset: str | None) -> str:
-    """Return our name, fit for files, of a preset that may be called by the paper's."""
-    return presets.find_preset(preset or profile.preset).name
+    @classmethod
+    def of(cls, folder, name: str) -> ModelFiles:
+        """Return the files of a model of this name in a folder."""
+        return cls(*(Path(folder) / f"{name}.{what}" for what in ("safetensors", "state.safetensors", "history.csv")))
 
 
 def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> ModelFiles:
@@ -142,20 +142,15 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
       preset: by default the profile's own.
       folder: instead of `runs/<data set>/<profile>/models`.
     """
-    preset = _preset_name(profile, preset)
-    name = preset if profile.window == 32 else f"{preset}-{profile.window}frames"
-    if folder is None:
-        folder = runs_dir(profile.dataset, profile.name) / "models"
-    folder = Path(folder)
-    return ModelFiles(
-        folder / f"{name}.safetensors", folder / f"{name}.state.safetensors", folder / f"{name}.history.csv"
-    )
+    name = presets.find_preset(preset or profile.preset).name
+    if profile.window != 32:
+        name += f"-{profile.window}frames"
+    return ModelFiles.of(runs_dir(profile.dataset, profile.name) / "models" if folder is None else folder, name)
 
 
 def train(
     prepared: PreparedData, profile: Profile, *, preset: str | None = None, config: TrainingConfig | None = None,
-    network: Mapping | None = None, folder=None, mesh: Mesh | None = None, stop_at: float | None = None,
-    progress: bool = True,
+    network: Mapping | None = None, folder=None, mesh: Mesh | None = None, **leg,
 ) -> tuple[TrainedModel | None, pd.DataFrame]:  # fmt: skip
     """Train a preset to the end, going on from its training state if there is one.
 
@@ -167,8 +162,7 @@ def train(
       network: fields of the preset's network to change.
       folder: where files go instead of `runs/`; several processes must see the same one.
       mesh: devices that share each batch (`parallel.all_devices`); by default one.
-      stop_at: see `optimise`.
-      progress: show a progress bar.
+      **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       (model, history): the history has a row per 50 steps or fewer, with held-out losses
@@ -179,26 +173,43 @@ def train(
         trains the same there, or the devices cannot share a batch equally.
       TrainingDiverged: if the loss stops being a number.
     """
-    preset = _preset_name(profile, preset)
+    preset = presets.find_preset(preset or profile.preset).name
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
     parallel.check_batch(config.batch_size, mesh)
     task = prepared.task(preset, config, network=network)
     if prepared.held_out_split == "train":
         log.warning("no clip is held out: 'held-out' losses are of clips that the model was trained on")
+    devices = {} if mesh is None else {"training_devices": mesh.size}
+    return train_and_keep(prepared, profile, preset, task, files, devices, mesh=mesh, **leg)
+
+
+def train_and_keep(
+    prepared: PreparedData, profile: Profile, preset: str, task: Task, files: ModelFiles, about: dict, **leg
+) -> tuple[TrainedModel | None, pd.DataFrame]:
+    """Train a task on windows of a data set to the end, and keep the model.
+
+    Args:
+      prepared, profile, preset: as for `train`.
+      task: a denoiser's, or the distillation of one (`denoising`): the student's moving average is its target.
+      files: of the run.
+      about: what else its record says.
+      **leg: mesh, stop_at and progress, as for `train`.
+
+    Returns:
+      (model, history), as for `train`.
+    """
+    denoising, config = getattr(task, "denoising", task), task.config
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=config.seed, model=preset, training=config.to_dict(),
-        held_out_split=prepared.held_out_split, num_train_windows=int(task.windows.num_windows),
-        **({} if mesh is None else {"training_devices": mesh.size}),
+        held_out_split=prepared.held_out_split, num_train_windows=int(denoising.windows.num_windows), **about,
     )  # fmt: skip
-    held_out = prepared.windows(prepared.held_out_split)
     with alone_with(files):
-        state, history = train_in_legs(
-            task, files, record, held_out=held_out, mesh=mesh, stop_at=stop_at, progress=progress
-        )
+        state, history = train_in_legs(task, files, record, held_out=prepared.windows(prepared.held_out_split), **leg)
         if int(state.step) < config.num_steps:
             return None, history
-        trained = as_trained(prepared, task, preset, state.averaged, record)
+        weights = state.averaged if denoising is task else state.params
+        trained = as_trained(prepared, denoising, preset, weights, record)
         if parallel.is_first_process():
             save_model(files.model, trained)
             trained = load_model(files.model)  # in the precision of the file
@@ -245,16 +256,9 @@ def train_in_legs(
             write_table(files.history, pd.DataFrame(rows), record)
 
     state, _ = optimise(
-        task,
-        state,
-        checkpoint=files.state,
-        checkpoint_every=every,
-        held_out=held_out,
-        chunk=min(50, every),
-        mesh=mesh,
-        on_chunk=keep,
-        **leg,
-    )
+        task, state, checkpoint=files.state, checkpoint_every=every, held_out=held_out, chunk=min(50, every), mesh=mesh,
+        on_chunk=keep, **leg,
+    )  # fmt: skip
     return state, pd.DataFrame(rows)
 
 
@@ -308,7 +312,7 @@ def obtain_model(
     Returns:
       (model, history, origin), origin being "shipped", "earlier run" or "trained now".
     """
-    preset = _preset_name(profile, preset)
+    preset = presets.find_preset(preset or profile.preset).name
     wanted = prepared.model_config(preset)
     if profile.name == "laptop":
         shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
@@ -424,11 +428,8 @@ def available_models(profile: Profile) -> list[str]:
         folders.append(PRETRAINED_DIR / profile.dataset)
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
     names = [name + end for end in ("", *presets.FORMS) for name in presets.of_paper()]
-    return [
-        name
-        for name in dict.fromkeys(names)
-        if any((folder / f"{name}{suffix}.safetensors").exists() for folder in folders)
-    ]
+    found = {path.name for folder in folders for path in folder.glob("*.safetensors")}
+    return [name for name in dict.fromkeys(names) if f"{name}{suffix}.safetensors" in found]
 
 
 def find_model(dataset: str) -> Path:
@@ -445,13 +446,9 @@ def find_model(dataset: str) -> Path:
         ("laptop", PRETRAINED_DIR / dataset),
     ):
         first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
-        found = [
-            path
-            for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stat().st_mtime)
-            if not re.search(r"\.state\.|\.old\d+\.", path.name)
-        ]
-        if found:
-            return first if first in found else found[-1]
+        models = [path for path in folder.glob("*.safetensors") if not re.search(r"\.state\.|\.old\d+\.", path.name)]
+        if models:
+            return first if first in models else max(models, key=lambda path: path.stat().st_mtime)
     raise ValueError(
         f"no trained model for data set {dataset!r}: run `f3amd train --data "
         f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"

@@ -110,24 +110,22 @@ def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CA
 
     flat: dict[str, np.ndarray] = {"style.kernel": take("embed_style.action_embedding")}
 
-    def linear(ours: str, weight, bias) -> None:
-        flat[f"{ours}.kernel"], flat[f"{ours}.bias"] = weight.T, bias
+    def layer(ours: str, theirs: str, weight: str = "kernel") -> None:
+        flat[f"{ours}.{weight}"], flat[f"{ours}.bias"] = take(f"{theirs}.weight").T, take(f"{theirs}.bias")
 
     for ours, theirs in _NAMES["linear"].items():
-        linear(ours, take(f"{theirs}.weight"), take(f"{theirs}.bias"))
+        layer(ours, theirs)
     depth = 0
     while any(name.startswith(f"{_BLOCK.format(depth)}.") for name in left):
         mine, theirs = f"blocks.{depth}", _BLOCK.format(depth)
         for ours, name in _NAMES["in_block"].items():
-            linear(f"{mine}.{ours}", take(f"{theirs}.{name}.weight"), take(f"{theirs}.{name}.bias"))
+            layer(f"{mine}.{ours}", f"{theirs}.{name}")
         # Query, key and value lie in one array, one below the other.
         packed = (np.split(take(f"{theirs}.self_attn.in_proj_{part}"), 3) for part in ("weight", "bias"))
         for role, weight, bias in zip(("query", "key", "value"), *packed, strict=True):
-            linear(f"{mine}.attention.{role}", weight, bias)
+            flat[f"{mine}.attention.{role}.kernel"], flat[f"{mine}.attention.{role}.bias"] = weight.T, bias
         for ours, name in _NAMES["norms"].items():
-            flat[f"{mine}.{ours}.scale"], flat[f"{mine}.{ours}.bias"] = (
-                take(f"{theirs}.{name}.{part}") for part in ("weight", "bias")
-            )
+            layer(f"{mine}.{ours}", f"{theirs}.{name}", "scale")
         depth += 1
     if not depth:
         take(f"{_BLOCK.format(0)}.linear1.weight")
@@ -135,20 +133,12 @@ def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CA
         raise ValueError(f"{where}: has an array {min(left)!r} that the released network has not")
     num_styles, width = flat["style.kernel"].shape
     released = presets.find_preset("CAMDM-K4")
-    config = CAMDMConfig.from_dict(
-        {
-            **released.network,
-            **presets.find_preset("CAMDM-code").network,
-            "noise_levels": released.network["noise_levels"],
-            "channels": flat["history.kernel"].shape[0],
-            "num_styles": num_styles,
-            "latent_width": width,
-            "depth": depth,
-            "feed_forward_factor": flat["blocks.0.hidden.kernel"].shape[1] // width,
-            "window": WINDOW,
-            "num_history": NUM_HISTORY,
-        }
-    )
+    sizes = {"num_styles": num_styles, "latent_width": width, "depth": depth, "window": WINDOW}
+    config = CAMDMConfig.from_dict({
+        **released.network, **presets.find_preset("CAMDM-code").network, **sizes, "num_history": NUM_HISTORY,
+        "noise_levels": released.network["noise_levels"], "channels": flat["history.kernel"].shape[0],
+        "feed_forward_factor": flat["blocks.0.hidden.kernel"].shape[1] // width,
+    })  # fmt: skip
     network = nnx.eval_shape(lambda: presets.build_from_config(config, jax.random.key(0)))
     for keys, leaf in nnx.to_flat_state(nnx.state(network)):
         name = ".".join(map(str, keys))

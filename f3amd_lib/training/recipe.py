@@ -7,34 +7,16 @@ goes with it is chosen here.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
 
 import optax
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
-from f3amd_lib.ground.names import check_known, checked_seed, refuse_unknown
+from f3amd_lib.ground.names import checked_seed, refuse_unknown
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.losses import LossWeights
-
-_CHOICES = {
-    "schedule": ("inverse_square", "inverse_sqrt", "warmup_cosine"),
-    "noise": ("schedule", "mixed", "log_normal"),
-    "noise_weighting": ("uniform", "low_noise"),
-}
-"""For each setting that names a variant: the names there are."""
-
-_SHARES = ("history_dropout", "condition_dropout", "captured_path_share", "own_history_share", "history_damping")
-
-_RANGES = (
-    (("num_steps", "batch_size", "warmup_steps"), lambda x: type(x) is int and x >= 1, "positive and whole"),
-    (("learning_rate", "decay_steps"), lambda x: 0 < x < math.inf, "positive and finite"),
-    (("gradient_clip", "history_noise"), lambda x: 0 <= x < math.inf, "0 or more and finite"),
-    (_SHARES, lambda x: 0 <= x <= 1, "in [0, 1]"),
-    (("ema_decay",), lambda x: 0 <= x < 1, "in [0, 1)"),
-)
-"""Settings that are numbers, what they must fulfil, and how an error says so."""
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -102,19 +84,19 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self):
-        for name, known in _CHOICES.items():
-            check_known(getattr(self, name), known, name)
+        check_settings(self)
         checked_seed(self.seed)
-        for names, fits, wanted in _RANGES:
-            for name in names:
-                if not fits(getattr(self, name)):
-                    raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
         # The other draws reach below 1 by a logarithm, which such a schedule alone has room for.
         exploding = self.diffusion.kind == "variance_exploding"
         if self.noise != "schedule" and not (exploding and self.diffusion.sigma_min < 1.0):
             raise ValueError(
                 f"{self.noise} noise needs a variance-exploding schedule with sigma_min below 1, got {self.diffusion!r}"
             )
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """Return Adam at the config's learning rate (section 4.5), after clipping where it asks for it."""
+        clipping = [optax.clip_by_global_norm(self.gradient_clip)] if self.gradient_clip else []
+        return optax.chain(*clipping, optax.adam(learning_rate_schedule(self)))
 
     def to_dict(self) -> dict:
         """Return the fields as JSON-ready values."""
@@ -156,14 +138,9 @@ def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
     Args:
       preset, num_steps, **settings: as for `paper_recipe`.
     """
-    short = {
-        "batch_size": 128,
-        "learning_rate": 2e-3,
-        "schedule": "warmup_cosine",
-        "warmup_steps": max(1, min(200, num_steps // 10)),
-        "gradient_clip": 1.0,
-    }
-    return paper_recipe(preset, num_steps, **{**short, **settings})
+    short = {"batch_size": 128, "learning_rate": 2e-3, "schedule": "warmup_cosine", "gradient_clip": 1.0}
+    warm_up = {"warmup_steps": max(1, min(200, num_steps // 10))}
+    return paper_recipe(preset, num_steps, **{**short, **warm_up, **settings})
 
 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
@@ -176,32 +153,14 @@ def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfi
     preset = find_preset(preset or profile.preset).name
     as_printed = profile.name == "gpu" and not preset.endswith(("-plus", "-steady"))
     recipe = paper_recipe if as_printed else short_recipe
-    return recipe(
-        preset,
-        profile.train_steps,
-        learning_rate=profile.learning_rate,
-        batch_size=profile.batch_size,
-        seed=profile.seed,
-    )
+    own = {name: getattr(profile, name) for name in ("learning_rate", "batch_size", "seed")}
+    return recipe(preset, profile.train_steps, **own)
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     """Return learning rate against step (section 4.5: "inverse-square")."""
     if config.schedule == "warmup_cosine":
-        return optax.warmup_cosine_decay_schedule(
-            0.0,
-            config.learning_rate,
-            min(config.warmup_steps, config.num_steps - 1),
-            config.num_steps,
-            0.01 * config.learning_rate,
-        )
+        warm, peak = min(config.warmup_steps, config.num_steps - 1), config.learning_rate
+        return optax.warmup_cosine_decay_schedule(0.0, peak, warm, config.num_steps, 0.01 * peak)
     power = {"inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
     return lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
-
-
-def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
-    """Return Adam at the config's learning rate (section 4.5), after clipping where it asks for it."""
-    steps = [optax.adam(learning_rate_schedule(config))]
-    if config.gradient_clip > 0:
-        steps.insert(0, optax.clip_by_global_norm(config.gradient_clip))
-    return optax.chain(*steps)

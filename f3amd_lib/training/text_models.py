@@ -25,10 +25,8 @@ from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.data.text_encoders import TextEncoder, embed_captions, words_of
 from f3amd_lib.data.text_motions import UNIT, AxisNormaliser, TextMotions, bandai_text_motions, clip_table, pad_motions
-from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
-from f3amd_lib.ground.records import run_record
 from f3amd_lib.motion.body import make_body
 from f3amd_lib.motion.body_mesh import BodyMesh, standing
 from f3amd_lib.motion.redundant import NUM_JOINT_FEATURES
@@ -39,20 +37,13 @@ from f3amd_lib.networks.acmdm_control import ControlBranch
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
-from f3amd_lib.training.captioned_models import load_captioned_model, save_captioned_model
+from f3amd_lib.training import text_motion
+from f3amd_lib.training.captioned_models import CaptionedModel, load_captioned_model, save_captioned_model, train_part
 from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
 from f3amd_lib.training.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.optimise import Task, differences
-from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles, alone_with, train_in_legs
-from f3amd_lib.training.text_motion import (
-    AutoencoderTask,
-    ControlTask,
-    MeshAutoencoderTask,
-    TextMotionTask,
-    TextMotionTraining,
-    branch_with,
-    text_motion_recipe,
-)
+from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
+from f3amd_lib.training.settings import profile_part_recipe
 
 CONTROL = "+control"
 """Behind a preset's name: the model with its control branch."""
@@ -70,33 +61,19 @@ _KIND = "text-to-motion model"
 _ENCODED_AT_ONCE = 64
 
 
-@dataclass(frozen=True, eq=False)
-class TextModel:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TextModel(CaptionedModel):
     """A trained model of text to motion, or a motion autoencoder alone.
 
+    Its name has "+control" or "+control-pelvis" at its end where there is a branch; weights are the moving average.
+
     Attributes:
-      name: preset, with "+control" or "+control-pelvis" where there is a branch.
       codec: between motion and the network's states: normaliser and autoencoder.
-      skeleton, fps: of the motion it was trained on.
-      record: how it was trained, on what, under what terms.
-      config, params: of the denoiser (the moving average); None for an autoencoder alone.
-      schedule: the noise schedule it was trained with.
-      text_encoder: identity of the encoder whose pooled vectors it reads.
-      words: of all captions that it was trained with.
       starts: of the prefix form alone: by caption, first frames of a clip to go on from, states [P, J, C].
       branch: weights of the control branch, None without one.
     """
 
-    name: str
     codec: MotionCodec
-    skeleton: Skeleton
-    fps: float
-    record: dict
-    config: ACMDMConfig | None = None
-    params: Any = None
-    schedule: NoiseSchedule | None = None
-    text_encoder: str = ""
-    words: tuple[str, ...] = ()
     starts: dict = field(default_factory=dict)
     branch: Any = None
 
@@ -108,7 +85,7 @@ class TextModel:
         """Return the control branch with its weights; ValueError says how to train one if there is none."""
         if self.branch is None:
             raise ValueError(f"{self.name} has no control branch; train one: f3amd train --preset {self.name}{CONTROL}")
-        return branch_with(self.config, self.codec, self.branch)
+        return text_motion.branch_with(self.config, self.codec, self.branch)
 
     @property
     def controlled(self) -> dict[str, int]:
@@ -147,11 +124,8 @@ def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
       dtype: of the weights, as for `checkpoints.save_model`.
     """
     codec = trained.codec
-    arrays = {"axes": codec.axes._asdict()}
-    if codec.autoencoder is not None:
-        arrays["latent"] = codec.latent._asdict()
-    if codec.redundancy is not None:
-        arrays["redundancy"] = codec.redundancy._asdict()
+    normalisers = {"axes": codec.axes, "latent": codec.latent, "redundancy": codec.redundancy}
+    arrays = {what: normaliser._asdict() for what, normaliser in normalisers.items() if normaliser is not None}
     if codec.mesh is not None:
         arrays["rest"] = jnp.asarray(codec.mesh.skeleton.offsets, jnp.float32)
     arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
@@ -274,24 +248,24 @@ def pooled_captions(captions: Sequence[str], encoder: TextEncoder) -> jax.Array:
 
 
 def autoencoder_task(
-    data: TextMotions, split: str, preset: str, config: TextMotionTraining
-) -> AutoencoderTask | MeshAutoencoderTask:
+    data: TextMotions, split: str, preset: str, config: text_motion.TextMotionTraining
+) -> text_motion.AutoencoderTask | text_motion.MeshAutoencoderTask:
     """Return the training of a preset's autoencoder on the clips of a split."""
     axes, part = data.normaliser(), data.select(data.members(split))
     table, _ = clip_table(part, axes.normalise(part.positions))
     if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
-        return AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+        return text_motion.AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
     # The body stands as people do when clips begin: those of training, whatever the split.
     rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
     model = presets.build_config(preset, num_vertices=len(make_body(rest).vertices))
     codec = MotionCodec(axes, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
-    return MeshAutoencoderTask(model, config, table, data.fingerprint, codec)
+    return text_motion.MeshAutoencoderTask(model, config, table, data.fingerprint, codec)
 
 
 def denoiser_task(
-    data: TextMotions, split: str, encoder: TextEncoder, preset: str, config: TextMotionTraining, codec: MotionCodec,
-    window: int | None = None,
-) -> TextMotionTask:  # fmt: skip
+    data: TextMotions, split: str, encoder: TextEncoder, preset: str, config: text_motion.TextMotionTraining,
+    codec: MotionCodec, window: int | None = None,
+) -> text_motion.TextMotionTask:  # fmt: skip
     """Return the training of a preset's denoiser on the clips of a split.
 
     Args:
@@ -311,12 +285,12 @@ def denoiser_task(
     fingerprint = data.fingerprint
     if codec.autoencoder is not None:
         fingerprint += f" in the latent of {weights_digest(codec.params)}"
-    return TextMotionTask(model, config, presets.find_preset(preset).diffusion, table, pooled, fingerprint)
+    return text_motion.TextMotionTask(model, config, presets.find_preset(preset).diffusion, table, pooled, fingerprint)
 
 
 def control_task(
-    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: TextMotionTraining, joints
-) -> ControlTask:
+    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: text_motion.TextMotionTraining, joints
+) -> text_motion.ControlTask:
     """Return the training of a branch that controls `joints` beside a finished model, on the clips of a split."""
     part, codec, frames = data.select(data.members(split)), base.codec, base.codec.frames_per_state
     table, pooled = _captioned_states(codec, part, encoder)
@@ -324,7 +298,7 @@ def control_task(
     positions = positions.reshape(len(table.frames), frames, *positions.shape[1:])
     table = table._replace(frames=(table.frames, positions))
     fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
-    return ControlTask(
+    return text_motion.ControlTask(
         base.config, config, base.schedule, table, pooled, base.params, codec, tuple(joints), fingerprint
     )
 
@@ -334,8 +308,7 @@ def control_task(
 
 def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
     """Return where a model of a data set and profile lies: `runs/<data set>/<profile>/text` or a folder of yours."""
-    folder = Path(folder or runs_dir(profile.dataset, profile.name) / "text")
-    return ModelFiles(*(folder / f"{name}.{what}" for what in ("safetensors", "state.safetensors", "history.csv")))
+    return ModelFiles.of(folder or runs_dir(profile.dataset, profile.name) / "text", name)
 
 
 def of_this_training(found, task: Task, files: ModelFiles):
@@ -409,10 +382,9 @@ def train_text_model(
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
     part = "control" if branch else _AUTOENCODERS.get(preset.family, "denoiser")
     codec = _codec_of_positions(data, preset) if before is None else before.codec
-    settings = {"seed": profile.seed, "unit": max(1, UNIT // codec.frames_per_state)}
-    settings |= {} if batch_size is None else {"batch_size": batch_size}
-    recipe = part if profile.name == "gpu" else f"short-{part}"
-    config = text_motion_recipe(recipe, profile.train_steps, None if part == "control" else preset.name, **settings)
+    settings = {"unit": max(1, UNIT // codec.frames_per_state), "batch_size": batch_size}
+    own = None if branch else preset.name
+    config = profile_part_recipe(text_motion.TextMotionTraining, part, profile, own, **settings)
     if part == "denoiser":
         task_of = lambda split: denoiser_task(data, split, encoder, preset.name, config, codec, window)
     elif part == "control":
@@ -426,20 +398,14 @@ def train_text_model(
     held_out = task_of("validation").draw(None, jax.random.key(0))[0]
     if preset.family in _AUTOENCODERS:
         held_out = (held_out, jnp.ones(held_out.shape[:2], bool))
-    record = run_record(
-        profile=profile, dataset=data, seed=config.seed, model=name, identity=task.identity(),
-        num_train_clips=len(data.members("train")),
-    )  # fmt: skip
-    with alone_with(files):
-        state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
-    if int(state.step) < config.num_steps:
+    state, about = train_part(task, files, data, profile, name, held_out, **leg)
+    if state is None:
         return None
-    about = {"skeleton": data.skeleton, "fps": data.fps, "record": record, "name": name}
     if preset.family in _AUTOENCODERS:
         made = TextModel(codec=_codec_of(task, codec, state.averaged, data), **about)
     elif part == "control":
         kept = {key: before.record[key] for key in ("guidance",) if key in before.record}
-        made = dataclasses.replace(before, branch=state.averaged, name=name, record=record | kept)
+        made = dataclasses.replace(before, branch=state.averaged, name=name, record=about["record"] | kept)
     else:
         trained_on = data.select(data.members("train"))
         made = TextModel(
@@ -467,7 +433,7 @@ def _codec_of_positions(data: TextMotions, preset: presets.Preset) -> MotionCode
     return MotionCodec(data.normaliser(), redundancy=redundancy)
 
 
-def _codec_of(task: AutoencoderTask, codec: MotionCodec, params, data: TextMotions) -> MotionCodec:
+def _codec_of(task: text_motion.AutoencoderTask, codec: MotionCodec, params, data: TextMotions) -> MotionCodec:
     """Return the codec of a trained autoencoder, its latent normalised over up to 512 training clips."""
     part = data.members("train")
     part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]

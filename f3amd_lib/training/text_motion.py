@@ -6,9 +6,6 @@ Each is a task of `training.optimise`; its data are arrays on the device. The pa
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,20 +18,16 @@ from f3amd_lib.data.text_motions import ClipTable, draw_clips
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import check_known, refuse_unknown
-from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, smooth_l1, variational_loss
-from f3amd_lib.networks.presets import build_from_config, find_preset
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.motion_codec import MotionCodec
-from f3amd_lib.training.optimise import TrainingState
-
-_SCHEDULES = ("steps", "warmup_cosine")
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -64,6 +57,8 @@ class TextMotionTraining:
       ValueError: for a number out of its range or an unknown schedule.
     """
 
+    paper: ClassVar[str] = "acmdm"
+
     num_steps: int
     batch_size: int = 64
     learning_rate: float = 2e-4
@@ -84,23 +79,7 @@ class TextMotionTraining:
 
     def __post_init__(self):
         object.__setattr__(self, "drops", tuple(self.drops))
-        check_known(self.schedule, _SCHEDULES, "schedule")
-        whole, shares = (
-            ("num_steps", "batch_size", "warmup_steps", "unit", "window"),
-            ("text_dropout", "control_dropout"),
-        )
-        positive = ("learning_rate", "drop_factor")
-        for names, fits, wanted in (
-            (whole, lambda x: type(x) is int and x >= 1, "positive and whole"),
-            (("prefix_frames",), lambda x: type(x) is int and x >= 0, "0 or more and whole"),
-            (positive, lambda x: 0 < x < math.inf, "positive and finite"),
-            (("weight_decay", "gradient_clip", "control_weight"), lambda x: 0 <= x < math.inf, "0 or more and finite"),
-            (shares, lambda x: 0 <= x <= 1, "in [0, 1]"),
-            (("ema_decay",), lambda x: x is None or 0 <= x < 1, "in [0, 1), or None"),
-        ):
-            for name in names:
-                if not fits(getattr(self, name)):
-                    raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
+        check_settings(self)
 
     def rate(self, step):
         """Return the learning rate of a step."""
@@ -117,51 +96,12 @@ class TextMotionTraining:
         return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam) if self.gradient_clip else adam
 
 
-def text_motion_recipe(part: str, num_steps: int, preset: str | None = None, **settings) -> TextMotionTraining:
-    """Return how a part is trained.
-
-    Args:
-      part: a name of `papers/acmdm/recipes.toml`, "denoiser" or "short-denoiser" for instance.
-      num_steps: optimiser steps.
-      preset: adds what its own training says (`presets.find_preset`).
-      **settings: fields of `TextMotionTraining` to change.
-
-    Raises:
-      ValueError: for an unknown part, preset or field, with the nearest name.
-    """
-    return part_recipe("acmdm", TextMotionTraining, part, num_steps, preset, settings)
-
-
-def part_recipe(paper: str, training: type, part: str, num_steps: int, preset: str | None, settings: dict):
-    """Return a `training` from a paper's recipe of a part, what the preset itself says, and settings, in this order."""
-    recipes = load_paper_file("recipes", paper)
-    check_known(part, recipes, "recipe")
-    own = {} if preset is None else find_preset(preset).training
-    values = {**recipes[part]["training"], **own, **settings}
-    refuse_unknown(values, training, "training setting")
-    return training(num_steps, **values)
-
-
-def part_identity(part: str, models: dict, config, fingerprint: str) -> dict:
-    """Return what tells one training of a part from another, as JSON has it."""
-    settings = {name: model if isinstance(model, dict) else model.to_dict() for name, model in models.items()}
-    return {"part": part, "model": settings, "training": dataclasses.asdict(config), "dataset_fingerprint": fingerprint}
-
-
-def task_tree(data: tuple[str, ...], meta: tuple[str, ...]):
-    """Make a dataclass a JAX tree: its data are leaves, all else is compared by value."""
-    return functools.partial(
-        jax.tree_util.register_dataclass, data_fields=data, meta_fields=(*meta, "config", "dataset_fingerprint")
-    )
-
-
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
-@task_tree(("clips",), ("model_config",))
-@dataclass(frozen=True, eq=False)
-class AutoencoderTask:
-    """A motion autoencoder to train on windows of clips that are long enough (a `training.optimise.Task`).
+@frozen_tree("clips")
+class AutoencoderTask(Task):
+    """A motion autoencoder to train on windows of clips that are long enough.
 
     Attributes:
       model_config: the autoencoder.
@@ -170,25 +110,12 @@ class AutoencoderTask:
       dataset_fingerprint: of the data they come from.
     """
 
-    name: ClassVar[str] = "autoencoder"
+    name = part = "autoencoder"
 
     model_config: AutoencoderConfig
     config: TextMotionTraining
     clips: ClipTable
     dataset_fingerprint: str = ""
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """AdamW, as the config says."""
-        return self.config.optimiser()
-
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        return part_identity(self.name, {"autoencoder": self.model_config}, self.config, self.dataset_fingerprint)
-
-    def init(self, key):
-        """Return initial weights."""
-        return nnx.state(build_from_config(self.model_config, key)), None
 
     def draw(self, state: TrainingState, key):
         """Draw windows [B, window, J, 3] from clips of at least that length."""
@@ -198,58 +125,52 @@ class AutoencoderTask:
         first = clips.start[clip] + jax.random.randint(key_start, size, 0, clips.length[clip] - window + 1)
         return clips.frames[first[:, None] + jnp.arange(window)], key_loss
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)): smooth L1, or the variational loss (ACMDM App. B)."""
-        model, key_latent = network_with(self.model_config, params), jax.random.fold_in(key, 1)
-        encoded = model.encode(batch, key=jax.random.fold_in(key, 2))
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return smooth L1, and as the loss it or the variational loss (ACMDM App. B).
+
+        Args:
+          params: weights.
+          batch: what `draw` drew; out of training, without dropout, whole clips: (positions, mask).
+          key: of dropout and latent.
+          training: whether this is a step of training.
+        """
+        model = network_with(self.model_config, params)
+        if not training:
+            positions, mask = batch
+            latent_mask = mask[:, :: self.model_config.frames_per_latent]
+            loss = smooth_l1(model.decode(model.latent_of(positions, mask), latent_mask), positions, mask)
+            return {"loss": loss, "smooth_l1": loss}
+        latent = model.encode(batch, key=jax.random.fold_in(key, 2))
         if self.model_config.variational:
-            mean, log_variance = model.moments(encoded)
-            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key_latent, mean.shape)
-        else:
-            latent = encoded
+            mean, log_variance = model.moments(latent)
+            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
         positions_hat = model.decode(latent, key=jax.random.fold_in(key, 3))
-        terms = {"smooth_l1": smooth_l1(positions_hat, batch)}
-        loss = terms["smooth_l1"]
+        loss = error = smooth_l1(positions_hat, batch)
         if self.model_config.variational:
             loss = variational_loss(positions_hat, batch, mean, log_variance)
-        return loss, ({"loss": loss, **terms}, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the error on held-out clips, (positions, mask), without dropout."""
-        positions, mask = held_out
-        model = network_with(self.model_config, params)
-        positions_hat = model.decode(model.latent_of(positions, mask), mask[:, :: self.model_config.frames_per_latent])
-        loss = smooth_l1(positions_hat, positions, mask)
-        return {"loss": loss, "smooth_l1": loss}
+        return {"loss": loss, "smooth_l1": error}
 
 
-@task_tree(("clips", "codec"), ("model_config",))
-@dataclass(frozen=True, eq=False)
+@frozen_tree("clips", "codec")
 class MeshAutoencoderTask(AutoencoderTask):
-    """A mesh autoencoder to train on frames, one of each clip that is drawn (a `training.optimise.Task`).
+    """A mesh autoencoder to train on frames, one of each clip that is drawn.
 
     Attributes:
       codec: of positions, with the mesh whose vertices they move.
     """
 
-    name: ClassVar[str] = "mesh autoencoder"
+    name = "mesh autoencoder"
 
     model_config: MeshAutoencoderConfig
     codec: MotionCodec | None = None
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)): L1, summed over a frame, mean over frames (ACMDM's released code)."""
-        loss = self._distance(params, batch)
-        return loss, ({"loss": loss}, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the error on held-out frames, (positions [B, 1, J, 3], mask)."""
-        return {"loss": self._distance(params, held_out[0])}
-
-    def _distance(self, params, clips):
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return L1, summed over a frame, mean over frames (ACMDM's released code); arguments as above."""
+        clips = batch if training else batch[0]
         model, lists = network_with(self.model_config, params), self.codec.mesh.lists
         vertices = self.codec.vertices_of(clips[:, 0])
-        return jnp.sum(jnp.abs(model.decode(model.encode(vertices, lists), lists) - vertices)) / len(clips)
+        distance = jnp.abs(model.decode(model.encode(vertices, lists), lists) - vertices)
+        return {"loss": jnp.sum(distance) / len(clips)}
 
 
 # ------------------------------------------------------------------------------------------------------------ denoiser
@@ -331,10 +252,9 @@ def draw_captioned(key, clips: ClipTable, pooled, config: TextMotionTraining, wi
     return batch, TextCondition(jnp.where(told[:, None], pooled[batch.caption], 0.0), batch.mask)
 
 
-@task_tree(("clips", "pooled"), ("model_config", "schedule"))
-@dataclass(frozen=True, eq=False)
-class TextMotionTask:
-    """A denoiser of text and motion to train (a `training.optimise.Task`).
+@frozen_tree("clips", "pooled")
+class TextMotionTask(Task):
+    """A denoiser of text and motion to train.
 
     Attributes:
       model_config: an `ACMDMConfig` or `MaskedACMDMConfig`.
@@ -345,7 +265,7 @@ class TextMotionTask:
       dataset_fingerprint: of the data, and of the autoencoder where the states are its latents.
     """
 
-    name: ClassVar[str] = "text and motion"
+    name, part = "text and motion", "denoiser"
 
     model_config: ACMDMConfig
     config: TextMotionTraining
@@ -354,35 +274,16 @@ class TextMotionTask:
     pooled: Any
     dataset_fingerprint: str = ""
 
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """AdamW, as the config says."""
-        return self.config.optimiser()
-
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        models = {"denoiser": self.model_config, "diffusion": self.schedule.to_dict()}
-        return part_identity(self.name, models, self.config, self.dataset_fingerprint)
-
-    def init(self, key):
-        """Return initial weights."""
-        return nnx.state(build_from_config(self.model_config, key)), None
-
     def draw(self, state: TrainingState, key):
         """Draw (states, condition) and the key of the loss."""
         key_draw, key_loss = jax.random.split(key)
         batch, condition = draw_captioned(key_draw, self.clips, self.pooled, self.config, self.model_config.window)
         return (batch.motion, condition), key_loss
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)) of what `draw` drew."""
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the loss on a batch as `draw` makes it."""
         network = network_with(self.model_config, params)
-        loss = denoising_loss(network, self.schedule, *batch, key, prefix_frames=self.config.prefix_frames)
-        return loss, ({"loss": loss}, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the loss on a batch as `draw` makes it, of other motions."""
-        return self.loss(params, statistics, held_out, key)[1][0]
+        return {"loss": denoising_loss(network, self.schedule, *batch, key, prefix_frames=self.config.prefix_frames)}
 
 
 # ------------------------------------------------------------------------------------------------------ control branch
@@ -425,20 +326,16 @@ def control_loss(
     state, t, alpha, sigma = noisy_state(key_time, schedule, x0, noise)
     prediction = controlled(base, branch, condition, control)(state, network_time(schedule, t))
     denoising = frame_error(prediction, prediction_target(objective, x0, noise), condition.mask)
-    if objective == "v":
-        x0_hat = noise + prediction
-    else:
-        x0_hat = clean_estimate(objective, prediction, state, alpha, sigma)
+    x0_hat = noise + prediction if objective == "v" else clean_estimate(objective, prediction, state, alpha, sigma)
     motion_mask = jnp.repeat(condition.mask, codec.frames_per_state, axis=1)
     distance = codec.axes.restore(codec.decode(x0_hat, motion_mask)) - codec.axes.restore(positions)
     square = jnp.sum(distance**2 * control.asked[..., None])
     return {"denoising": denoising, "control": square / jnp.maximum(1.0, 3.0 * control.asked.sum())}
 
 
-@task_tree(("clips", "pooled", "base", "codec"), ("model_config", "schedule", "joints"))
-@dataclass(frozen=True, eq=False)
-class ControlTask:
-    """A control branch to train beside a frozen denoiser (a `training.optimise.Task`).
+@frozen_tree("clips", "pooled", "base", "codec")
+class ControlTask(Task):
+    """A control branch to train beside a frozen denoiser.
 
     Attributes:
       model_config: of the denoiser, which is that of the branch.
@@ -453,7 +350,7 @@ class ControlTask:
       dataset_fingerprint: of data, autoencoder and denoiser.
     """
 
-    name: ClassVar[str] = "control branch"
+    name, part = "control branch", "denoiser"
 
     model_config: ACMDMConfig
     config: TextMotionTraining
@@ -465,15 +362,10 @@ class ControlTask:
     joints: tuple[int, ...]
     dataset_fingerprint: str = ""
 
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """AdamW, as the config says."""
-        return self.config.optimiser()
-
     def identity(self) -> dict:
-        """Return all that decides the weights."""
-        models = {"denoiser": self.model_config, "diffusion": self.schedule.to_dict(), "joints": {"of": self.joints}}
-        return part_identity(self.name, models, self.config, self.dataset_fingerprint)
+        """Return all that decides the weights, as JSON has it."""
+        identity = super().identity()
+        return identity | {"model": identity["model"] | {"joints": {"of": self.joints}}}
 
     def init(self, key):
         """Return a branch whose blocks are the base's."""
@@ -491,18 +383,13 @@ class ControlTask:
         kept = jax.random.bernoulli(key_drop, 1.0 - self.config.control_dropout, batch.length.shape)
         return (states, positions, condition, control._replace(kept=kept.astype(states.dtype))), key_loss
 
-    def loss(self, params, statistics, batch, key):
-        """Return (loss, (terms, statistics)) of what `draw` drew."""
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the loss terms on a batch as `draw` makes it."""
         terms = control_loss(
             network_with(self.model_config, self.base), branch_with(self.model_config, self.codec, params),
             self.schedule, self.codec, *batch, key,
         )  # fmt: skip
-        loss = terms["denoising"] + self.config.control_weight * terms["control"]
-        return loss, ({"loss": loss, **terms}, statistics)
-
-    def held_out_terms(self, params, statistics, held_out, key) -> dict:
-        """Return the loss terms on a batch as `draw` makes it, of other motions."""
-        return self.loss(params, statistics, held_out, key)[1][0]
+        return {"loss": terms["denoising"] + self.config.control_weight * terms["control"], **terms}
 
 
 def branch_with(config: ACMDMConfig, codec: MotionCodec, params) -> ControlBranch:

@@ -32,7 +32,7 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import cosine_basis
 from f3amd_lib.training.optimise import TrainingState, advance, initial_state
-from f3amd_lib.training.recipe import TrainingConfig, make_optimiser
+from f3amd_lib.training.recipe import TrainingConfig
 from flax import nnx
 
 UNKNOWN, LEFT, RIGHT = range(3)
@@ -269,7 +269,7 @@ def _initial_weights(config, keys):
 
 def optimiser_by_seed(config: TrainingConfig) -> optax.GradientTransformation:
     """Return a recipe's optimiser for each seed on its own: one seed's large gradient clips no other's."""
-    one = make_optimiser(config)
+    one = config.optimiser()
     return optax.GradientTransformation(jax.vmap(one.init), jax.vmap(one.update))
 
 
