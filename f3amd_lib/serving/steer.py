@@ -16,17 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.generation.foot_locking import leg_chains
 from f3amd_lib.generation.steering import first_pose, usual_pace
 from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.serving.npm_packages import package_credit, package_file
 from f3amd_lib.serving.onnx_export import denoiser_program, model_card
-from f3amd_lib.serving.web_page import head_and_parent, page_json
+from f3amd_lib.serving.web_page import FOLDER, page_json
 from f3amd_lib.training.checkpoints import TrainedModel
 
-WEB = Path(__file__).parent / "web"
 _PAGE = read_toml(Path(__file__).with_name("steer.toml"))
 MODULES = _PAGE["modules"]
 """Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
@@ -71,7 +70,7 @@ def steer_page(
         first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in zip(trained.styles, paces, strict=True)
     ]
     legs = _legs(trained.skeleton)
-    files = {name: package_file("three", path) if path else (WEB / name).read_bytes() for name, _, path in MODULES}
+    files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
     files |= {
         "worker": _worker(RUNTIMES[runtime][0]).encode(),
         "wasm": package_file("onnxruntime-web", RUNTIMES[runtime][1]),
@@ -96,7 +95,7 @@ def steer_page(
     credit = ". ".join(
         filter(None, (card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))))
     )
-    return string.Template((WEB / "steer.html").read_text(encoding="utf-8")).substitute(
+    return string.Template((FOLDER / "steer.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"Steer {trained.name}"),
         name=html.escape(trained.name),
         about=html.escape(
@@ -110,12 +109,12 @@ def steer_page(
         steps=steps,
         feet=" checked" if legs else " disabled",
         about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
-        style=string.Template((WEB / "steer.css").read_text(encoding="utf-8")).substitute(
+        style=string.Template((FOLDER / "steer.css").read_text(encoding="utf-8")).substitute(
             marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
         ),
         data=page_json(data),
         files=page_json({name: _packed(content) for name, content in files.items()}),
-        loader=(WEB / "loader.js").read_text(encoding="utf-8"),
+        loader=(FOLDER / "loader.js").read_text(encoding="utf-8"),
     )
 
 
@@ -149,8 +148,8 @@ def _worker(script: str) -> str:
     # It asks for its address only to find files that the page hands it.
     body = body.replace("import.meta.url", '"https://page.invalid/"')
     exported = ",".join(f"{name}:{own}" for own, name in pairs)
-    motion = (WEB / "motion.js").read_text(encoding="utf-8")
-    worker = (WEB / "steer_worker.js").read_text(encoding="utf-8")
+    motion = (FOLDER / "motion.js").read_text(encoding="utf-8")
+    worker = (FOLDER / "steer_worker.js").read_text(encoding="utf-8")
     ours = re.sub(r"^export ", "", motion, flags=re.M) + re.sub(r"^import .*\n", "", worker, flags=re.M)
     return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
 
