@@ -14,6 +14,7 @@ import re
 import string
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
@@ -60,15 +61,12 @@ def steer_page(
             f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
         )
     card = model_card(trained, num_steps)
-    missing = [style for style in trained.styles if style not in trained.start_poses]
-    if missing:
+    if missing := [style for style in trained.styles if style not in trained.start_poses]:
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
     if program is None:
         program = denoiser_program(trained.network(), weights=weights)
-    paces = [usual_pace(trained, style) for style in trained.styles]
-    poses = [
-        first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in zip(trained.styles, paces, strict=True)
-    ]
+    paces = {style: usual_pace(trained, style) for style in trained.styles}
+    poses = [first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in paces.items()]
     legs = _legs(trained.skeleton)
     files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
     files |= {
@@ -78,13 +76,13 @@ def steer_page(
         "poses": np.asarray(poses, np.float32).tobytes(),
     }
     data = {
-        "card": _used(card)
+        "card": {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
         | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
         | {"legs": legs, "webgpu": runtime == "webgpu"},
         "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
         "head": head_and_parent(trained.skeleton),
-        "paces": paces,
+        "paces": list(paces.values()),
         "colors": LIMB_COLORS,
         "marks": _MARKS,
         "first_styles": _first_styles(trained.styles),
@@ -92,19 +90,16 @@ def steer_page(
     choice = '<label><input type="radio" name="steps" value="{0}"{1}>{0}</label>'
     offered = sorted(map(int, card["sigmas"]), reverse=True)
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
-    credit = ". ".join(
-        filter(None, (card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))))
-    )
+    credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
+    count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
     return string.Template((FOLDER / "steer.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"Steer {trained.name}"),
         name=html.escape(trained.name),
-        about=html.escape(
-            f"{trained.name}, trained on {card['data']}, a diffusion model of {_count(trained)} weights."
-        ),
+        about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
         window=trained.config.window,
         history=trained.config.num_history,
         runtime=html.escape(package_credit("onnxruntime-web").split(":")[0]),
-        credit=html.escape(credit),
+        credit=html.escape(". ".join(filter(None, credits))),
         licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
         steps=steps,
         feet=" checked" if legs else " disabled",
@@ -113,7 +108,9 @@ def steer_page(
             marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
         ),
         data=page_json(data),
-        files=page_json({name: _packed(content) for name, content in files.items()}),
+        files=page_json(
+            {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode("ascii") for name, file in files.items()}
+        ),
         loader=(FOLDER / "loader.js").read_text(encoding="utf-8"),
     )
 
@@ -154,15 +151,6 @@ def _worker(script: str) -> str:
     return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
 
 
-def _packed(content: bytes) -> str:
-    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
-
-
-def _used(card: dict) -> dict:
-    """Return a card without what the page does not read."""
-    return {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
-
-
 def _legs(skeleton) -> list[list[int]] | None:
     """Return hip, knee, ankle and toe of both legs, or None where they are others."""
     try:
@@ -175,9 +163,3 @@ def _first_styles(styles) -> tuple[str, str]:
     """Return the two styles that the slider blends at first."""
     first = "Neutral" if "Neutral" in styles else styles[0]
     return first, next((style for style in ("Proud", *styles) if style in styles and style != first), first)
-
-
-def _count(trained: TrainedModel) -> str:
-    import jax
-
-    return f"{sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params)):,}"
