@@ -105,11 +105,6 @@ class ExportedRound:
         """The program as a portable StableHLO artefact (MLIR bytecode)."""
         return self.exported.mlir_module_serialized
 
-    @property
-    def num_steps(self) -> int:
-        """N, steps of the sampler."""
-        return len(self.sigmas) - 1
-
 
 def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: bool = True) -> ExportedRound:
     """Export a whole round of synthesis with the weights inside.
@@ -315,7 +310,7 @@ def _manifest(
         "format": artefact.FORMAT,
         "model": name,
         "config": config.to_dict(),
-        "num_steps": exported.num_steps,
+        "num_steps": len(exported.sigmas) - 1,
         "sampler": exported.sampler,
         "sigmas": list(exported.sigmas),
         "batch": exported.batch,
