@@ -117,9 +117,9 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
         asked.append((noise.shape, list(times)))
         return real(predict, schedule, noise, times)
 
-    real = latent_motion.follow
+    real = latent_motion.phases.follow
     monkeypatch.setattr(command_line, "_write_shown", written)
-    monkeypatch.setattr(latent_motion, "follow", follow)
+    monkeypatch.setattr(latent_motion.phases, "follow", follow)
     words = ["text", "a person raises the left hand", "--seconds", "1.2", "--seed", "3", "--out", str(tmp_path)]
     assert command_line.main([*words, "--model", "motionpcm", "--steps", "1"]) == 0
     ((name, motion),), ((shape, times),) = made, asked

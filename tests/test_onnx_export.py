@@ -19,7 +19,7 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.serving.onnx_export import (
     CARD,
     PROGRAM,
-    OnnxDenoiser,
+    OnnxProgram,
     denoiser_program,
     export_onnx,
     largest_difference,
@@ -46,16 +46,20 @@ def folder(trained, tmp_path_factory):
 def whole_walks(program, trained, num_steps, batch):
     """The same round by ONNX Runtime and by JAX, [B, T, C] each, of the same noise."""
     network, schedule = trained.network(), trained.diffusion
-    noise, condition = seeded_inputs(trained.config, batch)
+    noise, _, *given = seeded_inputs(trained.config, batch).values()
+    run, condition = OnnxProgram(program), Condition(*given)
     sigmas, key = schedule.grid(num_steps), jax.random.key(7)
     if schedule.sampler == "ddpm":  # draws at each step: the same keys, and then the same start
         key_steps = jax.random.split(key)[1]
     else:
         key_steps = None
-    denoise = OnnxDenoiser(program).given(condition)
+
+    def denoise(x_noisy, sigma):
+        return run(x_noisy=x_noisy, sigma=np.full(batch, sigma), **condition._asdict())
+
     states = list(walk(schedule.sampler, denoise, np.float32(sigmas[0]) * noise, sigmas, key=key_steps))
-    run = jax.jit(lambda noise: sample_round(network, condition, sigmas, key, noise=noise, sampler=schedule.sampler))
-    return np.asarray(states[-1].x_noisy), np.asarray(run(noise))
+    jitted = jax.jit(lambda noise: sample_round(network, condition, sigmas, key, noise=noise, sampler=schedule.sampler))
+    return np.asarray(states[-1].x_noisy), np.asarray(jitted(noise))
 
 
 @needs_onnx
@@ -68,15 +72,13 @@ def test_a_round_agrees_with_jax_for_any_number_of_characters(folder, trained, n
 
 @needs_onnx
 def test_other_weights_or_another_condition_would_be_seen(folder, trained):
-    run, network = OnnxDenoiser((folder / PROGRAM).read_bytes()), trained.network()
-    noise, condition = seeded_inputs(trained.config, 2)
+    run, network = OnnxProgram((folder / PROGRAM).read_bytes()), trained.network()
     level = np.array([1.0, 3.0], np.float32)  # one a character
-    found = run(noise, level, *condition)
-    np.testing.assert_allclose(found, builders.evaluate(network, noise, level, condition), atol=1e-5)
-    assert np.abs(found - run(noise, level[::-1], *condition)).max() > 1e-3
-    for field in Condition._fields:
-        other = condition._replace(**{field: getattr(condition, field)[::-1]})
-        assert np.abs(found - run(noise, level, *other)).max() > 1e-4, field
+    inputs = seeded_inputs(trained.config, 2) | {"sigma": level}
+    found, condition = run(**inputs), Condition(*list(inputs.values())[2:])
+    np.testing.assert_allclose(found, builders.evaluate(network, inputs["x_noisy"], level, condition), atol=1e-5)
+    for name, least in {"sigma": 1e-3, "history": 1e-4, "path": 1e-4, "style": 1e-4}.items():
+        assert np.abs(found - run(**inputs | {name: inputs[name][::-1]})).max() > least, name
 
 
 @needs_onnx
@@ -115,7 +117,7 @@ def test_fewer_bits_are_smaller_and_cost_what_is_measured(folder, trained):
 @needs_onnx
 def test_a_fixed_number_of_characters_is_fixed(trained):
     program = denoiser_program(trained.network(), batch=2)
-    assert OnnxDenoiser(program).input_shapes["history"] == (2, builders.HISTORY, builders.CHANNELS)
+    assert OnnxProgram(program).input_shapes["history"] == (2, builders.HISTORY, builders.CHANNELS)
 
 
 @needs_onnx

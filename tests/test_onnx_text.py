@@ -19,14 +19,8 @@ from f3amd_lib.generation.text_to_motion import text_prediction
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
-from f3amd_lib.serving.onnx_export import CARD, PROGRAM, OnnxProgram
-from f3amd_lib.serving.onnx_text import (
-    export_text_onnx,
-    load_text_or_latent,
-    seeded_text_inputs,
-    text_inputs,
-    text_program,
-)
+from f3amd_lib.serving.onnx_export import CARD, PROGRAM, OnnxProgram, denoiser_program, input_shapes, seeded_inputs
+from f3amd_lib.serving.onnx_text import export_text_onnx, load_text_or_latent
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
 from f3amd_lib.training.latent_models import LatentModel, save_latent_model
 from f3amd_lib.training.motion_codec import MotionCodec
@@ -135,7 +129,7 @@ def by_jax(trained, inputs, count: int) -> np.ndarray:
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_walk_by_the_card_ends_where_jax_ends(exported, batch):
     trained, folder = exported
-    inputs = seeded_text_inputs(network_with(trained.config, trained.params), batch)
+    inputs = seeded_inputs(trained.config, batch)
     counts = json.loads((folder / CARD).read_text(encoding="utf-8"))["steps"]
     assert list(counts) == (["2"] if "guidance" in inputs else ["1", "4"])
     motion = inputs["mask"] > 0.5 if "mask" in inputs else np.s_[:]
@@ -148,7 +142,7 @@ def test_a_walk_by_the_card_ends_where_jax_ends(exported, batch):
 def test_every_input_is_heard(exported):
     trained, folder = exported
     run = OnnxProgram((folder / PROGRAM).read_bytes())
-    inputs = seeded_text_inputs(network_with(trained.config, trained.params), 2)
+    inputs = seeded_inputs(trained.config, 2)
     inputs["time"] = np.array([0.2, 0.9]) if "mask" in inputs else np.array([100.0, 900.0])
     said = run(**inputs)
     # Frames of early blocks see no later ones, and only those are masked here.
@@ -176,9 +170,9 @@ def test_what_is_no_model_of_text_is_left_to_others_or_refused(tmp_path, monkeyp
     save_model(tmp_path / "walker.safetensors", walker)
     assert load_text_or_latent(tmp_path / "walker.safetensors") is None
     refused("other.safetensors", load_text_or_latent, tmp_path / "other.safetensors")
-    refused("only ACMDM", text_inputs, walker.network(), 2)
+    refused("got LatentAutoencoderConfig", input_shapes, motionpcm(0).autoencoder, 2)
     alone = dataclasses.replace(motionpcm(0), config=None, params=None)
     refused("autoencoder alone", export_text_onnx, alone, tmp_path / "out")
     network = network_with(acmdm().config, acmdm().params)
-    refused("at least 1", text_program, network, batch=0)
-    refused("unknown weights", text_program, network, weights="int4")
+    refused("at least 1", denoiser_program, network, batch=0)
+    refused("unknown weights", denoiser_program, network, weights="int4")

@@ -27,7 +27,8 @@ from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.serving import npm_packages, steer
 from f3amd_lib.serving.npm_packages import package_file
 from f3amd_lib.serving.onnx_export import model_card
-from f3amd_lib.serving.steer import WEB, steer_page, write_steer
+from f3amd_lib.serving.steer import steer_page, write_steer
+from f3amd_lib.serving.web_page import FOLDER
 from f3amd_lib.training.checkpoints import describe_skeleton
 
 SIGMAS = variance_exploding().grid(3)
@@ -36,7 +37,7 @@ BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};
 
 def in_node(tmp_path, body: str, **given):
     """Run a script with motion.js as `m` and `given`; what it hands to `say` comes back."""
-    (tmp_path / "motion.mjs").write_bytes((WEB / "motion.js").read_bytes())
+    (tmp_path / "motion.mjs").write_bytes((FOLDER / "motion.js").read_bytes())
     (tmp_path / "given.json").write_text(json.dumps(given))
     (tmp_path / "test.mjs").write_text(
         'import * as m from "./motion.mjs"; import { readFileSync } from "node:fs";'
@@ -218,7 +219,7 @@ def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp
     path = write_steer(tmp_path / "steer.html", trained, program=b"weights")
     page = path.read_text(encoding="utf-8")
     files = {name: gzip.decompress(base64.b64decode(text)) for name, text in carried(page, "steer-files").items()}
-    assert files["program"] == b"weights" and files["motion.js"] == (WEB / "motion.js").read_bytes()
+    assert files["program"] == b"weights" and files["motion.js"] == (FOLDER / "motion.js").read_bytes()
     poses = np.frombuffer(files["poses"], np.float32).reshape(2, builders.HISTORY, builders.CHANNELS)
     np.testing.assert_allclose(poses[:, -1, [0, 2]], 0.0, atol=1e-6)
     data = carried(page, "steer-data")
@@ -262,7 +263,7 @@ def test_the_page_for_a_graphics_card_carries_the_runtime_for_both(trained, monk
     ],
 )
 def test_the_worker_takes_webgpu_only_where_it_is_wanted_and_works(tmp_path, wanted, card, works, runs):
-    worker = re.sub(r"^import .*\n", "", (WEB / "steer_worker.js").read_text(encoding="utf-8"), flags=re.M)
+    worker = re.sub(r"^import .*\n", "", (FOLDER / "steer_worker.js").read_text(encoding="utf-8"), flags=re.M)
     script = (
         "const given = JSON.parse(process.argv[2]), normalNumbers = () => 0, asked = [];"
         "const ort = {env: {wasm: {}}, InferenceSession: {create: async (program, {executionProviders: [name]}) => {"

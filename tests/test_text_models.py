@@ -352,7 +352,7 @@ def test_the_model_is_told_the_caption_and_the_control_in_its_own_units(folder, 
         seen.update(condition=condition, control=control, told=told)
         return control.positions
 
-    monkeypatch.setattr(captioned_motion, "sample_control", sample)
+    monkeypatch.setattr(captioned_motion.text_to_motion, "sample_control", sample)
     points = np.array([[0.1, 1.2, 0.3], [0.4, 0.9, 0.6]])
     wrist = controlled_joints(trained.skeleton)["left_wrist"]
     control = captioned_motion.control_of(trained, wrist, [3, 20], points, 24)
@@ -382,7 +382,7 @@ def test_a_stream_goes_straight_on_wherever_it_walks(folder, name, monkeypatch):
         steps = 1.0 + jnp.arange(network.config.window - prefix.shape[1])[:, None, None]
         yield prefix[:, -1:] + steps * (prefix[:, -1:] - prefix[:, -2:-1])
 
-    monkeypatch.setattr(captioned_motion, "continue_prefix", go_on)
+    monkeypatch.setattr(captioned_motion.text_to_motion, "continue_prefix", go_on)
     pooled = np.eye(8, dtype=np.float32)[:2]
     positions = captioned_motion.stream_motions(trained, pooled, [1, 2], jax.random.key(0))
     first = 12

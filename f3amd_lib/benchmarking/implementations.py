@@ -120,10 +120,10 @@ def compile_round(workload: Workload, run: Callable, sharding=None) -> Round:
     return Round(call, seconds, None if accessed is None else int(accessed))
 
 
-def _jit(workload: Workload, form=lambda network: network) -> Round:
+def _jit(workload: Workload, form=lambda network: network, sample=sample_round, sharding=None) -> Round:
     network, sigmas = form(_network(workload)), workload.sigmas
-    run = lambda condition, key: sample_round(network, condition, sigmas, key, sampler=workload.sampler)
-    return compile_round(workload, run)
+    run = lambda condition, key: sample(network, condition, sigmas, key, sampler=workload.sampler)
+    return compile_round(workload, run, sharding)
 
 
 def _all_devices(workload: Workload) -> Round:
@@ -131,11 +131,8 @@ def _all_devices(workload: Workload) -> Round:
     if len(devices) < 2:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
     mesh = Mesh(np.array(devices), ("characters",))
-    network, sigmas = _network(workload), workload.sigmas
-    run = lambda condition, key: sample_round_on_devices(
-        network, condition, sigmas, key, mesh=mesh, sampler=workload.sampler
-    )
-    return compile_round(workload, run, NamedSharding(mesh, PartitionSpec("characters")))
+    sharding = NamedSharding(mesh, PartitionSpec("characters"))
+    return _jit(workload, sample=partial(sample_round_on_devices, mesh=mesh), sharding=sharding)
 
 
 def _check_outside_of_jax(workload: Workload, framework: str) -> None:

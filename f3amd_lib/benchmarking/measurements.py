@@ -55,13 +55,8 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra)
 def _circumstances() -> dict:
     """Return what of the machine may change from one group of rows to the next."""
     machine = describe_machine()
-    return {
-        "load": machine["load"],
-        "clock_mhz": machine["clock_mhz"],
-        "devices": jax.local_device_count(),
-        "xla_flags": machine["xla_flags"],
-        "clocks": machine["graphics_clocks"],
-    }
+    changing = {name: machine[name] for name in ("load", "clock_mhz")} | {"devices": jax.local_device_count()}
+    return changing | {"xla_flags": machine["xla_flags"], "clocks": machine["graphics_clocks"]}
 
 
 def measure_synthesis_time(

@@ -16,14 +16,7 @@ from pathlib import Path
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_lib.benchmarking.implementations import (
-    IMPLEMENTATIONS,
-    NotPossible,
-    Workload,
-    framework_probe,
-    prepare_round,
-    round_flops,
-)
+from f3amd_lib.benchmarking import implementations
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.files import read_toml
@@ -109,29 +102,27 @@ def time_group(
     if len(groups) != 1:
         raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
     ((window, characters, precision),) = groups
-    ready, workloads, failed = {}, {}, {}
+    ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:
             bar.set_postfix_str(str(candidate))
             config = build_config(candidate.model, window)
-            workload = Workload(candidate.model, config, candidate.steps, characters, precision)
+            workload = implementations.Workload(candidate.model, config, candidate.steps, characters, precision)
             try:
-                ready[candidate] = prepare_round(candidate.implementation, workload)
-            except NotPossible as reason:
+                ready[candidate] = workload, implementations.prepare_round(candidate.implementation, workload)
+            except implementations.NotPossible as reason:
                 failed[str(candidate)] = str(reason)
-            else:
-                workloads[candidate] = workload
     if not ready:
         return pd.DataFrame(), failed
-    frameworks = {candidate: IMPLEMENTATIONS[candidate.implementation][0] for candidate in ready}
+    frameworks = {candidate: implementations.IMPLEMENTATIONS[candidate.implementation][0] for candidate in ready}
     yardsticks = {candidate: "torch" if framework == "torch" else "jax" for candidate, framework in frameworks.items()}
-    probes = {name: framework_probe(name, precision) for name in dict.fromkeys(yardsticks.values())}
-    calls = {candidate: done.call for candidate, done in ready.items()}
+    probes = {name: implementations.framework_probe(name, precision) for name in dict.fromkeys(yardsticks.values())}
+    calls = {candidate: done.call for candidate, (_, done) in ready.items()}
     calls |= {name: multiply for name, (multiply, _) in probes.items()}
     timings = take_turns(calls, progress=progress, **turns)
     rows = []
-    for candidate, workload in workloads.items():
-        timing, yardstick, flops = timings[candidate], yardsticks[candidate], round_flops(workload)
+    for candidate, (workload, done) in ready.items():
+        timing, yardstick, flops = timings[candidate], yardsticks[candidate], implementations.round_flops(workload)
         reached = flops / timing.median / 1e9
         peak = probes[yardstick][1] / timings[yardstick].median / 1e9
         rows.append(
@@ -147,8 +138,8 @@ def time_group(
                 "characters": characters,
                 **timing.columns("ms", 1e3),
                 "rounds": timing.rounds,
-                "compile_seconds": round(ready[candidate].compile_seconds, 2),
-                "bytes_accessed": ready[candidate].bytes_accessed,
+                "compile_seconds": round(done.compile_seconds, 2),
+                "bytes_accessed": done.bytes_accessed,
                 "flops": flops,
                 "gflops": reached,
                 "peak_gflops": peak,

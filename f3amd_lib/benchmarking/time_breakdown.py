@@ -96,9 +96,8 @@ def time_breakdown(workload: Workload, *, progress: bool = False, **turns) -> pd
       value, low and high in ms, rounds, and saved: the share of the whole round's time.
     """
     network = presets.build_from_config(workload.config, jax.random.key(0))
-    noise = jax.random.normal(
-        jax.random.key(1), (workload.characters, workload.config.window, workload.config.channels)
-    )
+    shape = workload.characters, workload.config.window, workload.config.channels
+    noise = jax.random.normal(jax.random.key(1), shape)
 
     def call(network, noise=None):
         run = lambda condition, key: sample_round(

@@ -29,6 +29,8 @@ from f3amd_lib.drawing.stick_figures import (
     body_lines,
     drawn_points,
     path_on_ground,
+    toes_of,
+    yaw_of,
 )
 from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style, save_figure
 from f3amd_lib.ground.files import whole_file
@@ -82,25 +84,9 @@ def _on_ground(xz: np.ndarray) -> np.ndarray:
     return np.stack([xz[..., 0], np.zeros(xz.shape[:-1]), xz[..., 1]], axis=-1)
 
 
-def _facing(motion: Motion) -> np.ndarray | None:
-    """Yaw per frame, [T], or None where the skeleton's hips are not known."""
-    try:
-        return motion.yaw
-    except ValueError:
-        return None
-
-
-def _toes(motion: Motion) -> list[int]:
-    """Left and right toe, or none where they are not known."""
-    try:
-        return list(motion.skeleton.toes)
-    except ValueError:
-        return []
-
-
 def _toes_down(motion: Motion, frames) -> list:
     """Toes in contact at each frame that is asked for."""
-    toes = np.array(_toes(motion))
+    toes = np.array(toes_of(motion.skeleton))
     return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]] if len(toes) else [()] * len(frames)
 
 
@@ -165,7 +151,7 @@ def film_strip(
         poses.set_xlim(ends[:, 0].min(), ends[:, 1].max())
     for side in ("left", "right"):
         axes[0, 0].plot([], [], color=LIMB_COLORS[side], linewidth=3, label=side)
-    if any(_toes(motion) for motion, *_ in rows):
+    if any(toes_of(motion.skeleton) for motion, *_ in rows):
         axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
     small = {"fontsize": 8, "handlelength": 1.2, "columnspacing": 1.2, "borderaxespad": 0.2}
     # Below everything: titles may be as long as the strip.
@@ -197,7 +183,7 @@ SLOT = 1.15  # metres of page a pose
 
 def _draw_poses(axis, motion: Motion, chosen, around: float, *, scale: float = 60.0, numbered: bool = True) -> None:
     points = drawn_points(motion, chosen)
-    yaw, touching = _facing(motion), _toes_down(motion, chosen)
+    yaw, touching = yaw_of(motion), _toes_down(motion, chosen)
     facing = np.zeros(len(chosen))
     if yaw is not None:
         facing = gaussian_filter1d(np.unwrap(yaw), 0.3 * motion.fps, mode="nearest")[chosen]
@@ -225,7 +211,7 @@ def _draw_plan(axis, motion: Motion, chosen, path) -> None:
     everything = np.concatenate([root, target])
     extent = np.ptp(everything, axis=0).max()
     reach, side = 0.09 * max(extent, 1.0), max(1.25 * extent, 2.0)
-    yaw, numbered = _facing(motion), np.full(2, np.inf)
+    yaw, numbered = yaw_of(motion), np.full(2, np.inf)
     for place, frame in enumerate(chosen, start=1):
         angle = 0.0 if yaw is None else yaw[frame]
         ahead, beside = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
@@ -364,7 +350,7 @@ def draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) 
         paler = 0.4 * (depths[k] - depths.min()) / max(np.ptp(depths), 3.0)  # who walk abreast look alike
         tints = {"left": color + 0.22 * (1 - color), "right": 0.82 * color, "middle": color, "head": color}
         tints = {side: tint + paler * (1 - tint) for side, tint in tints.items()}
-        past = motion.positions[max(0, frame - round(1.5 * motion.fps)) : frame + 1, _toes(motion)]
+        past = motion.positions[max(0, frame - round(1.5 * motion.fps)) : frame + 1, toes_of(motion.skeleton)]
         for foot in range(past.shape[1]):
             lower = past[:, foot, 1] <= past[..., 1].min(axis=1)
             prints = np.where(lower[:, None], past[:, foot][:, [0, 2]], np.nan)
@@ -459,7 +445,7 @@ def write_gif(
 def _gif_panel(axis, motion: Motion, target, title: str, frames, size, around: float):
     """Prepare a panel of a GIF; return what draws it at a place in `frames`, held at the motion's last."""
     frames = np.minimum(frames, motion.num_frames - 1)
-    points, touching, yaw = drawn_points(motion, frames), _toes_down(motion, frames), _facing(motion)
+    points, touching, yaw = drawn_points(motion, frames), _toes_down(motion, frames), yaw_of(motion)
     root = np.asarray(motion.root_position, dtype=np.float64)
     follow = gaussian_filter1d(root, 0.25 * motion.fps, axis=0, mode="nearest")[frames]
     walked, target = root[:, [0, 2]], None if target is None else path_on_ground(target)

@@ -84,6 +84,28 @@ def is_head(name: str) -> bool:
     return name.lower().split(":")[-1] == "head"
 
 
+def head_and_parent(skeleton: Skeleton) -> list[int] | None:
+    """Return the head joint and its parent; None where no joint is called head, or the root is."""
+    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
+    return [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None
+
+
+def toes_of(skeleton: Skeleton) -> list[int]:
+    """Return the left and the right toe, or none where they are not known."""
+    try:
+        return list(skeleton.toes)
+    except ValueError:
+        return []
+
+
+def yaw_of(motion: Motion) -> np.ndarray | None:
+    """Return where a motion faces, [T], radians, or None where the skeleton's hips are not known."""
+    try:
+        return motion.yaw
+    except ValueError:
+        return None
+
+
 def drawn_points(motion: Motion, frames: np.ndarray) -> np.ndarray:
     """Positions of joints and end sites at some frames, [len(frames), J + tips, 3]."""
     positions = np.asarray(motion.positions, dtype=np.float64)[frames]
@@ -99,10 +121,10 @@ def drawn_points(motion: Motion, frames: np.ndarray) -> np.ndarray:
 
 def head_center(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
     """Where to draw a head: a little beyond the head joint, away from its parent, [F, 3]."""
-    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
-    if not heads or skeleton.parents[heads[0]] < 0:
+    joints = head_and_parent(skeleton)
+    if joints is None:
         return None
-    head, neck = points[:, heads[0]], points[:, skeleton.parents[heads[0]]]
+    head, neck = np.moveaxis(points[:, joints], 1, 0)
     along = head - neck
     length = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
     return head + 0.07 * along / length

@@ -21,6 +21,8 @@ result is linear in the offset.
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -95,54 +97,43 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
     start = before.shape[-2]
     for seam in range(start or window, len(whole), int(window)):
         stop = min(seam + int(blend_frames), len(whole))
-        for space, values in ((_Positions, root), (_Rotations, turns)):
-            added = _offsets(space, values, seam, int(blend_frames))[: stop - seam]
-            values[seam:stop] = space.add(added, values[seam:stop])
+        for values, between, add in ((root, np.subtract, np.add), (turns, _turn_between, _turned)):
+            added = _offsets(values, between, add, seam, int(blend_frames))[: stop - seam]
+            values[seam:stop] = add(added, values[seam:stop])
     flat = rotation_6d_from_matrix(turns).reshape(*whole.shape[:-1], -1)
     blended = np.concatenate([root, flat], axis=-1)[start:]
     return np.moveaxis(blended, 0, -2)
 
 
-class _Positions:
-    """Differences and sums of positions [..., 3]."""
-
-    @staticmethod
-    def between(first, second):
-        return second - first
-
-    @staticmethod
-    def add(step, value):
-        return value + step
+def _turn_between(second, first):
+    """Return the rotation vectors [..., 3] that turn rotations [..., 3, 3] into others, the second, from the left."""
+    turn = second @ np.swapaxes(first, -1, -2)
+    return Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:-1])
 
 
-class _Rotations:
-    """The same for rotation matrices [..., 3, 3], with rotation vectors [..., 3] as steps."""
-
-    @staticmethod
-    def between(first, second):
-        turn = second @ np.swapaxes(first, -1, -2)
-        vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec()
-        return vectors.reshape(turn.shape[:-1])
-
-    @staticmethod
-    def add(step, value):
-        step = np.array(np.broadcast_to(step, value.shape[:-1]))
-        turn = Rotation.from_rotvec(step.reshape(-1, 3)).as_matrix()
-        return turn.reshape(value.shape) @ value
+def _turned(vectors, rotations):
+    """Return rotations [..., 3, 3], turned by rotation vectors [..., 3] from the left."""
+    vectors = np.array(np.broadcast_to(vectors, rotations.shape[:-1]))
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(rotations.shape) @ rotations
 
 
-def _offsets(space, values, seam: int, num_frames: int) -> np.ndarray:
-    """Return what has to be added to the frames after a seam, [N, ..., 3]."""
+def _offsets(values, between: Callable, add: Callable, seam: int, num_frames: int) -> np.ndarray:
+    """Return what has to be added to the frames after a seam, [N, ..., 3].
+
+    Args:
+      values: positions or rotations by frame; `between(second, first)` is the step from first to second, [..., 3], and
+        `add(step, first)` takes it.
+    """
     earlier = values[max(0, seam - 3) : seam][::-1]
     later = values[seam : seam + 3]
-    steps = [[space.between(side[k + 1], side[k]) for k in range(len(side) - 1)] for side in (earlier, later)]
+    steps = [[between(towards, away) for towards, away in itertools.pairwise(side)] for side in (earlier, later)]
     # A side of one frame goes on as the other does; one of two frames keeps its step.
-    still = np.zeros_like(space.between(values[seam], values[seam]))
+    still = np.zeros_like(between(values[seam], values[seam]))
     toward = [own or [-other[0] if other else still] for own, other in (steps, steps[::-1])]
     (left, left_before), (right, right_before) = ((own[0], own[-1]) for own in toward)
     # Towards the seam: linear in value (equal accelerations of both sides cancel), and with its own
     # acceleration in velocity. The later side runs backwards in time.
-    offset = space.between(space.add(0.5 * right, later[0]), space.add(0.5 * left, earlier[0]))
+    offset = between(add(0.5 * left, earlier[0]), add(0.5 * right, later[0]))
     velocity = (2.0 * left - left_before) + (2.0 * right - right_before)
     return dying_offset(offset, velocity, num_frames)
 

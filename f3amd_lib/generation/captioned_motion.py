@@ -15,14 +15,8 @@ import numpy as np
 
 from f3amd_lib.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
+from f3amd_lib.generation import text_to_motion
 from f3amd_lib.generation.latent_motion import latent_motions
-from f3amd_lib.generation.text_to_motion import (
-    continue_prefix,
-    sample_blocks,
-    sample_control,
-    sample_masked,
-    sample_text,
-)
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import smoothed_yaw
 from f3amd_lib.motion.rotations import matrix_from_yaw
@@ -192,12 +186,12 @@ def motion_drawer(
     def compiled(weights, codec, pooled, mask, noise, key, control):
         network, condition = network_with(config, weights["network"]), TextCondition(pooled, codec.state_mask(mask))
         if controlled:
-            branch = branch_with(config, codec, weights["branch"])
-            state = sample_control(network, branch, schedule, condition, control, noise, key=key, **asked)
+            given = branch_with(config, codec, weights["branch"]), schedule, condition, control, noise
+            state = text_to_motion.sample_control(network, *given, key=key, **asked)
         elif isinstance(config, MaskedACMDMConfig):
-            state = sample_masked(network, schedule, condition, key, **asked)
+            state = text_to_motion.sample_masked(network, schedule, condition, key, **asked)
         else:
-            sample = sample_blocks if config.block_frames else sample_text
+            sample = text_to_motion.sample_blocks if config.block_frames else text_to_motion.sample_text
             state = sample(network, schedule, condition, noise, key=key, **asked)
         return codec.decode_vertices(state) if mesh else codec.decode(state, mask)
 
@@ -297,7 +291,7 @@ def stream_motions(
     @jax.jit
     def go_on(before, caption, key):
         prefix = codec.encode(before, jnp.ones((1, given), bool))
-        (made,) = continue_prefix(trained.network(), trained.schedule, prefix, [caption], key, **asked)
+        (made,) = text_to_motion.continue_prefix(trained.network(), trained.schedule, prefix, [caption], key, **asked)
         state = jnp.concatenate([prefix, made], axis=1)
         return codec.decode(state, jnp.ones((1, state.shape[1] * codec.frames_per_state), bool))[:, given:]
 

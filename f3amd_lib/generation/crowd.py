@@ -135,9 +135,8 @@ def _sunflower(characters: range) -> np.ndarray:
 
 
 def plan_crowd(
-    num_characters: int, num_frames: int, *, pace=_TEMPLATE_SPEED, seed: int = 0,
-    min_distance: float = MIN_DISTANCE, radius: float | None = None, names: Sequence[str] = PATHS,
-) -> tuple[RootPath, ...]:  # fmt: skip
+    num_characters: int, num_frames: int, *, pace=_TEMPLATE_SPEED, seed: int = 0, min_distance: float = MIN_DISTANCE
+) -> tuple[RootPath, ...]:
     """Plan paths for a crowd that keeps apart, ready for `MotionGenerator.rollout`.
 
     Args:
@@ -146,25 +145,20 @@ def plan_crowd(
       pace: of all, or of each, [B], m/s.
       seed: of all choices.
       min_distance: metres between any two characters at every frame.
-      radius: of the disc that holds the starting places, metres; they fill it only if they have
-        to. By default it is as large as it has to be.
-      names: of `paths.NAMES` to draw from.
 
     Returns:
       A path each; the same for the same arguments.
 
     Raises:
-      ValueError: for counts or paces out of range, an unknown path, or what `keep_apart` refuses.
+      ValueError: for counts or paces out of range, or what `keep_apart` refuses.
     """
     num_characters = _whole("num_characters", num_characters, 1)
     num_frames, seed = _whole("num_frames", num_frames, 2), checked_seed(seed)
     pace = np.asarray(pace, np.float64)
     if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
         raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
-    make_paths, _ = _path_maker(names)
-    pace = np.broadcast_to(pace, (num_characters,))
-    paths = make_paths(range(num_characters), pace, num_frames, seed)
-    position, yaw = keep_apart(*paths, min_distance=min_distance, radius=radius, fps=_FPS)
+    paths = crowd_paths(range(num_characters), np.broadcast_to(pace, (num_characters,)), num_frames, seed)
+    position, yaw = keep_apart(*paths, min_distance=min_distance, fps=_FPS)
     return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
 
 

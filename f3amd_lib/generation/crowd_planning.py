@@ -7,8 +7,7 @@ motion. That is repeated until no two are too close at any frame. Bumps change h
 walks. Who would have to hurry or dawdle out of bounds gets the old path back, and from then on is
 moved aside as a whole. Starting places of a crowd that has to be untangled are moved apart before
 that, by 1.44, and again as long as it is too dense even so. So it ends: places that lie farther
-apart than two paths are long need no bump at all. Within a given radius they are moved apart only
-if they cannot stay where they are, and no farther than it allows.
+apart than two paths are long need no bump at all.
 
 Nothing is left to chance or to a proof: `keep_apart` measures every frame of what it returns.
 Networks follow paths to a few centimetres, so that generated characters keep a little less distance
@@ -18,8 +17,6 @@ Source: ours. The paper does not say how the characters of its Figure 1 keep apa
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter1d
@@ -43,8 +40,6 @@ _ROUNDS = 60
 _EVERY = 5  # frames looked at until the last rounds; two pass each other more slowly than that
 _SPREADS = 1.2 ** np.arange(2, 40)  # ends at a factor of 1000
 _LARGE = 256  # characters; larger crowds begin farther apart, as a round takes them seconds
-_TIGHTER = (1.0, 0.97, 0.94, 0.9, 0.85)  # shares of a given radius that are tried
-_DENSEST = math.pi / math.sqrt(12.0)  # share of a plane that discs can cover
 _SMOOTH_TURN = 0.15  # seconds; what is turned by a bump is smoothed so far
 
 
@@ -68,7 +63,7 @@ def closest_approach(position) -> np.ndarray:
 
 
 def keep_apart(
-    position, yaw, *, min_distance: float = MIN_DISTANCE, radius: float | None = None, fps: float = 30.0
+    position, yaw, *, min_distance: float = MIN_DISTANCE, fps: float = 30.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bend and spread paths until all characters keep a distance at every frame.
 
@@ -76,60 +71,34 @@ def keep_apart(
       position: paths that know nothing of each other, [B, F, 2], metres.
       yaw: their facing, [B, F], radians; turned with the line.
       min_distance: metres between any two roots at any frame.
-      radius: all starting places stay within this distance of their middle, metres; they are
-        spread no wider than they have to be. By default they take the room they need.
       fps: frames per second.
 
     Returns:
       (position [B, F, 2], yaw [B, F]), float64; the same for the same input. Every character's
       speed lies within `SPEED_BOUNDS` of its own. Paths that keep apart already come back
-      unchanged, unless they start outside the radius.
+      unchanged.
 
     Raises:
-      ValueError: for arrays that do not fit, a distance that is not above 0, or a radius within
-        which so many characters cannot keep apart.
+      ValueError: for arrays that do not fit, a distance that is not above 0, or characters that find no
+        paths however far they are spread.
     """
     position = finite_array("position", position, _SHAPE)
     yaw = finite_array("yaw", yaw, position.shape[:2])
     if not (np.isfinite(min_distance) and min_distance > 0):
         raise ValueError(f"min_distance must be above 0 metres, got {min_distance}")
     check_positive("fps", fps)
-    if radius is not None:
-        _check_room(len(position), min_distance, radius)
+    if closest_approach(position).min() >= min_distance:
+        return position.copy(), yaw.copy()
     start = position[:, 0]
     middle = 0.5 * (start.min(axis=0) + start.max(axis=0))
     places, walked = start - middle, position - position[:, :1]
-    reach = float(np.linalg.norm(places, axis=-1).max())
-    if (radius is None or reach <= radius) and closest_approach(position).min() >= min_distance:
-        return position.copy(), yaw.copy()
-    spreads = _SPREADS[2 if len(position) > _LARGE else 0 :]
-    if radius is not None:
-        widest = radius / reach if reach > 0 else 1.0
-        wider = np.concatenate([[1.0], spreads])
-        # In the end nearly as wide as it may be, for stepping aside moves starting places, too.
-        spreads = np.concatenate([wider[wider < widest], widest * np.array(_TIGHTER)])
-    for spread in spreads:
+    for spread in _SPREADS[2 if len(position) > _LARGE else 0 :]:
         wanted = middle + spread * places[:, None] + walked
         bent = _untangle(wanted, min_distance, fps)
-        if bent is None:
-            continue
-        if radius is None or np.linalg.norm(bent[:, 0] - middle, axis=-1).max() <= radius:
+        if bent is not None:
             return bent, _turned(wanted, bent, yaw, fps)
     what = f"{len(position)} characters found no paths {min_distance:g} m apart"
-    if radius is None:
-        raise ValueError(f"{what} however far they were spread; do some of them start in the same place?")
-    raise ValueError(f"{what} from starting places within {radius:g} m; give them more room or a smaller distance")
-
-
-def _check_room(count: int, min_distance: float, radius: float) -> None:
-    """Refuse what no arrangement can do: discs of the distance cover a share of the plane."""
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be above 0 metres, got {radius}")
-    room = (radius + 0.5 * min_distance) ** 2  # discs may stick out by half
-    most = math.floor(_DENSEST * room / (0.5 * min_distance) ** 2)
-    if count > most:
-        what = f"{count} characters cannot stand {min_distance:g} m apart within {radius:g} m: at most {most} can"
-        raise ValueError(f"{what}; give them more room or a smaller distance")
+    raise ValueError(f"{what} however far they were spread; do some of them start in the same place?")
 
 
 def _untangle(wanted: np.ndarray, min_distance: float, fps: float) -> np.ndarray | None:

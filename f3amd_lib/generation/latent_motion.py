@@ -13,14 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.data.text_motions import frame_mask
-from f3amd_lib.diffusion.phases import (
-    LATENT_CONSISTENCY_TIMES,
-    cut_phases,
-    ddim_times,
-    follow,
-    guided_noise,
-    sample_latent_consistency,
-)
+from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.motion.redundant import positions_from_redundant
 from f3amd_lib.networks.motionpcm import LatentAutoencoder, LatentDenoiser
@@ -54,7 +47,7 @@ def teacher_prediction(teacher: LatentDenoiser, text, empty, guidance=TEACHER_GU
     told, free = teacher.encode(text), teacher.encode(jnp.broadcast_to(empty, text.shape))
     if guidance == 0.0:
         return lambda state, time: teacher(state, time, told)
-    return lambda state, time: guided_noise(teacher(state, time, told), teacher(state, time, free), guidance)
+    return lambda state, time: phases.guided_noise(teacher(state, time, told), teacher(state, time, free), guidance)
 
 
 def sample_student(
@@ -71,8 +64,8 @@ def sample_student(
       skip: k of the training: it says where phases end.
       guidance: w.
     """
-    visited = cut_phases(len(schedule.levels), skip, num_steps).visited
-    return follow(student_prediction(student, text, guidance), schedule, noise, visited)
+    visited = phases.cut_phases(len(schedule.levels), skip, num_steps).visited
+    return phases.follow(student_prediction(student, text, guidance), schedule, noise, visited)
 
 
 def sample_teacher(
@@ -80,8 +73,8 @@ def sample_teacher(
     guidance=TEACHER_GUIDANCE, spacing: str = "trailing",
 ):  # fmt: skip
     """Draw latents by DDIM with guidance; arguments as of `teacher_prediction` and `phases.ddim_times`."""
-    times = ddim_times(len(schedule.levels), num_steps, spacing)
-    return follow(teacher_prediction(teacher, text, empty, guidance), schedule, noise, times)
+    times = phases.ddim_times(len(schedule.levels), num_steps, spacing)
+    return phases.follow(teacher_prediction(teacher, text, empty, guidance), schedule, noise, times)
 
 
 def sample_latent_student(student: LatentDenoiser, schedule: NoiseSchedule, text, noise, key, *, num_steps=1, guidance):
@@ -94,7 +87,7 @@ def sample_latent_student(student: LatentDenoiser, schedule: NoiseSchedule, text
       num_steps: 1, 2 or 4 (`phases.LATENT_CONSISTENCY_TIMES`).
     """
     predict = student_prediction(student, text, guidance)
-    return sample_latent_consistency(predict, schedule, noise, LATENT_CONSISTENCY_TIMES[num_steps], key)
+    return phases.sample_latent_consistency(predict, schedule, noise, phases.LATENT_CONSISTENCY_TIMES[num_steps], key)
 
 
 def decode_latent(autoencoder: LatentAutoencoder, statistics, latent, mask):
@@ -133,7 +126,7 @@ def steps_of(trained: LatentModel, num_steps: int | None = None) -> int:
         fits = range(1, levels + 1)
         own = min(TEACHER_STEPS, levels)
     elif told["consistency"] == "latent":
-        fits, own = tuple(LATENT_CONSISTENCY_TIMES), 1
+        fits, own = tuple(phases.LATENT_CONSISTENCY_TIMES), 1
     else:
         fits, own = (told["num_phases"],), told["num_phases"]
     if (num_steps or own) not in fits:

@@ -26,6 +26,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,31 +37,20 @@ from jax.extend.mlir import ir, passmanager
 from jax.extend.mlir.dialects import stablehlo
 
 from f3amd_lib.diffusion.samplers import ddpm_step
-from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.generation.rounds import sample_round
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.serving.artefact import (
-    FEATURES,
-    FORMAT,
-    JAX_EXPORT,
-    MANIFEST,
-    STABLEHLO,
-    cpu_features,
-    iree_version,
-    manifest_digest,
-    read_manifest,
-)
+from f3amd_lib.serving import artefact
 from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 
 _ENTRY = "main"
 """What JAX calls the program's one public function."""
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(NamedTuple):
     """What IREE compiles for, and how.
 
     Attributes:
@@ -71,28 +61,21 @@ class Target:
 
     backend: str
     driver: str
-    flags: tuple[str, ...] = ()
+    flags: list[str]
 
+
+TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
+"""Targets by name. "cuda-sm_NN" is a generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
 
 # Matrices in tiles of the CPU's own size, weights packed so at compile time.
 _DATA_TILING = ("--iree-opt-data-tiling", "--iree-dispatch-creation-data-tiling")
 
-TARGETS = {
-    "llvm-cpu": Target(
-        "llvm-cpu", "local-task", ("--iree-llvmcpu-target-cpu=host", "--iree-opt-level=O3", *_DATA_TILING)
-    ),
-    "vmvx": Target("vmvx", "local-task"),
-    "vulkan-spirv": Target("vulkan-spirv", "vulkan", ("--iree-opt-level=O3",)),
-}
-"""Targets by name: the CPU of this machine, IREE's portable bytecode, Vulkan. "cuda-sm_NN" is a
-generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
-
 
 def _find_target(name: str) -> Target:
     if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
-        return Target("cuda", "cuda", (f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"))
+        return Target("cuda", "cuda", [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"])
     check_known(name, [*TARGETS, "cuda-sm_80"], "target")
-    return TARGETS[name]
+    return Target(name, **TARGETS[name])
 
 
 @dataclass(frozen=True)
@@ -121,11 +104,6 @@ class ExportedRound:
     def stablehlo(self) -> bytes:
         """The program as a portable StableHLO artefact (MLIR bytecode)."""
         return self.exported.mlir_module_serialized
-
-    @property
-    def num_steps(self) -> int:
-        """N, steps of the sampler."""
-        return len(self.sigmas) - 1
 
 
 def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: bool = True) -> ExportedRound:
@@ -159,12 +137,7 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         )
     config = network.config
     shape = (batch, config.window, config.channels)
-    inputs = {
-        "history": (batch, config.num_history, config.channels),
-        "path": (batch, config.window, 8),
-        "style": (batch, config.num_styles),
-        "noise": shape,
-    }
+    inputs = {name: part.shape for name, part in config.condition_shapes(batch)._asdict().items()} | {"noise": shape}
     if sampler == "ddpm":
         inputs["step_noise"] = (len(sigmas) - 1, *shape)
     # Split here and merged inside: the weights then are constants of the program.
@@ -223,7 +196,7 @@ def _has_loop(program: bytes) -> bool:
         return "stablehlo.while" in module.operation.get_asm(large_elements_limit=8)
 
 
-def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, tuple[str, ...]]:
+def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[str]]:
     """Compile a program with IREE.
 
     Args:
@@ -251,26 +224,21 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, tuple
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
     # Tiles are faster, but some programs do not compile in them.
-    untiled = tuple(flag for flag in settings.flags if flag not in _DATA_TILING)
+    untiled = [flag for flag in settings.flags if flag not in _DATA_TILING]
     with tempfile.TemporaryDirectory() as folder:
-        source, compiled = Path(folder) / STABLEHLO, Path(folder) / "round.vmfb"
+        source, compiled = Path(folder) / artefact.STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
-        for flags in dict.fromkeys((settings.flags, untiled)):
+        for flags in [settings.flags, untiled] if untiled != settings.flags else [untiled]:
             # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
             # process that holds both dies when it ends.
-            command = [
-                *(sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile"),
-                *(str(source), "-o", str(compiled)),
-                "--iree-input-type=stablehlo",
-                f"--iree-hal-target-backends={settings.backend}",
-                "--iree-vm-bytecode-module-strip-source-map",
-                *flags,
-            ]
+            command = [sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile", str(source), "-o"]
+            command += [str(compiled), "--iree-input-type=stablehlo", f"--iree-hal-target-backends={settings.backend}"]
+            command += ["--iree-vm-bytecode-module-strip-source-map", *flags]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode == 0:
                 return compiled.read_bytes(), flags
     found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
-    raise ValueError(f"IREE {iree_version()} cannot compile this program for {target}: {found[0]}")
+    raise ValueError(f"IREE {artefact.iree_version()} cannot compile this program for {target}: {found[0]}")
 
 
 def save_artefact(
@@ -302,18 +270,18 @@ def save_artefact(
     _check_free(folder, overwrite)
     if trained is not None and weights_digest(trained.params) != exported.weights_digest:
         raise ValueError(f"the exported round does not hold the weights of the trained model {trained.name}")
-    files = {STABLEHLO: exported.stablehlo, JAX_EXPORT: bytes(exported.exported.serialize())}
+    files = {artefact.STABLEHLO: exported.stablehlo, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
     compiled = {}
     for target in dict.fromkeys(targets):
         file, settings, started = f"round.{target}.vmfb", _find_target(target), time.perf_counter()
         files[file], flags = compile_iree(exported.stablehlo, target)
-        host = {"machine": platform.machine(), "features": list(cpu_features())}
+        host = {"machine": platform.machine(), "features": list(artefact.cpu_features())}
         compiled[target] = {
             "file": file,
             "entry": _ENTRY,
             "driver": settings.driver,
-            "iree_version": iree_version(),
-            "flags": list(flags),
+            "iree_version": artefact.iree_version(),
+            "flags": flags,
             "compile_seconds": round(time.perf_counter() - started, 1),
             "cpu": host if settings.backend == "llvm-cpu" else None,
         }
@@ -321,9 +289,9 @@ def save_artefact(
         scales = trained.normaliser._asdict()
         scales = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
         features = {"normaliser": scales, "styles": list(trained.styles)}
-        files[FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
+        files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
     manifest = _manifest(exported, name, files, compiled, trained)
-    files[MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
+    files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
     with _whole_folder(folder) as temporary:
         for file, content in files.items():
             (temporary / file).write_bytes(content)
@@ -339,10 +307,10 @@ def _manifest(
         **{key: training.get(f"dataset_{key}") for key in ("fingerprint", "licence", "credit")},
     )
     manifest = {
-        "format": FORMAT,
+        "format": artefact.FORMAT,
         "model": name,
         "config": config.to_dict(),
-        "num_steps": exported.num_steps,
+        "num_steps": len(exported.sigmas) - 1,
         "sampler": exported.sampler,
         "sigmas": list(exported.sigmas),
         "batch": exported.batch,
@@ -351,12 +319,11 @@ def _manifest(
         "weights": exported.weights_digest,
         "targets": targets,
         "files": {
-            file: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-            for file, content in files.items()
+            name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()
         },
         "record": run_record(profile="export", dataset=dataset, seed=training.get("seed", 0), training=training),
     }
-    return manifest | {"sha256": manifest_digest(manifest)}
+    return manifest | {"sha256": artefact.manifest_digest(manifest)}
 
 
 def _check_free(folder: Path, overwrite: bool) -> None:
@@ -365,7 +332,7 @@ def _check_free(folder: Path, overwrite: bool) -> None:
         return
     if not overwrite:
         raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
-    ours = {MANIFEST, *read_manifest(folder)["files"]}
+    ours = {artefact.MANIFEST, *artefact.read_manifest(folder)["files"]}
     others = sorted({item.name for item in folder.iterdir()} - ours)
     if others:
         raise ValueError(f"{folder}: holds {others[0]}, which is no part of the artefact; it is not overwritten")
@@ -390,7 +357,7 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 def export_model(
     trained: TrainedModel, folder, *, num_steps: int = 8, batch: int = 1, sampler: str | None = None,
-    schedule: NoiseSchedule | None = None, targets: Iterable[str] = ("llvm-cpu",), overwrite: bool = False,
+    targets: Iterable[str] = ("llvm-cpu",), overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Export a trained model: what `f3amd export` does.
 
@@ -399,8 +366,7 @@ def export_model(
       folder, targets, overwrite: as for `save_artefact`.
       num_steps: N, steps of the sampler.
       batch: B, characters of one call.
-      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule.
-      schedule: noise levels; by default those that the model was trained with.
+      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the model's noise schedule.
 
     Returns:
       The folder.
@@ -408,7 +374,7 @@ def export_model(
     Raises:
       ImportError, ValueError: as `export_round`, `compile_iree` and `save_artefact`.
     """
-    schedule, targets = schedule or trained.diffusion, tuple(targets)
+    schedule, targets = trained.diffusion, tuple(targets)
     # Before the minutes of compiling.
     _check_free(Path(folder), overwrite)
     for target in targets:

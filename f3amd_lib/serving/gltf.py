@@ -24,6 +24,12 @@ _KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 _GREY = [0.42, 0.47, 0.55, 1.0]
 
 
+def _append(items: list, item) -> int:
+    """Append an item, and return its place."""
+    items.append(item)
+    return len(items) - 1
+
+
 class _File:
     """A glTF document and the bytes that its accessors point into."""
 
@@ -34,22 +40,15 @@ class _File:
     def put(self, values: np.ndarray, dtype: str, target: int | None = None) -> int:
         """Store an array, [N, ...], and return its accessor."""
         values = np.ascontiguousarray(values, f"<{dtype}")
-        document = self.document
-        document.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=len(self.bytes), byteLength=values.nbytes, target=target)
-        )
+        view = gltf.BufferView(buffer=0, byteOffset=len(self.bytes), byteLength=values.nbytes, target=target)
         flat = values.reshape(len(values), -1)
         bounds = {name: getattr(flat, name)(axis=0).tolist() for name in ("min", "max")}
         if values.ndim == 3:  # of matrices nobody asks for bounds
             bounds, values = {}, np.swapaxes(values, 1, 2)  # column by column
         self.bytes += values.tobytes() + bytes(-values.nbytes % 4)
-        kind = _KINDS[values.shape[1:]]
-        view = len(document.bufferViews) - 1
-        accessor = gltf.Accessor(
-            bufferView=view, componentType=_COMPONENTS[dtype], count=len(values), type=kind, **bounds
-        )
-        document.accessors.append(accessor)
-        return len(document.accessors) - 1
+        about = {"componentType": _COMPONENTS[dtype], "count": len(values), "type": _KINDS[values.shape[1:]]}
+        accessor = gltf.Accessor(bufferView=_append(self.document.bufferViews, view), **about, **bounds)
+        return _append(self.document.accessors, accessor)
 
 
 def _quaternions(rotations) -> np.ndarray:
@@ -76,13 +75,8 @@ def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Ani
     rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
     inverse = np.tile(np.eye(4), (skeleton.num_joints, 1, 1))
     inverse[:, :3, 3] = -rest
-    document.skins.append(
-        gltf.Skin(
-            joints=list(range(first, first + skeleton.num_joints)),
-            skeleton=first,
-            inverseBindMatrices=file.put(inverse, "f4"),
-        )
-    )
+    joints = list(range(first, first + skeleton.num_joints))
+    skin = gltf.Skin(joints=joints, skeleton=first, inverseBindMatrices=file.put(inverse, "f4"))
     padding = ((0, 0), (0, 4 - body.joints.shape[1]))
     corners = body.vertices[body.faces]
     normals = np.zeros_like(body.vertices)  # of a vertex: the sum of its faces' ones, which weighs them by area
@@ -94,16 +88,15 @@ def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Ani
         WEIGHTS_0=file.put(np.pad(body.weights, padding), "f4", gltf.ARRAY_BUFFER),
     )
     indices = file.put(body.faces.ravel(), "u4", gltf.ELEMENT_ARRAY_BUFFER)
-    document.meshes.append(gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)]))
-    label = motion.name or f"character {number}"
-    document.nodes.append(gltf.Node(name=label, mesh=len(document.meshes) - 1, skin=len(document.skins) - 1))
-    for node, path, values in [(first, "translation", root)] + [
-        (first + joint, "rotation", turns[:, joint]) for joint in range(skeleton.num_joints)
-    ]:
-        animation.samplers.append(gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
+    mesh = gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])
+    whole = {"mesh": _append(document.meshes, mesh), "skin": _append(document.skins, skin)}
+    top = _append(document.nodes, gltf.Node(name=motion.name or f"character {number}", **whole))
+    turning = [(node, "rotation", turns[:, joint]) for joint, node in enumerate(joints)]
+    for node, path, values in [(first, "translation", root), *turning]:
+        sampler = _append(animation.samplers, gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
         target = gltf.AnimationChannelTarget(node=node, path=path)
-        animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
-    return [first, len(document.nodes) - 1]
+        animation.channels.append(gltf.AnimationChannel(sampler=sampler, target=target))
+    return [first, top]
 
 
 def write_glb(path, motions: Motion | Sequence[Motion], *, credit: str = "", overwrite: bool = False) -> Path:

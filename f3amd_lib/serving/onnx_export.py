@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import logging
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -27,7 +26,10 @@ from flax import nnx
 
 from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.networks.conditioning import Condition, ConditionedConfig
+from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
+from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition, ConditionedConfig
+from f3amd_lib.networks.motionpcm import LatentDenoiserConfig
 from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel, describe_skeleton
 
 PROGRAM = "denoiser.onnx"
@@ -36,53 +38,30 @@ EXAMPLES = Path(__file__).parent / "onnx_example"
 WEIGHTS = ("float32", "float16", "int8")
 """How weights are stored. All are computed with in float32: a runtime widens them once, when it loads the file."""
 
-INPUTS = ("x_noisy", "sigma", "history", "path", "style")
+ABOUT = read_toml(Path(__file__).with_name("onnx_card.toml"))
+"""What the numbers of a program mean, in the words of its card, by kind of model."""
+
 INSTALL = 'pip install "f3amd_lib[onnx]", or in a clone: make onnx-tools'
 
 
 def denoiser_program(network, *, batch: int | None = None, weights: str = "float32") -> bytes:
-    """Return one evaluation of a denoiser as an ONNX program, weights inside.
+    """Return one evaluation of a network as an ONNX program, weights inside.
 
     Args:
-      network: a denoiser that history, path and style guide (F3AMD and CAMDM), with its weights.
+      network: with its weights: of history, path and style (F3AMD and CAMDM), or of text to motion (`onnx_text`).
       batch: B; by default the program takes any.
       weights: one of `WEIGHTS`.
 
     Returns:
-      The file's content. Inputs are `INPUTS`, float32; sigma is [B]. The output is x0_hat, [B, T, C].
+      The file's content. Inputs are those of `input_shapes`, float32, the output that of `output_name`.
 
     Raises:
       ImportError: if jax2onnx is not installed, saying how to install it.
-      ValueError: for another family, less than one character, or unknown `weights`.
+      ValueError: for another network, less than one character, or unknown `weights`.
     """
-
-    def denoise(network, x_noisy, sigma, history, path, style):
-        return network(x_noisy, sigma, network.encode(Condition(history, path, style)))
-
-    return onnx_program(network, denoise, input_shapes(network.config, check_batch(batch)), "x0_hat", weights=weights)
-
-
-def check_batch(batch: int | None) -> int | str:
-    """Return the first number of an input's shape: `batch`, or the name "B" for any; ValueError below 1."""
     if batch is not None and batch < 1:
         raise ValueError(f"batch must be at least 1 character, got {batch}")
-    return "B" if batch is None else batch
-
-
-def onnx_program(network, evaluate, shapes: dict[str, tuple], output: str, *, weights: str = "float32") -> bytes:
-    """Return one evaluation of a network as an ONNX program, weights inside.
-
-    Args:
-      network: with its weights.
-      evaluate: `evaluate(network, *inputs)`, one array.
-      shapes: input -> shape, in the order of a call; the first number may be "B", for any. All are float32.
-      output: its name.
-      weights: one of `WEIGHTS`.
-
-    Raises:
-      ImportError: if jax2onnx is not installed, saying how to install it.
-      ValueError: for unknown `weights`.
-    """
+    shapes = input_shapes(network.config, batch or "B")
     check_known(weights, WEIGHTS, "weights")
     try:
         import jax2onnx
@@ -95,21 +74,43 @@ def onnx_program(network, evaluate, shapes: dict[str, tuple], output: str, *, we
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of every shape that it does not need to know
     model = jax2onnx.to_onnx(
         lambda *inputs: evaluate(network, *inputs), list(shapes.values()), model_name="denoiser",
-        input_names=list(shapes), output_names=[output],
+        input_names=list(shapes), output_names=[output_name(network.config)],
     )  # fmt: skip
     if weights != "float32":
         _store_small(model.graph, weights)
     return model.SerializeToString()
 
 
-def input_shapes(config: ConditionedConfig, batch) -> dict[str, tuple]:
-    """Return the shapes of `INPUTS`, in the order of a call; `batch` may be a name. ValueError for another family."""
-    if not isinstance(config, ConditionedConfig):
-        raise ValueError(f"only networks of history, path and style are exported here, got {type(config).__name__}")
-    frames = (batch, config.window, config.channels)
-    history = (batch, config.num_history, config.channels)
-    shapes = frames, (batch,), history, (batch, config.window, 8), (batch, config.num_styles)
-    return dict(zip(INPUTS, shapes, strict=True))
+def input_shapes(config, batch) -> dict[str, tuple]:
+    """Return input -> shape in the order of a call; `batch` may be a name. ValueError for a network of another kind."""
+    if isinstance(config, ConditionedConfig):
+        frames, history = (batch, config.window, config.channels), (batch, config.num_history, config.channels)
+        path, style = (batch, config.window, PATH_CHANNELS), (batch, config.num_styles)
+        return {"x_noisy": frames, "sigma": (batch,), "history": history, "path": path, "style": style}
+    if type(config) not in (ACMDMConfig, LatentDenoiserConfig):  # of masked ACMDM one evaluation is another thing
+        known = "networks of history, path and style, ACMDM, and teacher or student of MotionPCM"
+        raise ValueError(f"only {known} are exported, got {type(config).__name__}")
+    state = config.state_shape(batch)
+    inputs = {"state": state, "time": (batch,), "text": (batch, config.text_width)}
+    if type(config) is ACMDMConfig:
+        return inputs | {"mask": state[:2]}
+    return inputs | ({"guidance": (batch,)} if config.guidance_features else {})
+
+
+def output_name(config) -> str:
+    """Return what a program's output is called; it has the shape of its first input."""
+    return "x0_hat" if isinstance(config, ConditionedConfig) else "prediction"
+
+
+def evaluate(network, state, level, *given):
+    """Ask a network; the inputs are those of `input_shapes`, of which a mask is 1 or 0."""
+    if isinstance(network.config, ConditionedConfig):
+        return network(state, level, network.encode(Condition(*given)))
+    if isinstance(network, ACMDM):
+        text, mask = given
+        return network(state, level, network.encode(TextCondition(text, mask > 0.5)))
+    text, *guidance = given
+    return network(state, level, network.encode(text), *guidance)
 
 
 def _store_small(graph, weights: str) -> None:
@@ -157,52 +158,71 @@ class OnnxProgram:
         return self._session.run(None, {name: np.asarray(value, np.float32) for name, value in inputs.items()})[0]
 
 
-class OnnxDenoiser(OnnxProgram):
-    """A program of `denoiser_program`, callable as `denoise(x_noisy, sigma)` after `given`."""
-
-    def __call__(self, x_noisy, sigma, history, path, style) -> np.ndarray:
-        """Return x0_hat, [B, T, C]; sigma is [B] or one level for all."""
-        sigma = np.broadcast_to(np.asarray(sigma, np.float32), (len(history),))
-        return super().__call__(x_noisy=x_noisy, sigma=sigma, history=history, path=path, style=style)
-
-    def given(self, condition: Condition):
-        """Return the callable that samplers take, under one condition."""
-        return lambda x_noisy, sigma: self(x_noisy, sigma, *condition)
-
-
-def seeded_inputs(config: ConditionedConfig, batch: int, seed: int = 0) -> tuple[np.ndarray, Condition]:
-    """Return standard normal noise [B, T, C] and a condition, to compare programs by."""
-    draw = np.random.default_rng(seed)
-    shapes = input_shapes(config, batch)
-    noise, history, path = (
-        draw.normal(size=shapes[name]).astype(np.float32) for name in ("x_noisy", "history", "path")
-    )
-    yaw = draw.uniform(-0.5, 0.5, path.shape[:2])
-    zero, one = np.zeros_like(yaw), np.ones_like(yaw)
-    path[..., 2:] = np.stack([np.cos(yaw), zero, -np.sin(yaw), zero, one, zero], axis=-1)
-    path[..., :2] = 0.03 * np.arange(1, config.window + 1)[None, :, None] * path[:, :1, :2]
-    style = np.eye(config.num_styles, dtype=np.float32)[np.arange(batch) % config.num_styles]
-    return noise, Condition(history, path, style)
+def seeded_inputs(config, batch: int) -> dict[str, np.ndarray]:
+    """Return inputs to compare programs by, float32; of a mask the last quarter of each second sample is padding."""
+    draw, shapes = np.random.default_rng(0), input_shapes(config, batch)
+    drawn = [name for name in shapes if name not in ("sigma", "style")]
+    inputs = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
+    inputs |= {name: draw.normal(size=shapes[name]).astype(np.float32) for name in drawn}
+    if "path" in inputs:
+        path = inputs["path"]
+        yaw = draw.uniform(-0.5, 0.5, path.shape[:2])
+        zero, one = np.zeros_like(yaw), np.ones_like(yaw)
+        path[..., 2:] = np.stack([np.cos(yaw), zero, -np.sin(yaw), zero, one, zero], axis=-1)
+        path[..., :2] = 0.03 * np.arange(1, config.window + 1)[None, :, None] * path[:, :1, :2]
+        inputs["style"] = np.eye(config.num_styles, dtype=np.float32)[np.arange(batch) % config.num_styles]
+    if "mask" in inputs:
+        inputs["mask"][:] = 1
+        inputs["mask"][1::2, -(shapes["mask"][1] // 4 or 1) :] = 0
+    if "guidance" in inputs:
+        inputs["guidance"] = np.linspace(5.0, 15.0, batch, dtype=np.float32)
+    return inputs
 
 
-def largest_difference(program: bytes, network, sigmas, batch: int = 2) -> float:
-    """Return how far a program is from JAX at every noise level, network units: the largest of all numbers.
+def largest_difference(program: bytes, network, levels) -> float:
+    """Return how far a program is from JAX at noise levels or times, network units: the largest of all numbers.
+
+    What is said of padding means nothing, and is not compared.
 
     Args:
       program: from `denoiser_program`.
       network: that was exported.
-      sigmas: levels above 0.
-      batch: B, if the program takes any.
+      levels: sigmas above 0, by which the noise is scaled, or times.
     """
-    run = OnnxDenoiser(program)
-    fixed = run.input_shapes["sigma"][0]
-    noise, condition = seeded_inputs(network.config, fixed if isinstance(fixed, int) else batch)
-    apply = jax.jit(lambda x_noisy, sigma: network(x_noisy, sigma, network.encode(condition)))
+    run = OnnxProgram(program)
+    state, level = list(run.input_shapes)[:2]
+    fixed = run.input_shapes[level][0]
+    inputs = seeded_inputs(network.config, fixed if isinstance(fixed, int) else 2)
+    noise, _, *given = inputs.values()
+    ask = lambda state, level: evaluate(network, state, level, *given)
+    if level == "sigma":
+        ask = jax.jit(ask)
     differences = []
-    for sigma in np.asarray(sigmas, np.float32):
-        level = np.full(len(noise), sigma, np.float32)
-        differences.append(np.abs(run(sigma * noise, level, *condition) - apply(sigma * noise, level)).max())
+    for value in np.asarray(levels, np.float32):
+        asked = value * noise if level == "sigma" else noise, np.full(len(noise), value)
+        gap = np.abs(run(**inputs | dict(zip((state, level), asked, strict=True))) - np.asarray(ask(*asked)))
+        differences.append((gap[inputs["mask"] > 0.5] if "mask" in inputs else gap).max())
     return float(max(differences))
+
+
+def card_head(trained, form: str, frames_per_second: float) -> dict:
+    """Return how a card begins: what the model is, under which terms, and what goes in and out."""
+    shapes = {name: {"shape": list(shape)} for name, shape in input_shapes(trained.config, "B").items()}
+    return {
+        "format": form,
+        "model": trained.name,
+        "data": trained.record.get("dataset"),
+        "terms": trained.record.get("dataset_licence"),
+        "credit": trained.record.get("dataset_credit"),
+        "frames_per_second": frames_per_second,
+        "inputs": shapes,
+        "output": {output_name(trained.config): next(iter(shapes.values()))},
+    }
+
+
+def skeleton_card(skeleton: Skeleton) -> dict:
+    """Return a skeleton with its offsets, JSON-ready."""
+    return describe_skeleton(skeleton) | {"offsets": np.asarray(skeleton.offsets).tolist()}
 
 
 def model_card(trained: TrainedModel, num_steps: int) -> dict:
@@ -210,78 +230,45 @@ def model_card(trained: TrainedModel, num_steps: int) -> dict:
 
     Arrays are [batch, frames, ...], metres, radians, +Y up; a character with yaw 0 faces +Z.
     """
-    config, skeleton = trained.config, trained.skeleton
-    steps = {number: trained.diffusion.grid(number).tolist() for number in sorted({1, num_steps})}
-    record = trained.record
-    return {
-        "format": "f3amd-onnx-1",
-        "model": trained.name,
-        "data": record.get("dataset"),
-        "terms": record.get("dataset_licence"),
-        "credit": record.get("dataset_credit"),
-        "frames_per_second": 30,
-        "inputs": {name: {"shape": list(shape)} for name, shape in input_shapes(config, "B").items()},
-        "output": {"x0_hat": {"shape": ["B", config.window, config.channels]}},
-        "about": read_toml(Path(__file__).with_name("onnx_card.toml")),
-        "normaliser": {
-            name: np.asarray(value, np.float32).tolist() for name, value in trained.normaliser._asdict().items()
-        },
-        "skeleton": describe_skeleton(skeleton) | {"offsets": np.asarray(skeleton.offsets).tolist()},
+    scales = trained.normaliser._asdict()
+    return card_head(trained, "f3amd-onnx-1", 30) | {
+        "about": ABOUT["walk"],
+        "normaliser": {name: np.asarray(value, np.float32).tolist() for name, value in scales.items()},
+        "skeleton": skeleton_card(trained.skeleton),
         "styles": list(trained.styles),
         "sampler": trained.diffusion.sampler,
-        "sigmas": steps,
+        "sigmas": {number: trained.diffusion.grid(number).tolist() for number in sorted({1, num_steps})},
     }
 
 
-def export_onnx(
-    trained: TrainedModel,
-    folder,
-    *,
-    num_steps: int = 8,
-    batch: int | None = None,
-    weights: str = "float32",
-    overwrite: bool = False,
-) -> Path:
+def export_onnx(trained: TrainedModel, folder, *, num_steps: int = 8, **how) -> Path:
     """Write a trained model as ONNX with its card and worked examples: `f3amd export --target onnx`.
 
     Args:
       trained: the model.
       folder: is made, if need be.
-      num_steps: for which the card lists noise levels, beside 1.
-      batch, weights: as for `denoiser_program`.
-      overwrite: replace an earlier export.
-
-    Returns:
-      The folder. Its card says how far the program is from JAX at the noise levels of `num_steps` steps, network units
-      (`largest_error`), measured before it is written.
+      num_steps: for which the card lists noise levels, beside 1; the program is compared with JAX at them.
+      **how: batch, weights and overwrite, of `write_export`.
 
     Raises:
-      ImportError, ValueError: as `denoiser_program`; or if a file is there and `overwrite` is false.
+      ImportError, ValueError: as `write_export`.
     """
-    network = trained.network()
     levels = trained.diffusion.grid(num_steps)[:-1]
-    return write_export(
-        folder,
-        model_card(trained, num_steps),
-        partial(denoiser_program, network),
-        lambda program: largest_difference(program, network, levels),
-        batch=batch,
-        weights=weights,
-        overwrite=overwrite,
-        examples=True,
-    )
+    return write_export(folder, trained.network(), model_card(trained, num_steps), levels, examples=True, **how)
 
 
 def write_export(
-    folder, card: dict, make, error_of, *, batch: int | None, weights: str, overwrite: bool, examples: bool = False
-) -> Path:
+    folder, network, card: dict, levels, *, batch: int | None = None, weights: str = "float32", overwrite: bool = False,
+    examples: bool = False,
+) -> Path:  # fmt: skip
     """Make a program, measure it, and write it with its card, each file whole or not at all.
 
     Args:
       folder: is made, if need be.
-      card: what whoever runs the program has to know; batch, weights, size and error are added.
-      make: `make(batch=, weights=)`, the program.
-      error_of: `error_of(program)`, how far it is from JAX.
+      network: with its weights.
+      card: what whoever runs the program has to know; added are batch, weights, size, and how far the program is from
+        JAX, network units (`largest_error`).
+      levels: at which it is compared, as of `largest_difference`.
       batch, weights: as for `denoiser_program`.
       overwrite: replace an earlier export.
       examples: write the worked examples beside it.
@@ -290,13 +277,15 @@ def write_export(
       The folder.
 
     Raises:
-      ValueError: if an export is there that may not be replaced; said before anything is made.
+      ImportError, ValueError: as `denoiser_program`; if an export is there that may not be replaced, said before
+        anything is made.
     """
     folder = Path(folder)
     if not overwrite and (folder / PROGRAM).exists():
         raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
-    program = make(batch=batch, weights=weights)
-    card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error_of(program)}
+    program = denoiser_program(network, batch=batch, weights=weights)
+    error = largest_difference(program, network, levels)
+    card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
     folder.mkdir(parents=True, exist_ok=True)
     files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()}
     for path in EXAMPLES.glob("*.txt"):

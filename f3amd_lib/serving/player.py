@@ -30,28 +30,20 @@ import html
 import re
 import string
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.pictures import film_strip
-from f3amd_lib.drawing.stick_figures import (
-    CONTACT_COLOR,
-    LIMB_COLORS,
-    TARGET_COLOR,
-    TRAIL_COLOR,
-    bones_of,
-    limb_side,
-    path_on_ground,
-)
 from f3amd_lib.drawing.style import save_figure, show_figure
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-from f3amd_lib.serving.web_page import POLICY, head_and_parent, module_scripts, page_json, read_web
+from f3amd_lib.serving.web_page import POLICY, module_scripts, page_json, read_web
 
 _MILLIMETRES = 1000.0
 _FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
@@ -98,27 +90,11 @@ class Scene:
     boundaries: Sequence[int] = field(default=())
 
 
-def rollout_scene(rollout, title: str = "", *, note: str = "", colors=None) -> Scene:
-    """Make a scene of all characters of a rollout, with target paths and window boundaries.
-
-    Args:
-      rollout: a `generation.generated.Rollout`.
-      title, note: see `Scene`.
-      colors: one "#rrggbb" a character, or None.
-
-    Returns:
-      The scene; ticks stand where a window of the rollout begins.
-
-    Raises:
-      ValueError: if there are not as many colours as characters.
-    """
-    count, num_frames = rollout.frames.shape[:2]
-    colors = [None] * count if colors is None else list(colors)
-    if len(colors) != count:
-        raise ValueError(f"{len(colors)} colours for {count} characters")
-    characters = [Character(rollout.motion(k), path=rollout.paths[k], color=colors[k]) for k in range(count)]
-    boundaries = range(rollout.window, num_frames, rollout.window)
-    return Scene(characters, title=title, note=note, boundaries=boundaries)
+def rollout_scene(rollout, title: str = "") -> Scene:
+    """Make a scene of all characters of a `generation.generated.Rollout`, with target paths and window boundaries."""
+    characters = [Character(rollout.motion(k), path=path) for k, path in enumerate(rollout.paths)]
+    boundaries = range(rollout.window, rollout.frames.shape[1], rollout.window)
+    return Scene(characters, title=title, boundaries=boundaries)
 
 
 def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = True, follow: bool | None = None) -> str:
@@ -152,12 +128,12 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
     for scene in scenes:
         boundaries = _checked_boundaries(scene, first.num_frames)
         described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
-        for character in _with_ghosts(scene.characters):
+        for character, ghost in _with_ghosts(scene.characters):
             _check_in_step(character, first)
             skeleton = character.motion.skeleton
             if skeleton not in skeletons:
                 skeletons.append(skeleton)
-            about, pieces = _encode_character(character, steps)
+            about, pieces = _encode_character(character, ghost, steps)
             described[-1]["characters"].append({"skeleton": skeletons.index(skeleton), **about})
             tracks.extend(pieces)
     data = {
@@ -187,56 +163,45 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
     )
 
 
-def write_player(path, scenes, *, strip: bool = True, overwrite: bool = True, **options) -> Path:
+def write_player(path, scenes, *, strip: bool = True, **options) -> Path:
     """Write the player as one HTML file, and beside it a film strip of the same name as PNG.
 
     Args:
-      path: ends in .html; folders are made.
+      path: ends in .html; folders are made, files that are there are replaced.
       scenes, options: as for `player_page`.
       strip: write the film strip, for readers without a browser (`scenes_strip`).
-      overwrite: replace files that are there; else they are an error.
 
     Returns:
       The path of the page.
 
     Raises:
-      ValueError: for a wrong suffix, a file that is there already, or as for `player_page`.
+      ValueError: for a wrong suffix, or as for `player_page`.
     """
     path = Path(path)
     if path.suffix != ".html":
         raise ValueError(f"{path}: players are written as .html")
-    targets = [path, path.with_suffix(".png")] if strip else [path]
-    taken = ", ".join(str(target) for target in targets if target.exists())
-    if taken and not overwrite:
-        raise ValueError(f"{taken}: exists already; pass overwrite=True or another path")
     page = player_page(scenes, **options)
     figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
     with whole_file(path, overwrite=True) as temporary:
         temporary.write_text(page, encoding="utf-8")
     if strip:
-        save_figure(figure, targets[1])
+        save_figure(figure, path.with_suffix(".png"))
     return path
 
 
-def scenes_strip(scenes, *, num_poses: int = 8, max_rows: int = 4):
-    """Draw a film strip of the first character of each scene: what the player shows, on paper.
+def scenes_strip(scenes):
+    """Draw a film strip of the first character of up to four scenes: what the player shows, on paper.
 
     Args:
       scenes: as for `player_page`.
-      num_poses: poses a row.
-      max_rows: scenes drawn at most.
 
     Returns:
       A matplotlib Figure (see `pictures.film_strip`).
     """
-    scenes = _as_scenes(scenes)[:max_rows]
+    scenes = _as_scenes(scenes)[:4]
     firsts = [scene.characters[0] for scene in scenes]
-    return film_strip(
-        [character.motion for character in firsts],
-        paths=[character.path for character in firsts],
-        titles=[scene.title or None for scene in scenes],
-        num_poses=num_poses,
-    )
+    titles = [scene.title or None for scene in scenes]
+    return film_strip([one.motion for one in firsts], paths=[one.path for one in firsts], titles=titles)
 
 
 class Player:
@@ -271,16 +236,13 @@ class Player:
             display(self.strip)
 
 
-def show_player(
-    scenes, *, height: int = 480, strip: bool = True, strip_dpi: int = 70, autoplay: bool = False, **options
-) -> Player:
+def show_player(scenes, *, height: int = 480, strip: bool = True, autoplay: bool = False, **options) -> Player:
     """Show the player in a notebook, with a film strip as an image below it.
 
     Args:
       scenes, options: as for `player_page`.
       height: of the player, CSS pixels.
       strip: show the film strip (`scenes_strip`).
-      strip_dpi: its dots an inch.
       autoplay: start at once. A notebook with many players rests easier without.
 
     Returns:
@@ -292,7 +254,7 @@ def show_player(
     if not height >= 200:
         raise ValueError(f"height must be 200 or more pixels, got {height}")
     page = player_page(scenes, autoplay=autoplay, **options)
-    image = show_figure(scenes_strip(scenes), dpi=strip_dpi, colors=128) if strip else None
+    image = show_figure(scenes_strip(scenes), dpi=70, colors=128) if strip else None
     return Player(page, int(height), image)
 
 
@@ -355,17 +317,12 @@ def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
 # ------------------------------------------------------------------------------ what is drawn of it
 
 
-@dataclass(frozen=True, eq=False)
-class _Ghost(Character):
-    """A character that can be seen through."""
-
-
-def _with_ghosts(characters) -> list[Character]:
-    """Put each ghost behind its character."""
-    ghosts = [
-        [_Ghost(one.ghost, name=f"{one.name}, ghost")] if isinstance(one.ghost, Motion) else [] for one in characters
-    ]
-    return [each for one, ghost in zip(characters, ghosts, strict=True) for each in (one, *ghost)]
+def _with_ghosts(characters) -> Iterator[tuple[Character, bool]]:
+    """Put each ghost behind its character: (who, whether it can be seen through)."""
+    for one in characters:
+        yield one, False
+        if isinstance(one.ghost, Motion):
+            yield Character(one.ghost, name=f"{one.name}, ghost"), True
 
 
 def describe_for_web(skeleton: Skeleton) -> dict:
@@ -384,50 +341,38 @@ def describe_for_web(skeleton: Skeleton) -> dict:
         "names": list(skeleton.names),
         "parents": list(skeleton.parents),
         "offsets": [numbers(offset) for offset in skeleton.offsets],
-        "sides": [limb_side(name) for name in skeleton.names],
+        "sides": [stick_figures.limb_side(name) for name in skeleton.names],
         "capsules": capsules,
-        "bones": [[parent, numbers(offsets[child]), side] for parent, child, side in bones_of(skeleton)],
-        "head": head_and_parent(skeleton),
-        "toes": list(_toes(skeleton) or ()) or None,
+        "bones": [[parent, numbers(offsets[child]), side] for parent, child, side in stick_figures.bones_of(skeleton)],
+        "head": stick_figures.head_and_parent(skeleton),
+        "toes": stick_figures.toes_of(skeleton) or None,
     }
-
-
-def _toes(skeleton: Skeleton) -> tuple[int, int] | None:
-    """Return the toes; None for a rig that we do not know, which has no contacts to show."""
-    try:
-        return skeleton.toes
-    except ValueError:
-        return None
 
 
 def _first_azimuth(motion: Motion) -> float:
     """Where the camera stands at first: 50 degrees to the right of where the first one faces."""
-    try:
-        facing = float(motion.yaw[0])
-    except ValueError:  # hips unknown
-        facing = 0.0
-    return round(facing - np.deg2rad(50.0), 4)
+    yaw = stick_figures.yaw_of(motion)
+    return round((0.0 if yaw is None else float(yaw[0])) - np.deg2rad(50.0), 4)
 
 
 # ----------------------------------------------------------------------------------- as numbers
 
 
-def _encode_character(character: Character, steps: int) -> tuple[dict, list[bytes]]:
+def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[dict, list[bytes]]:
     """Describe a character and turn its tracks into bytes."""
     motion, label = character.motion, character.name
-    num_frames, toes = motion.num_frames, _toes(motion.skeleton)
+    num_frames, toes = motion.num_frames, stick_figures.toes_of(motion.skeleton)
     rotations = motion.needed_rotations("the player")
     turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
     turns = np.rint(steps * turns).reshape(num_frames, -1)
     pieces = [_track(_whole_millimetres(motion.root_position, label, "root"), "<i4"), _track(turns, "<i2")]
-    ghost = isinstance(character, _Ghost)
 
     contacts = character.contacts
-    if contacts is None and toes is not None and not ghost:
+    if contacts is None and toes and not ghost:
         contacts = motion.contacts
     if contacts is not None:
         contacts = np.asarray(contacts)
-        if toes is None:
+        if not toes:
             raise ValueError(f"{label}: contacts are given, but this skeleton's toes are not known")
         if contacts.shape != (num_frames, 2):
             raise ValueError(f"{label}: contacts must be [{num_frames}, 2] (left, right), got {contacts.shape}")
@@ -437,7 +382,7 @@ def _encode_character(character: Character, steps: int) -> tuple[dict, list[byte
 
     if character.path is not None:
         try:
-            path = path_on_ground(character.path)
+            path = stick_figures.path_on_ground(character.path)
         except ValueError as error:
             raise ValueError(f"{label}: {error}") from None
         fps = getattr(character.path, "fps", motion.fps)
@@ -473,7 +418,8 @@ def _track(values: np.ndarray, dtype: str) -> bytes:
 
 def _color_rules() -> str:
     """The pictures' colours, so that strips, GIFs and the player look alike; CSS has dark ones."""
-    colors = {**LIMB_COLORS, "contact": CONTACT_COLOR, "target": TARGET_COLOR, "trail": TRAIL_COLOR}
+    others = {name: getattr(stick_figures, f"{name.upper()}_COLOR") for name in ("contact", "target", "trail")}
+    colors = stick_figures.LIMB_COLORS | others
     return ":root { " + " ".join(f"--{name}: {color};" for name, color in colors.items()) + " }"
 
 
@@ -498,20 +444,19 @@ def _element(opening: str, text: str) -> str:
 def _legend(scenes: list[dict]) -> str:
     """Say what the colours mean, of those that are there."""
     characters = [character for scene in scenes for character in scene["characters"]]
-    keys = [("line", "left", "left"), ("line", "right", "right")]
-    if any(character["contacts"] for character in characters):
-        keys.append(("dot", "contact", "toe in contact"))
-    if not all(character["color"] for character in characters):
-        keys.append(("line", "trail", "walked"))
-    if any(character["ghost"] for character in characters):
-        keys.append(("line", "flesh", "ghost: the real clip"))
-    if any(character["path"] for character in characters):
-        keys.append(("dash", "target", "target path"))
-    if any(scene["boundaries"] for scene in scenes):
-        keys.append(("tick", None, "a window begins"))
+    keys = [
+        ("line", "left", "left", True),
+        ("line", "right", "right", True),
+        ("dot", "contact", "toe in contact", any(character["contacts"] for character in characters)),
+        ("line", "trail", "walked", not all(character["color"] for character in characters)),
+        ("line", "flesh", "ghost: the real clip", any(character["ghost"] for character in characters)),
+        ("dash", "target", "target path", any(character["path"] for character in characters)),
+        ("tick", None, "a window begins", any(scene["boundaries"] for scene in scenes)),
+    ]
     items = []
-    for kind, color, text in keys:
+    for kind, color, text, is_there in keys:
         rule = "border-color" if kind == "dash" else "background"
         style = f' style="{rule}:var(--{color})"' if color else ""
-        items.append(f'<span><i class="{kind}"{style}></i>{text}</span>')
+        if is_there:
+            items.append(f'<span><i class="{kind}"{style}></i>{text}</span>')
     return "".join(items) + '<span id="grid-key"></span>'

@@ -14,19 +14,19 @@ import re
 import string
 from pathlib import Path
 
+import jax
 import numpy as np
 
-from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.generation.foot_locking import leg_chains
 from f3amd_lib.generation.steering import first_pose, usual_pace
 from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.serving.npm_packages import package_credit, package_file
 from f3amd_lib.serving.onnx_export import denoiser_program, model_card
-from f3amd_lib.serving.web_page import head_and_parent, page_json
+from f3amd_lib.serving.web_page import FOLDER, page_json
 from f3amd_lib.training.checkpoints import TrainedModel
 
-WEB = Path(__file__).parent / "web"
 _PAGE = read_toml(Path(__file__).with_name("steer.toml"))
 MODULES = _PAGE["modules"]
 """Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
@@ -61,17 +61,14 @@ def steer_page(
             f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
         )
     card = model_card(trained, num_steps)
-    missing = [style for style in trained.styles if style not in trained.start_poses]
-    if missing:
+    if missing := [style for style in trained.styles if style not in trained.start_poses]:
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
     if program is None:
         program = denoiser_program(trained.network(), weights=weights)
-    paces = [usual_pace(trained, style) for style in trained.styles]
-    poses = [
-        first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in zip(trained.styles, paces, strict=True)
-    ]
+    paces = {style: usual_pace(trained, style) for style in trained.styles}
+    poses = [first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in paces.items()]
     legs = _legs(trained.skeleton)
-    files = {name: package_file("three", path) if path else (WEB / name).read_bytes() for name, _, path in MODULES}
+    files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
     files |= {
         "worker": _worker(RUNTIMES[runtime][0]).encode(),
         "wasm": package_file("onnxruntime-web", RUNTIMES[runtime][1]),
@@ -79,13 +76,13 @@ def steer_page(
         "poses": np.asarray(poses, np.float32).tobytes(),
     }
     data = {
-        "card": _used(card)
+        "card": {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
         | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
         | {"legs": legs, "webgpu": runtime == "webgpu"},
         "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
         "head": head_and_parent(trained.skeleton),
-        "paces": paces,
+        "paces": list(paces.values()),
         "colors": LIMB_COLORS,
         "marks": _MARKS,
         "first_styles": _first_styles(trained.styles),
@@ -93,29 +90,28 @@ def steer_page(
     choice = '<label><input type="radio" name="steps" value="{0}"{1}>{0}</label>'
     offered = sorted(map(int, card["sigmas"]), reverse=True)
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
-    credit = ". ".join(
-        filter(None, (card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))))
-    )
-    return string.Template((WEB / "steer.html").read_text(encoding="utf-8")).substitute(
+    credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
+    count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
+    return string.Template((FOLDER / "steer.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"Steer {trained.name}"),
         name=html.escape(trained.name),
-        about=html.escape(
-            f"{trained.name}, trained on {card['data']}, a diffusion model of {_count(trained)} weights."
-        ),
+        about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
         window=trained.config.window,
         history=trained.config.num_history,
         runtime=html.escape(package_credit("onnxruntime-web").split(":")[0]),
-        credit=html.escape(credit),
+        credit=html.escape(". ".join(filter(None, credits))),
         licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
         steps=steps,
         feet=" checked" if legs else " disabled",
         about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
-        style=string.Template((WEB / "steer.css").read_text(encoding="utf-8")).substitute(
+        style=string.Template((FOLDER / "steer.css").read_text(encoding="utf-8")).substitute(
             marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
         ),
         data=page_json(data),
-        files=page_json({name: _packed(content) for name, content in files.items()}),
-        loader=(WEB / "loader.js").read_text(encoding="utf-8"),
+        files=page_json(
+            {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode("ascii") for name, file in files.items()}
+        ),
+        loader=(FOLDER / "loader.js").read_text(encoding="utf-8"),
     )
 
 
@@ -149,19 +145,10 @@ def _worker(script: str) -> str:
     # It asks for its address only to find files that the page hands it.
     body = body.replace("import.meta.url", '"https://page.invalid/"')
     exported = ",".join(f"{name}:{own}" for own, name in pairs)
-    motion = (WEB / "motion.js").read_text(encoding="utf-8")
-    worker = (WEB / "steer_worker.js").read_text(encoding="utf-8")
+    motion = (FOLDER / "motion.js").read_text(encoding="utf-8")
+    worker = (FOLDER / "steer_worker.js").read_text(encoding="utf-8")
     ours = re.sub(r"^export ", "", motion, flags=re.M) + re.sub(r"^import .*\n", "", worker, flags=re.M)
     return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
-
-
-def _packed(content: bytes) -> str:
-    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
-
-
-def _used(card: dict) -> dict:
-    """Return a card without what the page does not read."""
-    return {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
 
 
 def _legs(skeleton) -> list[list[int]] | None:
@@ -176,9 +163,3 @@ def _first_styles(styles) -> tuple[str, str]:
     """Return the two styles that the slider blends at first."""
     first = "Neutral" if "Neutral" in styles else styles[0]
     return first, next((style for style in ("Proud", *styles) if style in styles and style != first), first)
-
-
-def _count(trained: TrainedModel) -> str:
-    import jax
-
-    return f"{sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params)):,}"

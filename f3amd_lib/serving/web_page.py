@@ -12,9 +12,6 @@ import json
 import zlib
 from pathlib import Path
 
-from f3amd_lib.drawing.stick_figures import is_head
-from f3amd_lib.motion.skeleton import Skeleton
-
 FOLDER = Path(__file__).parent / "web"
 
 POLICY = (
@@ -47,12 +44,6 @@ def module_scripts(start: str) -> str:
     modules = json.dumps({"start": start, "modules": packed})
     begin = read_web("start.js")
     return f'<script type="application/json" id="modules">{modules}</script>\n<script>\n{begin}\n</script>'
-
-
-def head_and_parent(skeleton: Skeleton) -> list[int] | None:
-    """Return the head joint and its parent, for a page; None where no joint is called head, or the root is."""
-    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
-    return [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None
 
 
 def page_json(value) -> str:
