@@ -803,11 +803,16 @@ def test_the_gate_asks_what_a_claim_needs(tmp_path):
 
 
 def snapshots(root, rows):
-    """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each."""
+    """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each.
+
+    A worth may be a pair, of what is seen through the classifier and of the others.
+    """
+    through = {"FID", "EMD", "style_coverage"}
     table = [
         {
             "run": f"{model}-{recipe}-{seed}", "model": model, "windows": windows, "recipe": recipe, "seed": seed,
-            "classifier": classifier, "window_frames": 32, "steps": 8, "metric": metric, "unit": unit, "value": worth,
+            "classifier": classifier, "window_frames": 32, "steps": 8, "metric": metric, "unit": unit,
+            "value": np.broadcast_to(worth, 2)[int(metric not in through)],
         }
         for model, windows, recipe, seed, classifier, worth in rows
         for metric, (unit, _) in NINE_METRICS.items()
@@ -823,7 +828,7 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     alike = [(model, 200_000, "paper", 0, "one", 1.0) for model in models]
     # Other recipes, lengths and classifiers are other networks.
     others = [(FNO, 200_000, "wide-decoder", 0, "one", 9.0), (FNO, 400_000, "paper", 0, "one", 9.0)]
-    others.append((FNO, 200_000, "paper", 2, "another", 9.0))
+    others.append((FNO, 200_000, "paper", 2, "another", (9.0, 1.0)))
     judgement = snapshots(tmp_path, [*alike, *others])
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure == "alike in 9 of 9"
     assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
@@ -836,8 +841,11 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("alike in 0 of 9")
     missing = [*alike[:3], (models[3], 400_000, "paper", 0, "one", 1.0)]
     assert snapshots(tmp_path / "missing", missing).verdict == UNMEASURED
+    # What needs no classifier is averaged over all seeds, whoever saw them.
+    walks_worse = snapshots(tmp_path / "pooled", [*alike, (FNO, 200_000, "paper", 2, "another", (1.0, 9.0))])
+    assert walks_worse.ours[0].figure.startswith("alike in 3 of 9")
     # A classifier that saw all four decides, though another saw more networks; two that saw two each do not.
-    busier = [(model, 200_000, "paper", seed, "other", 9.0) for model in models[:2] for seed in range(3)]
+    busier = [(model, 200_000, "paper", seed, "other", (9.0, 1.0)) for model in models[:2] for seed in (1, 2, 3)]
     whole = snapshots(tmp_path / "whole", [*alike, *busier])
     assert whole.ours[0].figure == "alike in 9 of 9" and "classifier one" in str(whole.ours[0].sources[0])
     halves = [*alike[:2], *((model, 200_000, "paper", 0, "other", 1.0) for model in models[2:])]
