@@ -24,6 +24,7 @@ from f3amd_lib.reports.evidence import (
     power_law,
     ratio,
     recorded_evidence,
+    snapshot_evidence,
 )
 from f3amd_lib.reports.judgements import (
     FAILS,
@@ -819,8 +820,8 @@ def snapshots(root, rows):
     ]  # fmt: skip
     record = {"dataset": "bandai", "profile": "laptop", "seed": 0, "device_platform": "cpu", "cores": 2}
     write_table(root / "bandai" / "laptop" / "records" / "campaign.csv", pd.DataFrame(table), record)
-    (judgement,) = (each for each in claims.judge_claims(root) if each.claim.id == "Q10")
-    return judgement
+    evidence = [recorded_evidence(root, "bandai", "laptop"), *snapshot_evidence(root, "bandai", "laptop")]
+    return claims.judge_claim(claims.find_claim("Q10"), {"bandai": evidence})
 
 
 def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_path):
@@ -833,6 +834,8 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure == "alike in 9 of 9"
     assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
     assert "at 200,000 windows" in str(judgement.ours[0].sources[0])
+    # As the whole ledger has it.
+    assert judgement == next(each for each in claims.judge_claims(tmp_path) if each.claim.id == "Q10")
     # Seeds are averaged, and two that differ have a wide interval.
     seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "one", 1.2)])
     assert f"FID 1.1x ({FNO} over" in seeds.ours[0].figure

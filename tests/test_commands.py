@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from f3amd_lib.__main__ import main
-from f3amd_lib.benchmarking import measurements, synthesis
+from f3amd_lib.benchmarking import implementations, measurements, synthesis
 from f3amd_lib.experiments import measure, protocol, sensitivity
 from f3amd_lib.experiments.recipes import RECIPES
 from f3amd_lib.experiments.sensitivity import FOOT_BANDS, STRENGTHS
@@ -52,7 +52,7 @@ def tables(run: str) -> dict[str, list[dict]]:
                 "model": one.model,
                 "window_frames": one.window,
                 "steps": one.steps,
-                "framework": synthesis.IMPLEMENTATIONS[one.implementation][0],
+                "framework": implementations.IMPLEMENTATIONS[one.implementation][0],
                 "device": "GPU" if what == "gpu" else "CPU",
                 "characters": one.characters,
             }
