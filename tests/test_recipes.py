@@ -249,6 +249,9 @@ def test_what_notebook_15_says_of_ablations_follows_from_the_record():
     seeds = rows[rows["model"] == "F3AMD-FNO-96"].pivot(index="run", columns="metric", values="value")
     # Equal losses, other walks.
     assert sorted(seeds["held_out_loss"].round(3)) == [0.274, 0.280, 0.287]
+    spread = seeds.max() - seeds.min()
+    assert (round(spread["held_out_loss"], 3), round(spread["x0_error_ratio"], 3)) == (0.013, 0.004)
+    assert seeds["joint_acceleration"].max() > 2 * seeds["joint_acceleration"].min()
     ranges = {"trajectory_error": (0.10, 0.23), "joint_acceleration": (4.1, 8.9), "IRD": (4.7, 14.0)}
     for metric, (least, most) in ranges.items():
         assert seeds[metric].agg(["min", "max"]).tolist() == pytest.approx([least, most], rel=0.02), metric
