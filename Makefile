@@ -71,7 +71,7 @@ sweep-tools: $(INSTALLED) ## Add Dask distributed to .venv, for f3amd sweep (abo
 
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
 	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
-	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) \
+	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) --no-loadscope-reorder \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
