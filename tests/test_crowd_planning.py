@@ -5,6 +5,7 @@ import pytest
 from builders import refused
 from scipy.spatial.distance import pdist
 
+from f3amd_lib.generation import crowd_planning
 from f3amd_lib.generation.crowd import crowd_paths, plan_crowd
 from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, SPEED_BOUNDS, closest_approach, keep_apart
 from f3amd_lib.motion.root_paths import tangent_yaw
@@ -132,3 +133,9 @@ def test_a_plan_walks_at_the_pace_that_is_asked_for():
 )
 def test_impossible_asks_are_refused(call, message):
     refused(message, call)
+
+
+def test_a_crowd_that_finds_no_paths_however_far_it_is_spread_is_refused(monkeypatch):
+    position, yaw = two_who_meet()
+    monkeypatch.setattr(crowd_planning, "_untangle", lambda wanted, min_distance, fps: None)
+    refused("2 characters found no paths .* however far they were spread", keep_apart, position, yaw)

@@ -376,11 +376,11 @@ def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
 
 @needs_iree
 def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatch):
-    seen = []
+    seen, tiling = [], export_module.TARGETS["llvm-cpu"]["tiling"]
 
     def run(command, **settings):
         seen.append(command)
-        tiled = any(flag in export_module._DATA_TILING for flag in command) or "vmvx" in " ".join(command)
+        tiled = any(flag in tiling for flag in command) or "vmvx" in " ".join(command)
         if not tiled:
             Path(command[command.index("-o") + 1]).write_bytes(b"module")
         return subprocess.CompletedProcess(command, int(tiled), "", "error: large vector sizes")
@@ -389,5 +389,5 @@ def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatc
     monkeypatch.setattr(export_module, "_has_loop", lambda program: False)
     module, flags = compile_iree(b"program", "llvm-cpu")
     assert module == b"module" and len(seen) == 2
-    assert not set(flags) & set(export_module._DATA_TILING)
+    assert not set(flags) & set(tiling)
     refused("large vector sizes", compile_iree, b"program", "vmvx")

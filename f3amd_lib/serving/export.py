@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,18 +57,17 @@ class Target(NamedTuple):
       backend: IREE's name of the code generator.
       driver: IREE's name of what runs it.
       flags: of the compiler.
+      tiling: further ones, with which some programs do not compile.
     """
 
     backend: str
     driver: str
     flags: list[str]
+    tiling: Sequence[str] = ()
 
 
 TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
 """Targets by name. "cuda-sm_NN" is a generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
-
-# Matrices in tiles of the CPU's own size, weights packed so at compile time.
-_DATA_TILING = ("--iree-opt-data-tiling", "--iree-dispatch-creation-data-tiling")
 
 
 def _find_target(name: str) -> Target:
@@ -224,11 +223,11 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
     # Tiles are faster, but some programs do not compile in them.
-    untiled = [flag for flag in settings.flags if flag not in _DATA_TILING]
+    ways = [[*settings.flags, *tiling] for tiling in dict.fromkeys((tuple(settings.tiling), ()))]
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / artefact.STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
-        for flags in [settings.flags, untiled] if untiled != settings.flags else [untiled]:
+        for flags in ways:
             # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
             # process that holds both dies when it ends.
             command = [sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile", str(source), "-o"]
