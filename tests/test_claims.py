@@ -1306,7 +1306,7 @@ def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
     claims.write_ledger(path, fails, accept=True)
     assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
     assert claims.write_ledger(path, fails) == []
-    with pytest.raises(ValueError, match="must end in .md"):
+    with pytest.raises(ValueError, match="ledgers are written as .md"):
         claims.write_ledger(tmp_path / "claims.csv", fails)
 
 

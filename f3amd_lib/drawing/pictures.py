@@ -33,7 +33,7 @@ from f3amd_lib.drawing.stick_figures import (
     yaw_of,
 )
 from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style, save_figure
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import named_file, whole_file
 from f3amd_lib.motion.skeleton import Motion
 
 # ------------------------------------------------------------------------------------ one body
@@ -402,9 +402,7 @@ def write_gif(
       ValueError: for a wrong suffix, no motion, unlike frame rates, or more than 30 frames a
         second.
     """
-    path = Path(path)
-    if path.suffix != ".gif":
-        raise ValueError(f"{path}: moving pictures are written as .gif")
+    path = named_file(path, ".gif", "moving pictures")
     rows = _beside_each_other(motions, target_paths, titles)
     motions = [motion for motion, *_ in rows]
     rates = {motion.fps for motion in motions}

@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
 
 _COLORS = read_toml(Path(__file__).with_name("colors.toml"))
 PALETTE: dict[str, str] = _COLORS["palette"]
@@ -144,12 +144,8 @@ def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
     Raises:
       ValueError: if the name does not end in .png.
     """
-    path = Path(path)
-    if path.suffix != ".png":
-        raise ValueError(f"{path}: figures are written as .png")
-    with whole_file(path, overwrite=True) as temporary:
-        temporary.write_bytes(_png(figure, dpi))
-    return path
+    path = named_file(path, ".png", "figures")
+    return write_whole(path, _png(figure, dpi))
 
 
 def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):

@@ -55,6 +55,21 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
         temporary.chmod(permissions)  # safetensors makes a new file that the owner alone may read
 
 
+def named_file(path, ending: str, what: str) -> Path:
+    """Return a path; ValueError unless its name ends as files of a kind do: `what`, such as "figures"."""
+    path = Path(path)
+    if path.suffix != ending:
+        raise ValueError(f"{path}: {what} are written as {ending}")
+    return path
+
+
+def write_whole(path, content: str | bytes, *, overwrite: bool = True) -> Path:
+    """Write a file by `whole_file`, text as UTF-8 with the line ends that it has; return its path."""
+    with whole_file(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+    return Path(path)
+
+
 @contextlib.contextmanager
 def _unfinished(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; what is there at the end becomes `path`, or is removed on an error.

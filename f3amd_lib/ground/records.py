@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import f3amd_lib
-from f3amd_lib.ground.files import read_toml, set_aside, whole_file
+from f3amd_lib.ground.files import named_file, read_toml, set_aside, write_whole
 from f3amd_lib.ground.names import asked_network
 
 log = logging.getLogger("f3amd")
@@ -115,9 +115,7 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
         record lacks data set, profile or seed, or there is already a table (or a file without a
         record) that is not of the same data set and profile.
     """
-    path = Path(path)
-    if path.suffix != ".csv":
-        raise ValueError(f"{path}: a table's name must end in .csv")
+    path = named_file(path, ".csv", "tables")
     if frame.empty or not frame.columns.is_unique:
         raise ValueError(f"{path}: nothing to write: no rows, or two columns of one name")
     for key in ("dataset", "profile", "seed"):
@@ -133,8 +131,7 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
     # Each file appears whole. Should the run die between the two, the checksum tells.
     contents = {path: text, record_path: json.dumps(described, indent=2, ensure_ascii=False) + "\n"}
     for file, content in contents.items():
-        with whole_file(file, overwrite=True) as temporary:
-            temporary.write_text(content, encoding="utf-8", newline="\n")
+        write_whole(file, content)
     return path
 
 
@@ -364,8 +361,7 @@ def _described_rows(path: Path) -> tuple[pd.DataFrame, dict] | None:
     if _text_hash(text) != digest:
         return None
     kept = set_aside([path], path.stem)
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_whole(path, text, overwrite=False)
     log.warning("%s: a run died while writing; its last rows lie in %s.csv and are made again", path, kept)
     return read_table(path)
 

@@ -24,7 +24,7 @@ from pathlib import Path
 import pandas as pd
 import tyro
 
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.tables import compact_table, markdown_table
@@ -503,23 +503,17 @@ def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, ac
     Raises:
       ValueError: if the name does not end in .md.
     """
-    path = ledger_path() if path is None else Path(path)
-    if path.suffix != ".md":
-        raise ValueError(f"{path}: the ledger's name must end in .md")
+    path = named_file(ledger_path() if path is None else path, ".md", "ledgers")
     judgements = judge_claims() if judgements is None else judgements
     frame = ledger(judgements)
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if changes and not accept:
         return changes
-    kept = frame.set_index("id")[["verdict", "ours", "paper_verdict", "paper_figure"]]
-    verdicts = kept.rename(columns={"ours": "figure"}).to_dict("index")
-    texts = {
-        path: ledger_markdown(judgements),
-        path.with_suffix(".json"): json.dumps(verdicts, indent=2, ensure_ascii=False) + "\n",
-    }
-    for place, text in texts.items():
-        with whole_file(place, overwrite=True) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="\n")
+    columns = ["verdict", "ours", "paper_verdict", "paper_figure"]
+    verdicts = frame.set_index("id")[columns].rename(columns={"ours": "figure"}).to_dict("index")
+    page, kept = ledger_markdown(judgements), json.dumps(verdicts, indent=2, ensure_ascii=False)
+    write_whole(path, page)
+    write_whole(path.with_suffix(".json"), f"{kept}\n")
     return changes
 
 

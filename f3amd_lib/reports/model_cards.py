@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
@@ -310,13 +310,9 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     Returns:
       The cards.
     """
-    cards = []
-    for path in sorted(folder.rglob("*.safetensors")):
-        card = path.with_suffix(".md")
-        with whole_file(card, overwrite=True) as temporary:
-            temporary.write_text(card_of(path), encoding="utf-8")
-        cards.append(card)
-    (folder / "checksums.txt").write_text(checksums(folder), encoding="utf-8")
+    weights = sorted(folder.rglob("*.safetensors"))
+    cards = [write_whole(path.with_suffix(".md"), card_of(path)) for path in weights]
+    write_whole(folder / "checksums.txt", checksums(folder))
     return cards
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import make_body
 from f3amd_lib.motion.skeleton import Motion, forward_kinematics
 
@@ -115,9 +115,7 @@ def write_glb(path, motions: Motion | Sequence[Motion], *, credit: str = "", ove
       ValueError: for a wrong suffix, a file that is there, no motion, unlike rates or lengths, or motion without
         rotations.
     """
-    path = Path(path)
-    if path.suffix != ".glb":
-        raise ValueError(f"{path}: binary glTF is written as .glb")
+    path = named_file(path, ".glb", "motions in binary glTF")
     motions = [motions] if isinstance(motions, Motion) else list(motions)
     if len({(motion.num_frames, motion.fps) for motion in motions}) != 1:
         raise ValueError(f"{path}: needs motions of one length and frame rate, got {len(motions)} motions")
@@ -133,6 +131,4 @@ def write_glb(path, motions: Motion | Sequence[Motion], *, credit: str = "", ove
     document.scene = 0
     document.buffers.append(gltf.Buffer(byteLength=len(file.bytes)))
     document.set_binary_blob(file.bytes)
-    with whole_file(path, overwrite=overwrite) as unfinished:
-        unfinished.write_bytes(b"".join(document.save_to_bytes()))
-    return path
+    return write_whole(path, b"".join(document.save_to_bytes()), overwrite=overwrite)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
@@ -294,6 +294,5 @@ def write_export(
         else:  # those of an export that is replaced would not fit the new card
             (folder / path.stem).unlink(missing_ok=True)
     for name, content in files.items():
-        with whole_file(folder / name, overwrite=True) as temporary:
-            Path(temporary).write_bytes(content)
+        write_whole(folder / name, content)
     return folder

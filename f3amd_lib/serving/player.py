@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.style import save_figure, show_figure
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.serving.web_page import POLICY, module_scripts, page_json, read_web
@@ -177,13 +177,10 @@ def write_player(path, scenes, *, strip: bool = True, **options) -> Path:
     Raises:
       ValueError: for a wrong suffix, or as for `player_page`.
     """
-    path = Path(path)
-    if path.suffix != ".html":
-        raise ValueError(f"{path}: players are written as .html")
+    path = named_file(path, ".html", "players")
     page = player_page(scenes, **options)
     figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
-    with whole_file(path, overwrite=True) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_whole(path, page)
     if strip:
         save_figure(figure, path.with_suffix(".png"))
     return path

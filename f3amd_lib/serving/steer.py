@@ -20,7 +20,7 @@ import numpy as np
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.generation.foot_locking import leg_chains
 from f3amd_lib.generation.steering import first_pose, usual_pace
-from f3amd_lib.ground.files import read_toml, whole_file
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.serving.npm_packages import package_credit, package_file
 from f3amd_lib.serving.onnx_export import denoiser_program, model_card
@@ -121,13 +121,8 @@ def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **option
     Raises:
       ImportError, ValueError: as `steer_page`; for a suffix other than .html, or a file that is there already.
     """
-    path = Path(path)
-    if path.suffix != ".html":
-        raise ValueError(f"{path}: the page is written as .html")
-    page = steer_page(trained, **options)
-    with whole_file(path, overwrite=overwrite) as temporary:
-        Path(temporary).write_text(page, encoding="utf-8")
-    return path
+    path = named_file(path, ".html", "pages")
+    return write_whole(path, steer_page(trained, **options), overwrite=overwrite)
 
 
 def _worker(script: str) -> str:
