@@ -41,10 +41,6 @@ class ModelStyle:
         return {"color": self.color, "marker": self.marker, "linestyle": self.linestyle}
 
 
-# Our own recipes stand beside the paper's models and are never to be taken for one of them.
-_OUR_COLORS = {"-plus": PALETTE["vermilion"], "-steady": PALETTE["blue"]}
-
-
 def model_style(name: str) -> ModelStyle:
     """Return colour, marker and line style of a model by its name.
 
@@ -58,25 +54,11 @@ def model_style(name: str) -> ModelStyle:
     """
     lowered = name.lower()
     number = re.search(r"-(32|48|64|96|128)(?!\d)", lowered)
-    width = number.group(1) if number else "96"
-    if lowered.startswith("real"):
-        return ModelStyle(PALETTE["black"], "", "--")
-    if lowered.startswith("paper"):
-        return ModelStyle(PALETTE["grey"], "x", ":")
-    if lowered in _COLORS["broken"]:
-        return ModelStyle(_COLORS["broken"][lowered], ".", "-")
-    if lowered.startswith("camdm"):
-        line = ":" if "pytorch" in lowered else "--" if "code" in lowered or number else "-"
-        return ModelStyle(PALETTE["green"], "P", line)
-    if "transformer" in lowered:
-        return ModelStyle(_COLORS["transformer"][width], _COLORS["markers"][width], "-")
-    if lowered.startswith("f3amd"):
-        for suffix, color in _OUR_COLORS.items():
-            if lowered.split(",")[0].endswith(suffix):
-                return ModelStyle(color, _COLORS["markers"][width], "-")
-        line = ":" if "raw" in lowered else "--" if "dct" in lowered else "-"
-        return ModelStyle(_COLORS["fno"][width], _COLORS["markers"][width], line)
-    return ModelStyle(PALETTE["grey"], ".", "-")
+    width = number[1] if number else "96"
+    look = next(look for look in _COLORS["model"] if re.match(look["name"], lowered))
+    shades = _COLORS["shades"].get(look["color"])
+    color = shades[width] if shades else PALETTE.get(look["color"], look["color"])
+    return ModelStyle(color, look.get("marker", _COLORS["markers"][width]), look.get("line", "-"))
 
 
 def system_line(label: str) -> dict:
