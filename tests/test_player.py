@@ -128,18 +128,13 @@ def test_walkers_of_every_style_come_back_to_a_millimetre_and_a_half():
 def test_contacts_and_path_come_back():
     motion = wandering_motion(FRAMES)
     path = path_from_motion(motion)
-    contacts = np.zeros((FRAMES, 2), bool)
-    contacts[5:9, 0] = contacts[8:12, 1] = True
-    character = Character(motion, path=path, contacts=contacts)
-    tracks = read_tracks(page_data(player_page(character)))[0][0]
-    np.testing.assert_array_equal(tracks["contacts"] & 1, contacts[:, 0])
-    np.testing.assert_array_equal(tracks["contacts"] >> 1, contacts[:, 1])
+    tracks = read_tracks(page_data(player_page(Character(motion, path=path))))[0][0]
+    np.testing.assert_array_equal(tracks["contacts"] & 1, motion.contacts[:, 0])
+    np.testing.assert_array_equal(tracks["contacts"] >> 1, motion.contacts[:, 1])
     np.testing.assert_allclose(tracks["path"], 1000 * path.position, atol=0.5001)
-    # A plain array of x and z does as well, and by default contacts are the motion's own.
+    # A plain array of x and z does as well.
     other = read_tracks(page_data(player_page(Character(motion, path=path.position))))[0][0]
     np.testing.assert_array_equal(other["path"], tracks["path"])
-    own = motion.contacts.astype(int) @ np.array([1, 2])
-    np.testing.assert_array_equal(other["contacts"], own)
 
 
 def test_every_bone_is_described_once_with_its_side_and_the_body_is_pythons():
@@ -328,7 +323,7 @@ def test_numbers_that_do_not_fit_are_refused():
     refused("the player needs rotations", player_page, alone)
 
 
-def test_paths_and_contacts_that_do_not_fit_are_refused():
+def test_paths_that_do_not_fit_are_refused():
     motion = wandering_motion(FRAMES)
     path = path_from_motion(motion)
     with pytest.raises(ValueError, match="wandering 0: the target path has 39 frames at 30"):
@@ -338,10 +333,6 @@ def test_paths_and_contacts_that_do_not_fit_are_refused():
     bad = np.array(path.position)
     bad[3, 1] = np.nan
     refused(r"wandering 0: a target path must be \[T, 2\]", player_page, Character(motion, path=bad))
-    with pytest.raises(ValueError, match=r"contacts must be \[40, 2\] .* got \(39, 2\)"):
-        player_page(Character(motion, contacts=np.zeros((FRAMES - 1, 2), bool)))
-    refused("true or false", player_page, Character(motion, contacts=np.full((FRAMES, 2), 0.5)))
-    refused("true or false", player_page, Character(motion, contacts=np.full((FRAMES, 2), np.nan)))
 
 
 @pytest.mark.parametrize("boundaries", [[0], [FRAMES], [-3], [3.5]])

@@ -57,8 +57,6 @@ class Character:
     Attributes:
       motion: what it does, T frames.
       path: its target path: a `RootPath` of T frames, or [T, 2] (x, z) in metres.
-      contacts: which toe is in contact, boolean [T, 2], left then right; by default
-        `Motion.contacts`, where the skeleton's toes are known.
       name: for messages; by default the motion's.
       color: "#rrggbb" of body and trail, to tell characters apart; of sticks, limbs keep the colours of left and right.
       ghost: another motion that is drawn with this one and can be seen through, such as the real clip.
@@ -66,7 +64,6 @@ class Character:
 
     motion: Motion
     path: object = None
-    contacts: np.ndarray | None = None
     name: str = ""
     color: str | None = None
     ghost: Motion | None = None
@@ -115,7 +112,7 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
       The page, HTML; it needs no file and no network.
 
     Raises:
-      ValueError: for no scene or no character, unlike frame rates or lengths (of motions, paths or contacts), motion
+      ValueError: for no scene or no character, unlike frame rates or lengths (of motions or paths), motion
         without rotations, numbers not finite or too far out, boundaries that are no frames of the motion, or a colour
         that is none.
     """
@@ -358,24 +355,14 @@ def _first_azimuth(motion: Motion) -> float:
 def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[dict, list[bytes]]:
     """Describe a character and turn its tracks into bytes."""
     motion, label = character.motion, character.name
-    num_frames, toes = motion.num_frames, stick_figures.toes_of(motion.skeleton)
+    num_frames, has_contacts = motion.num_frames, bool(stick_figures.toes_of(motion.skeleton)) and not ghost
     rotations = motion.needed_rotations("the player")
     turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
     turns = np.rint(steps * turns).reshape(num_frames, -1)
     pieces = [_track(_whole_millimetres(motion.root_position, label, "root"), "<i4"), _track(turns, "<i2")]
 
-    contacts = character.contacts
-    if contacts is None and toes and not ghost:
-        contacts = motion.contacts
-    if contacts is not None:
-        contacts = np.asarray(contacts)
-        if not toes:
-            raise ValueError(f"{label}: contacts are given, but this skeleton's toes are not known")
-        if contacts.shape != (num_frames, 2):
-            raise ValueError(f"{label}: contacts must be [{num_frames}, 2] (left, right), got {contacts.shape}")
-        if not np.isin(contacts, (0, 1)).all():
-            raise ValueError(f"{label}: contacts must be true or false, or 0 or 1")
-        pieces.append(_track((contacts.astype(bool) @ np.array([1, 2]))[:, None], "u1"))
+    if has_contacts:
+        pieces.append(_track((motion.contacts.astype(bool) @ np.array([1, 2]))[:, None], "u1"))
 
     if character.path is not None:
         try:
@@ -390,7 +377,7 @@ def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[di
             )
         pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
     about = {"name": label, "color": character.color, "ghost": ghost}
-    return about | {"contacts": contacts is not None, "path": character.path is not None}, pieces
+    return about | {"contacts": has_contacts, "path": character.path is not None}, pieces
 
 
 def _whole_millimetres(metres: np.ndarray, label: str, what: str) -> np.ndarray:
