@@ -303,25 +303,23 @@ def rollout(
     blend, lock = (0, False) if raw else (blend, not slide and _has_legs(trained.skeleton))
     made = generator.rollout(line, style, seed=seed, history=history, blend_frames=blend, lock_feet=lock)
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
-    motion = made.motion()
     title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
-    _write_shown(targets, motion, rollout_scene(made, title), trained, paths=line, overwrite=model.overwrite)
+    _write_shown(targets, rollout_scene(made, title), trained, overwrite=model.overwrite)
 
 
-def _write_shown(targets, motion, scene, trained, *, paths=None, overwrite: bool) -> None:
-    """Write a motion as film strip, GIF (its first 12 s) and player page, then in each format that was asked for."""
-    from f3amd_lib.drawing.pictures import film_strip, write_gif
-    from f3amd_lib.drawing.style import save_figure
+def _write_shown(targets, scene, trained, *, overwrite: bool) -> None:
+    """Write a scene of one character as GIF (its first 12 s), player page with film strip, and in each format asked."""
+    from f3amd_lib.drawing.pictures import write_gif
     from f3amd_lib.generation.generated import generated_credit
     from f3amd_lib.serving.player import write_player
 
-    strip, gif, page, *files = targets
-    strip.parent.mkdir(parents=True, exist_ok=True)
+    _, gif, page, *files = targets
+    (character,) = scene.characters
+    motion = character.motion
     credit = generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
-    save_figure(film_strip(motion, paths=paths, titles=[scene.title]), strip)
     every = max(1, round(motion.fps / 10))
-    write_gif(gif, motion, target_paths=paths, titles=[scene.title], every=every, max_seconds=12.0)
-    write_player(page, scene, credit=credit, strip=False)
+    write_gif(gif, motion, target_paths=character.path, titles=[scene.title], every=every, max_seconds=12.0)
+    write_player(page, scene, credit=credit)  # the strip has its name
     for path in files:
         _write_motion(path, motion, credit, overwrite)
     for target in targets:
@@ -414,8 +412,8 @@ def text(
     if points is not None:
         missed = 100 * np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
         log.info("control      %s is %.1f cm away on average, %.1f cm at most", joint, missed.mean(), missed.max())
-    scene = Scene(Character(motion, name=name), title=title, boundaries=boundaries)
-    _write_shown(targets, motion, scene, trained, overwrite=overwrite)
+    scene = Scene([Character(motion, name=name)], title=title, boundaries=boundaries)
+    _write_shown(targets, scene, trained, overwrite=overwrite)
 
 
 def _motion_formats(given: str) -> list[str]:
