@@ -33,11 +33,6 @@ _REPOSITORY = _LIBRARY.parent
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
 _EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
-_CIRCUMSTANCES = (
-    "git_commit git_dirty library_version versions device_platform device_kind num_devices cores date_utc "
-    "not_possible weights_digests table"
-).split()
-
 _TABLES = read_toml(Path(__file__).with_name("records.toml"))
 
 ON_WEIGHTS = frozenset(_TABLES["on_weights"])
@@ -95,7 +90,7 @@ def record_hash(record: dict) -> str:
     Returns:
       64 hex digits, equal for runs that should give the same numbers up to rounding.
     """
-    asked = {key: value for key, value in record.items() if key not in _CIRCUMSTANCES}
+    asked = {key: value for key, value in record.items() if key not in _TABLES["circumstances"]}
     return hashlib.sha256(json.dumps(_plain(asked), sort_keys=True).encode()).hexdigest()
 
 
