@@ -85,11 +85,6 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     Raises:
       ValueError: if there is no such table.
     """
-    return _read_table(number, paper).copy()
-
-
-@functools.cache
-def _read_table(number: int | str, paper: str) -> pd.DataFrame:
     description = load_paper_file("paper", paper)
     entries = {entry["number"]: entry for entry in description.get("table", ())}
     if number not in entries:
