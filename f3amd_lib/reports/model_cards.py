@@ -35,6 +35,8 @@ from f3amd_lib.training.text_models import JUDGE, load_text_model
 
 log = logging.getLogger("f3amd")
 
+_CARDS = read_toml(Path(__file__).with_name("cards.toml"))
+
 
 def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
     """Return the table of a model's figures beside real motion's."""
@@ -51,7 +53,7 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     value = measured[measured["steps"] == measured["steps"].max()].set_index("metric")["value"]
     real = real.set_index("metric")["value"]
     limits = []
-    for limit in read_toml(Path(__file__).with_name("limits.toml"))["limit"]:
+    for limit in _CARDS["limit"]:
         figure, source = value.get(limit["metric"], np.nan), real.get(limit["metric"], np.nan)
         bound = limit["bound"] * (source if limit.get("of_real") else 1.0)
         # What was not measured is beyond no bound.
@@ -117,11 +119,7 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
         measured = quality[(quality["model"] == trained.name) & (quality["weights"] == weights)]
         real = quality[quality["model"] == "real"]
         if len(measured):
-            figures = (
-                f"{markdown_table(_figures(measured, real))}\n\n"
-                "Means and 95 % intervals over seeds, by notebook 07's protocol with these weights. "
-                "FID and EMD compare within this data set alone."
-            )
+            figures = _CARDS["measured"]["model"].format(table=markdown_table(_figures(measured, real)))
             limits = _limits(measured, real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     if training["passes"] < 20:
@@ -155,11 +153,7 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
             columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
             counts = own.fillna({"wording": "clips"}).groupby(["model", "wording"], sort=False)[columns].sum()
             counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
-            measured = f"Which hand goes up where the caption says left or right:\n\n{markdown_table(counts)}"
-    command = (
-        f"f3amd train --preset {trained.name} --data {record['dataset']} --window {trained.most_frames} "
-        f"--steps {training['steps']} --batch-size {recipe['batch_size']} --seed {recipe['seed']}"
-    )
+            measured = _CARDS["measured"]["text"].format(table=markdown_table(counts))
     state = "positions of joints" + (" and redundant features" if codec.redundancy else "")
     if codec.frames_per_state > 1:
         state = f"latent of {codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
@@ -168,7 +162,7 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     guidance = f"{record['guidance']:g}" if "guidance" in record else "the paper's 3"
     return _filled(
         "text_model_card", path, trained, (trained.params, codec.params), **training,
-        state=state, guidance=guidance, measured=measured, command=command,
+        state=state, guidance=guidance, measured=measured,
     )  # fmt: skip
 
 
@@ -196,10 +190,7 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
         wide = own.drop_duplicates(["steps", "metric"]).pivot(index="steps", columns="metric", values="text")
         wide = wide[[metric for metric in shown if metric in wide]].fillna("–")
         wide.columns = [METRICS[metric].title for metric in wide.columns]
-        measured = (
-            f"On held-out captions, by a judge of ours, in 16 bits:\n\n{markdown_table(wide.reset_index())}\n\n"
-            "Figures of one judge compare with each other alone."
-        )
+        measured = _CARDS["measured"]["latent"].format(table=markdown_table(wide.reset_index()))
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
     if (table := tables.get("text_pcm3")) is not None:
         values = table.set_index(["trained", "metric"])["value"]
@@ -233,10 +224,8 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
         table, shown = seen[0], ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
         wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), shown]
         wide.columns = [METRICS[metric].title for metric in shown]
-        measured = (
-            "Asked about real held-out clips and about clips that are wrong on purpose "
-            f"(means of {seen[1]['settings']['repeats']} repeats):\n\n{markdown_table(wide.reset_index(), digits=3)}"
-        )
+        repeats, as_text = seen[1]["settings"]["repeats"], markdown_table(wide.reset_index(), digits=3)
+        measured = _CARDS["measured"]["judge"].format(repeats=repeats, table=as_text)
     return _filled("judge_card", path, judge, judge.params, digest=digest, measured=measured)
 
 
