@@ -92,10 +92,8 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
         raise ValueError(f"the {description['name']} paper has {known}, not {number!r}")
     entry = entries[number]
     frame = pd.read_csv(_FOLDER / paper / "numbers" / entry["file"], dtype=str, keep_default_na=False)
-    frame = frame.rename(columns={"value": "printed"})
-    for column in ("window_frames", "steps", "characters"):
-        if column in frame:
-            frame[column] = frame[column].astype(int)
+    counts = [column for column in ("window_frames", "steps", "characters") if column in frame]
+    frame = frame.rename(columns={"value": "printed"}).astype(dict.fromkeys(counts, int))
     for column in ("metric", "unit", "better"):
         if column in entry:
             frame.insert(frame.columns.get_loc("printed"), column, entry[column])

@@ -240,13 +240,11 @@ def _git_state() -> tuple[str | None, bool | None]:
     """Return the commit of the library's checkout and whether its code differs from it."""
 
     def git(*arguments: str) -> str | None:
+        asked = ["git", "-C", str(_REPOSITORY), *arguments]
         try:
-            done = subprocess.run(
-                ["git", "-C", str(_REPOSITORY), *arguments], capture_output=True, text=True, timeout=20, check=False
-            )
-        except (OSError, subprocess.TimeoutExpired):
+            return subprocess.run(asked, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+        except (OSError, subprocess.SubprocessError):
             return None
-        return done.stdout.strip() if done.returncode == 0 else None
 
     # The library may be installed inside somebody else's checkout, whose commit says nothing.
     if not git("ls-files", "--", str(Path(__file__).resolve())):

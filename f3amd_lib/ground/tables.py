@@ -58,7 +58,8 @@ def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
     for title, values in frame.items():
         cells, heading = [_cell(value, digits) for value in values], _escape(str(title))
         width = max(map(len, ["---", heading, *cells]))
-        flush = bool(cells) and all(map(_looks_numeric, cells))
+        numbers = pd.to_numeric([cell for cell in cells if cell != "–"], errors="coerce")
+        flush = bool(cells) and pd.notna(numbers).all()
         rule = "-" * (width - 1) + ":" if flush else "-" * width
         columns.append([cell.rjust(width) if flush else cell.ljust(width) for cell in (heading, rule, *cells)])
     return "".join(f"| {' | '.join(line)} |\n" for line in zip(*columns, strict=True))
@@ -88,16 +89,6 @@ def _cell(value, digits: int) -> str:
         return f"{value:.{max(digits - 1, 0)}e}"
     whole = len(str(int(abs(value)))) if abs(value) >= 1 else 1
     return f"{value:.{max(0, min(digits, digits + 1 - whole))}f}"
-
-
-def _looks_numeric(cell: str) -> bool:
-    if cell == "–":
-        return True
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _escape(text: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import asked_network, check_known, nearest_hint
+from f3amd_lib.ground.names import asked_network, check_known, counted_cores, nearest_hint
 from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
@@ -345,8 +345,7 @@ def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
     if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
-        cores = record.get("cores")
-        return f"CPU, {cores} core" + "s" * (cores != 1)
+        return f"CPU, {counted_cores(record)}"
     kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
 

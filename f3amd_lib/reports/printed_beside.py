@@ -53,10 +53,8 @@ def judge_note(dataset: str, name: str) -> str:
 
     Judges of one recipe differ from training to training, so that their figures are on scales of their own.
     """
-    judges = {}
-    for other in ("text_judge", *TABLES):
-        if found := committed_table(dataset, other):
-            judges[other] = found[1]["judge_weights"]
+    tables = {other: committed_table(dataset, other) for other in ("text_judge", *TABLES)}
+    judges = {other: found[1]["judge_weights"] for other, found in tables.items() if found}
     others = [f"`{other}`" for other, judge in judges.items() if judge != judges[name]]
     if not others:
         return ""
