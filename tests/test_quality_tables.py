@@ -178,7 +178,3 @@ def test_the_papers_numbers_stand_in_columns_of_their_own():
     assert table["metric"].tolist() == ["IRD (cm)", "drift ↓"]
     assert table.loc[0, paper].tolist() == [1.795, 3.834]
     assert table.loc[1, ["real", *paper]].isna().all()
-
-
-def test_paper_rows_that_are_not_there():
-    refused("Table 3 has no row 'F3AMD-FNO-97'", paper_rows, ["F3AMD-FNO-97", "CAMDM"])

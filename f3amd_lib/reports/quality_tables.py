@@ -240,24 +240,14 @@ def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.Data
     return pd.DataFrame(rows)
 
 
-def paper_rows(models: Sequence[str] = ("F3AMD-FNO-96", "CAMDM"), *, table: int = 3, window: int = 32) -> pd.DataFrame:
-    """Return printed rows of the paper with the labels that `side_by_side` wants.
-
-    Args:
-      models: names as printed.
-      table: number of a quality table (3, 5, 6, 8 to 12).
-      window: frames.
+def paper_rows() -> pd.DataFrame:
+    """Return the rows of Table 3 for F3AMD-FNO-96 and CAMDM, 32 frames, with the labels that `side_by_side` wants.
 
     Returns:
       Tidy rows of the paper's table, with `label` naming paper, model and steps.
-
-    Raises:
-      ValueError: if the table has no such row.
     """
-    printed = load_paper_table(table)
-    kept = printed[printed["model"].isin(models) & (printed["window_frames"] == window)]
-    if missing := sorted(set(models) - set(kept["model"])):
-        raise ValueError(f"Table {table} has no row {missing[0]!r} for {window} frames")
+    printed = load_paper_table(3)
+    kept = printed[printed["model"].isin(["F3AMD-FNO-96", "CAMDM"]) & (printed["window_frames"] == 32)]
     labels = [f"paper, {m}, {s} steps" for m, s in zip(kept["model"], kept["steps"], strict=True)]
     return kept.assign(label=labels)
 

@@ -25,7 +25,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -301,10 +300,9 @@ def _manifest(
     exported: ExportedRound, name: str, files: dict[str, bytes], targets: dict[str, dict], trained: TrainedModel | None
 ) -> dict:
     training, config = trained.record if trained else {}, exported.config
-    dataset = SimpleNamespace(
-        name=training.get("dataset", "none"),
-        **{key: training.get(f"dataset_{key}") for key in ("fingerprint", "licence", "credit")},
-    )
+    dataset, seed = training.get("dataset", "none"), training.get("seed", 0)
+    record = run_record(profile="export", dataset=dataset, seed=seed, training=training)
+    record |= {key: training.get(key) for key in ("dataset_fingerprint", "dataset_licence", "dataset_credit")}
     manifest = {
         "format": artefact.FORMAT,
         "model": name,
@@ -320,7 +318,7 @@ def _manifest(
         "files": {
             name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()
         },
-        "record": run_record(profile="export", dataset=dataset, seed=training.get("seed", 0), training=training),
+        "record": record,
     }
     return manifest | {"sha256": artefact.manifest_digest(manifest)}
 
