@@ -121,19 +121,9 @@ def test_quaternions_do_not_jump(tmp_path):
     assert (np.sum(output[1:] * output[:-1], axis=1) > 0.9).all()
 
 
-def test_several_characters_share_a_file_and_keep_their_places(tmp_path):
-    motions = [wandering_motion(7, seed) for seed in range(3)]
-    file = Reader(write_glb(tmp_path / "crowd.glb", motions))
-    world = file.world(6)
-    for motion, skin in zip(motions, file.json["skins"], strict=True):
-        np.testing.assert_allclose(world[skin["joints"], :3, 3], motion.positions[6], atol=1e-5)
-
-
 def test_what_cannot_be_written_is_refused(tmp_path):
     motion = wandering_motion(4)
     refused("written as .glb", write_glb, tmp_path / "walk.gltf", motion)
-    refused("one length and frame rate", write_glb, tmp_path / "walk.glb", [motion, wandering_motion(5)])
-    refused("got 0 motions", write_glb, tmp_path / "walk.glb", [])
     write_glb(tmp_path / "walk.glb", motion)
     refused("exists already", write_glb, tmp_path / "walk.glb", motion)
     alone = Motion.from_positions(motion.skeleton, motion.positions)

@@ -1,14 +1,13 @@
 """Motion as glTF 2.0 (`.glb`): skeleton, skin and animation in one file, which engines and Blender open.
 
-Each character has its own joints, skin and mesh (`motion.body`); all play in one animation. Units are metres, +Y is up,
-a character with yaw 0 faces +Z: glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of sign.
+A character has joints, a skin and a mesh (`motion.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z:
+glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of sign.
 
 Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,15 +58,29 @@ def _quaternions(rotations) -> np.ndarray:
     return turns
 
 
-def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Animation, times: int) -> list[int]:
-    """Add joints, mesh, skin and channels; return the character's two top nodes."""
-    document, skeleton = file.document, motion.skeleton
-    body = make_body(skeleton)
+def write_glb(path, motion: Motion, *, credit: str = "", overwrite: bool = False) -> Path:
+    """Write a motion as a binary glTF file.
+
+    Args:
+      path: ends in .glb; folders are made.
+      motion: of one character.
+      credit: whose motion this is and under which terms; stands in the file as its copyright.
+      overwrite: replace what is there.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: for a wrong suffix, a file that is there, or motion without rotations.
+    """
+    path = named_file(path, ".glb", "motions in binary glTF")
+    file = _File(credit)
+    document, skeleton, body = file.document, motion.skeleton, make_body(motion.skeleton)
     turns = _quaternions(np.asarray(motion.needed_rotations("a glTF animation"), np.float64))
     root = np.asarray(motion.root_position, np.float64)
-    first = len(document.nodes)
+    times = file.put(np.arange(motion.num_frames) / motion.fps, "f4")
     for joint, name in enumerate(skeleton.names):
-        children = [first + child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
         place = root[0] if joint == 0 else skeleton.offsets[joint]
         document.nodes.append(
             gltf.Node(name=name, translation=place.tolist(), rotation=turns[0, joint].tolist(), children=children)
@@ -75,8 +88,8 @@ def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Ani
     rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
     inverse = np.tile(np.eye(4), (skeleton.num_joints, 1, 1))
     inverse[:, :3, 3] = -rest
-    joints = list(range(first, first + skeleton.num_joints))
-    skin = gltf.Skin(joints=joints, skeleton=first, inverseBindMatrices=file.put(inverse, "f4"))
+    joints = list(range(skeleton.num_joints))
+    document.skins.append(gltf.Skin(joints=joints, skeleton=0, inverseBindMatrices=file.put(inverse, "f4")))
     padding = ((0, 0), (0, 4 - body.joints.shape[1]))
     corners = body.vertices[body.faces]
     normals = np.zeros_like(body.vertices)  # of a vertex: the sum of its faces' ones, which weighs them by area
@@ -89,45 +102,18 @@ def _add_character(file: _File, motion: Motion, number: int, animation: gltf.Ani
     )
     indices = file.put(body.faces.ravel(), "u4", gltf.ELEMENT_ARRAY_BUFFER)
     mesh = gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])
-    whole = {"mesh": _append(document.meshes, mesh), "skin": _append(document.skins, skin)}
-    top = _append(document.nodes, gltf.Node(name=motion.name or f"character {number}", **whole))
-    turning = [(node, "rotation", turns[:, joint]) for joint, node in enumerate(joints)]
-    for node, path, values in [(first, "translation", root), *turning]:
-        sampler = _append(animation.samplers, gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
-        target = gltf.AnimationChannelTarget(node=node, path=path)
-        animation.channels.append(gltf.AnimationChannel(sampler=sampler, target=target))
-    return [first, top]
-
-
-def write_glb(path, motions: Motion | Sequence[Motion], *, credit: str = "", overwrite: bool = False) -> Path:
-    """Write motions as one binary glTF file.
-
-    Args:
-      path: ends in .glb; folders are made.
-      motions: one or several, of one frame rate and length.
-      credit: whose motion this is and under which terms; stands in the file as its copyright.
-      overwrite: replace what is there.
-
-    Returns:
-      The path.
-
-    Raises:
-      ValueError: for a wrong suffix, a file that is there, no motion, unlike rates or lengths, or motion without
-        rotations.
-    """
-    path = named_file(path, ".glb", "motions in binary glTF")
-    motions = [motions] if isinstance(motions, Motion) else list(motions)
-    if len({(motion.num_frames, motion.fps) for motion in motions}) != 1:
-        raise ValueError(f"{path}: needs motions of one length and frame rate, got {len(motions)} motions")
-    file = _File(credit)
-    document = file.document
+    document.meshes.append(mesh)
     material = gltf.PbrMetallicRoughness(baseColorFactor=_GREY, metallicFactor=0.0, roughnessFactor=0.8)
     document.materials.append(gltf.Material(name="body", pbrMetallicRoughness=material))
+    top = _append(document.nodes, gltf.Node(name=motion.name or "character", mesh=0, skin=0))
     animation = gltf.Animation(name="motion")
-    times = file.put(np.arange(motions[0].num_frames) / motions[0].fps, "f4")
-    top = [node for k, motion in enumerate(motions) for node in _add_character(file, motion, k, animation, times)]
+    turning = [(joint, "rotation", turns[:, joint]) for joint in joints]
+    for node, channel, values in [(0, "translation", root), *turning]:
+        sampler = _append(animation.samplers, gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
+        target = gltf.AnimationChannelTarget(node=node, path=channel)
+        animation.channels.append(gltf.AnimationChannel(sampler=sampler, target=target))
     document.animations.append(animation)
-    document.scenes.append(gltf.Scene(nodes=top))
+    document.scenes.append(gltf.Scene(nodes=[0, top]))
     document.scene = 0
     document.buffers.append(gltf.Buffer(byteLength=len(file.bytes)))
     document.set_binary_blob(file.bytes)
