@@ -191,7 +191,7 @@ def test_tables_of_other_runs_are_never_overwritten(tmp_path, key):
 
 
 def test_bad_tables_are_refused(tmp_path):
-    refused(r"end in \.csv", records.write_table, tmp_path / "quality.txt", FRAME, record())
+    refused(r"quality.txt: tables are written as \.csv", records.write_table, tmp_path / "quality.txt", FRAME, record())
     refused("no rows", records.write_table, tmp_path / "quality.csv", FRAME.head(0), record())
     refused("has no 'profile'", records.write_table, tmp_path / "quality.csv", FRAME, {"dataset": "x", "seed": 0})
     assert not list(tmp_path.iterdir())
