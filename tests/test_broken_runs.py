@@ -189,12 +189,13 @@ def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
 
 
 def test_a_picture_appears_whole_or_not_at_all(tmp_path, monkeypatch):
-    def cut(figure, dpi):
+    def cut(path, content):
         raise OSError(28, "No space left on device")
 
     path = tmp_path / "figure.png"
     path.write_bytes(b"the old one")
-    monkeypatch.setattr(style, "_png", cut)
+    monkeypatch.setattr(style, "_png", lambda figure, dpi: b"a new one")
+    monkeypatch.setattr(type(path), "write_bytes", cut)
     with pytest.raises(OSError, match="figure.png: cannot be written .*No space"):
         style.save_figure(None, path)
     assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
