@@ -220,9 +220,7 @@ READERS = {
         lambda f: read_caption_table(f / "captions.csv"),
         "captions.csv",
     ),
-    "humanml3d": Reader(
-        _make_humanml3d, lambda f: read_humanml3d(f / "set", vectors=True, fewest_frames=2), "set/**/*"
-    ),
+    "humanml3d": Reader(_make_humanml3d, lambda f: read_humanml3d(f / "set"), "set/**/*"),
     "control": Reader(
         lambda f: (f / "control.csv").write_text("frame,x,y,z\n0,0,1,0\n9,0.5,1.5,0.25\n39,1e-1,2,3\n"),
         _read_control,

@@ -178,7 +178,7 @@ def test_the_table_has_the_unblended_rollout_beside_the_blended(plain):
         ({"window": 0}, "window must be a whole number .* got 0"),
         ({"frames": np.zeros((4, 10))}, r"frames must be .* got \(4, 10\)"),
         ({"frames": np.full((4, CHANNELS), np.nan)}, "not finite at frame 0"),
-        ({"history": np.zeros((3, CHANNELS - 6))}, "does not fit"),
+        ({"history": np.zeros((3, CHANNELS - 6))}, r"history must be \[frame, .*\] .* got \(3, "),
     ],
 )
 def test_bad_input_is_refused(changed, message):

@@ -1,6 +1,5 @@
 """The BVH reader and writer: hand-made files with known positions, broken files, round trips."""
 
-import io
 import warnings
 
 import numpy as np
@@ -276,18 +275,15 @@ def test_content_of_another_type_is_refused():
     refused("odd: BVH content must be str or bytes, not int", parse_bvh, 3, "odd")
 
 
-def test_read_from_path_and_open_files(tmp_path):
+def test_read_from_path(tmp_path):
     path = tmp_path / "arm.bvh"
     path.write_text(ARM)
-    for source in (path, str(path), io.StringIO(ARM), io.BytesIO(ARM.encode())):
+    for source in (path, str(path)):
         np.testing.assert_allclose(read_bvh(source).positions, ARM_POSITIONS, atol=1e-12)
-    assert read_bvh(text=ARM, name="mine").name == "mine"
-    with path.open("rb") as file:
-        assert read_bvh(file).name == str(path)
+        assert read_bvh(source).name == str(path)
     path.write_text(ARM.replace("-90", "x"))
     refused(r"arm\.bvh, line 26: 'x'", read_bvh, path)
     refused(r"absent\.bvh: cannot be read", read_bvh, tmp_path / "absent.bvh")
-    refused("needs a path", read_bvh)
 
 
 def random_motion(seed: int = 0, frames: int = 7) -> Motion:

@@ -50,7 +50,7 @@ def test_motion_to_frames_and_back_is_exact():
 
 
 def test_frames_of_another_skeleton_are_refused():
-    with pytest.raises(ValueError, match=rf"\[T, {CHANNELS}\] for this skeleton of 6 joints"):
+    with pytest.raises(ValueError, match=rf"frames of 6 joints must be \[frame, {CHANNELS}\]"):
         motion_from_frames(SKELETON, np.zeros((4, CHANNELS + 6)))
     refused(r"got \(39,\)", motion_from_frames, SKELETON, np.zeros(CHANNELS))
 

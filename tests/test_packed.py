@@ -244,11 +244,6 @@ def test_a_broken_clip_leaves_no_cache(motions, cache_dir, tmp_path):
     assert packed.clip_names == ("happy_1", "sad_1", "sad_é")
 
 
-def test_worker_processes_give_the_same():
-    dataset = open_dataset("synthetic", seconds_per_style=6.0, num_styles=2)
-    assert_same(pack(dataset, progress=False), pack(dataset, progress=False, workers=2))
-
-
 @pytest.mark.slow
 def test_real_bandai_packs_small(bandai_dataset, tmp_path):
     packed = pack(bandai_dataset, progress=False)

@@ -1,6 +1,7 @@
 """Data sets by name: finding, verifying, refusing, splitting."""
 
 import collections
+import hashlib
 import shutil
 import zipfile
 import zlib
@@ -318,8 +319,8 @@ def small_bandai(tmp_path, monkeypatch) -> Path:
             (folder / f"{name}.bvh").write_text(text)
             data = text.encode()
             listed.append(
-                sources._ListedFile(
-                    name, 40 + 5 * number, len(data), zlib.crc32(data), sources.hashlib.sha256(data).hexdigest()[:16]
+                sources._listed_file(
+                    name, 40 + 5 * number, len(data), f"{zlib.crc32(data):x}", hashlib.sha256(data).hexdigest()[:16]
                 )
             )
     monkeypatch.setattr(sources, "_bandai_list", lambda: tuple(listed))

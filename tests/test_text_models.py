@@ -478,8 +478,8 @@ CONTROL = ("a person walks", "--seconds", "1.2", "--control", "CSV")
         (CONTROL, "tiny+control", "frame,x,y,z\n", "needs at least one row"),
         (CONTROL, "tiny+control", "frame,x,y,z\n0,0,1,0\n24,0,1,0\n", "line 3: frame 24 is not one of the clip's"),
         (CONTROL, "tiny+control", "frame,x,y,z\n3,0,1,0\n3,0,1,0\n", "line 3: frame 3 comes twice"),
-        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,one,0\n", "line 2: '3,0,one,0' is not four numbers"),
-        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,inf,0\n", "line 2: '3,0,inf,0' is not four finite numbers"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,one,0\n", "line 2: y is 'one', not a finite number"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,inf,0\n", "line 2: y is 'inf', not a finite number"),
         ((*CONTROL, "--joint", "left_wirst"), "tiny+control", "frame,x,y,z\n3,0,1,0\n", "did you mean 'left_wrist'?"),
     ],
 )

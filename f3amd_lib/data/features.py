@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from f3amd_lib.ground.arrays import array_module, finite_array
 from f3amd_lib.motion.rotations import (
-    array_module,
     matrix_from_rotation_6d,
     matrix_from_yaw,
     rotation_6d_from_matrix,
@@ -50,11 +50,8 @@ def motion_from_frames(skeleton: Skeleton, frames, fps: float = 30.0, name: str 
     Raises:
       ValueError: if the channel count does not fit the skeleton, or a number is not finite.
     """
-    frames = np.asarray(frames, np.float64)
-    if frames.ndim != 2 or frames.shape[1] != num_channels(skeleton):
-        what = f"[T, {num_channels(skeleton)}] for this skeleton of {skeleton.num_joints} joints"
-        raise ValueError(f"frames must be {what}, got {frames.shape}")
-    root_position, rotation_6d = split_frames(frames)
+    label = f"frames of {skeleton.num_joints} joints"
+    root_position, rotation_6d = split_frames(finite_array(label, frames, ("frame", num_channels(skeleton))))
     return Motion(skeleton, root_position, matrix_from_rotation_6d(rotation_6d), fps, name)
 
 

@@ -35,7 +35,7 @@ from f3amd_lib.data.text_motions import (
     text_motions,
 )
 from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
-from f3amd_lib.ground.names import check_known, nearest_hint
+from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
@@ -46,8 +46,7 @@ _SPLIT_FILES = dict(zip(SPLITS, ("train.txt", "val.txt", "test.txt"), strict=Tru
 
 
 def layout_skeleton(layout: str) -> Skeleton:
-    """Return the skeleton of a published layout, bones of length 1; ValueError for another name."""
-    check_known(layout, LAYOUTS, "layout")
+    """Return the skeleton of a published layout, one of `LAYOUTS`, bones of length 1."""
     described = LAYOUTS[layout]
     rest = [[(axis == way[-1:]) * (-1.0 if way[:1] == "-" else 1.0) for axis in "xyz"] for way in described["rest"]]
     return Skeleton(described["joints"], described["parents"], rest)
@@ -96,13 +95,13 @@ def _load(path: Path, fix: str) -> np.ndarray:
     return array
 
 
-def _array(path: Path, shape: tuple, fix: str) -> np.ndarray:
-    """Return a file's array as float32; -1 in the shape stands for any length."""
+def _positions(path: Path, joints: int, fix: str) -> np.ndarray:
+    """Return a file's positions, [L, J, 3], as float32."""
     array = _load(path, fix)
-    if array.shape == shape[1:]:
+    if array.shape == (joints, 3):
         array = array[None]  # a clip of one frame is stored without a frame axis
-    if array.ndim != len(shape) or array.shape[1:] != shape[1:] or not array.size:
-        raise ValueError(f"{path}: has shape {array.shape} instead of {('L', *shape[1:])}; {fix}")
+    if array.shape != (len(array), joints, 3) or not array.size:
+        raise ValueError(f"{path}: has shape {array.shape} instead of {('L', joints, 3)}; {fix}")
     if not np.isfinite(array).all():
         raise ValueError(f"{path}: is not finite in frame {int(np.argwhere(~np.isfinite(array))[0][0])}; {fix}")
     return array.astype(np.float32)
@@ -115,19 +114,15 @@ def _lines(path: Path, fix: str) -> list[str]:
         raise ValueError(f"{path}: cannot be read as text ({error}); {fix}") from error
 
 
-def read_humanml3d(
-    folder, *, layout: str | None = None, vectors: bool = False, fewest_frames: int | None = None
-) -> TextMotions:
-    """Read a folder in HumanML3D's layout.
+def read_humanml3d(folder) -> TextMotions:
+    """Read a folder in HumanML3D's layout: its positions, captions and splits.
 
     A caption with times is a clip of its own, `<id>@begin-end`, cut at int(begin fps) and int(end fps).
-    Clips under the fewest frames, or of 200 and more, are left out and listed in `skipped`.
+    Clips under the layout's fewest frames (40; KIT-ML 24), or of 200 and more, are left out and listed in `skipped`.
 
     Args:
-      folder: with `new_joints`, `texts` and the split files.
-      layout: "humanml3d" or "kit"; by default `skeleton.json` says it, else the number of joints.
-      vectors: read `new_joint_vecs` as well.
-      fewest_frames: instead of the layout's own (40; KIT-ML 24).
+      folder: with `new_joints`, `texts` and the split files; `skeleton.json` says whose joints they are, else their
+        number does.
 
     Returns:
       The clips, float32.
@@ -138,10 +133,9 @@ def read_humanml3d(
     """
     folder = Path(folder).expanduser()
     fix = "fetch or write the folder again"
-    skeleton, described = _skeleton_of(folder, layout, fix)
-    fewest = described["fewest_frames"] if fewest_frames is None else fewest_frames
-    joints, fps = skeleton.num_joints, described["fps"]
-    clips, kept_vectors, skipped, seen = [], [], [], {}
+    skeleton, described = _skeleton_of(folder, fix)
+    fewest, fps = described["fewest_frames"], described["fps"]
+    clips, skipped, seen = [], [], {}
     for split, file in _SPLIT_FILES.items():
         for number, name in enumerate(_lines(folder / file, fix), 1):
             name = name.strip()
@@ -153,13 +147,7 @@ def read_humanml3d(
             seen[name] = file
             if Path(name).name != name or "\0" in name or len(name) > 200:
                 raise ValueError(f"{where}: {name!r} is no plain id; mend the line")
-            positions = _array(folder / "new_joints" / f"{name}.npy", (-1, joints, 3), fix)
-            wide = positions[:, :0, 0]
-            if vectors:
-                wide = _array(folder / "new_joint_vecs" / f"{name}.npy", (-1, 12 * joints - 1), fix)
-                if len(wide) != len(positions):
-                    what = f"{len(wide)} vectors for {len(positions)} frames of positions"
-                    raise ValueError(f"{folder / 'new_joint_vecs' / name}.npy: {what}; {fix}")
+            positions = _positions(folder / "new_joints" / f"{name}.npy", skeleton.num_joints, fix)
             for clip, captions, part in _captioned(folder / "texts" / f"{name}.txt", name, fps, len(positions), fix):
                 length = len(positions[part])
                 if not fewest <= length <= MOST_FRAMES:
@@ -167,13 +155,11 @@ def read_humanml3d(
                     continue
                 pair = described.get("pairs", {}).get(clip, clip)
                 clips.append((clip, captions, split, pair, positions[part]))
-                kept_vectors.append(wide[part])
     if not clips:
         raise ValueError(f"{folder}: no clip of {fewest} to {MOST_FRAMES} frames; {fix}")
     usual = {"name": folder.name, "licence": "as its owner says", "credit": ""}
     terms = {what: described.get(what, value) for what, value in usual.items()}
-    kept = np.concatenate(kept_vectors) if vectors else None
-    return TextMotions.joined(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), vectors=kept, **terms)
+    return TextMotions.joined(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **terms)
 
 
 def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list[tuple[str, tuple, slice]]:
@@ -196,10 +182,10 @@ def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list
     return clips + [(clip, tuple(captions), slice(first, last)) for (clip, first, last), captions in parts.items()]
 
 
-def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, dict]:
+def _skeleton_of(folder: Path, fix: str) -> tuple[Skeleton, dict]:
     """Return the skeleton of a folder, and its rate, terms and pairs."""
     own = folder / "skeleton.json"
-    if layout is None and own.is_file():
+    if own.is_file():
         try:
             described = json.loads(own.read_text(encoding="utf-8"))
             skeleton = Skeleton(described["joints"], described["parents"], np.array(described["offsets"], np.float64))
@@ -213,17 +199,13 @@ def _skeleton_of(folder: Path, layout: str | None, fix: str) -> tuple[Skeleton, 
         except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); {fix}") from error
         return skeleton, described
-    if layout is None:
-        ids = [line.strip() for line in _lines(folder / "train.txt", fix) if line.strip()]
-        first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
-        joints = (0, *_load(first, fix).shape)[-2]
-        known = {len(described["joints"]): name for name, described in LAYOUTS.items()}
-        if joints not in known:
-            raise ValueError(
-                f"{first}: has {joints} joints, HumanML3D has 22 and KIT-ML 21; a skeleton.json tells others"
-            )
-        layout = known[joints]
-    return layout_skeleton(layout), {"name": layout, **LAYOUTS[layout]}
+    ids = [line.strip() for line in _lines(folder / "train.txt", fix) if line.strip()]
+    first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
+    joints = (0, *_load(first, fix).shape)[-2]
+    known = {len(described["joints"]): name for name, described in LAYOUTS.items()}
+    if joints not in known:
+        raise ValueError(f"{first}: has {joints} joints, HumanML3D has 22 and KIT-ML 21; a skeleton.json tells others")
+    return layout_skeleton(known[joints]), {"name": known[joints], **LAYOUTS[known[joints]]}
 
 
 # ------------------------------------------------------------------------------------------ writing

@@ -8,10 +8,8 @@ and small enough to carry to another machine.
 
 from __future__ import annotations
 
-import concurrent.futures
 import hashlib
 import json
-import multiprocessing
 import os
 import warnings
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ import numpy as np
 import pooch
 from tqdm import tqdm
 
-from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Clip, Dataset
+from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset
 from f3amd_lib.data.statistics import lowest_toe_height
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
@@ -120,29 +118,7 @@ class PackedMotion:
         )
 
 
-def _compact(clip: Clip):
-    """Load one clip and return its skeleton, arrays and floor; runs in worker processes too."""
-    motion = clip.load()
-    return (
-        motion.skeleton,
-        motion.root_position.astype(np.float32),
-        rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16),
-        lowest_toe_height(motion),
-    )
-
-
-def _compact_all(clips: tuple[Clip, ...], workers: int):
-    """Yield `_compact` of every clip, in order."""
-    if workers <= 1:
-        yield from map(_compact, clips)
-        return
-    # Spawned, because a process that runs JAX must not be forked.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(_compact, clips, chunksize=4)
-
-
-def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> PackedMotion:
+def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     """Read all clips of a data set into one packed set of arrays.
 
     Clips shorter than one window (`MINIMUM_FRAMES`) are left out and listed in `skipped`. Any clip
@@ -151,8 +127,6 @@ def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> Packed
     Args:
       dataset: from `open_dataset`.
       progress: show a progress bar.
-      workers: processes that read; more than one pays off from some ten thousand frames on, and
-        needs the caller's script to be guarded by `if __name__ == "__main__"`.
 
     Returns:
       The packed arrays.
@@ -162,23 +136,24 @@ def pack(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> Packed
     """
     kept, skipped = [], []
     clips = tqdm(dataset.clips, desc=f"reading {dataset.name}", unit="clip", disable=not progress)
-    for clip, part in zip(clips, _compact_all(dataset.clips, workers), strict=True):
-        skeleton, root_position, *_ = part
-        if len(root_position) < MINIMUM_FRAMES:
-            reason = f"{len(root_position)} frames, shorter than a window of {MINIMUM_FRAMES}"
+    for clip in clips:
+        motion = clip.load()
+        if motion.num_frames < MINIMUM_FRAMES:
+            reason = f"{motion.num_frames} frames, shorter than a window of {MINIMUM_FRAMES}"
             skipped.append((clip.name, reason))
             continue
-        if kept and skeleton != kept[0][1][0]:
+        if kept and motion.skeleton != kept[0][1]:
             raise ValueError(
                 f"{clip.name}: its skeleton differs from that of {kept[0][0].name} (names, parents "
                 "or bone lengths); a data set needs one skeleton: retarget or remove the file"
             )
-        kept.append((clip, part))
+        rotations = rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16)
+        root = motion.root_position.astype(np.float32)
+        kept.append((clip, motion.skeleton, root, rotations, lowest_toe_height(motion)))
     if not kept:
         what = f"has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are shorter"
         raise ValueError(f"data set {dataset.name!r} {what}")
-    clips, parts = zip(*kept, strict=True)
-    skeletons, root_positions, rotations, floors = zip(*parts, strict=True)
+    clips, skeletons, root_positions, rotations, floors = zip(*kept, strict=True)
     return PackedMotion(
         skeleton=skeletons[0], dataset=dataset.name, **{name: getattr(dataset, name) for name in _SHARED},
         root_position=np.concatenate(root_positions), rotation_6d=np.concatenate(rotations),
@@ -284,12 +259,12 @@ def cache_path(dataset: Dataset) -> Path:
     return cache_folder() / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.npz"
 
 
-def packed_dataset(dataset: Dataset, *, progress: bool = True, workers: int = 1) -> PackedMotion:
+def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     """Return the packed form of a data set: from the cache if it is there, else packed and kept.
 
     Args:
       dataset: from `open_dataset`; its fingerprint is the cache's key.
-      progress, workers: as in `pack`.
+      progress: as in `pack`.
 
     Returns:
       The packed arrays.
@@ -307,6 +282,6 @@ def packed_dataset(dataset: Dataset, *, progress: bool = True, workers: int = 1)
             warnings.warn(f"{path}: belongs to another data set; packing anew", stacklevel=2)
         except ValueError as error:
             warnings.warn(f"{error} (packing anew)", stacklevel=2)
-    packed = pack(dataset, progress=progress, workers=workers)
+    packed = pack(dataset, progress=progress)
     save_packed(path, packed, overwrite=True)
     return packed

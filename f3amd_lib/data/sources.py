@@ -27,6 +27,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 import pooch
@@ -59,7 +60,7 @@ class Clip:
       style: style label, one of the data set's `styles`.
       content: what is done in it, such as "walk" or "FW"; may be empty.
       split: "train", "validation" or "test".
-      loader: picklable callable without arguments that returns the motion.
+      loader: callable without arguments that returns the motion.
     """
 
     name: str
@@ -198,7 +199,7 @@ _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError, Runt
 
 @dataclass(frozen=True)
 class _Archive:
-    """A folder or a zip file, read alike. Holds only its path, so that it can be pickled."""
+    """A folder or a zip file, read alike. Holds only its path: a zip stays open for all who read from it."""
 
     path: str
 
@@ -248,10 +249,6 @@ class _Archive:
 
     def label(self, name: str) -> str:
         return f"{self.path}: {name}"
-
-    def file(self, name: str, **how) -> _BvhFile:
-        """Return the loader of a file as it is now."""
-        return _BvhFile(self, name, *self.size_and_crc(name), **how)
 
 
 def _archive_at(path) -> _Archive:
@@ -349,35 +346,30 @@ def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
     return _dataset(dataset.name, clips, dataset.fingerprint, primary=primary, mirror=mirror, notes=dataset.notes)
 
 
-# --- loaders (plain data, so that a worker process can be handed them) ----------------------------
+# --- loaders --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _BvhFile:
-    """Reads one file of an archive, checks its bytes, and cuts out a range of 30 fps frames."""
+def _bvh_loader(
+    archive: _Archive, member: str, expected: tuple[int, int], *, sha256_prefix: str = "", start=0, stop=None
+) -> Callable[[], Motion]:
+    """Return what reads one file of an archive, checks its bytes, and cuts out a range of 30 fps frames."""
 
-    archive: _Archive
-    member: str
-    size: int
-    crc32: int
-    sha256_prefix: str = ""
-    start: int = 0
-    stop: int | None = None
-
-    def __call__(self) -> Motion:
-        data = self.archive.read(self.member)
-        label = self.archive.label(self.member)
-        sound = (len(data), zlib.crc32(data)) == (self.size, self.crc32)
-        if not (sound and hashlib.sha256(data).hexdigest().startswith(self.sha256_prefix)):
+    def load() -> Motion:
+        data = archive.read(member)
+        label = archive.label(member)
+        sound = (len(data), zlib.crc32(data)) == expected
+        if not (sound and hashlib.sha256(data).hexdigest().startswith(sha256_prefix)):
             raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
         motion = parse_bvh(data, label)
-        if self.stop is None:
+        if stop is None:
             return motion
         motion = resample(motion, FPS)
-        if self.stop > motion.num_frames:
-            what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {self.stop}"
+        if stop > motion.num_frames:
+            what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {stop}"
             raise ValueError(f"{label}: {what}; the file or the table is not the original: fetch both again")
-        return motion.slice(self.start, self.stop)
+        return motion.slice(start, stop)
+
+    return load
 
 
 def _synthetic_take(style: str, seconds: float, seed: int) -> Motion:
@@ -424,39 +416,30 @@ def _synthetic_probe(styles: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True)
-class _ListedFile:
+class _ListedFile(NamedTuple):
     """A row of `bandai_files.csv`: what a sound file of the Bandai archive is."""
 
     name: str
     frames: int
-    size: int
-    crc32: int
+    size_and_crc: tuple[int, int]
     sha256_prefix: str
-
-    @property
-    def parts(self) -> list[str]:
-        """Data set, content, style and number; none of them holds an underscore."""
-        return self.name.split("_")
-
-    @property
-    def style(self) -> str:
-        return f"{self.parts[0].removeprefix('dataset-')}-{self.parts[2]}"
-
-    @property
-    def is_locomotion(self) -> bool:
-        return self.parts[1] in _SETS["bandai"]["locomotion"][self.parts[0]]
+    style: str
+    content: str
+    is_locomotion: bool
 
 
-@functools.lru_cache(maxsize=1)
+def _listed_file(name: str, frames: str, size: str, crc32: str, sha256_prefix: str) -> _ListedFile:
+    """Return a row, told by its name: data set, content, style and number; none of them holds an underscore."""
+    part, content, style, _ = name.split("_")
+    style, walks = f"{part.removeprefix('dataset-')}-{style}", content in _SETS["bandai"]["locomotion"][part]
+    return _ListedFile(name, int(frames), (int(size), int(crc32, 16)), sha256_prefix, style, content, walks)
+
+
+@functools.cache
 def _bandai_list() -> tuple[_ListedFile, ...]:
     """Return the committed list of files: sizes and checksums at the pinned commit."""
-    source = Path(__file__).with_name("bandai_files.csv")
-    with source.open("r", encoding="utf-8", newline="") as file:
-        return tuple(
-            _ListedFile(row["name"], int(row["frames"]), int(row["size"]), int(row["crc32"], 16), row["sha256_prefix"])
-            for row in csv.DictReader(file)
-        )
+    lines = Path(__file__).with_name("bandai_files.csv").read_text(encoding="utf-8").splitlines()
+    return tuple(_listed_file(*row) for row in csv.reader(lines[1:]))
 
 
 def _open_bandai(path, locomotion_only: bool) -> Dataset:
@@ -472,7 +455,7 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
         what = f"{len(missing)} of the {len(wanted)} Bandai files needed are missing, the first is {missing[0]}.bvh"
         raise ValueError(f"{archive.path}: {what}; fetch the whole archive again")
     for item in listed:
-        if archive.size_and_crc(members[item.name]) != (item.size, item.crc32):
+        if archive.size_and_crc(members[item.name]) != item.size_and_crc:
             label = archive.label(members[item.name])
             raise ValueError(f"{label}: is not the published file, the archive is refused; fetch it again")
     # Locomotion and other clips are split apart, so that a clip's split does not depend on
@@ -483,8 +466,8 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     )
     clips = []
     for item in sorted(listed, key=lambda item: item.name):
-        loader = _BvhFile(archive, members[item.name], item.size, item.crc32, item.sha256_prefix)
-        clips.append(Clip(item.name, item.style, item.parts[1], splits[item.name], loader))
+        loader = _bvh_loader(archive, members[item.name], item.size_and_crc, sha256_prefix=item.sha256_prefix)
+        clips.append(Clip(item.name, item.style, item.content, splits[item.name], loader))
     return _dataset(
         "bandai",
         clips,
@@ -518,9 +501,10 @@ def _open_100style(path) -> Dataset:
             continue
         # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
         # the same as cutting at even frames of the original and then halving.
-        loader = archive.file(members[name], start=start // 2, stop=stop // 2)
+        there = archive.size_and_crc(members[name])
+        loader = _bvh_loader(archive, members[name], there, start=start // 2, stop=stop // 2)
         clips.append(Clip(name, style, code, splits[name], loader))
-        content.append((name, loader.size, loader.crc32, start, stop))
+        content.append((name, *there, start, stop))
     if not clips:
         what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there, such as {missing[0]}"
         raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_100STYLE_URL})")
@@ -604,10 +588,10 @@ def _open_folder(path) -> Dataset:
     if not labelled:
         raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
-    clips = [
-        Clip(name, style, content, splits[name], archive.file(member))
-        for name, (member, style, content) in sorted(labelled.items())
-    ]
-    identities = [(clip.name, clip.loader.size, clip.loader.crc32) for clip in clips]
+    clips, identities = [], []
+    for name, (member, style, content) in sorted(labelled.items()):
+        there = archive.size_and_crc(member)
+        clips.append(Clip(name, style, content, splits[name], _bvh_loader(archive, member, there)))
+        identities.append((name, *there))
     # Whether a style keeps its name when mirrored is not for us to guess.
     return _dataset("folder", clips, identities, mirror=lambda style: False)

@@ -84,7 +84,6 @@ class TextMotions:
         the same pair; unique names where nothing is known.
       licence, credit: terms of the motion.
       skipped: (clip, reason) of those left out.
-      vectors: redundant vectors of the same frames, where they were read with them.
     """
 
     name: str
@@ -99,7 +98,6 @@ class TextMotions:
     licence: str = ""
     credit: str = ""
     skipped: tuple[tuple[str, str], ...] = ()
-    vectors: np.ndarray | None = None
 
     @classmethod
     def joined(cls, clips, **attributes) -> TextMotions:
@@ -147,9 +145,7 @@ class TextMotions:
         kept = self.lengths[list(clips)] if most_frames is None else np.minimum(self.lengths[list(clips)], most_frames)
         rows = np.concatenate([self.start[k] + np.arange(count) for k, count in zip(clips, kept, strict=True)])
         chosen = {what: tuple(getattr(self, what)[k] for k in clips) for what in _LISTS}
-        vectors = None if self.vectors is None else self.vectors[rows]
-        start = np.cumsum([0, *kept])
-        return dataclasses.replace(self, positions=self.positions[rows], start=start, vectors=vectors, **chosen)
+        return dataclasses.replace(self, positions=self.positions[rows], start=np.cumsum([0, *kept]), **chosen)
 
     def cut(self, most_frames: int) -> TextMotions:
         """Return the same clips, of each no more than its first frames, so that all begin at the origin.
@@ -166,12 +162,10 @@ class TextMotions:
         return AxisNormaliser.of(self.select(self.members("train")).positions)
 
     def redundant_vectors(self) -> np.ndarray:
-        """Return redundant vectors of all frames, [N, 12 J - 1], float32: those read, or computed.
+        """Return redundant vectors of all frames, [N, 12 J - 1], float32.
 
         A clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        if self.vectors is not None:
-            return self.vectors
         return self._of_each(redundant_from_positions)
 
     def essential_features(self) -> np.ndarray:

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import split_frames
 from f3amd_lib.generation.generated import Rollout
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 
 
@@ -75,19 +76,13 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
     frames = np.asarray(frames, np.float64)
     if frames.ndim < 2 or frames.shape[-1] < 9 or (frames.shape[-1] - 3) % 6:
         raise ValueError(f"frames must be [..., F, 3 + 6 J], got {frames.shape}")
-    if not np.isfinite(frames).all():
-        frame = int(np.argwhere(~np.isfinite(frames))[0][-2])
-        raise ValueError(f"frames hold a number that is not finite at frame {frame}")
+    shape = (*frames.shape[:-2], "frame", frames.shape[-1])
+    finite_array("frames", frames, shape)
     if int(window) != window or window < 1:
         raise ValueError(f"window must be a whole number of frames, 1 or more, got {window}")
     if int(blend_frames) != blend_frames or not 0 <= blend_frames <= window:
         raise ValueError(f"blend_frames must be a whole number from 0 to {window}, the window, got {blend_frames}")
-    before = np.zeros((*frames.shape[:-2], 0, frames.shape[-1]))
-    if history is not None:
-        before = np.asarray(history, np.float64)
-        expected = (*frames.shape[:-2], frames.shape[-1])
-        if before.ndim != frames.ndim or (*before.shape[:-2], before.shape[-1]) != expected:
-            raise ValueError(f"history of shape {before.shape} does not fit frames of shape {frames.shape}")
+    before = frames[..., :0, :] if history is None else finite_array("history", history, shape)
     if blend_frames == 0:
         return frames.copy()
     # Time first: seams are walked one after the other, as a blended window is the next one's past.

@@ -5,9 +5,7 @@ What a user asks for is checked here, once; `generation.text_to_motion` has the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +17,7 @@ from f3amd_lib.generation import text_to_motion
 from f3amd_lib.generation.latent_motion import latent_motions
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import smoothed_yaw
+from f3amd_lib.motion.root_paths import read_points_csv
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
@@ -98,34 +97,17 @@ def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
       (frames [K], points [K, 3]).
 
     Raises:
-      ValueError: naming file and line, for another header, a cell that is no number, a frame that is outside the clip
-        or comes twice, or no row at all.
+      ValueError: naming file and line, as `read_points_csv`, or for a frame that is outside the clip or comes twice,
+        or no row at all.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; write a CSV with the header frame,x,y,z")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
-    if (header := [cell.strip() for cell in "".join(lines[:1]).split(",")]) != ["frame", "x", "y", "z"]:
-        raise ValueError(f"{path}: line 1: the header must be frame,x,y,z, it is {','.join(header)[:80] or 'empty'}")
     points: dict[int, list[float]] = {}
-    for number, line in enumerate(lines[1:], 2):
-        if not line.strip():
-            continue
-        where = f"{path}: line {number}:"
-        try:
-            frame, *point = map(float, line.split(","))
-        except ValueError:
-            raise ValueError(f"{where} {line[:80]!r} is not four numbers") from None
-        if len(point) != 3 or not all(map(math.isfinite, (frame, *point))):
-            raise ValueError(f"{where} {line[:80]!r} is not four finite numbers: frame, x, y, z")
+    for where, row in read_points_csv(path, "frame,x,y,z"):
+        frame = row["frame"]
         if frame != int(frame) or not 0 <= frame < num_frames:
             raise ValueError(f"{where} frame {frame:g} is not one of the clip's, 0 to {num_frames - 1}; see --seconds")
         if frame in points:
             raise ValueError(f"{where} frame {frame:g} comes twice; keep one of its points")
-        points[int(frame)] = point
+        points[int(frame)] = [row[axis] for axis in "xyz"]
     if not points:
         raise ValueError(f"{path}: needs at least one row below its header")
     return np.array(list(points)), np.array(list(points.values()))

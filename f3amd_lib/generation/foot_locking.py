@@ -35,6 +35,7 @@ from f3amd_lib.data.features import frame_positions, world_frames
 from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.measures.walking import STEP_PROMINENCE, toe_positions
+from f3amd_lib.motion.anatomy import joint_chain
 from f3amd_lib.motion.curves import smooth_above, unit
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, global_rotations
 
@@ -58,10 +59,8 @@ def leg_chains(skeleton: Skeleton) -> np.ndarray:
     """
     chains = []
     for side in ("left", "right"):
-        hip, chain = skeleton.role(f"{side}_hip"), [skeleton.role(f"{side}_toe")]
-        while chain[0] != hip and skeleton.parents[chain[0]] > 0:
-            chain.insert(0, skeleton.parents[chain[0]])
-        if len(chain) != 4 or chain[0] != hip:
+        chain = joint_chain(skeleton, skeleton.role(f"{side}_toe"), skeleton.role(f"{side}_hip"))
+        if len(chain) != 4:
             there = ", ".join(skeleton.names[joint] for joint in chain)
             raise ValueError(f"the {side} leg must be hip, knee, ankle, toe; this skeleton has {there}")
         chains.append(chain)
@@ -306,9 +305,7 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     positions = np.asarray(motion.positions, np.float64)
     if contacts is None:
         contacts = plan_contacts(positions, skeleton, fps, floor)
-    contacts = np.asarray(contacts, dtype=bool)
-    if contacts.shape != (motion.num_frames, 2):
-        raise ValueError(f"contacts must be [{motion.num_frames}, 2], got {contacts.shape}")
+    contacts = finite_array("contacts", contacts, (motion.num_frames, 2), bool)
     if floor is None:
         height = toe_positions(positions, skeleton)[..., 1]
         floor = np.median(height[contacts]) if contacts.any() else height.min()

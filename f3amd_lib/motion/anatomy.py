@@ -10,7 +10,7 @@ _ARM = ("shoulder", "elbow", "wrist")
 _LEG = ("hip", "knee", "ankle", "toe")
 
 
-def _chain(skeleton: Skeleton, joint: int, top: int) -> list[int]:
+def joint_chain(skeleton: Skeleton, joint: int, top: int) -> list[int]:
     """Return the joints from `top` down to `joint`; only `joint` itself where it does not hang on `top`."""
     chain = [joint]
     while chain[0] != top and chain[0] >= 0:
@@ -32,7 +32,7 @@ def joint_roles(skeleton: Skeleton) -> dict[str, int]:
     """
     roles = {"hips": 0}
     if skeleton.has_role("head"):
-        *spine, head = _chain(skeleton, skeleton.role("head"), 0)[1:] or [0]
+        *spine, head = joint_chain(skeleton, skeleton.role("head"), 0)[1:] or [0]
         if spine:
             roles["neck"] = spine.pop()
         roles |= {f"spine_{number}": joint for number, joint in enumerate(spine, start=1)} | {"head": head}
@@ -41,7 +41,7 @@ def joint_roles(skeleton: Skeleton) -> dict[str, int]:
             first, last = f"{side}_{parts[0]}", f"{side}_{parts[-1]}"
             if not (skeleton.has_role(first) and skeleton.has_role(last)):
                 continue
-            chain = _chain(skeleton, skeleton.role(last), skeleton.role(first))
+            chain = joint_chain(skeleton, skeleton.role(last), skeleton.role(first))
             if len(chain) == len(parts):
                 roles |= {f"{side}_{part}": joint for part, joint in zip(parts, chain, strict=True)}
         above = skeleton.parents[roles[f"{side}_shoulder"]] if f"{side}_shoulder" in roles else 0

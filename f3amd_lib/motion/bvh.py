@@ -44,34 +44,24 @@ class _Broken(Exception):
     """(line, what is wrong and what to do); `parse_bvh` adds the file's name."""
 
 
-def read_bvh(path_or_file=None, *, text=None, name=None, scale: float = 0.01) -> Motion:
+def read_bvh(path, scale: float = 0.01) -> Motion:
     """Read a BVH file.
 
     Args:
-      path_or_file: a path, or an open file in binary or text mode; not needed with `text`.
-      text: the file's content (str or bytes), where it is at hand already.
-      name: what messages and the motion call it; by default the file's name.
+      path: of the file; its text from elsewhere is for `parse_bvh`.
       scale: metres per unit of length in the file (centimetres: 0.01).
 
     Returns:
-      A `Motion` at the file's own frame rate (see `parse_bvh`).
+      A `Motion` at the file's own frame rate, called by its path (see `parse_bvh`).
 
     Raises:
       ValueError: naming the file, the line and what to mend; also if the file cannot be read.
     """
-    if text is not None:
-        return parse_bvh(text, name or "BVH text", scale)
-    if hasattr(path_or_file, "read"):
-        label = name or str(getattr(path_or_file, "name", "BVH file"))
-        return parse_bvh(path_or_file.read(), label, scale)
-    if path_or_file is None:
-        raise ValueError("read_bvh needs a path, an open file, or text=...")
-    path = Path(path_or_file)
     try:
-        content = path.read_bytes()
+        content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    return parse_bvh(content, name or str(path), scale)
+    return parse_bvh(content, str(path), scale)
 
 
 def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:

@@ -101,7 +101,7 @@ def canonical_start(skeleton: Skeleton, positions) -> np.ndarray:
     return (positions - start) @ matrix_from_yaw(smoothed_yaw(skeleton, positions[:1], 0.0)[0])
 
 
-def essential_features(skeleton: Skeleton, positions, smoothing: float = FACING_SMOOTHING) -> np.ndarray:
+def essential_features(skeleton: Skeleton, positions) -> np.ndarray:
     """Return the first four parts of redundant vectors, which tell the whole motion: what a judge looks at.
 
     Args, errors: as `redundant_from_positions`.
@@ -111,7 +111,7 @@ def essential_features(skeleton: Skeleton, positions, smoothing: float = FACING_
 
     Source: ACMDM's released evaluation code ("essential" features).
     """
-    return _first_parts(skeleton, positions, smoothing)[0]
+    return _first_parts(skeleton, positions, FACING_SMOOTHING)[0]
 
 
 def _first_parts(skeleton: Skeleton, positions, smoothing: float):
@@ -128,16 +128,13 @@ def _first_parts(skeleton: Skeleton, positions, smoothing: float):
     return np.concatenate(parts, axis=-1), turned
 
 
-def redundant_from_positions(
-    skeleton: Skeleton, positions, *, smoothing: float = FACING_SMOOTHING, contact_step: float = CONTACT_STEP
-) -> np.ndarray:
+def redundant_from_positions(skeleton: Skeleton, positions, *, smoothing: float = FACING_SMOOTHING) -> np.ndarray:
     """Turn positions into redundant vectors.
 
     Args:
       skeleton: J joints; its offsets are the rest pose that rotations start from, in any length.
       positions: [L, J, 3], metres, from `canonical_start`.
       smoothing: as in `smoothed_yaw`.
-      contact_step: squared step below which a foot is in contact.
 
     Returns:
       [L - 1, 12 J - 1], float64: a frame's steps need the next one.
@@ -151,7 +148,7 @@ def redundant_from_positions(
         first,
         rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1])),
         step @ turned[:-1],
-        np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < contact_step,
+        np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < CONTACT_STEP,
     ]
     return np.concatenate([part.reshape(len(step), -1) for part in parts], axis=-1)
 
@@ -171,13 +168,11 @@ def joint_features(skeleton: Skeleton, positions) -> np.ndarray:
 
     Source: ACMDM section 4.2; Liang et al. 2024 (InterGen), its non-canonical representation.
     """
-    _, turned = _first_parts(skeleton, positions, FACING_SMOOTHING)
-    step = np.diff(np.asarray(positions, np.float64), axis=0)
-    features = np.zeros((*step.shape[:2], NUM_JOINT_FEATURES))
-    features[..., :3] = step
-    features[:, 1:, 3:9] = rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1]))
-    feet = _feet(skeleton)
-    features[:, feet, 9] = np.sum(step[:, feet] ** 2, axis=-1) < CONTACT_STEP
+    vectors, parts = redundant_from_positions(skeleton, positions), vector_parts(skeleton.num_joints)
+    features = np.zeros((len(vectors), skeleton.num_joints, NUM_JOINT_FEATURES))
+    features[..., :3] = np.diff(np.asarray(positions, np.float64), axis=0)
+    features[:, 1:, 3:9] = vectors[:, parts["rotations"]].reshape(len(vectors), -1, 6)
+    features[:, _feet(skeleton), 9] = vectors[:, parts["contacts"]]
     return features
 
 

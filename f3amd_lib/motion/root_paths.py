@@ -7,7 +7,6 @@ conditioned on (paper section 3.3) and judged against (section 4.4).
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ MAX_STEP = 0.5
 """Longest step between two rows of a path file, metres (15 m/s at 30 fps: nobody runs so fast)."""
 
 MAX_DISTANCE = 1e4
-"""Largest number in a path file: 10 km from the origin, where single precision still tells millimetres."""
+"""Largest number in a file of points: 10 km from the origin, where single precision still tells millimetres."""
 
 MAX_ROWS = 30 * 3600
 MAX_LINE = 1000
@@ -229,6 +228,50 @@ def _complex_profile(seconds: float, speed: float, seed: int):
     return ((time, speed * smooth(1, 0.4)), (time, smooth(2, 0.4)), (time, smooth(3, 0.5)))
 
 
+def read_points_csv(path, *headers: str) -> list[tuple[str, dict[str, float]]]:
+    """Read a CSV file of points, all of whose cells are numbers; blank rows are left out.
+
+    Args:
+      path: the file.
+      headers: those that it may have, such as "x,z"; columns may come in any order.
+
+    Returns:
+      (place, which begins what is said of a row: file and line; number by column) of each row.
+
+    Raises:
+      ValueError: naming file and line, for a missing, repeated or unknown column, a row of the wrong length, a cell
+        that is not a finite number of at most 10,000, or more than an hour's rows.
+    """
+    path, known = Path(path), " or ".join(headers)
+    if path.is_dir() or not path.exists():
+        raise ValueError(f"{path}: no such file; write a CSV with the header {known}")
+    try:
+        # With quotes a cell could run over lines; numbers and headings need none.
+        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+    if len(lines) > MAX_ROWS + 1:
+        raise ValueError(f"{path}: line {MAX_ROWS + 2}: more than {MAX_ROWS} rows, an hour at 30 fps; cut the file up")
+    columns = [cell.strip() for cell in "".join(lines[:1]).split(",")]
+    if sorted(columns) not in [sorted(header.split(",")) for header in headers]:
+        raise ValueError(f"{path}: line 1: the header must be {known}, it is {','.join(columns)[:80] or 'empty'}")
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        where, cells = f"{path}: line {number}:", [cell.strip() for cell in line.split(",")]
+        if len(line) > MAX_LINE:
+            raise ValueError(f"{where} is longer than {MAX_LINE} characters; a row holds {len(columns)} numbers")
+        if not any(cells):
+            continue
+        if len(cells) != len(columns):
+            raise ValueError(f"{where} {len(cells)} cells where the header has {len(columns)}")
+        numbers = [finite_number(cell, MAX_DISTANCE) for cell in cells]
+        if None in numbers:
+            wrong, what = numbers.index(None), f"not a finite number of at most {MAX_DISTANCE:g} either way"
+            raise ValueError(f"{where} {columns[wrong]} is {cells[wrong]!r}, {what}")
+        rows.append((where, dict(zip(columns, numbers, strict=True))))
+    return rows
+
+
 def read_path_csv(path) -> RootPath:
     """Read a path from a CSV file with one row a frame at 30 fps.
 
@@ -243,48 +286,18 @@ def read_path_csv(path) -> RootPath:
       The path, one frame a row, neither moved nor resampled.
 
     Raises:
-      ValueError: naming file and line, for a missing, repeated or unknown column, a row of the
-        wrong length, a cell that is not a finite number of at most 10,000, a step over 0.5 m, or fewer
-        than 2 rows or more than an hour's.
+      ValueError: naming file and line, as `read_points_csv`, or for a step over 0.5 m or fewer than 2 rows.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
-    lines = text.splitlines()
-    if long := next((line for line, row in enumerate(lines, 1) if len(row) > MAX_LINE), None):
-        raise ValueError(f"{path}: line {long}: is longer than {MAX_LINE} characters; a row holds 2 or 3 numbers")
-    if len(lines) > MAX_ROWS + 1:
-        raise ValueError(f"{path}: line {MAX_ROWS + 2}: more than {MAX_ROWS} rows, an hour at 30 fps; cut the path up")
-    # With quotes a cell could run over lines; numbers and the three headings need none.
-    reader = csv.reader(text.replace('"', "").splitlines())
-    header = [cell.strip() for cell in next(reader, [])]
-    if sorted(header) not in (["x", "z"], ["x", "yaw_deg", "z"]):
-        raise ValueError(f"{path}: line 1: the header must be x,z or x,z,yaw_deg, it is {','.join(header) or 'empty'}")
-    rows: list[dict[str, float]] = []
-    for cells in reader:
-        if not "".join(cells).strip():
-            continue
-        where = f"{path}: line {reader.line_num}:"
-        if len(cells) != len(header):
-            raise ValueError(f"{where} {len(cells)} cells where the header has {len(header)}")
-        row = {column: finite_number(cell.strip(), MAX_DISTANCE) for column, cell in zip(header, cells, strict=True)}
-        for column, cell in zip(header, cells, strict=True):
-            if row[column] is None:
-                what = f"not a finite number of at most {MAX_DISTANCE:g} either way"
-                raise ValueError(f"{where} {column} is {cell.strip()!r}, {what}")
-        jump = np.hypot(row["x"] - rows[-1]["x"], row["z"] - rows[-1]["z"]) if rows else 0.0
+    rows = read_points_csv(path, "x,z", "x,z,yaw_deg")
+    if len(rows) < 2:
+        raise ValueError(f"{path}: a path needs at least 2 rows below its header, has {len(rows)}")
+    position = np.array([[row["x"], row["z"]] for _, row in rows])
+    for (where, _), jump in zip(rows[1:], np.hypot(*np.diff(position, axis=0).T), strict=True):
         if jump > MAX_STEP:
             limit = f"at most {MAX_STEP} m at 30 fps"
             raise ValueError(f"{where} jumps {jump:.2f} m in a frame ({limit}); units are metres, a row is a frame")
-        rows.append(row)
-    if len(rows) < 2:
-        raise ValueError(f"{path}: a path needs at least 2 rows below its header, has {len(rows)}")
-    position = np.array([[row["x"], row["z"]] for row in rows])
-    if "yaw_deg" in header:
-        return RootPath(position, np.deg2rad([row["yaw_deg"] for row in rows]))
-    return RootPath(position, tangent_yaw(position))
+    given = [row["yaw_deg"] for _, row in rows if "yaw_deg" in row]
+    return RootPath(position, np.deg2rad(given) if given else tangent_yaw(position))
 
 
 def tangent_yaw(position: np.ndarray) -> np.ndarray:

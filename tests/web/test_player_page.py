@@ -9,7 +9,7 @@ import pytest
 from builders import wandering_motion
 from conftest import DESKTOP, PHONE
 
-from f3amd_lib.motion.bvh import format_bvh, read_bvh
+from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.root_paths import path_from_motion
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.serving.player import Character, Scene, player_page, show_player, write_player
@@ -662,7 +662,7 @@ def test_slow_machines_get_sticks_and_are_told(browser, tmp_path, screenshots, c
 def test_what_the_page_saves_as_bvh_is_what_python_reads(browser, side_by_side, walks, tmp_path):
     opened(browser, side_by_side)
     text = browser.script("return player.bvhText(player.characters[1])")
-    again = read_bvh(text=text)
+    again = parse_bvh(text, "page")
     assert again.skeleton.names == walks[1].skeleton.names
     np.testing.assert_allclose(again.positions, walks[1].positions, atol=2e-3)
     assert np.abs(again.positions - walks[2].positions).max() > 0.02
