@@ -75,6 +75,15 @@ def test_vectors_and_positions_tell_the_same(tmp_path):
             assert np.abs(redundant.positions_from_redundant(vectors) - data.clip(number)).max() < 1e-5
 
 
+@pytest.mark.parametrize("layout, contact_step", [("humanml3d", 0.002), ("kit", 0.05)])
+def test_contacts_are_judged_by_the_step_of_the_folders_own_unit(tmp_path, layout, contact_step):
+    data = humanml3d.read_humanml3d(write_tree(tmp_path, layout)).select([0])
+    clip = data.clip(0)
+    feet = redundant.redundant_from_positions(data.skeleton, clip, contact_step=contact_step)[:, -4:]
+    other = redundant.redundant_from_positions(data.skeleton, clip, contact_step=0.052 - contact_step)[:, -4:]
+    assert np.array_equal(data.redundant_vectors()[:-1, -4:], feet) and not np.array_equal(feet, other)
+
+
 def append(path, text):
     path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
 

@@ -36,7 +36,7 @@ from f3amd_lib.data.text_motions import (
 )
 from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.motion.redundant import grouped_statistics, redundant_from_positions
+from f3amd_lib.motion.redundant import CONTACT_STEP, grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
 LAYOUTS = read_toml(Path(__file__).with_name("layouts.toml"))
@@ -159,7 +159,9 @@ def read_humanml3d(folder) -> TextMotions:
         raise ValueError(f"{folder}: no clip of {fewest} to {MOST_FRAMES} frames; {fix}")
     usual = {"name": folder.name, "licence": "as its owner says", "credit": ""}
     terms = {what: described.get(what, value) for what, value in usual.items()}
-    return TextMotions.joined(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **terms)
+    return TextMotions.joined(
+        clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), contact_step=described["contact_step"], **terms
+    )
 
 
 def _captioned(path: Path, name: str, fps: float, frames: int, fix: str) -> list[tuple[str, tuple, slice]]:
@@ -198,7 +200,7 @@ def _skeleton_of(folder: Path, fix: str) -> tuple[Skeleton, dict]:
                 raise ValueError("its names and terms must be text")
         except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); {fix}") from error
-        return skeleton, described
+        return skeleton, described | {"contact_step": CONTACT_STEP}  # its positions are in metres
     ids = [line.strip() for line in _lines(folder / "train.txt", fix) if line.strip()]
     first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
     joints = (0, *_load(first, fix).shape)[-2]
@@ -239,7 +241,7 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
         training = []
         for number, name in enumerate(data.names):
             clip = data.clip(number)
-            vectors = redundant_from_positions(data.skeleton, clip).astype(np.float32)
+            vectors = redundant_from_positions(data.skeleton, clip, contact_step=data.contact_step).astype(np.float32)
             np.save(temporary / "new_joints" / f"{name}.npy", clip[:-1])
             np.save(temporary / "new_joint_vecs" / f"{name}.npy", vectors)
             _write(temporary / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))

@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -21,7 +22,13 @@ from f3amd_lib.data.captions import CAPTIONED, compose_captions, other_side, pla
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.redundant import canonical_start, essential_features, joint_features, redundant_from_positions
+from f3amd_lib.motion.redundant import (
+    CONTACT_STEP,
+    canonical_start,
+    essential_features,
+    joint_features,
+    redundant_from_positions,
+)
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
 FPS = 20.0
@@ -84,6 +91,7 @@ class TextMotions:
         the same pair; unique names where nothing is known.
       licence, credit: terms of the motion.
       skipped: (clip, reason) of those left out.
+      contact_step: squared step below which a foot is in contact, in the positions' unit.
     """
 
     name: str
@@ -98,6 +106,7 @@ class TextMotions:
     licence: str = ""
     credit: str = ""
     skipped: tuple[tuple[str, str], ...] = ()
+    contact_step: float = CONTACT_STEP
 
     @classmethod
     def joined(cls, clips, **attributes) -> TextMotions:
@@ -166,7 +175,7 @@ class TextMotions:
 
         A clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        return self._of_each(redundant_from_positions)
+        return self._of_each(partial(redundant_from_positions, contact_step=self.contact_step))
 
     def essential_features(self) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
@@ -174,7 +183,7 @@ class TextMotions:
 
     def joint_features(self) -> np.ndarray:
         """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
-        return self._of_each(joint_features)
+        return self._of_each(partial(joint_features, contact_step=self.contact_step))
 
     def _of_each(self, features) -> np.ndarray:
         clips = (self.clip(number) for number in range(self.num_clips))

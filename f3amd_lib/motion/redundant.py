@@ -128,13 +128,16 @@ def _first_parts(skeleton: Skeleton, positions, smoothing: float):
     return np.concatenate(parts, axis=-1), turned
 
 
-def redundant_from_positions(skeleton: Skeleton, positions, *, smoothing: float = FACING_SMOOTHING) -> np.ndarray:
+def redundant_from_positions(
+    skeleton: Skeleton, positions, *, smoothing: float = FACING_SMOOTHING, contact_step: float = CONTACT_STEP
+) -> np.ndarray:
     """Turn positions into redundant vectors.
 
     Args:
       skeleton: J joints; its offsets are the rest pose that rotations start from, in any length.
       positions: [L, J, 3], metres, from `canonical_start`.
       smoothing: as in `smoothed_yaw`.
+      contact_step: squared step below which a foot is in contact.
 
     Returns:
       [L - 1, 12 J - 1], float64: a frame's steps need the next one.
@@ -148,16 +151,16 @@ def redundant_from_positions(skeleton: Skeleton, positions, *, smoothing: float 
         first,
         rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1])),
         step @ turned[:-1],
-        np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < CONTACT_STEP,
+        np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < contact_step,
     ]
     return np.concatenate([part.reshape(len(step), -1) for part in parts], axis=-1)
 
 
-def joint_features(skeleton: Skeleton, positions) -> np.ndarray:
+def joint_features(skeleton: Skeleton, positions, *, contact_step: float = CONTACT_STEP) -> np.ndarray:
     """Return what InterGen's representation adds to each joint's position.
 
     Args:
-      skeleton, positions: as in `redundant_from_positions`.
+      skeleton, positions, contact_step: as in `redundant_from_positions`.
 
     Returns:
       [L - 1, J, 10], float64: step to the next frame in the world, metres; 6D rotation of the bone that leads to the
@@ -168,7 +171,8 @@ def joint_features(skeleton: Skeleton, positions) -> np.ndarray:
 
     Source: ACMDM section 4.2; Liang et al. 2024 (InterGen), its non-canonical representation.
     """
-    vectors, parts = redundant_from_positions(skeleton, positions), vector_parts(skeleton.num_joints)
+    vectors = redundant_from_positions(skeleton, positions, contact_step=contact_step)
+    parts = vector_parts(skeleton.num_joints)
     features = np.zeros((len(vectors), skeleton.num_joints, NUM_JOINT_FEATURES))
     features[..., :3] = np.diff(np.asarray(positions, np.float64), axis=0)
     features[:, 1:, 3:9] = vectors[:, parts["rotations"]].reshape(len(vectors), -1, 6)
