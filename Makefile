@@ -46,6 +46,8 @@ course: $(INSTALLED) ## Run the notebooks of the course on samplers (no data, no
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
 PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durations=5
 # Files side by side on the cores there are; the tests of one file, or the cells of one notebook, in order.
+# The plugin for notebooks takes five seconds to load, in each process.
+NO_NOTEBOOKS := -p no:nbval
 SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
@@ -70,23 +72,23 @@ sweep-tools: $(INSTALLED) ## Add Dask distributed to .venv, for f3amd sweep (abo
 	  -q --require-hashes --no-deps -r requirements-sweep.txt
 
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
-	$(PYTEST) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
 	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) --no-loadscope-reorder \
 	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
 test-slow: $(INSTALLED) ## Run the slow tests that `make test` leaves out
-	$(PYTEST) tests $(SIDE_BY_SIDE) -m slow --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m slow --ignore tests/web $(PYTEST_OPTIONS)
 
 test-long: $(INSTALLED) ## Rehearse each command of the ledger at smoke size, and the notebooks with other seeds
-	$(PYTEST) tests $(SIDE_BY_SIDE) -m long --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m long --ignore tests/web $(PYTEST_OPTIONS)
 
 test-all: test test-slow test-long test-extras site test-web ## All tests there are, with the site and the browser
 
 # What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
 # the marker `needs`.
 test-extras: bench-tools onnx-tools sweep-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime, Dask or Sphinx
-	$(PYTEST) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
 
 coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, the slow tests among them (long)
 	$(PYTHON) -m coverage erase
@@ -101,7 +103,7 @@ web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if 
 	  -q --require-hashes --no-deps -r requirements-web.txt
 
 test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
-	$(PYTEST) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
 
 site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
