@@ -463,7 +463,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
 
     def walk_windows(row: Mapping) -> dict:
         walks = literal_update.walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
-        return {"literal_update_windows": literal_update.window_figures(walks)}
+        return {"literal_update_windows": literal_update.window_figures(*walks)}
 
     def walk_rollouts(row: Mapping) -> dict:
         generator = MotionGenerator(
