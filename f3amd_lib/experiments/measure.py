@@ -499,24 +499,18 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
         model = trained[row["model"]]
         levels = getattr(model.config, "noise_levels", ()) or SIGMAS
         steps = [count for count in (8, 1) if count <= len(levels)]
+        condition = denoising.held_out_condition(held_out, model)
         return {
-            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
             "x0_by_sigma": denoising.x0_error_by_sigma(model, held_out, levels),
+            "input_use": denoising.input_use(model, condition, seed=profile.seed),
+            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
         }
 
-    keys = dict.fromkeys(["x0_by_sigma", "noise_use", "input_use"], ["model"])
+    # The table that says what was measured is written last.
+    keys = dict.fromkeys(["noise_use", "x0_by_sigma", "input_use"], ["model"])
     records = Records(_records_dir(profile), record, keys, again=asked)
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
-    rows = _with_weights(rows, trained)
-    records.measure(rows, ask)
-
-    def ask_inputs(row: Mapping) -> dict:
-        model = trained[row["model"]]
-        condition = denoising.held_out_condition(held_out, model)
-        return {"input_use": denoising.input_use(model, condition, seed=profile.seed)}
-
-    records.measure(rows, ask_inputs, into="input_use")
-    return records.path("noise_use")
+    return records.measure(_with_weights(rows, trained), ask)
 
 
 def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
