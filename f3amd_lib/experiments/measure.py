@@ -108,10 +108,6 @@ def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
     return list(profile.evaluation_styles or prepared.packed.primary_styles[: profile.num_characters])
 
 
-def _names(models: Iterable[str] | None) -> list[str]:
-    return [presets.find_preset(name).name for name in models or ()]
-
-
 def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
     if models:
         raise ValueError(f"{reason}: leave --model out")
@@ -136,7 +132,7 @@ def _asked(
     among: Iterable[str] = (),
 ) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
     """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
-    names = asked = _names(models)
+    names = asked = list(models or ())
     if not asked:
         known = (models_with_weights if at_least_one else available_models)(profile)
         names = [name for name in among if name in known] if among else known
@@ -194,7 +190,7 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
       The table, `records/learning.csv`.
     """
     record = _record(prepared, profile, "learning", **SHORT_RUN)
-    asked = _names(models)
+    asked = list(models or ())
     records = Records(_records_dir(profile), record, {"learning": ["model"]}, again=asked)
 
     def curve(row: Mapping) -> dict:
@@ -277,7 +273,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    return _measure_walks(prepared, profile, models, "walking", ["model", "window_frames", "steps"], ["as made"])
+    return _measure_walks(prepared, profile, models, "walking", {"window_frames": profile.window}, ["as made"])
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -289,14 +285,14 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
       The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
       clips.
     """
-    return _measure_walks(prepared, profile, models, "feet", ["model", "steps"], TREATMENTS)
+    return _measure_walks(prepared, profile, models, "feet", {}, TREATMENTS)
 
 
 def _measure_walks(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, keys: list[str],
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, also: dict,
     treatments: Iterable[str],
 ) -> Path:  # fmt: skip
-    """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated; `also` names rows, too."""
     packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
@@ -330,10 +326,9 @@ def _measure_walks(
         ]  # fmt: skip
         return {name: pd.DataFrame(rows)}
 
-    known = {"window_frames": profile.window} if "window_frames" in keys else {}
     rows = [("real", 0), *itertools.product(trained, (8, 1))]
-    todo = [{"model": model, **known, "steps": steps} for model, steps in rows]
-    records = Records(_records_dir(profile), record, {name: keys}, again=asked)
+    todo = [{"model": model, **also, "steps": steps} for model, steps in rows]
+    records = Records(_records_dir(profile), record, {name: list(todo[0])}, again=asked)
     return records.measure(_with_weights(todo, trained), measured)
 
 
@@ -346,7 +341,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
       the held-out loss fell over the last quarter of training (NaN where none was watched).
     """
-    asked = _names(models)
+    asked = list(models or ())
     record = _record(prepared, profile, "trained")
     found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
 
@@ -544,7 +539,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
     classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     held_out = prepared.windows(prepared.held_out_split)
-    names, asked = _names(models) or ["F3AMD-FNO-96", "CAMDM"], _names(models)
+    asked = list(models or ())
     folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
     keys = ["model", "snapshot"]
     records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
@@ -560,6 +555,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
         rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
         return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
 
+    names = asked or ["F3AMD-FNO-96", "CAMDM"]
     todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
     return records.measure(todo, score)
 
