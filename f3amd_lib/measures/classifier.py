@@ -33,7 +33,7 @@ from flax import nnx
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
@@ -497,7 +497,8 @@ def _asked_for(
             f"a style classifier needs at least two styles, each named once; got {len(chosen)} "
             f"({', '.join(chosen[:5])})"
         )
-    config = ClassifierConfig.from_dict({"num_styles": len(chosen), **sizes})
+    refuse_unknown(sizes, ClassifierConfig, "size of a style classifier")
+    config = ClassifierConfig(len(chosen), **sizes)
     return chosen, config, ClassifierTraining(num_steps, batch_size, seed)
 
 
