@@ -81,7 +81,7 @@ def test_frozen_pose_is_the_first_pose_carried_along_the_path():
 
 def test_half_frozen_joints_are_half_as_far_from_the_first_pose():
     motion = wandering_motion()
-    half = frozen_pose(motion, 0.5)
+    half = frozen_pose(motion, strength=0.5)
 
     def angle(rotations):
         turned = np.swapaxes(motion.rotations[:1, 1:], -1, -2) @ rotations[:, 1:]
@@ -132,9 +132,6 @@ def test_noise_has_the_stated_size():
     np.testing.assert_allclose(
         half.root_position - motion.root_position, 0.5 * (noisy.root_position - motion.root_position), atol=1e-12
     )
-    only_root = noisy_motion(motion, seed=1, rotation_scale=0.0, root_scale=0.1)
-    np.testing.assert_allclose(only_root.rotations, motion.rotations, atol=1e-7)
-    assert (only_root.root_position - motion.root_position).std() == pytest.approx(0.1, rel=0.05)
 
 
 # ----------------------------------------------------------------------------- what metrics see
@@ -232,4 +229,3 @@ def test_bad_input_is_refused(name):
 def test_unknown_names_and_other_misuse_are_refused():
     refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", wandering_motion())
     refused("1 frame cannot be shuffled", shuffled_frames, wandering_motion(1))
-    refused("must not be negative", noisy_motion, wandering_motion(), root_scale=-0.02)

@@ -15,7 +15,7 @@ from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import literal_update, measure
 from f3amd_lib.experiments.denoising import held_out_batch
-from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, WindowWalks, walk_windows, window_figures
+from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, walk_windows, window_figures
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw
@@ -36,7 +36,7 @@ def one(table, update, steps, metric):
 def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, spacing):
     trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy + 0.2)
     walks = walk_windows(trained, tiny_windows(), (4, 2), spacing=spacing, **FEW)
-    table = window_figures(walks)
+    table = window_figures(*walks)
     for steps in (4, 2):
         for metric in ("from_rescaled", "seed_spread"):
             assert one(table, "literal", steps, metric) == pytest.approx(0.0, abs=1e-4)
@@ -53,7 +53,7 @@ def test_a_network_that_uses_its_input_shows_it(model_that):
     deviation = normaliser.deviation.at[3:9].set(0.2)
     normaliser = normaliser._replace(mean=mean, deviation=deviation)
     trained = dataclasses.replace(trained, normaliser=normaliser)
-    table = window_figures(walk_windows(trained, tiny_windows(), (8, 1), **FEW))
+    table = window_figures(*walk_windows(trained, tiny_windows(), (8, 1), **FEW))
     assert one(table, "literal", 1, "from_rescaled") == 0.0
     assert one(table, "literal", 8, "from_rescaled") > 1.0
     assert one(table, "literal", 8, "seed_spread") < 0.2 * one(table, "rescaled", 8, "seed_spread")
@@ -61,7 +61,7 @@ def test_a_network_that_uses_its_input_shows_it(model_that):
 
 def test_the_walks_are_those_of_the_samplers_by_name():
     trained, windows = tiny_trained(), tiny_windows()
-    walks = walk_windows(trained, windows, (4,), seed=3, **FEW)
+    walks, _ = walk_windows(trained, windows, (4,), seed=3, **FEW)
     x0, condition = network_inputs(held_out_batch(windows, trained, 3), trained.normaliser)
     network, grid = trained.network(), trained.diffusion.grid(4)
     noise = jax.random.normal(jax.random.split(jax.random.key(3), 2)[1], x0.shape)
@@ -71,8 +71,8 @@ def test_the_walks_are_those_of_the_samplers_by_name():
         )
         x = jax.jit(walked)(noise, condition)
         joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
-        np.testing.assert_allclose(walks.made[update, 4][1], joints, atol=1e-4)
-    assert np.abs(walks.made["literal", 4] - walks.made["rescaled", 4]).max() > 1e-3
+        np.testing.assert_allclose(walks[update, 4][1], joints, atol=1e-4)
+    assert np.abs(walks["literal", 4] - walks["rescaled", 4]).max() > 1e-3
 
 
 def test_figures_by_hand():
@@ -81,7 +81,7 @@ def test_figures_by_hand():
     apart = np.zeros((2, 1, 4, 2, 3))
     apart[1, ..., 1, 0] = 0.02
     made = {("rescaled", 2): apart, ("rescaled", 1): 0.0 * apart, ("literal", 2): apart + 0.03}
-    table = window_figures(WindowWalks(real, made))
+    table = window_figures(made, real)
     found = lambda *row: one(table, *row)
     assert found("rescaled", 2, "joint_error") == pytest.approx(0.5)  # 2 cm, one of two joints
     assert found("rescaled", 1, "joint_error") == 0.0
@@ -196,8 +196,7 @@ def test_seed_histories_go_straight_on_at_their_own_pace():
 def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     trained = tiny_trained()
     walks = walk_seed_histories(trained, (8, 4), num_seeds=2, seed=1)
-    assert walks.real is None
-    assert walks.made["literal", 8].shape[:3] == (2, len(trained.styles), WINDOW)
+    assert walks["literal", 8].shape[:3] == (2, len(trained.styles), WINDOW)
     table = window_figures(walks)
     assert set(table["metric"]) == set(WINDOW_METRICS) - {"joint_error"}
     assert set(table["update"]) == set(UPDATES)
@@ -214,5 +213,5 @@ def test_walks_from_seed_histories_need_no_data_and_have_no_error():
         )
     )(noise)
     joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
-    np.testing.assert_allclose(walks.made["rescaled", 8][0], joints, atol=1e-4)
+    np.testing.assert_allclose(walks["rescaled", 8][0], joints, atol=1e-4)
     refused("num_seeds must be at least 2", walk_seed_histories, trained, num_seeds=1)

@@ -178,11 +178,10 @@ def test_settling_draws_as_many_windows_of_each_style_and_at_most_half():
     # Where styles lie far apart, a mix of them would show; EMD of equal shares does not see it.
     for reference in known.references.values():
         reference.features[reference.styles == 1] += 1000.0
-    curve = settling(known, [5], repeats=3)
-    assert (curve["windows"] == 10).all() and (curve["repeats"] == 3).all()
-    assert curve.set_index("metric").loc["EMD", "value"] < 10.0
-    for sizes in ([6], [0, 5], []):
-        refused("between 1 and 5 windows of a style", settling, known, sizes)
+    curve = settling(known).set_index(["metric", "windows"])
+    assert curve.index.unique("windows").tolist() == [2, 4, 10] and (curve["repeats"] == 5).all()
+    assert curve.loc[("EMD", 10), "value"] < 10.0
+    refused("fewer than two windows on a side", settling, gaussian_clouds(40, 2))
 
 
 FREQUENCY = 3 * 30 / 64

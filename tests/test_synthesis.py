@@ -101,7 +101,7 @@ def test_groups_are_not_mixed():
 
 
 def test_plans_name_presets_and_implementations_that_exist_each_once():
-    for suite in synthesis.suites():
+    for suite in synthesis.SUITES:
         members = [c for group in plan(suite).values() for c in group]
         assert members and len(members) == len(set(members))
         for candidate in members:

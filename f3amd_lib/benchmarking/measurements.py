@@ -68,7 +68,7 @@ def measure_synthesis_time(
     Args:
       prepared: its channels and styles are the networks'.
       profile: names the results' folder and, without `suites`, what is timed.
-      suites: keys of `synthesis.suites`.
+      suites: keys of `synthesis.SUITES`.
       characters: time groups of these numbers of characters only.
       again: time groups anew that an earlier run with the same settings has timed.
 

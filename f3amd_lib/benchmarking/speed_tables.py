@@ -116,22 +116,14 @@ def times_beside_paper(table: pd.DataFrame, number: int, device: str) -> pd.Data
         raise ValueError(f"table {number} holds no synthesis times by characters: use 1, 4 or 7")
     paper = load_paper_table(number)
     paper = paper[paper["device"] == device].rename(columns={"value": "paper"})
-    torch = paper["model"].str.contains("PyTorch")
-    paper = paper.assign(
-        asked_framework=torch.map({True: "torch", False: "jax"}),
-        preset=paper["model"].str.replace(r" \((JAX|PyTorch)\)", "", regex=True),
-    )
-    ours = table[table["device"] == device]
-    keys = ["window_frames", "steps", "characters"]
-    joined = paper.merge(
-        ours[["model", "framework", "way", *keys, "value", "low", "high"]],
-        how="left",
-        left_on=["preset", "asked_framework", *keys],
-        right_on=["model", "framework", *keys],
-        suffixes=("", "_ours"),
-    ).rename(columns={"value": "ours"})
-    columns = ["model", *keys, "paper", "ours", "low", "high", "framework", "way"]
-    return joined[columns].reset_index(drop=True)
+    asked = paper["model"].str.contains("PyTorch").map({True: "torch", False: "jax"})
+    paper = paper.assign(asked=asked, preset=paper["model"].str.replace(r" \((JAX|PyTorch)\)", "", regex=True))
+    ours = table[table["device"] == device].rename(columns={"model": "preset", "value": "ours"})
+    ours, keys = ours.assign(asked=ours["framework"]), ["window_frames", "steps", "characters"]
+    told = ["ours", "low", "high", "framework", "way"]
+    matched = ["preset", "asked", *keys]
+    joined = paper[["model", "paper", *matched]].merge(ours[[*matched, *told]], how="left", on=matched)
+    return joined[["model", *keys, "paper", *told]]
 
 
 def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
@@ -180,6 +172,5 @@ def speedups(times: pd.DataFrame, *, window: int = 32) -> pd.DataFrame:
     if not camdm.index.is_unique:
         raise ValueError("CAMDM is timed twice for one number of characters: keep one framework")
     others = of_window[~is_camdm]
-    keys = pd.MultiIndex.from_frame(others[["device", "characters"]])
-    slow = camdm.reindex(keys).to_numpy()
+    slow = others.join(camdm.rename("slow"), on=["device", "characters"])["slow"]
     return others.assign(speedup=slow / others["value"]).dropna(subset=["speedup"])

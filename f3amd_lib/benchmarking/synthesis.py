@@ -7,7 +7,6 @@ every row can say which share of the machine's arithmetic it used.
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -49,17 +48,15 @@ CANDIDATE_COLUMNS = ["model", "steps", "characters", "way", "window_frames", "pr
 """Columns of a table that name the candidate of a row, in the order of its fields."""
 
 
-@functools.cache
-def suites() -> dict[str, list[dict]]:
-    """Return what each suite times, as `suites.toml` has it."""
-    return read_toml(Path(__file__).with_name("suites.toml"))
+SUITES: dict[str, list[dict]] = read_toml(Path(__file__).with_name("suites.toml"))
+"""What each suite times."""
 
 
 def check_suites(names: Iterable[str]) -> list[str]:
     """Return the names as a list; ValueError for an unknown one."""
     names = list(names)
     for name in names:
-        check_known(name, suites(), "suite")
+        check_known(name, SUITES, "suite")
     return names
 
 
@@ -67,7 +64,7 @@ def plan(suite: str) -> dict[tuple, list[Candidate]]:
     """Return what a suite times, by group, each candidate once; ValueError for an unknown suite."""
     check_suites([suite])
     groups: dict[tuple, dict[Candidate, None]] = {}
-    for block in suites()[suite]:
+    for block in SUITES[suite]:
         for implementation, counts in block["characters"].items():
             for characters, model, steps in itertools.product(counts, block["models"], block["steps"]):
                 candidate = Candidate(

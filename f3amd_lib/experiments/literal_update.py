@@ -11,7 +11,6 @@ rollouts choose the update by the name of its sampler, `UPDATES[...]`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -20,7 +19,7 @@ import pandas as pd
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.diffusion.samplers import walk
-from f3amd_lib.experiments.denoising import held_out_batch
+from f3amd_lib.experiments.denoising import CM, held_out_batch
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.networks.conditioning import Condition
@@ -34,26 +33,14 @@ WINDOW_METRICS = dict.fromkeys(("joint_error", "seed_spread", "from_rescaled", "
 WINDOW_METRICS["joint_acceleration"] = "cm/frame^2"
 """Metric of `window_figures` -> unit."""
 
-CM = 100.0
-
-
-@dataclass(frozen=True, eq=False)
-class WindowWalks:
-    """Windows that one network made from the same noise in several ways.
-
-    Attributes:
-      real: joints as captured, [B, T, J, 3], metres; None where nothing was.
-      made: (update, steps) -> joints, [S, B, T, J, 3]; seed s has the same noise in all of them.
-    """
-
-    real: np.ndarray | None
-    made: dict[tuple[str, int], np.ndarray]
+Walks = dict[tuple[str, int], np.ndarray]
+"""(update, steps) -> joints that one network made, [S, B, T, J, 3], metres; seed s has one noise in all of them."""
 
 
 def walk_windows(
     trained: TrainedModel, windows: WindowSet, steps: Sequence[int] = (8, 4, 2, 1), *, spacing: str = "endpoints",
     num_windows: int = 64, num_seeds: int = 8, seed: int = 0,
-) -> WindowWalks:  # fmt: skip
+) -> tuple[Walks, np.ndarray]:  # fmt: skip
     """Sample held-out windows with both updates and several numbers of steps.
 
     Args:
@@ -66,7 +53,7 @@ def walk_windows(
       seed: of the noise.
 
     Returns:
-      The walks.
+      (the walks, joints as captured [B, T, J, 3], metres).
 
     Raises:
       ValueError: for windows of another length, or fewer than 2 seeds, which have no spread.
@@ -74,14 +61,13 @@ def walk_windows(
     batch = held_out_batch(windows, trained, num_windows)
     _, condition = network_inputs(batch, trained.normaliser)
     real = frame_positions(trained.skeleton, np.asarray(batch.future))
-    walked = walk_conditions(trained, condition, steps, spacing=spacing, num_seeds=num_seeds, seed=seed)
-    return WindowWalks(real, walked)
+    return walk_conditions(trained, condition, steps, spacing=spacing, num_seeds=num_seeds, seed=seed), real
 
 
 def walk_conditions(
     trained: TrainedModel, condition: Condition, steps: Sequence[int] = (8, 4, 2, 1), *, spacing: str = "endpoints",
     num_seeds: int = 8, seed: int = 0,
-) -> dict[tuple[str, int], np.ndarray]:  # fmt: skip
+) -> Walks:  # fmt: skip
     """Sample windows under given conditions with both updates, as `walk_windows` does.
 
     Args:
@@ -89,7 +75,7 @@ def walk_conditions(
       condition: B rows, in network units.
 
     Returns:
-      `WindowWalks.made`.
+      The walks.
 
     Raises:
       ValueError: for fewer than 2 seeds, which have no spread.
@@ -114,11 +100,12 @@ def _distance(first: np.ndarray, second: np.ndarray) -> float:
     return float(CM * np.mean(np.linalg.norm(first - second, axis=-1)))
 
 
-def window_figures(walks: WindowWalks) -> pd.DataFrame:
+def window_figures(made: Walks, real: np.ndarray | None = None) -> pd.DataFrame:
     """Measure what walks from the same noise made.
 
     Args:
-      walks: from `walk_windows`, or of `walk_conditions`.
+      made: walks, of `walk_windows` or `walk_conditions`.
+      real: joints as captured, [B, T, J, 3], metres; None where nothing was.
 
     Returns:
       Columns update, steps, metric, unit, value, means over windows and seeds; update "real" with
@@ -131,17 +118,17 @@ def window_figures(walks: WindowWalks) -> pd.DataFrame:
           that was walked.
     """
     rows = []
-    if walks.real is not None:
-        rows.append(("real", 0, "joint_acceleration", float(np.mean(joint_acceleration(walks.real)))))
-    for (update, number), joints in walks.made.items():
-        figures = {} if walks.real is None else {"joint_error": _distance(joints, walks.real)}
+    if real is not None:
+        rows.append(("real", 0, "joint_acceleration", float(np.mean(joint_acceleration(real)))))
+    for (update, number), joints in made.items():
+        figures = {} if real is None else {"joint_error": _distance(joints, real)}
         figures |= {
             "joint_acceleration": float(np.mean(joint_acceleration(joints))),
             "seed_spread": diversity(np.swapaxes(joints, 0, 1)),
-            "from_rescaled": _distance(joints, walks.made["rescaled", number]),
+            "from_rescaled": _distance(joints, made["rescaled", number]),
         }
-        if number % 2 == 0 and (update, number // 2) in walks.made:
-            figures["from_half_the_steps"] = _distance(joints, walks.made[update, number // 2])
+        if number % 2 == 0 and (update, number // 2) in made:
+            figures["from_half_the_steps"] = _distance(joints, made[update, number // 2])
         rows += [(update, number, name, value) for name, value in figures.items()]
     table = pd.DataFrame(rows, columns=["update", "steps", "metric", "value"])
     table.insert(3, "unit", table["metric"].map(WINDOW_METRICS))

@@ -21,14 +21,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-import jax
 import numpy as np
 import pandas as pd
 
+from f3amd_lib.benchmarking.implementations import Workload, prepare_round
+from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.experiments import denoising, literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
@@ -49,7 +49,6 @@ from f3amd_lib.generation.blending import blend_rollout
 from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.online_feet import lock_rollout_online
 from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
@@ -59,9 +58,8 @@ from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
-from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
 from f3amd_lib.training.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
-from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.published import NAME as PUBLISHED
 from f3amd_lib.training.published import published_model
@@ -110,10 +108,6 @@ def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
     return list(profile.evaluation_styles or prepared.packed.primary_styles[: profile.num_characters])
 
 
-def _names(models: Iterable[str] | None) -> list[str]:
-    return [presets.find_preset(name).name for name in models or ()]
-
-
 def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
     if models:
         raise ValueError(f"{reason}: leave --model out")
@@ -138,7 +132,7 @@ def _asked(
     among: Iterable[str] = (),
 ) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
     """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
-    names = asked = _names(models)
+    names = asked = list(models or ())
     if not asked:
         known = (models_with_weights if at_least_one else available_models)(profile)
         names = [name for name in among if name in known] if among else known
@@ -196,7 +190,7 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
       The table, `records/learning.csv`.
     """
     record = _record(prepared, profile, "learning", **SHORT_RUN)
-    asked = _names(models)
+    asked = list(models or ())
     records = Records(_records_dir(profile), record, {"learning": ["model"]}, again=asked)
 
     def curve(row: Mapping) -> dict:
@@ -279,7 +273,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    return _measure_walks(prepared, profile, models, "walking", ["model", "window_frames", "steps"], ["as made"])
+    return _measure_walks(prepared, profile, models, "walking", {"window_frames": profile.window}, ["as made"])
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -291,14 +285,14 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
       The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
       clips.
     """
-    return _measure_walks(prepared, profile, models, "feet", ["model", "steps"], TREATMENTS)
+    return _measure_walks(prepared, profile, models, "feet", {}, TREATMENTS)
 
 
 def _measure_walks(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, keys: list[str],
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, also: dict,
     treatments: Iterable[str],
 ) -> Path:  # fmt: skip
-    """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated; `also` names rows, too."""
     packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
@@ -332,10 +326,9 @@ def _measure_walks(
         ]  # fmt: skip
         return {name: pd.DataFrame(rows)}
 
-    known = {"window_frames": profile.window} if "window_frames" in keys else {}
     rows = [("real", 0), *itertools.product(trained, (8, 1))]
-    todo = [{"model": model, **known, "steps": steps} for model, steps in rows]
-    records = Records(_records_dir(profile), record, {name: keys}, again=asked)
+    todo = [{"model": model, **also, "steps": steps} for model, steps in rows]
+    records = Records(_records_dir(profile), record, {name: list(todo[0])}, again=asked)
     return records.measure(_with_weights(todo, trained), measured)
 
 
@@ -348,7 +341,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
       the held-out loss fell over the last quarter of training (NaN where none was watched).
     """
-    asked = _names(models)
+    asked = list(models or ())
     record = _record(prepared, profile, "trained")
     found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
 
@@ -465,7 +458,7 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
 
     def walk_windows(row: Mapping) -> dict:
         walks = literal_update.walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
-        return {"literal_update_windows": literal_update.window_figures(walks)}
+        return {"literal_update_windows": literal_update.window_figures(*walks)}
 
     def walk_rollouts(row: Mapping) -> dict:
         generator = MotionGenerator(
@@ -501,24 +494,18 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
         model = trained[row["model"]]
         levels = getattr(model.config, "noise_levels", ()) or SIGMAS
         steps = [count for count in (8, 1) if count <= len(levels)]
+        condition = denoising.held_out_condition(held_out, model)
         return {
-            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
             "x0_by_sigma": denoising.x0_error_by_sigma(model, held_out, levels),
+            "input_use": denoising.input_use(model, condition, seed=profile.seed),
+            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
         }
 
-    keys = dict.fromkeys(["x0_by_sigma", "noise_use", "input_use"], ["model"])
+    # The table that says what was measured is written last.
+    keys = dict.fromkeys(["noise_use", "x0_by_sigma", "input_use"], ["model"])
     records = Records(_records_dir(profile), record, keys, again=asked)
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
-    rows = _with_weights(rows, trained)
-    records.measure(rows, ask)
-
-    def ask_inputs(row: Mapping) -> dict:
-        model = trained[row["model"]]
-        condition = denoising.held_out_condition(held_out, model)
-        return {"input_use": denoising.input_use(model, condition, seed=profile.seed)}
-
-    records.measure(rows, ask_inputs, into="input_use")
-    return records.path("noise_use")
+    return records.measure(_with_weights(rows, trained), ask)
 
 
 def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -552,7 +539,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
     classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     held_out = prepared.windows(prepared.held_out_split)
-    names, asked = _names(models) or ["F3AMD-FNO-96", "CAMDM"], _names(models)
+    asked = list(models or ())
     folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
     keys = ["model", "snapshot"]
     records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
@@ -568,6 +555,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
         rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
         return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
 
+    names = asked or ["F3AMD-FNO-96", "CAMDM"]
     todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
     return records.measure(todo, score)
 
@@ -665,25 +653,18 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Time a window for 32 characters at 8, 4, 2 and 1 steps, by turns: what a student of one step is compared by.
 
-    A student is as large as its teacher and takes its teacher's time at one step.
+    The rounds are those of `f3amd bench` under jit, whose times depend on sizes alone, not on weights. A student is as
+    large as its teacher and takes its teacher's time at one step.
 
     Returns:
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
     _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
-    batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
-
-    def compiled(model: TrainedModel, steps: int) -> Callable:
-        sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
-        _, condition = network_inputs(batch, model.normaliser)
-
-        @jax.jit
-        def draw(params, condition, key):
-            return sample_round(network_with(model.config, params), condition, sigmas, key, sampler=sampler)
-
-        return lambda: draw(model.params, condition, jax.random.key(0)).block_until_ready()
-
-    rounds = {(name, steps): compiled(model, steps) for name, model in trained.items() for steps in STEPS}
+    precision = "tf32" if device_name() == "GPU" else "float32"  # what JAX multiplies in by itself
+    rounds = {
+        (name, steps): prepare_round("jit", Workload(name, model.config, steps, _TIMED_CHARACTERS, precision)).call
+        for name, model in trained.items() for steps in STEPS
+    }  # fmt: skip
     rows = [
         {"model": name, "steps": steps, "characters": _TIMED_CHARACTERS, "milliseconds": 1000.0 * timing.median}
         | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}

@@ -145,42 +145,31 @@ def most_windows(classifier: StyleClassifier) -> int:
     return min(map(len, clouds)) // 2
 
 
-def settling(
-    classifier: StyleClassifier, sizes: Sequence[int] | None = None, *, repeats: int = 5, seed: int = 0
-) -> pd.DataFrame:
+def settling(classifier: StyleClassifier) -> pd.DataFrame:
     """Follow FID and EMD of real held-out motion against real training motion over the windows.
 
     Both sides are real, so what is measured is other clips of the same people, and the number of
     windows. (`distributions.settling_curve` does it for any two clouds.)
 
     Args:
-      classifier: its reference features are the two clouds.
-      sizes: windows of each style on either side, at most half of what the poorest style has, lest
-        draws share too many windows for their interval; by default halvings of that.
-      repeats: draws a size.
-      seed: of the draws.
+      classifier: its reference features are the two clouds. From each at most half of what the poorest style has is
+        drawn, lest draws share too many windows for their interval, and halvings of that.
 
     Returns:
       Columns metric, windows (of all styles together), value, low, high (95 % over draws), repeats.
 
     Raises:
-      ValueError: for a classifier that cannot tell styles apart, or a size out of range.
+      ValueError: for a classifier that cannot tell styles apart, or has too few windows to halve.
 
     Source: ours.
     """
     require_telling_styles(classifier)
+    if not (most := most_windows(classifier)):
+        raise ValueError("a style of the classifier has fewer than two windows on a side: take more data")
     sides = [
         {style: classifier.reference(split, style) for style in classifier.styles} for split in ("held_out", "train")
     ]
-    most = most_windows(classifier)
-    if sizes is None:
-        sizes = [most >> k for k in range(10, -1, -1) if most >> k]
-    if not len(sizes) or not 1 <= min(sizes) <= max(sizes) <= most:
-        raise ValueError(
-            f"sizes must lie between 1 and {most} windows of a style, half of what the poorest "
-            f"style has; got {list(sizes)}"
-        )
-    return distributions.settling_curve(*sides, sizes, repeats=repeats, seed=seed)
+    return distributions.settling_curve(*sides, [most >> k for k in range(10, -1, -1) if most >> k])
 
 
 # ------------------------------------------------------------------------------------ foot spectra

@@ -90,9 +90,7 @@ def probes_of(real: TextMotions, others: TextMotions, seed: int) -> dict:
     }  # fmt: skip
 
 
-def measure_judge(
-    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models=None, folder=None, **leg
-) -> Path | None:  # fmt: skip
+def measure_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, models=None, **leg) -> Path | None:
     """Ask the judge about real motion and about motion that is wrong on purpose; it is trained if it is not.
 
     Returns:
@@ -100,7 +98,7 @@ def measure_judge(
     """
     if models:
         raise ValueError("text_judge judges real motion alone: leave --model out")
-    bench = bench_of(data, encoder, profile, folder=folder, **leg)
+    bench = bench_of(data, encoder, profile, **leg)
     if bench is None:
         return None
     others = data.cut(bench.settings["most_frames"])
@@ -155,9 +153,8 @@ def _told_rows(trained, encoder: TextEncoder, profile: Profile) -> pd.DataFrame:
 
 
 def measure_hands(
-    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, folder=None,
-    **leg,
-) -> Path:  # fmt: skip
+    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, **leg
+) -> Path:
     """Count which hand goes up where a caption says "left" or "right".
 
     Held-out clips must all be right and their mirror images all wrong. A model makes 50 motions of each caption.
@@ -165,7 +162,6 @@ def measure_hands(
     Args:
       data, encoder, profile: captioned motion, what embeds captions, how much is measured.
       models: presets that have weights; by default the one that `f3amd text` uses.
-      folder: where weights lie, instead of the user's own and the shipped ones.
 
     Returns:
       The table, `records/hands.csv`: a row per model, content, side and caption.
@@ -177,8 +173,7 @@ def measure_hands(
     rows = {"real clips": lambda: _clip_rows(data, False), "mirrored clips": lambda: _clip_rows(data, True)}
     todo = [{"model": name, "weights": ""} for name in rows]
     for name in asked or [None]:
-        path = find_text_model(profile.dataset, name) if folder is None else Path(folder) / f"{name}.safetensors"
-        trained = load_text_model(path)
+        trained = load_text_model(find_text_model(profile.dataset, name))
         rows[trained.name] = lambda trained=trained: _told_rows(trained, encoder, profile)
         todo.append({"model": trained.name, "weights": weights_digest(trained.params)})
     return records.measure(todo, lambda row: {"hands": rows[row["model"]]()})

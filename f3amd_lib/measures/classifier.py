@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,19 +39,16 @@ from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.attention import dropout
-from f3amd_lib.networks.config import LayerKeys
+from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.spectral import TemporalConvolution
 from f3amd_lib.training import checkpoints
-from f3amd_lib.training.optimise import TrainingState, optimise
+from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree, optimise
 
 ACCURACY_BAR = 0.8
 """Least held-out accuracy of a classifier whose features may be used for FID, EMD and coverage."""
 
 _SPLITS = {"train": ("train",), "held_out": ("validation", "test")}
 """Splits whose clips are trained on, and whose clips say how well."""
-
-_STATIC = {"static": True}
-"""Marks fields that JAX compiles for, as against arrays that it is given."""
 
 _BATCH = 256
 """Windows that are evaluated at once; fixed, so that a window's features depend on it alone."""
@@ -61,7 +58,7 @@ _BATCH = 256
 
 
 @dataclass(frozen=True)
-class ClassifierConfig:
+class ClassifierConfig(CheckedConfig):
     """Sizes of the network; the defaults are CAMDM's.
 
     Attributes:
@@ -73,6 +70,8 @@ class ClassifierConfig:
       dropout: share of block outputs that is blanked in training.
     """
 
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+
     num_styles: int
     window: int = 60
     widths: tuple[int, ...] = (64, 128)
@@ -81,22 +80,16 @@ class ClassifierConfig:
     dropout: float = 0.5
 
     def __post_init__(self):
+        super().__post_init__()
         object.__setattr__(self, "widths", tuple(self.widths))
-        sizes = (self.num_styles, self.window, *self.widths, self.hidden_width, self.feature_width)
-        if not self.widths or min(sizes) < 1:
-            raise ValueError(f"a style classifier's sizes must be 1 or more, got {self}")
-        if not 0.0 <= self.dropout < 1.0:
+        if not self.widths or min(self.widths) < 1:
+            raise ValueError(f"widths of a style classifier must be 1 or more, got {self.widths}")
+        if self.dropout >= 1.0:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
 
     def to_dict(self) -> dict:
-        """Return the sizes as JSON values."""
+        """Return the sizes as JSON values; files of classifiers have no family."""
         return dataclasses.asdict(self) | {"widths": list(self.widths)}
-
-    @classmethod
-    def from_dict(cls, values: dict) -> ClassifierConfig:
-        """Return the config of `to_dict`; ValueError for a name that is no size."""
-        refuse_unknown(values, cls, "size of a style classifier")
-        return cls(**values)
 
 
 def _batch_norm(width: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
@@ -421,6 +414,10 @@ class ClassifierTraining:
                 f"a style classifier needs at least 1 step and batches of 2, got {self.num_steps} and {self.batch_size}"
             )
 
+    def optimiser(self) -> optax.GradientTransformation:
+        """Return Adam, at a rate that falls to zero."""
+        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.num_steps))
+
 
 def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining) -> dict:
     """Return all but the data that decides a classifier's weights, as its record tells it."""
@@ -431,10 +428,9 @@ def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: Classi
     }
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class StyleTask:
-    """A style classifier to train (a `training.optimise.Task`).
+@frozen_tree("frames", "starts", "first", "count", "mirrored")
+class StyleTask(Task):
+    """A style classifier to train.
 
     Attributes:
       dataset_fingerprint, styles, network, config: what decides the weights.
@@ -444,22 +440,17 @@ class StyleTask:
       mirrored: whether a style's windows may be mirrored, [S].
     """
 
-    name: ClassVar[str] = "style classifier"
+    name = "style classifier"
 
-    dataset_fingerprint: str = field(metadata=_STATIC)
-    styles: tuple[str, ...] = field(metadata=_STATIC)
-    network: ClassifierConfig = field(metadata=_STATIC)
-    config: ClassifierTraining = field(metadata=_STATIC)
+    dataset_fingerprint: str
+    styles: tuple[str, ...]
+    network: ClassifierConfig
+    config: ClassifierTraining
     frames: jax.Array
     starts: jax.Array
     first: jax.Array
     count: jax.Array
     mirrored: jax.Array
-
-    @property
-    def optimiser(self) -> optax.GradientTransformation:
-        """Adam, at a rate that falls to zero."""
-        return optax.adam(optax.cosine_decay_schedule(self.config.learning_rate, self.config.num_steps))
 
     def identity(self) -> dict:
         """Return all that decides the weights."""
@@ -494,19 +485,6 @@ class StyleTask:
         return loss, ({"loss": loss}, nnx.state(network, nnx.BatchStat))
 
 
-def _style_task(
-    packed: PackedMotion, styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining, takes: _Takes
-) -> StyleTask:
-    starts, take = takes.starts(config.stride)
-    count = np.bincount(takes.styles[take], minlength=len(styles))
-    return StyleTask(
-        packed.fingerprint, styles, network, config, frames=jnp.asarray(takes.frames),
-        starts=jnp.asarray(starts, jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
-        count=jnp.asarray(count, jnp.int32),
-        mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
-    )  # fmt: skip
-
-
 def _asked_for(
     packed: PackedMotion, *, num_steps: int, batch_size: int, seed: int, styles=None, **sizes
 ) -> tuple[tuple[str, ...], ClassifierConfig, ClassifierTraining]:
@@ -519,7 +497,8 @@ def _asked_for(
             f"a style classifier needs at least two styles, each named once; got {len(chosen)} "
             f"({', '.join(chosen[:5])})"
         )
-    config = ClassifierConfig.from_dict({"num_styles": len(chosen), **sizes})
+    refuse_unknown(sizes, ClassifierConfig, "size of a style classifier")
+    config = ClassifierConfig(len(chosen), **sizes)
     return chosen, config, ClassifierTraining(num_steps, batch_size, seed)
 
 
@@ -562,7 +541,13 @@ def train_classifier(
     asked = {"num_steps": num_steps, "batch_size": batch_size, "seed": seed, "styles": styles}
     styles, config, training = _asked_for(packed, **asked, **sizes)
     takes = {split: _collect(packed, styles, members, config.window) for split, members in _SPLITS.items()}
-    task = _style_task(packed, styles, config, training, takes["train"])
+    starts, take = takes["train"].starts(training.stride)
+    count = np.bincount(takes["train"].styles[take], minlength=len(styles))
+    task = StyleTask(
+        packed.fingerprint, styles, config, training, frames=jnp.asarray(takes["train"].frames),
+        starts=jnp.asarray(starts, jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
+        count=jnp.asarray(count, jnp.int32), mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
+    )  # fmt: skip
     state, _ = optimise(task, chunk=max(1, min(20, num_steps // 10)), progress=progress)
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(leaf.dtype), state.params)
     references = {}

@@ -23,15 +23,7 @@ ROOT_NOISE = 0.02
 """Deviation of the noise on each coordinate of the root, metres."""
 
 
-def _checked(motion: Motion, strength: float) -> float:
-    if not isinstance(motion, Motion):
-        raise ValueError(f"only a Motion can be corrupted, got {type(motion).__name__}")
-    if not 0.0 <= strength <= 1.0:
-        raise ValueError(f"strength must lie between 0 (as it was) and 1, got {strength}")
-    return float(strength)
-
-
-def frozen_pose(motion: Motion, strength: float = 1.0) -> Motion:
+def frozen_pose(motion: Motion, seed: int = 0, strength: float = 1.0) -> Motion:
     """Hold the pose of the first frame while the root goes its way: a figurine pushed along.
 
     The local rotations, the height of the root and the tilt of the hips are those of frame 0; the
@@ -43,18 +35,15 @@ def frozen_pose(motion: Motion, strength: float = 1.0) -> Motion:
 
     Args:
       motion: any motion of T frames.
+      seed: nothing is random here; all recipes take one.
       strength: share of the way from each frame's own pose to that of frame 0, along the shortest
         arc in every joint.
 
     Returns:
       The motion, T frames.
 
-    Raises:
-      ValueError: for a strength out of range, or anything that is no `Motion`.
-
     Source: ours.
     """
-    strength = _checked(motion, strength)
     held = np.repeat(np.asarray(motion.rotations[:1], np.float64), motion.num_frames, axis=0)
     held[:, 0] = matrix_from_yaw(motion.yaw - motion.yaw[0]) @ held[:, 0]
     root = np.array(motion.root_position, dtype=np.float64)
@@ -76,11 +65,10 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
       The motion, T frames.
 
     Raises:
-      ValueError: for a single frame, a strength out of range, or anything that is no `Motion`.
+      ValueError: for a single frame.
 
     Source: ours.
     """
-    strength = _checked(motion, strength)
     if motion.num_frames < 2:
         raise ValueError("a motion of 1 frame cannot be shuffled; at least 2 are needed")
     ring = np.random.default_rng(seed).permutation(motion.num_frames)
@@ -90,46 +78,33 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
     return motion.replace(root_position=motion.root_position[order], rotations=motion.rotations[order])
 
 
-def noisy_motion(
-    motion: Motion, seed: int = 0, strength: float = 1.0, *, rotation_scale: float = ROTATION_NOISE,
-    root_scale: float = ROOT_NOISE,
-) -> Motion:  # fmt: skip
+def noisy_motion(motion: Motion, seed: int = 0, strength: float = 1.0) -> Motion:
     """Add Gaussian noise to every frame by itself: the right motion, trembling.
 
     Args:
       motion: any motion of T frames.
       seed: of the noise; one draw for all strengths.
-      strength: factor on both scales.
-      rotation_scale: deviation on each of the six numbers of a joint, which are then made a
-        rotation again.
-      root_scale: deviation on each coordinate of the root, metres.
+      strength: factor on both deviations, `ROOT_NOISE` and `ROTATION_NOISE`; a joint's six numbers are made a rotation
+        again.
 
     Returns:
       The motion, T frames.
 
-    Raises:
-      ValueError: for a strength out of range, a negative scale, or anything that is no `Motion`.
-
     Source: ours.
     """
-    strength = _checked(motion, strength)
-    if rotation_scale < 0 or root_scale < 0:
-        raise ValueError(f"scales of noise must not be negative, got {rotation_scale} and {root_scale}")
     frames = world_frames(motion)
     noise = np.random.default_rng(seed).normal(size=frames.shape)
     root_noise, rotation_noise = split_frames(noise)
-    root_noise *= root_scale
-    rotation_noise *= rotation_scale
+    root_noise *= ROOT_NOISE
+    rotation_noise *= ROTATION_NOISE
     noisy = motion_from_frames(motion.skeleton, frames + strength * noise)
     return motion.replace(root_position=noisy.root_position, rotations=noisy.rotations)
 
 
-CORRUPTIONS: dict[str, Callable[[Motion, float, int], Motion]] = {
-    "frozen pose": lambda motion, strength, seed: frozen_pose(motion, strength),
-    "shuffled frames": lambda motion, strength, seed: shuffled_frames(motion, seed, strength),
-    "noisy motion": lambda motion, strength, seed: noisy_motion(motion, seed, strength),
-}
-"""The bad generators of our tables by name, as functions of (motion, strength, seed)."""
+CORRUPTIONS: dict[str, Callable[[Motion, int, float], Motion]] = {
+    "frozen pose": frozen_pose, "shuffled frames": shuffled_frames, "noisy motion": noisy_motion,
+}  # fmt: skip
+"""The bad generators of our tables by name, as functions of (motion, seed, strength)."""
 
 
 def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) -> Motion:
@@ -145,7 +120,11 @@ def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) 
       The broken motion, as many frames on the same skeleton.
 
     Raises:
-      ValueError: for an unknown name, and as the recipe itself.
+      ValueError: for an unknown name, a strength out of range, anything that is no `Motion`, and as the recipe itself.
     """
     check_known(name, CORRUPTIONS, "corruption")
-    return CORRUPTIONS[name](motion, strength, seed)
+    if not isinstance(motion, Motion):
+        raise ValueError(f"only a Motion can be corrupted, got {type(motion).__name__}")
+    if not 0.0 <= strength <= 1.0:
+        raise ValueError(f"strength must lie between 0 (as it was) and 1, got {strength}")
+    return CORRUPTIONS[name](motion, seed, float(strength))

@@ -58,9 +58,10 @@ def quality_bars(
 
 def _compare(how: str, made: float, real: float, broken: pd.Series, spread: float) -> float:
     """Say how a figure of a model stands beside those of real and of broken motion."""
-    figure = abs(made - real) if how in ("distance to real", "distance over real", "nearness to real") else made
+    if how == "nearness to real":
+        return abs(made - real) / (made - broken).abs().min()
+    figure = abs(made - real) if how in ("distance to real", "distance over real") else made
     wholes = {"share of continuations": spread, "share of real": real, "distance over real": real}
-    wholes["nearness to real"] = (made - broken).abs().min()
     return 100.0 * made if how == "percent" else figure / wholes.get(how, 1.0)
 
 

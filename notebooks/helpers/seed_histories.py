@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from f3amd_lib.data.features import path_condition
-from f3amd_lib.experiments.literal_update import WindowWalks, walk_conditions
+from f3amd_lib.experiments.literal_update import Walks, walk_conditions
 from f3amd_lib.generation.rollout import pose_speed
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -33,7 +33,7 @@ def seed_condition(trained: TrainedModel) -> Condition:
     )
 
 
-def walk_seed_histories(trained: TrainedModel, steps=(8, 4, 2, 1), **settings) -> WindowWalks:
+def walk_seed_histories(trained: TrainedModel, steps=(8, 4, 2, 1), **settings) -> Walks:
     """Sample the window after a stored history of each style with both updates.
 
     Args:
@@ -42,4 +42,4 @@ def walk_seed_histories(trained: TrainedModel, steps=(8, 4, 2, 1), **settings) -
     Returns:
       The walks; nothing real stands beside them.
     """
-    return WindowWalks(None, walk_conditions(trained, seed_condition(trained), steps, **settings))
+    return walk_conditions(trained, seed_condition(trained), steps, **settings)
