@@ -21,14 +21,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.benchmarking.implementations import Workload, prepare_round
-from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.experiments import denoising, literal_update, sensitivity
 from f3amd_lib.experiments.bfloat16 import compare_precisions
 from f3amd_lib.experiments.learning_curves import SHORT_RUN, learning_curve, snapshot
@@ -49,6 +49,7 @@ from f3amd_lib.generation.blending import blend_rollout
 from f3amd_lib.generation.foot_locking import lock_rollout
 from f3amd_lib.generation.online_feet import lock_rollout_online
 from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
@@ -58,8 +59,9 @@ from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
-from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
 from f3amd_lib.training.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.published import NAME as PUBLISHED
 from f3amd_lib.training.published import published_model
@@ -653,18 +655,25 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Time a window for 32 characters at 8, 4, 2 and 1 steps, by turns: what a student of one step is compared by.
 
-    The rounds are those of `f3amd bench` under jit, whose times depend on sizes alone, not on weights. A student is as
-    large as its teacher and takes its teacher's time at one step.
+    A student is as large as its teacher and takes its teacher's time at one step.
 
     Returns:
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
     _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
-    precision = "tf32" if device_name() == "GPU" else "float32"  # what JAX multiplies in by itself
-    rounds = {
-        (name, steps): prepare_round("jit", Workload(name, model.config, steps, _TIMED_CHARACTERS, precision)).call
-        for name, model in trained.items() for steps in STEPS
-    }  # fmt: skip
+    batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
+
+    def compiled(model: TrainedModel, steps: int) -> Callable:
+        sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
+        _, condition = network_inputs(batch, model.normaliser)
+
+        @jax.jit
+        def draw(params, condition, key):
+            return sample_round(network_with(model.config, params), condition, sigmas, key, sampler=sampler)
+
+        return lambda: draw(model.params, condition, jax.random.key(0)).block_until_ready()
+
+    rounds = {(name, steps): compiled(model, steps) for name, model in trained.items() for steps in STEPS}
     rows = [
         {"model": name, "steps": steps, "characters": _TIMED_CHARACTERS, "milliseconds": 1000.0 * timing.median}
         | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}
