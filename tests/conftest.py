@@ -22,14 +22,15 @@ if f"jaxlib=={version('jaxlib')} " in (Path(__file__).resolve().parents[1] / "re
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["MPLBACKEND"] = "Agg"
-# Tracing makes many small objects, nearly all of which are kept: looking through them for garbage as often as Python
-# does by itself took a seventh of the time.
-gc.set_threshold(100_000, 20, 50)
 
 import pytest
 
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+
+# Tracing makes many small objects, nearly all of which are kept: looking through them for garbage as often as Python
+# does by itself took a seventh of the time.
+gc.set_threshold(100_000, 20, 50)
 
 REMEDY = {
     "sphinx": "make site-tools",
