@@ -190,15 +190,17 @@ def _task(preset: Preset, config, data: TextMotions, encoder: TextEncoder, befor
     stage = stage_of(preset)
     if stage == "autoencoder":
         model = presets.build_config(preset.name, features=12 * data.skeleton.num_joints - 1)
-        return latent_motion.LatentAutoencoderTask(model, config, None, None, data.fingerprint)
+        return latent_motion.LatentAutoencoderTask(model, config, None, None, dataset_fingerprint=data.fingerprint)
     fingerprint = f"{data.fingerprint} on "
     if stage == "teacher":
         width = pooled_captions(["a person walks"], encoder).shape[-1]
         model = presets.build_config(preset.name, text_width=width)
         fingerprint += weights_digest(before.autoencoder_params)
-        return latent_motion.TeacherTask(model, config, preset.diffusion, None, fingerprint)
+        return latent_motion.TeacherTask(model, config, None, preset.diffusion, dataset_fingerprint=fingerprint)
     fingerprint += weights_digest(before.params)
-    return latent_motion.DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
+    return latent_motion.DistillationTask(
+        before.config, config, None, before.schedule, before.params, dataset_fingerprint=fingerprint
+    )
 
 
 def _named_teacher(path, preset: Preset, data: TextMotions) -> LatentModel:

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, draw_clips, pad_motions
+from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 
 
@@ -143,24 +143,16 @@ def draw_latent(key, mean, log_variance):
 
 
 @frozen_tree("clips", "statistics")
-class LatentAutoencoderTask(Task):
-    """An autoencoder to train on whole clips (MotionPCM section 4.1).
+class LatentAutoencoderTask(ClipsTask):
+    """An autoencoder to train on whole clips, normalised redundant vectors (MotionPCM section 4.1).
 
     Attributes:
-      model_config: the autoencoder.
-      config: how to train it.
-      clips: normalised redundant vectors.
-      statistics: of them.
-      dataset_fingerprint: of the data they come from.
+      statistics: of these vectors.
     """
 
     name, part = "latent autoencoder", "autoencoder"
 
-    model_config: motionpcm.LatentAutoencoderConfig
-    config: LatentMotionTraining
-    clips: ClipTable
     statistics: AxisNormaliser
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw (features, mask) and the key of the loss."""
@@ -235,24 +227,16 @@ def latent_table(
 
 
 @frozen_tree("clips")
-class TeacherTask(Task):
-    """A teacher to train: the noise of latents under a caption, or none.
+class TeacherTask(ClipsTask):
+    """A teacher to train: the noise of latents under a caption, or none. Clips are a `LatentTable`.
 
     Attributes:
-      model_config: the denoiser.
-      config: how to train it.
       schedule: the noise schedule of its preset.
-      clips: latents and captions.
-      dataset_fingerprint: of the data, and of the autoencoder.
     """
 
     name, part = "latent teacher", "teacher"
 
-    model_config: motionpcm.LatentDenoiserConfig
-    config: LatentMotionTraining
     schedule: NoiseSchedule
-    clips: LatentTable
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw (latents, captions) and the key of the loss; a share of the captions is the empty one."""
@@ -302,7 +286,7 @@ class DistillationBatch(NamedTuple):
 
 
 @frozen_tree("teacher", "clips")
-class DistillationTask(Task):
+class DistillationTask(TeacherTask):
     """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1).
 
     Weights have the branches "student" and, with a discriminator, "discriminator". The loop's moving average of the
@@ -310,21 +294,12 @@ class DistillationTask(Task):
     looks at what the student of line 10 said; one step for both is therefore that algorithm's three updates.
 
     Attributes:
-      model_config, teacher: config and frozen weights of the teacher.
-      config: how to distil.
-      schedule: the teacher's noise schedule.
-      clips: latents and captions.
-      dataset_fingerprint: of the data, the autoencoder and the teacher.
+      teacher: its frozen weights; the config of the network and the schedule are the teacher's as well.
     """
 
-    name, part = "student", "teacher"
+    name = "student"
 
-    model_config: motionpcm.LatentDenoiserConfig
     teacher: Any
-    config: LatentMotionTraining
-    schedule: NoiseSchedule
-    clips: LatentTable
-    dataset_fingerprint: str = ""
 
     def __post_init__(self):
         if self.config.ema_decay is None:

@@ -26,7 +26,7 @@ from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from f3amd_lib.networks.config import with_fast_gradient
+from f3amd_lib.networks.config import CheckedConfig, with_fast_gradient
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
@@ -108,6 +108,23 @@ class Task:
     def held_out_terms(self, params, statistics, held_out, key) -> dict:
         """Return terms by name on held-out data, without what only training does; asked where such data are given."""
         return self.terms(params, held_out, key, training=False)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ClipsTask(Task):
+    """A training of one network on clips, whole or as states; a subclass adds what else it goes by.
+
+    Attributes:
+      model_config: the network.
+      config: how to train it.
+      clips: of the training split, on the device.
+      dataset_fingerprint: of the data they come from, and of the networks it stands on.
+    """
+
+    model_config: CheckedConfig
+    config: Any
+    clips: Any
+    dataset_fingerprint: str = dataclasses.field(default="", kw_only=True)
 
 
 def frozen_tree(*data: str):

@@ -254,12 +254,13 @@ def autoencoder_task(
     axes, part = data.normaliser(), data.select(data.members(split))
     table, _ = clip_table(part, axes.normalise(part.positions))
     if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
-        return text_motion.AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+        model = presets.build_config(preset)
+        return text_motion.AutoencoderTask(model, config, table, dataset_fingerprint=data.fingerprint)
     # The body stands as people do when clips begin: those of training, whatever the split.
     rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
     model = presets.build_config(preset, num_vertices=len(make_body(rest).vertices))
     codec = MotionCodec(axes, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
-    return text_motion.MeshAutoencoderTask(model, config, table, data.fingerprint, codec)
+    return text_motion.MeshAutoencoderTask(model, config, table, codec, dataset_fingerprint=data.fingerprint)
 
 
 def denoiser_task(
@@ -285,7 +286,8 @@ def denoiser_task(
     fingerprint = data.fingerprint
     if codec.autoencoder is not None:
         fingerprint += f" in the latent of {weights_digest(codec.params)}"
-    return text_motion.TextMotionTask(model, config, presets.find_preset(preset).diffusion, table, pooled, fingerprint)
+    schedule = presets.find_preset(preset).diffusion
+    return text_motion.TextMotionTask(model, config, table, schedule, pooled, dataset_fingerprint=fingerprint)
 
 
 def control_task(
@@ -299,8 +301,9 @@ def control_task(
     table = table._replace(frames=(table.frames, positions))
     fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
     return text_motion.ControlTask(
-        base.config, config, base.schedule, table, pooled, base.params, codec, tuple(joints), fingerprint
-    )
+        base.config, config, table, base.schedule, pooled, base.params, codec, tuple(joints),
+        dataset_fingerprint=fingerprint,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------------------- training
