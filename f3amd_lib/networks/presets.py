@@ -32,6 +32,7 @@ from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
+from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
 
 FAMILIES = {
     config.family: (config, network)
@@ -40,7 +41,7 @@ FAMILIES = {
         (AutoencoderConfig, MotionAutoencoder), (MeshAutoencoderConfig, MeshAutoencoder),
         (motionpcm.LatentAutoencoderConfig, motionpcm.LatentAutoencoder),
         (motionpcm.LatentDenoiserConfig, motionpcm.LatentDenoiser),
-        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator),
+        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator), (TextMotionConfig, TextMotionNetwork),
     )
 }  # fmt: skip
 """Config and network of each family."""
