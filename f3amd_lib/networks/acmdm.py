@@ -19,7 +19,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES
-from f3amd_lib.networks.attention import check_num_heads
+from f3amd_lib.networks.attention import check_num_heads, waves
 from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 
 TIME_FEATURES = 256
@@ -158,13 +158,6 @@ def rotated(x, angles):
     return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
 
 
-def time_features(time):
-    """Return 128 cosines and then 128 sines of a time, [...] -> [..., 256], from one radian a unit downwards."""
-    half = TIME_FEATURES // 2
-    angle = jnp.asarray(time)[..., None] * 10000.0 ** (-jnp.arange(half) / half)
-    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-
-
 def block_causal(num_queries: int, num_keys: int, tokens_per_block: int) -> np.ndarray:
     """Return which keys the last queries may see: those of their own block and of earlier ones, [Q, K]."""
     block = np.arange(num_keys) // tokens_per_block
@@ -288,7 +281,7 @@ class Trunk(nnx.Module):
 
     def conditioned(self, time, context: TextContext):
         """Return (time, text) in network width: [B, 1, d] each, or [B, tokens, d] for a time of its own a frame."""
-        time = self.time_second(jax.nn.silu(self.time_first(time_features(time))))
+        time = self.time_second(jax.nn.silu(self.time_first(waves(time, TIME_FEATURES, TIME_FEATURES / 2))))
         time = time[:, None] if time.ndim == 2 else jnp.repeat(time, self.config.num_patches, axis=1)
         return time, context.text[:, None]
 
