@@ -307,7 +307,10 @@ def optimise(
             state, terms = advance(task, state, length, mesh)
             terms = {name: np.asarray(value) for name, value in terms.items()}
             if broken := _what_is_broken(done, terms, state):
-                raise TrainingDiverged(f"{task.name}: {broken}{_advice(checkpoint)}")
+                kept = checkpoint is not None and Path(checkpoint).exists()
+                kept = f"; the last good state is in {checkpoint}" if kept else ""
+                advice = "lower the learning rate or check the data for broken frames"
+                raise TrainingDiverged(f"{task.name}: {broken}: {advice}{kept}")
             passed = (done + length) // checkpoint_every > done // checkpoint_every
             done += length
             row = {"step": done, **{name: float(value.mean()) for name, value in terms.items()}}
@@ -339,9 +342,3 @@ def _what_is_broken(done: int, terms: dict, state: TrainingState) -> str | None:
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
         return f"weights are not finite after step {done + len(bad)}"
     return None
-
-
-def _advice(checkpoint: Path | None) -> str:
-    kept = checkpoint is not None and Path(checkpoint).exists()
-    kept = f"; the last good state is in {checkpoint}" if kept else ""
-    return f": lower the learning rate or check the data for broken frames{kept}"
