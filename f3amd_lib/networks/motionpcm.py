@@ -62,8 +62,8 @@ class SkipTransformerConfig(CheckedConfig):
     def __post_init__(self):
         super().__post_init__()
         check_num_heads(self.latent_width, self.num_heads)
-        if self.depth % 2 == 0 or self.dropout >= 1.0:
-            raise ValueError(f"depth must be odd and dropout below 1, got {self.depth} and {self.dropout}")
+        if self.depth % 2 == 0:
+            raise ValueError(f"depth must be odd, got {self.depth}")
 
 
 class SkipTransformer(nnx.Module):
