@@ -372,10 +372,7 @@ class DistillationTask(TeacherTask):
         solved = phases.jump(schedule, state, phases.guided_noise(conditional, unconditional, guidance), time, before)
         target = network_with(self.student_config, target_params)
         eps = target(solved, before, target.encode(text), guidance)
-        if config.consistency == "latent":
-            end = phases.latent_consistency_end(schedule, solved, eps, before)
-        else:
-            end = phases.target_end(schedule, solved, eps, before, edge)
+        end = self._end(phases.target_end, solved, eps, before, edge)
         critic_time = jax.random.randint(key_critic, (size,), edge, cut.edges[phase + 1] + 1)
         real = noised(critic_time, jax.random.normal(key_real, latent.shape))
         fresh = jax.random.normal(key_fresh, latent.shape)
@@ -396,10 +393,7 @@ class DistillationTask(TeacherTask):
             batch = self.questions(params["student"], *batch, key)
         student = network_with(self.student_config, params["student"])
         eps = student(batch.state, batch.time, student.encode(batch.text), batch.guidance)
-        if config.consistency == "latent":
-            end = phases.latent_consistency_end(schedule, batch.state, eps, batch.time)
-        else:
-            end = phases.jump(schedule, batch.state, eps, batch.time, batch.edge)
+        end = self._end(phases.jump, batch.state, eps, batch.time, batch.edge)
         loss = jnp.mean(phases.pseudo_huber(end - jax.lax.stop_gradient(batch.target), config.huber_width))
         terms = {"consistency": loss}
         if config.adversarial_weight:
@@ -413,6 +407,12 @@ class DistillationTask(TeacherTask):
             # The heads' own loss has no weight: each branch is moved by its own optimiser.
             loss = loss + config.adversarial_weight * adversarial + terms["discriminator"]
         return {"loss": loss, **terms}
+
+    def _end(self, jump, state, eps, time, edge):
+        """Return what a noise estimate says of the data, or by `jump` of the phase's end."""
+        if self.config.consistency == "latent":
+            return phases.latent_consistency_end(self.schedule, state, eps, time)
+        return jump(self.schedule, state, eps, time, edge)
 
     def scores(self, heads, state, batch: DistillationBatch):
         """Return the discriminator's scores of states at `critic_time` under the captions, high for data."""
