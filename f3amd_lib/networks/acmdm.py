@@ -214,17 +214,14 @@ class ACMDMBlock(nnx.Module):
         Returns:
           (tokens [B, T, d], keys and values of earlier and these tokens).
         """
-        adaptive = hasattr(self, "modulation")
-        if adaptive:
-            shift, scale, gate, *feed_forward = jnp.split(self.modulation(jax.nn.silu(c)), 6, axis=-1)
-        normal = self.attention_norm(x)
-        update, past = self._attend(modulated(normal, shift, scale) if adaptive else normal, angles, mask, past)
-        x = x + gate * update if adaptive else x + update
-        normal = self.feed_forward_norm(x)
-        if not adaptive:
-            return x + self._feed_forward(normal), past
+        parts = [0.0, 0.0, 1.0] * 2  # these change nothing
+        if hasattr(self, "modulation"):
+            parts = jnp.split(self.modulation(jax.nn.silu(c)), 6, axis=-1)
+        shift, scale, gate, *feed_forward = parts
+        update, past = self._attend(modulated(self.attention_norm(x), shift, scale), angles, mask, past)
+        x = x + gate * update
         shift, scale, gate = feed_forward
-        return x + gate * self._feed_forward(modulated(normal, shift, scale)), past
+        return x + gate * self._feed_forward(modulated(self.feed_forward_norm(x), shift, scale)), past
 
     def _attend(self, x, angles, mask, past):
         heads = self.query_key_value(x).reshape(*x.shape[:2], 3, self.num_heads, -1)
