@@ -252,8 +252,8 @@ class TeacherTask(ClipsTask):
         network = network_with(self.model_config, params)
         time = jax.random.randint(key_time, (len(latent),), 0, len(self.schedule.levels))
         noise = jax.random.normal(key_noise, latent.shape)
-        alpha, sigma = (phases.beside(share, latent) for share in phases.shares(self.schedule, time))
-        eps = network(alpha * latent + sigma * noise, time, network.encode(text), key=key_dropout)
+        state = phases.noised(self.schedule, latent, noise, time)
+        eps = network(state, time, network.encode(text), key=key_dropout)
         return {"loss": jnp.mean((eps - noise) ** 2)}
 
 
@@ -358,11 +358,7 @@ class DistillationTask(TeacherTask):
         time, before, phase = cut.times[point], cut.before[point], cut.phase[point]
         edge = cut.edges[phase]
         noise = jax.random.normal(key_noise, latent.shape)
-        noised = lambda t, noise: sum(
-            phases.beside(share, latent) * part
-            for share, part in zip(phases.shares(schedule, t), (latent, noise), strict=True)
-        )
-        state = noised(time, noise)
+        state = phases.noised(schedule, latent, noise, time)
         limits = {"minval": config.least_guidance, "maxval": config.most_guidance}
         guidance = jax.random.uniform(key_guidance, (size,), **limits)
 
@@ -374,7 +370,7 @@ class DistillationTask(TeacherTask):
         eps = target(solved, before, target.encode(text), guidance)
         end = self._end(phases.target_end, solved, eps, before, edge)
         critic_time = jax.random.randint(key_critic, (size,), edge, cut.edges[phase + 1] + 1)
-        real = noised(critic_time, jax.random.normal(key_real, latent.shape))
+        real = phases.noised(schedule, latent, jax.random.normal(key_real, latent.shape), critic_time)
         fresh = jax.random.normal(key_fresh, latent.shape)
         return DistillationBatch(state, time, edge, guidance, text, end, critic_time, fresh, real)
 
