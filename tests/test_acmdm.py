@@ -15,9 +15,9 @@ from f3amd_lib.networks.acmdm import (
     rotary_angles,
     rotary_base,
     rotated,
-    time_features,
 )
 from f3amd_lib.networks.acmdm_control import Control, control_branch, controlled
+from f3amd_lib.networks.attention import waves
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig, draw_hidden, frames_known, spoil
 
 SIZE = {"num_joints": 5, "channels": 4, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 6}
@@ -103,7 +103,7 @@ def test_patches_put_together_again_are_the_state(patch):
 
 
 def test_time_has_cosines_first():
-    features = time_features(jnp.asarray([0.0, 0.5]))
+    features = waves(jnp.asarray([0.0, 0.5]), 256, 128)
     assert features.shape == (2, 256)
     np.testing.assert_allclose(features[0], np.repeat([1.0, 0.0], 128))
     np.testing.assert_allclose(features[1, [0, 128]], [np.cos(0.5), np.sin(0.5)], rtol=1e-6)

@@ -56,7 +56,7 @@ def acmdm(seed: int):
     from test_text_motion import JOINTS, POOLED, RAW, SIZE, recipe
 
     config = ACMDMConfig(**SIZE, channels=3, window=16)
-    task = TextMotionTask(config, recipe(seed=seed), straight(), RAW, POOLED)
+    task = TextMotionTask(config, recipe(seed=seed), RAW, straight(), POOLED)
     state, _ = optimise(task, chunk=3, progress=False)
     told = TextCondition(POOLED[:6], jnp.ones((6, 16), bool))
     noise = jax.random.normal(jax.random.key(seed), (6, 16, JOINTS, 3))

@@ -9,16 +9,13 @@ from flax import nnx
 from f3amd_lib.data.text_encoders import TextEmbeddings
 from f3amd_lib.data.text_motions import ClipTable, draw_clips
 from f3amd_lib.networks.text_motion import HalvingConvolution, TextMotionConfig, TextMotionNetwork
-from f3amd_lib.training.evaluator_task import (
-    EvaluatorTask,
-    EvaluatorTraining,
-    contrastive_loss,
-    embedded_captions,
-    evaluator_network,
-)
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.evaluator_task import EvaluatorTask, EvaluatorTraining, contrastive_loss, embedded_captions
 from f3amd_lib.training.optimise import optimise
 
-SMALL = TextMotionConfig(5, 6, movement_width=16, motion_hidden=16, text_hidden=16, embedding_width=8)
+SMALL = TextMotionConfig(
+    features=5, token_width=6, movement_width=16, motion_hidden=16, text_hidden=16, embedding_width=8
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +83,14 @@ def toy(honest: bool, pairs=4, clips=64, seed=0) -> EvaluatorTask:
     tokens = (words[told] + 0.1 * generator.normal(size=(2 * clips, 3, 6))).astype(np.float32)
     embedded = TextEmbeddings(tokens, np.ones((2 * clips, 3), bool), tokens.mean(axis=1))
     captions = embedded_captions(embedded, [f"{k:02d}" for k in np.repeat(kind, 2)])
-    return EvaluatorTask("toy", "toy", SMALL, EvaluatorTraining(100, 16, 3e-3, seed, num_frames=48), table, captions)
+    return EvaluatorTask(SMALL, EvaluatorTraining(100, 16, 3e-3, seed, num_frames=48), table, captions, "toy")
 
 
 def held_out_accuracy(honest: bool, seed: int) -> float:
     """Share of texts that find their motion among clips that were never trained on."""
     task, other = toy(honest, seed=seed), toy(honest, seed=seed + 100)
     # The same words for the same rates: only the clips are new.
-    other = EvaluatorTask("toy", "toy", SMALL, other.config, other.clips, task.captions)
+    other = EvaluatorTask(SMALL, other.config, other.clips, task.captions, "toy")
     state, history = optimise(task, progress=False)
     batch, _ = other.draw(None, jax.random.key(5))
     assert history[-1]["loss"] < history[0]["loss"]
@@ -109,20 +106,18 @@ def test_it_learns_what_captions_tell_and_not_what_they_do_not():
 
 def test_a_batch_carries_the_captions_of_its_clips():
     task = toy(True)
-    batch, _ = task.draw(None, jax.random.key(3))
+    (motion, captions), _ = task.draw(None, jax.random.key(3))
     again = draw_clips(jax.random.split(jax.random.key(3))[0], task.clips, 16, 48)
-    assert np.array_equal(batch.motion.caption, again.caption)
-    assert np.array_equal(batch.captions.pair, task.captions.pair[batch.motion.caption])
-    rate = np.abs(
-        np.diff(np.unwrap(np.arctan2(batch.motion.motion[:, :20, 0], batch.motion.motion[:, :20, 1]), axis=1))
-    )
-    assert np.allclose(rate.mean(axis=1), 0.1 + 0.3 * np.asarray(batch.captions.pair), atol=1e-4)
+    assert np.array_equal(motion.caption, again.caption)
+    assert np.array_equal(captions.pair, task.captions.pair[motion.caption])
+    rate = np.abs(np.diff(np.unwrap(np.arctan2(motion.motion[:, :20, 0], motion.motion[:, :20, 1]), axis=1)))
+    assert np.allclose(rate.mean(axis=1), 0.1 + 0.3 * np.asarray(captions.pair), atol=1e-4)
 
 
 def test_weights_go_back_into_the_network(network):
-    params = nnx.split(network, nnx.Param, ...)[1]
+    params = nnx.state(network)
     motion = jax.random.normal(jax.random.key(0), (2, 8, 5))
-    again = evaluator_network(SMALL, params).embed_motion(motion, jnp.array([8, 8]))
+    again = network_with(SMALL, params).embed_motion(motion, jnp.array([8, 8]))
     assert np.array_equal(again, network.embed_motion(motion, jnp.array([8, 8])))
 
 

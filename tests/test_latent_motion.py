@@ -65,7 +65,7 @@ def teacher_weights():
 
 def distillation(**settings):
     config = recipe(**{"ema_decay": 0.95, "num_phases": 2, **settings})
-    return DistillationTask(TEACHER, teacher_weights(), config, SCHEDULE, latents())
+    return DistillationTask(TEACHER, config, latents(), SCHEDULE, teacher_weights())
 
 
 @functools.cache
@@ -107,7 +107,7 @@ def test_recipes_are_the_papers_and_the_presets():
         with pytest.raises(ValueError, match=message):
             recipe(**settings)
     with pytest.raises(ValueError, match="set ema_decay"):
-        DistillationTask(TEACHER, teacher_weights(), recipe(), SCHEDULE, latents())
+        DistillationTask(TEACHER, recipe(), latents(), SCHEDULE, teacher_weights())
 
 
 # --------------------------------------------------------------------------------------------------------- autoencoder
@@ -205,7 +205,7 @@ def test_a_clips_captions_are_its_own_and_some_are_the_empty_one():
         mean=jnp.arange(5.0)[:, None, None] * jnp.ones((1, 2, 3)), pooled=jnp.arange(7.0)[:, None].repeat(4, 1)
     )
     marked = marked._replace(empty=jnp.full(4, -1.0))
-    task = TeacherTask(TEACHER, recipe(batch_size=512, text_dropout=0.25), SCHEDULE, marked)
+    task = TeacherTask(TEACHER, recipe(batch_size=512, text_dropout=0.25), marked, SCHEDULE)
     (latent, text), _ = task.draw(None, jax.random.key(0))
     owner, caption = (np.rint(np.asarray(column)).astype(int) for column in (latent[:, 0, 0], text[:, 0]))
     assert np.mean(caption == -1) == pytest.approx(0.25, abs=0.06)
@@ -232,7 +232,7 @@ class Looking:
 def test_a_teacher_is_asked_for_the_noise_at_the_level_that_it_is_told(monkeypatch):
     network = Looking()
     monkeypatch.setattr(latent_motion, "network_with", lambda config, params: network)
-    task = TeacherTask(TEACHER, recipe(), SCHEDULE, latents())
+    task = TeacherTask(TEACHER, recipe(), latents(), SCHEDULE)
     clean, text = normal(3, 512, 2, 3), normal(4, 512, 4)
     loss, (terms, _) = task.loss({}, None, (clean, text), jax.random.key(2))
     ((state, time, context),) = network.asked
@@ -509,12 +509,12 @@ def toys():
     made = {}
     for seed in range(3):
         config = LatentMotionTraining(1500, 256, 3e-3, 100, seed=seed, ema_decay=0.99)
-        teacher = optimise(TeacherTask(TOY, config, SCHEDULE, toy_table()), chunk=1500, progress=False)[0].averaged
+        teacher = optimise(TeacherTask(TOY, config, toy_table(), SCHEDULE), chunk=1500, progress=False)[0].averaged
         students = {}
         for num_phases in (1, 2, 4):
             settings = {"num_phases": num_phases, "adversarial_weight": 0.0, "ema_decay": 0.95, "huber_width": 0.05}
             config = LatentMotionTraining(1500, 256, 1e-3, 50, seed=seed, **settings)
-            task = DistillationTask(TOY, teacher, config, SCHEDULE, toy_table())
+            task = DistillationTask(TOY, config, toy_table(), SCHEDULE, teacher)
             students[num_phases] = optimise(task, chunk=1500, progress=False)[0].params["student"], task.student_config
         made[seed] = teacher, students
     return made

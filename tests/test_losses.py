@@ -176,8 +176,8 @@ def test_section_4_5_all_weights_are_one_and_the_seam_literal():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"foot": -1.0}, "foot must be >= 0"),
-        ({"ird": float("nan")}, "ird must be >= 0"),
+        ({"foot": -1.0}, "loss weight foot must be 0 or more"),
+        ({"ird": float("nan")}, "loss weight ird must be 0 or more"),
         ({"sample": float("inf")}, "sample"),
         ({"ird_form": "exces"}, "'exces'"),
     ],

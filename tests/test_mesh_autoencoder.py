@@ -90,7 +90,7 @@ def test_what_makes_no_sense_is_refused():
     for changes, words in (
         ({"coarse_levels": (300, 8)}, "levels must have fewer and fewer vertices, got .252, 300, 8.: .* too large"),
         ({"channels": (6,)}, "must be as many whole numbers"),
-        ({"around": (5, 0)}, "must be as many whole numbers"),
+        ({"around": (5, 0)}, "around must be whole numbers above 0"),
         ({"up": (3, 9)}, "up asks for more neighbours"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -64,7 +64,7 @@ def test_the_task_trains_on_training_clips_and_their_captions_alone(data, cache_
     task, _ = text_judge.judge_task(data, OneVectorAWord(), EvaluatorTraining(num_steps=1), **SIZES)
     assert len(task.clips.start) == len(data.members("train")) == 16
     assert len(task.captions.tokens) == 32 and len(np.unique(task.captions.pair)) == 4
-    assert task.network.features == 70 and task.network.token_width == 8
+    assert task.model_config.features == 70 and task.model_config.token_width == 8
 
 
 def test_a_motion_is_embedded_alike_wherever_it_stands_and_in_any_batch(data, judge):

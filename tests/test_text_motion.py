@@ -281,7 +281,7 @@ def test_a_text_decides_what_is_learnt():
     clips = ClipTable(states.reshape(16, JOINTS, 3), *(jnp.asarray(column) for column in columns))
     config = ACMDMConfig(**SIZE, channels=3, window=8, objective="x0")
     task = TextMotionTask(
-        config, recipe(num_steps=60, batch_size=16, text_dropout=0.0), straight(), clips, jnp.eye(4)[:2]
+        config, recipe(num_steps=60, batch_size=16, text_dropout=0.0), clips, straight(), jnp.eye(4)[:2]
     )
     _, state = rehearse(task, task.draw(None, jax.random.key(1))[0], 60)
     network = network_with(config, state.params)
@@ -304,7 +304,7 @@ def test_a_text_decides_what_is_learnt():
 )
 def test_every_form_takes_training_steps(family, network, training, schedule):
     clips = table(latent_codec().encode(NORMALISED, MASK), MASK[:, ::4])
-    task = TextMotionTask(family(**{**SIZE, "window": 10, **network}), recipe(**training), schedule, clips, POOLED)
+    task = TextMotionTask(family(**{**SIZE, "window": 10, **network}), recipe(**training), clips, schedule, POOLED)
     before, after = rehearse(task, task.draw(None, jax.random.key(1))[0])
     # From zero gates on, the last layer moves first and the others after it.
     assert {"['output']['kernel']", "['blocks'][0]['query_key_value']['kernel']", "['text']['kernel']"} <= changed(
@@ -314,7 +314,7 @@ def test_every_form_takes_training_steps(family, network, training, schedule):
 
 
 def test_a_task_resumes_where_it_belongs(tmp_path):
-    task = TextMotionTask(ACMDMConfig(**SIZE, channels=3, window=16), recipe(), straight(), RAW, POOLED)
+    task = TextMotionTask(ACMDMConfig(**SIZE, channels=3, window=16), recipe(), RAW, straight(), POOLED)
     state = initial_state(task)
     save_state(tmp_path / "state.safetensors", task, state)
     again = restore_state(tmp_path / "state.safetensors", task)
@@ -332,7 +332,7 @@ def test_a_control_branch_trains_beside_a_frozen_base():
     config = ACMDMConfig(**SIZE, window=10)
     base = nnx.state(presets.build_from_config(config, jax.random.key(7)))
     base = jax.tree.map(lambda leaf: leaf + 0.1, base)
-    task = ControlTask(config, recipe(control_dropout=0.0), straight(), clips, POOLED, base, codec, (0, 2))
+    task = ControlTask(config, recipe(control_dropout=0.0), clips, straight(), POOLED, base, codec, (0, 2))
     batch, key = task.draw(None, jax.random.key(8))
     states, positions, told, control = batch
     assert states.shape == (4, 10, JOINTS, 4) and positions.shape == control.positions.shape == (4, FRAMES, JOINTS, 3)
@@ -366,10 +366,10 @@ def test_a_trained_branch_takes_a_joint_where_it_is_asked_to_be():
     short = {"batch_size": 64, "learning_rate": 4e-3, "schedule": "warmup_cosine", "warmup_steps": 30}
     training = TextMotionTraining(num_steps=200, **short, ema_decay=0.97, gradient_clip=1.0, seed=0)
     nothing_said = jnp.zeros((number, 4))
-    state, _ = optimise(TextMotionTask(config, training, straight(), clips, nothing_said), progress=False)
+    state, _ = optimise(TextMotionTask(config, training, clips, straight(), nothing_said), progress=False)
     base, both = state.averaged, clips._replace(frames=(rows, rows[:, None]))
     training = dataclasses.replace(training, num_steps=250)
-    task = ControlTask(config, training, straight(), both, nothing_said, base, codec, (0, 1))
+    task = ControlTask(config, training, both, straight(), nothing_said, base, codec, (0, 1))
     state, _ = optimise(task, progress=False)
 
     told = TextCondition(jnp.zeros((64, 4)), jnp.ones((64, frames), bool))

@@ -86,6 +86,12 @@ def beside(x, state):
     return x if np.ndim(x) == 0 else x.reshape(-1, *[1] * (state.ndim - 1))
 
 
+def noised(schedule: NoiseSchedule, x0, noise, time):
+    """Return alpha x0 + sigma noise at level numbers `time`, [B] or a scalar; x0 and noise [B, ...]."""
+    alpha, sigma = (beside(share, x0) for share in shares(schedule, time))
+    return alpha * x0 + sigma * noise
+
+
 def jump(schedule: NoiseSchedule, state, eps, time, time_next):
     """Move a state along the straight line that one noise estimate says (MotionPCM Eqs 8, 10, 15, 16 and 19).
 
@@ -274,6 +280,6 @@ def sample_latent_consistency(predict: Callable, schedule: NoiseSchedule, noise,
     for number, time in enumerate(times):
         x0 = latent_consistency_end(schedule, state, predict(state, time), time)
         if number < last:
-            alpha, sigma = shares(schedule, times[number + 1])
-            state = alpha * x0 + sigma * jax.random.normal(jax.random.fold_in(key, number), x0.shape)
+            fresh = jax.random.normal(jax.random.fold_in(key, number), x0.shape)
+            state = noised(schedule, x0, fresh, times[number + 1])
     return x0

@@ -37,13 +37,7 @@ from f3amd_lib.motion.redundant import canonical_start, essential_features
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.text_motion import TextMotionConfig
 from f3amd_lib.training import checkpoints
-from f3amd_lib.training.evaluator_task import (
-    EvaluatorTask,
-    EvaluatorTraining,
-    blank_evaluator,
-    embedded_captions,
-    evaluator_network,
-)
+from f3amd_lib.training.evaluator_task import EvaluatorTask, EvaluatorTraining, embedded_captions
 from f3amd_lib.training.optimise import optimise
 
 SIGHT = 0.9
@@ -105,12 +99,12 @@ class TextJudge:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _embed_motion(config, params, features, length):
-    return evaluator_network(config, params).embed_motion(features, length)
+    return checkpoints.network_with(config, params).embed_motion(features, length)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _embed_text(config, params, tokens, mask):
-    return evaluator_network(config, params).embed_text(tokens, mask)
+    return checkpoints.network_with(config, params).embed_text(tokens, mask)
 
 
 def judged_features(data: TextMotions) -> tuple[np.ndarray, AxisNormaliser]:
@@ -143,9 +137,10 @@ def judge_task(
     features, normaliser = judged_features(training_split)
     table, captions = clip_table(training_split, features)
     pairs = [pair for pair, said in zip(training_split.pairs, training_split.captions, strict=True) for _ in said]
-    network = TextMotionConfig(features.shape[-1], encoder.width, **sizes)
+    network = TextMotionConfig(features=features.shape[-1], token_width=encoder.width, **sizes)
     told = embedded_captions(embed_captions(captions, encoder), pairs)
-    return EvaluatorTask(data.fingerprint, encoder.identity, network, training, table, told), normaliser
+    about = {"text_encoder": encoder.identity, "dataset_fingerprint": data.fingerprint}
+    return EvaluatorTask(network, training, table, told, **about), normaliser
 
 
 def train_judge(
@@ -167,7 +162,7 @@ def train_judge(
         return None
     identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}
     record = run_record(profile="none", dataset=data, seed=training.seed, **identity, history=history)
-    return TextJudge(task.network, state.params, normaliser, data.skeleton, encoder.identity, record)
+    return TextJudge(task.model_config, state.params, normaliser, data.skeleton, encoder.identity, record)
 
 
 def save_judge(path: Path, judge: TextJudge) -> None:
@@ -188,7 +183,7 @@ def load_judge(path: Path) -> TextJudge:
         numbers = jax.ShapeDtypeStruct((config.features,), jnp.float32)
         offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)
         normaliser = {"mean": numbers, "deviation": numbers}
-        return {"params": blank_evaluator(config)[1], "normaliser": normaliser, "offsets": offsets}
+        return {"params": checkpoints.weights_shapes(config), "normaliser": normaliser, "offsets": offsets}
 
     with checkpoints.errors_name(path):
         tree, metadata = checkpoints.load_tree(path, template)

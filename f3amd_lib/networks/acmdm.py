@@ -19,7 +19,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES
-from f3amd_lib.networks.attention import check_num_heads
+from f3amd_lib.networks.attention import check_num_heads, waves
 from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 
 TIME_FEATURES = 256
@@ -158,13 +158,6 @@ def rotated(x, angles):
     return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
 
 
-def time_features(time):
-    """Return 128 cosines and then 128 sines of a time, [...] -> [..., 256], from one radian a unit downwards."""
-    half = TIME_FEATURES // 2
-    angle = jnp.asarray(time)[..., None] * 10000.0 ** (-jnp.arange(half) / half)
-    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-
-
 def block_causal(num_queries: int, num_keys: int, tokens_per_block: int) -> np.ndarray:
     """Return which keys the last queries may see: those of their own block and of earlier ones, [Q, K]."""
     block = np.arange(num_keys) // tokens_per_block
@@ -221,17 +214,14 @@ class ACMDMBlock(nnx.Module):
         Returns:
           (tokens [B, T, d], keys and values of earlier and these tokens).
         """
-        adaptive = hasattr(self, "modulation")
-        if adaptive:
-            shift, scale, gate, *feed_forward = jnp.split(self.modulation(jax.nn.silu(c)), 6, axis=-1)
-        normal = self.attention_norm(x)
-        update, past = self._attend(modulated(normal, shift, scale) if adaptive else normal, angles, mask, past)
-        x = x + gate * update if adaptive else x + update
-        normal = self.feed_forward_norm(x)
-        if not adaptive:
-            return x + self._feed_forward(normal), past
+        parts = [0.0, 0.0, 1.0] * 2  # these change nothing
+        if hasattr(self, "modulation"):
+            parts = jnp.split(self.modulation(jax.nn.silu(c)), 6, axis=-1)
+        shift, scale, gate, *feed_forward = parts
+        update, past = self._attend(modulated(self.attention_norm(x), shift, scale), angles, mask, past)
+        x = x + gate * update
         shift, scale, gate = feed_forward
-        return x + gate * self._feed_forward(modulated(normal, shift, scale)), past
+        return x + gate * self._feed_forward(modulated(self.feed_forward_norm(x), shift, scale)), past
 
     def _attend(self, x, angles, mask, past):
         heads = self.query_key_value(x).reshape(*x.shape[:2], 3, self.num_heads, -1)
@@ -288,7 +278,7 @@ class Trunk(nnx.Module):
 
     def conditioned(self, time, context: TextContext):
         """Return (time, text) in network width: [B, 1, d] each, or [B, tokens, d] for a time of its own a frame."""
-        time = self.time_second(jax.nn.silu(self.time_first(time_features(time))))
+        time = self.time_second(jax.nn.silu(self.time_first(waves(time, TIME_FEATURES, TIME_FEATURES / 2))))
         time = time[:, None] if time.ndim == 2 else jnp.repeat(time, self.config.num_patches, axis=1)
         return time, context.text[:, None]
 

@@ -21,7 +21,7 @@ class CheckedConfig:
     """A config that refuses what makes no sense and survives JSON: fields, and what they may be.
 
     Raises:
-      ValueError: for a value of the wrong type, a number that is not positive, an unknown choice.
+      ValueError: for a value of the wrong type, a number that is not positive, an unknown choice, a dropout of all.
     """
 
     family: ClassVar[str] = ""
@@ -36,6 +36,13 @@ class CheckedConfig:
         for field in dataclasses.fields(self):
             if field.type in _TYPES:
                 self._check(field.name, _TYPES[field.type])
+            elif field.type == "tuple[int, ...]":
+                sizes = tuple(getattr(self, field.name))
+                object.__setattr__(self, field.name, sizes)
+                if any(type(size) is not int or size < 1 for size in sizes):
+                    raise ValueError(f"{field.name} must be whole numbers above 0, got {sizes}")
+        if getattr(self, "dropout", 0.0) >= 1.0:
+            raise ValueError(f"dropout must be below 1, got {self.dropout}")
 
     def _check(self, name: str, wanted: type) -> None:
         value = getattr(self, name)
@@ -87,7 +94,7 @@ class NetworkConfig(CheckedConfig):
       dropout: share of numbers that Transformer blocks drop in training; not in the paper, 0 here.
 
     Raises:
-      ValueError: as `CheckedConfig`, and for a window of less than 2 frames or a dropout of all.
+      ValueError: as `CheckedConfig`, and for a window of less than 2 frames.
     """
 
     may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
@@ -105,8 +112,6 @@ class NetworkConfig(CheckedConfig):
         super().__post_init__()
         if self.window < 2:
             raise ValueError(f"window must be at least 2 frames, got {self.window}")
-        if self.dropout >= 1.0:
-            raise ValueError(f"dropout must be below 1, got {self.dropout}")
 
     def state_shape(self, batch: int) -> tuple[int, ...]:
         """Return the shape of a noisy state, [B, T, C]."""

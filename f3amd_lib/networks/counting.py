@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import jax
+from jax.extend.core import jaxprs_in_params
 
 
 def count_flops(function, *arguments) -> int:
@@ -45,16 +46,8 @@ def _count_equation(equation) -> int:
         return 2 * equation.outvars[0].aval.size * (kernel.size // outputs)
     if name == "while":
         raise ValueError("a while loop has no fixed number of rounds: its operations are unknown")
-    inner = [_count(jaxpr) for jaxpr in _inner_jaxprs(parameters)]
+    # What an equation calls: jit, scan, custom gradients, branches.
+    inner = [_count(jaxpr) for jaxpr in jaxprs_in_params(parameters)]
     if name == "cond":
         return max(inner)
     return sum(inner) * (parameters["length"] if name == "scan" else 1)
-
-
-def _inner_jaxprs(parameters: dict):
-    """Yield the jaxprs that an equation calls (jit, scan, custom gradients, branches)."""
-    for value in parameters.values():
-        for item in value if isinstance(value, (list, tuple)) else (value,):
-            item = getattr(item, "jaxpr", item)
-            if hasattr(item, "eqns"):
-                yield item

@@ -53,13 +53,10 @@ class MeshAutoencoderConfig(CheckedConfig):
     up: tuple[int, ...] = (11, 14, 11, 1)
 
     def __post_init__(self):
-        lists = ("coarse_levels", "channels", "around", "down", "up")
-        for name in lists:
-            object.__setattr__(self, name, tuple(getattr(self, name)))
         super().__post_init__()
-        sizes = [getattr(self, name) for name in lists]
-        if len(set(map(len, sizes))) != 1 or any(type(size) is not int or size < 1 for one in sizes for size in one):
-            raise ValueError(f"{', '.join(lists)} must be as many whole numbers above 0 each, got {sizes}")
+        lists = {name: getattr(self, name) for name in ("coarse_levels", "channels", "around", "down", "up")}
+        if len(set(map(len, lists.values()))) != 1:
+            raise ValueError(f"{', '.join(lists)} must be as many whole numbers each, got {list(lists.values())}")
         fine, coarse = self.levels[:-1], self.levels[1:]
         if any(few >= many for many, few in zip(fine, coarse, strict=True)):
             raise ValueError(f"levels must have fewer and fewer vertices, got {self.levels}: this network is too large")

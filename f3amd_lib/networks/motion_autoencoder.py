@@ -53,12 +53,6 @@ class AutoencoderConfig(CheckedConfig):
     dilations: tuple[int, ...] = (9, 3, 1)
     dropout: float = 0.2
 
-    def __post_init__(self):
-        object.__setattr__(self, "dilations", tuple(self.dilations))
-        super().__post_init__()
-        if self.dropout >= 1.0 or any(type(size) is not int or size < 1 for size in self.dilations):
-            raise ValueError(f"dropout must be below 1 and dilations whole, got {self.dropout}, {self.dilations}")
-
     @property
     def frames_per_latent(self) -> int:
         """Frames that one latent frame stands for."""

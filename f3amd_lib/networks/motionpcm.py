@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from f3amd_lib.networks.attention import TransformerBlock, check_num_heads
+from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, waves
 from f3amd_lib.networks.config import CheckedConfig
 
 GUIDANCE_SCALE = 1000.0
@@ -62,8 +62,8 @@ class SkipTransformerConfig(CheckedConfig):
     def __post_init__(self):
         super().__post_init__()
         check_num_heads(self.latent_width, self.num_heads)
-        if self.depth % 2 == 0 or self.dropout >= 1.0:
-            raise ValueError(f"depth must be odd and dropout below 1, got {self.depth} and {self.dropout}")
+        if self.depth % 2 == 0:
+            raise ValueError(f"depth must be odd, got {self.depth}")
 
 
 class SkipTransformer(nnx.Module):
@@ -241,13 +241,6 @@ class LatentDenoiserConfig(SkipTransformerConfig):
     def condition_shapes(self, batch: int):
         """Return the shape of captions, [B, text_width]."""
         return jax.ShapeDtypeStruct((batch, self.text_width), jnp.float32)
-
-
-def waves(x, width: int, last: float, *, sine_first: bool = False):
-    """Return sinusoids of x, [...] -> [..., width], whose frequencies fall as 10000^(-i / last)."""
-    angle = jnp.asarray(x, jnp.float32)[..., None] * 10000.0 ** (-jnp.arange(width // 2) / last)
-    parts = jnp.cos(angle), jnp.sin(angle)
-    return jnp.concatenate(parts[::-1] if sine_first else parts, axis=-1)
 
 
 class LatentDenoiser(nnx.Module):

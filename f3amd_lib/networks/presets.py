@@ -32,6 +32,7 @@ from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
 from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig
 from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
+from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
 
 FAMILIES = {
     config.family: (config, network)
@@ -40,7 +41,7 @@ FAMILIES = {
         (AutoencoderConfig, MotionAutoencoder), (MeshAutoencoderConfig, MeshAutoencoder),
         (motionpcm.LatentAutoencoderConfig, motionpcm.LatentAutoencoder),
         (motionpcm.LatentDenoiserConfig, motionpcm.LatentDenoiser),
-        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator),
+        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator), (TextMotionConfig, TextMotionNetwork),
     )
 }  # fmt: skip
 """Config and network of each family."""
@@ -215,14 +216,15 @@ def build_from_config(config: CheckedConfig, key) -> nnx.Module:
     return FAMILIES[config.family][1](config, rngs=LayerKeys(key))
 
 
-@functools.lru_cache(maxsize=2)
-def _abstract(config: CheckedConfig):
-    return nnx.eval_shape(lambda: build_from_config(config, jax.random.key(0)))
+@functools.lru_cache(maxsize=32)
+def blank_network(config: CheckedConfig) -> tuple:
+    """Return a network's structure and the shapes of its weights, without building arrays."""
+    return nnx.split(nnx.eval_shape(lambda: build_from_config(config, jax.random.key(0))))
 
 
 def count_parameters(config: CheckedConfig) -> int:
     """Return the number of learned numbers, without building arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(nnx.state(_abstract(config), nnx.Param)))
+    return sum(leaf.size for leaf in jax.tree.leaves(blank_network(config)[1]))
 
 
 def count_model_flops(config: CheckedConfig) -> tuple[int, int]:
@@ -235,7 +237,7 @@ def count_model_flops(config: CheckedConfig) -> tuple[int, int]:
       (operations of encoding the condition, once a round; operations of one evaluation of the
       denoiser, once a step). See `counting.count_flops` for what is counted.
     """
-    graph, state = nnx.split(_abstract(config))
+    graph, state = blank_network(config)
     condition = config.condition_shapes(1)
     x_noisy = jax.ShapeDtypeStruct(config.state_shape(1), jnp.float32)
     sigma = jax.ShapeDtypeStruct((1,), jnp.float32)

@@ -9,17 +9,18 @@ Source: Guo et al. 2022 (HumanML3D), the evaluator of its released code; sizes i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from f3amd_lib.networks.attention import dropout
-from f3amd_lib.networks.config import scaled_normal
+from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 
 
-@dataclass(frozen=True)
-class TextMotionConfig:
+@dataclass(frozen=True, kw_only=True)
+class TextMotionConfig(CheckedConfig):
     """Sizes of both encoders; those of the published evaluator are 512, 1024, 512 and 512.
 
     Attributes:
@@ -30,6 +31,9 @@ class TextMotionConfig:
       embedding_width: of the common space.
       dropout: after each convolution, in training.
     """
+
+    family: ClassVar[str] = "text-to-motion judge"
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
 
     features: int
     token_width: int
@@ -62,8 +66,9 @@ class _BothWays(nnx.Module):
     def __init__(self, width_in: int, hidden: int, width_out: int, *, rngs: nnx.Rngs):
         self.inside = nnx.Linear(width_in, hidden, rngs=rngs)
         self.start = nnx.Param(scaled_normal(rngs.params(), 0.1, (2, hidden)))
-        self.forwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), return_carry=True)
-        self.backwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), return_carry=True, reverse=True)
+        options = {"return_carry": True, "rngs": False}  # its start is given: nothing is drawn
+        self.forwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), **options)
+        self.backwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), reverse=True, **options)
         self.middle = nnx.Linear(2 * hidden, hidden, rngs=rngs)
         self.norm = nnx.LayerNorm(hidden, rngs=rngs)
         self.output = nnx.Linear(hidden, width_out, rngs=rngs)

@@ -27,7 +27,7 @@ from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.networks.presets import build_from_config, config_from_dict
+from f3amd_lib.networks.presets import blank_network, config_from_dict
 
 FORMAT = "f3amd-1"
 
@@ -169,16 +169,10 @@ def described_skeleton(metadata: dict, offsets) -> Skeleton:
     return Skeleton(tuple(metadata["joints"]), tuple(metadata["parents"]), np.asarray(offsets, np.float64), end_sites)
 
 
-@functools.lru_cache(maxsize=32)
-def _blank(config: NetworkConfig) -> tuple:
-    """Return a network's structure and the shapes of its weights."""
-    return nnx.split(nnx.eval_shape(lambda: build_from_config(config, jax.random.key(0))))
-
-
 def network_with(config: NetworkConfig, params) -> nnx.Module:
     """Return a network with the given weights."""
     # A fresh tree, so that editing the network leaves the given weights alone.
-    return nnx.merge(_blank(config)[0], jax.tree.map(lambda leaf: leaf, params))
+    return nnx.merge(blank_network(config)[0], jax.tree.map(lambda leaf: leaf, params))
 
 
 @dataclass(frozen=True)
@@ -283,7 +277,7 @@ def unpacked_weights(packed: Any) -> Any:
 
 def weights_shapes(config: NetworkConfig) -> Any:
     """Return the shapes of a network's weights."""
-    return _blank(config)[1]
+    return blank_network(config)[1]
 
 
 def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -11,13 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import nnx
 
 from f3amd_lib.data.text_encoders import TextEmbeddings
-from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, ClipTable, MotionBatch, draw_clips
-from f3amd_lib.networks.config import LayerKeys
-from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
-from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, draw_clips
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 
 
 @dataclass(frozen=True)
@@ -63,13 +60,6 @@ class Captions(NamedTuple):
     pair: jax.Array
 
 
-class EvaluatorBatch(NamedTuple):
-    """Motions with the captions drawn for them, one each."""
-
-    motion: MotionBatch
-    captions: Captions
-
-
 def contrastive_loss(text, motion, pair):
     """Return how badly texts find their motions and motions their texts among the batch.
 
@@ -92,60 +82,38 @@ def contrastive_loss(text, motion, pair):
     return sum(both) / 2, jnp.mean(jnp.argmax(score, axis=1) == own)
 
 
-@functools.lru_cache(maxsize=8)
-def blank_evaluator(config: TextMotionConfig):
-    """Return the network's structure and the shapes of its weights."""
-    return nnx.split(
-        nnx.eval_shape(lambda: TextMotionNetwork(config, rngs=LayerKeys(jax.random.key(0)))), nnx.Param, ...
-    )
-
-
-def evaluator_network(config: TextMotionConfig, params) -> TextMotionNetwork:
-    """Return the network with the given weights."""
-    graph, _, rest = blank_evaluator(config)
-    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, params), rest)
-
-
 @frozen_tree("clips", "captions")
-class EvaluatorTask(Task):
-    """A judge to train.
+class EvaluatorTask(ClipsTask):
+    """A judge to train on clips of features in network units.
 
     Attributes:
-      dataset_fingerprint, text_encoder, network, config: what decides the weights.
-      clips: of the training split, features in network units.
       captions: of these clips.
+      text_encoder: identity of the encoder that embedded them.
     """
 
     name = "text-to-motion judge"
 
-    dataset_fingerprint: str
-    text_encoder: str
-    network: TextMotionConfig
-    config: EvaluatorTraining
-    clips: ClipTable
     captions: Captions
+    text_encoder: str
 
     def identity(self) -> dict:
         """Return all that decides the weights."""
-        settings = {"evaluator": dataclasses.asdict(self.network), "training": dataclasses.asdict(self.config)}
+        settings = {"evaluator": dataclasses.asdict(self.model_config), "training": dataclasses.asdict(self.config)}
         return {"dataset_fingerprint": self.dataset_fingerprint, "text_encoder": self.text_encoder, **settings}
 
-    def init(self, key):
-        """Return initial weights."""
-        return nnx.split(TextMotionNetwork(self.network, rngs=LayerKeys(key)), nnx.Param, ...)[1], None
-
     def draw(self, state: TrainingState | None, key):
-        """Draw a batch; return (batch, key of the dropout)."""
+        """Draw motions and a caption of each; return ((motions, captions), key of the dropout)."""
         key_draw, key_dropout = jax.random.split(key)
         motion = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
-        return EvaluatorBatch(motion, jax.tree.map(lambda rows: rows[motion.caption], self.captions)), key_dropout
+        return (motion, jax.tree.map(lambda rows: rows[motion.caption], self.captions)), key_dropout
 
-    def terms(self, params, batch: EvaluatorBatch, key, training=True) -> dict:
+    def terms(self, params, batch, key, training=True) -> dict:
         """Return loss and in-batch accuracy; out of training without dropout."""
-        network = evaluator_network(self.network, params)
-        text = network.embed_text(batch.captions.tokens, batch.captions.mask)
-        motion = network.embed_motion(batch.motion.motion, batch.motion.length, key if training else None)
-        loss, accuracy = contrastive_loss(text, motion, batch.captions.pair)
+        motion, captions = batch
+        network = network_with(self.model_config, params)
+        text = network.embed_text(captions.tokens, captions.mask)
+        seen = network.embed_motion(motion.motion, motion.length, key if training else None)
+        loss, accuracy = contrastive_loss(text, seen, captions.pair)
         return {"loss": loss, "accuracy": accuracy}
 
 

@@ -162,19 +162,13 @@ def find_latent_model(dataset: str, name: str, num_steps: int | None = None) -> 
     )
 
 
-def captioned_latents(before: LatentModel, data: TextMotions, encoder: TextEncoder, num_frames: int):
-    """Return a `LatentTable` of clips with their captions' embeddings; the zero vector stands for no caption."""
-    captions = [caption for several in data.captions for caption in several]
-    pooled = pooled_captions(captions, encoder)
-    model = network_with(before.autoencoder, before.autoencoder_params)
-    return latent_motion.latent_table(model, before.statistics, data, pooled, jnp.zeros_like(pooled[0]), num_frames)
-
-
 def _clips(part: TextMotions, encoder: TextEncoder, before: LatentModel | None, statistics, config):
-    """Return the clips of a split as a stage draws them: vectors for the autoencoder, else latents."""
+    """Return the clips of a split as a stage draws them: vectors for the autoencoder, else latents and captions."""
     if before is None:
         return clip_table(part, statistics.normalise(part.redundant_vectors()))[0]
-    return captioned_latents(before, part, encoder, config.num_frames)
+    pooled = pooled_captions([caption for several in part.captions for caption in several], encoder)
+    model, nothing = network_with(before.autoencoder, before.autoencoder_params), jnp.zeros_like(pooled[0])
+    return latent_motion.latent_table(model, statistics, part, pooled, nothing, config.num_frames)
 
 
 def held_out_clips(clips: ClipTable | latent_motion.LatentTable, config: latent_motion.LatentMotionTraining):
@@ -190,15 +184,17 @@ def _task(preset: Preset, config, data: TextMotions, encoder: TextEncoder, befor
     stage = stage_of(preset)
     if stage == "autoencoder":
         model = presets.build_config(preset.name, features=12 * data.skeleton.num_joints - 1)
-        return latent_motion.LatentAutoencoderTask(model, config, None, None, data.fingerprint)
+        return latent_motion.LatentAutoencoderTask(model, config, None, None, dataset_fingerprint=data.fingerprint)
     fingerprint = f"{data.fingerprint} on "
     if stage == "teacher":
         width = pooled_captions(["a person walks"], encoder).shape[-1]
         model = presets.build_config(preset.name, text_width=width)
         fingerprint += weights_digest(before.autoencoder_params)
-        return latent_motion.TeacherTask(model, config, preset.diffusion, None, fingerprint)
+        return latent_motion.TeacherTask(model, config, None, preset.diffusion, dataset_fingerprint=fingerprint)
     fingerprint += weights_digest(before.params)
-    return latent_motion.DistillationTask(before.config, before.params, config, before.schedule, None, fingerprint)
+    return latent_motion.DistillationTask(
+        before.config, config, None, before.schedule, before.params, dataset_fingerprint=fingerprint
+    )
 
 
 def _named_teacher(path, preset: Preset, data: TextMotions) -> LatentModel:

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, TextMotions, draw_clips, pad_motions
+from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 
 
@@ -143,24 +143,16 @@ def draw_latent(key, mean, log_variance):
 
 
 @frozen_tree("clips", "statistics")
-class LatentAutoencoderTask(Task):
-    """An autoencoder to train on whole clips (MotionPCM section 4.1).
+class LatentAutoencoderTask(ClipsTask):
+    """An autoencoder to train on whole clips, normalised redundant vectors (MotionPCM section 4.1).
 
     Attributes:
-      model_config: the autoencoder.
-      config: how to train it.
-      clips: normalised redundant vectors.
-      statistics: of them.
-      dataset_fingerprint: of the data they come from.
+      statistics: of these vectors.
     """
 
     name, part = "latent autoencoder", "autoencoder"
 
-    model_config: motionpcm.LatentAutoencoderConfig
-    config: LatentMotionTraining
-    clips: ClipTable
     statistics: AxisNormaliser
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw (features, mask) and the key of the loss."""
@@ -235,24 +227,16 @@ def latent_table(
 
 
 @frozen_tree("clips")
-class TeacherTask(Task):
-    """A teacher to train: the noise of latents under a caption, or none.
+class TeacherTask(ClipsTask):
+    """A teacher to train: the noise of latents under a caption, or none. Clips are a `LatentTable`.
 
     Attributes:
-      model_config: the denoiser.
-      config: how to train it.
       schedule: the noise schedule of its preset.
-      clips: latents and captions.
-      dataset_fingerprint: of the data, and of the autoencoder.
     """
 
     name, part = "latent teacher", "teacher"
 
-    model_config: motionpcm.LatentDenoiserConfig
-    config: LatentMotionTraining
     schedule: NoiseSchedule
-    clips: LatentTable
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw (latents, captions) and the key of the loss; a share of the captions is the empty one."""
@@ -268,8 +252,8 @@ class TeacherTask(Task):
         network = network_with(self.model_config, params)
         time = jax.random.randint(key_time, (len(latent),), 0, len(self.schedule.levels))
         noise = jax.random.normal(key_noise, latent.shape)
-        alpha, sigma = (phases.beside(share, latent) for share in phases.shares(self.schedule, time))
-        eps = network(alpha * latent + sigma * noise, time, network.encode(text), key=key_dropout)
+        state = phases.noised(self.schedule, latent, noise, time)
+        eps = network(state, time, network.encode(text), key=key_dropout)
         return {"loss": jnp.mean((eps - noise) ** 2)}
 
 
@@ -302,7 +286,7 @@ class DistillationBatch(NamedTuple):
 
 
 @frozen_tree("teacher", "clips")
-class DistillationTask(Task):
+class DistillationTask(TeacherTask):
     """A student to distil from a frozen teacher (MotionPCM section 4.2 and Algorithm 1).
 
     Weights have the branches "student" and, with a discriminator, "discriminator". The loop's moving average of the
@@ -310,21 +294,12 @@ class DistillationTask(Task):
     looks at what the student of line 10 said; one step for both is therefore that algorithm's three updates.
 
     Attributes:
-      model_config, teacher: config and frozen weights of the teacher.
-      config: how to distil.
-      schedule: the teacher's noise schedule.
-      clips: latents and captions.
-      dataset_fingerprint: of the data, the autoencoder and the teacher.
+      teacher: its frozen weights; the config of the network and the schedule are the teacher's as well.
     """
 
-    name, part = "student", "teacher"
+    name = "student"
 
-    model_config: motionpcm.LatentDenoiserConfig
     teacher: Any
-    config: LatentMotionTraining
-    schedule: NoiseSchedule
-    clips: LatentTable
-    dataset_fingerprint: str = ""
 
     def __post_init__(self):
         if self.config.ema_decay is None:
@@ -383,11 +358,7 @@ class DistillationTask(Task):
         time, before, phase = cut.times[point], cut.before[point], cut.phase[point]
         edge = cut.edges[phase]
         noise = jax.random.normal(key_noise, latent.shape)
-        noised = lambda t, noise: sum(
-            phases.beside(share, latent) * part
-            for share, part in zip(phases.shares(schedule, t), (latent, noise), strict=True)
-        )
-        state = noised(time, noise)
+        state = phases.noised(schedule, latent, noise, time)
         limits = {"minval": config.least_guidance, "maxval": config.most_guidance}
         guidance = jax.random.uniform(key_guidance, (size,), **limits)
 
@@ -397,12 +368,9 @@ class DistillationTask(Task):
         solved = phases.jump(schedule, state, phases.guided_noise(conditional, unconditional, guidance), time, before)
         target = network_with(self.student_config, target_params)
         eps = target(solved, before, target.encode(text), guidance)
-        if config.consistency == "latent":
-            end = phases.latent_consistency_end(schedule, solved, eps, before)
-        else:
-            end = phases.target_end(schedule, solved, eps, before, edge)
+        end = self._end(phases.target_end, solved, eps, before, edge)
         critic_time = jax.random.randint(key_critic, (size,), edge, cut.edges[phase + 1] + 1)
-        real = noised(critic_time, jax.random.normal(key_real, latent.shape))
+        real = phases.noised(schedule, latent, jax.random.normal(key_real, latent.shape), critic_time)
         fresh = jax.random.normal(key_fresh, latent.shape)
         return DistillationBatch(state, time, edge, guidance, text, end, critic_time, fresh, real)
 
@@ -421,10 +389,7 @@ class DistillationTask(Task):
             batch = self.questions(params["student"], *batch, key)
         student = network_with(self.student_config, params["student"])
         eps = student(batch.state, batch.time, student.encode(batch.text), batch.guidance)
-        if config.consistency == "latent":
-            end = phases.latent_consistency_end(schedule, batch.state, eps, batch.time)
-        else:
-            end = phases.jump(schedule, batch.state, eps, batch.time, batch.edge)
+        end = self._end(phases.jump, batch.state, eps, batch.time, batch.edge)
         loss = jnp.mean(phases.pseudo_huber(end - jax.lax.stop_gradient(batch.target), config.huber_width))
         terms = {"consistency": loss}
         if config.adversarial_weight:
@@ -438,6 +403,12 @@ class DistillationTask(Task):
             # The heads' own loss has no weight: each branch is moved by its own optimiser.
             loss = loss + config.adversarial_weight * adversarial + terms["discriminator"]
         return {"loss": loss, **terms}
+
+    def _end(self, jump, state, eps, time, edge):
+        """Return what a noise estimate says of the data, or by `jump` of the phase's end."""
+        if self.config.consistency == "latent":
+            return phases.latent_consistency_end(self.schedule, state, eps, time)
+        return jump(self.schedule, state, eps, time, edge)
 
     def scores(self, heads, state, batch: DistillationBatch):
         """Return the discriminator's scores of states at `critic_time` under the captions, high for data."""

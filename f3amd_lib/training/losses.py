@@ -6,7 +6,6 @@ units. Weights are fields of `LossWeights`; the paper sets them all to 1.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
+from f3amd_lib.training.settings import check_settings
 
 LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "floor", "ird")
 
@@ -47,14 +47,7 @@ class LossWeights:
     ird_form: str = "literal"
 
     def __post_init__(self):
-        for term in LOSS_TERMS:
-            if not 0.0 <= getattr(self, term) < math.inf:
-                raise ValueError(f"loss weight {term} must be >= 0 and finite, got {getattr(self, term)!r}")
-        _check_ird_form(self.ird_form)
-
-
-def _check_ird_form(ird_form: str) -> None:
-    check_known(ird_form, ("literal", "excess"), "ird_form")
+        check_settings(self, "loss weight ")
 
 
 def _mean(values, weights):
@@ -102,7 +95,7 @@ def loss_terms(
     toes' end joints where ours looks at the toe joints, which every skeleton here has, and it counts a step of exactly
     1 cm as contact. The F3AMD text says none of the three; ours is the plain reading of Eq. 13.
     """
-    _check_ird_form(ird_form)
+    check_known(ird_form, ("literal", "excess"), "ird_form")
 
     def mean_square(difference):
         return _mean(difference * difference, weights)

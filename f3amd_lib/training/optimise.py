@@ -26,7 +26,7 @@ from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from f3amd_lib.networks.config import with_fast_gradient
+from f3amd_lib.networks.config import CheckedConfig, with_fast_gradient
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import load_tree, save_tree
@@ -108,6 +108,23 @@ class Task:
     def held_out_terms(self, params, statistics, held_out, key) -> dict:
         """Return terms by name on held-out data, without what only training does; asked where such data are given."""
         return self.terms(params, held_out, key, training=False)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ClipsTask(Task):
+    """A training of one network on clips, whole or as states; a subclass adds what else it goes by.
+
+    Attributes:
+      model_config: the network.
+      config: how to train it.
+      clips: of the training split, on the device.
+      dataset_fingerprint: of the data they come from, and of the networks it stands on.
+    """
+
+    model_config: CheckedConfig
+    config: Any
+    clips: Any
+    dataset_fingerprint: str = dataclasses.field(default="", kw_only=True)
 
 
 def frozen_tree(*data: str):
@@ -290,7 +307,10 @@ def optimise(
             state, terms = advance(task, state, length, mesh)
             terms = {name: np.asarray(value) for name, value in terms.items()}
             if broken := _what_is_broken(done, terms, state):
-                raise TrainingDiverged(f"{task.name}: {broken}{_advice(checkpoint)}")
+                kept = checkpoint is not None and Path(checkpoint).exists()
+                kept = f"; the last good state is in {checkpoint}" if kept else ""
+                advice = "lower the learning rate or check the data for broken frames"
+                raise TrainingDiverged(f"{task.name}: {broken}: {advice}{kept}")
             passed = (done + length) // checkpoint_every > done // checkpoint_every
             done += length
             row = {"step": done, **{name: float(value.mean()) for name, value in terms.items()}}
@@ -322,9 +342,3 @@ def _what_is_broken(done: int, terms: dict, state: TrainingState) -> str | None:
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
         return f"weights are not finite after step {done + len(bad)}"
     return None
-
-
-def _advice(checkpoint: Path | None) -> str:
-    kept = checkpoint is not None and Path(checkpoint).exists()
-    kept = f"; the last good state is in {checkpoint}" if kept else ""
-    return f": lower the learning rate or check the data for broken frames{kept}"

@@ -97,16 +97,12 @@ def is_first_process() -> bool:
 
 def first_says(answer: bool) -> bool:
     """Return process 0's answer in every process, so that none goes on where another stops."""
-    if jax.process_count() == 1:
-        return answer
     return bool(multihost_utils.broadcast_one_to_all(np.array(answer)))
 
 
 def same_everywhere(number: int) -> bool:
     """Say whether a whole number is the same in every process."""
-    if jax.process_count() == 1:
-        return True
-    return len(set(np.ravel(multihost_utils.process_allgather(np.array(number))).tolist())) == 1
+    return len(np.unique(multihost_utils.process_allgather(np.array(number)))) == 1
 
 
 def wait_for_all(what: str) -> None:
@@ -115,5 +111,4 @@ def wait_for_all(what: str) -> None:
     Args:
       what: name of the place, the same in every process.
     """
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(what)
+    multihost_utils.sync_global_devices(what)

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -217,17 +217,15 @@ def train_and_keep(
     return trained, history
 
 
-@contextlib.contextmanager
-def alone_with(files: ModelFiles) -> Iterator[None]:
+def alone_with(files: ModelFiles) -> contextlib.AbstractContextManager:
     """Hold the files of a run, so that no second run writes there; its other processes hold nothing.
 
     Raises:
       ValueError: if another process trains the same there.
     """
-    with contextlib.ExitStack() as held:
-        if parallel.is_first_process():
-            held.enter_context(locked(files.model.with_suffix(".lock"), f"training {files.model.stem}"))
-        yield
+    if not parallel.is_first_process():
+        return contextlib.nullcontext()
+    return locked(files.model.with_suffix(".lock"), f"training {files.model.stem}")
 
 
 def train_in_legs(

@@ -24,14 +24,19 @@ _RANGES = {
 }
 
 
-def check_settings(settings) -> None:
-    """Raise ValueError for a field that is not what `settings.toml` says of its class: a variant, or in a range."""
+def check_settings(settings, kind: str = "") -> None:
+    """Raise ValueError for a field that is not what `settings.toml` says of its class: a variant, or in a range.
+
+    Args:
+      settings: of a class that the file has.
+      kind: what its numbers are, before their names in a message, such as "loss weight ".
+    """
     for name, wanted in _SETTINGS[type(settings).__name__].items():
         value = getattr(settings, name)
         if isinstance(wanted, list):
             check_known(value, wanted, name)
         elif not _RANGES[wanted](value):
-            raise ValueError(f"{name} must be {wanted}, got {value!r}")
+            raise ValueError(f"{kind}{name} must be {wanted}, got {value!r}")
 
 
 def part_recipe(training: type, part: str, num_steps: int, preset: str | None = None, **settings):

@@ -254,12 +254,13 @@ def autoencoder_task(
     axes, part = data.normaliser(), data.select(data.members(split))
     table, _ = clip_table(part, axes.normalise(part.positions))
     if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
-        return text_motion.AutoencoderTask(presets.build_config(preset), config, table, data.fingerprint)
+        model = presets.build_config(preset)
+        return text_motion.AutoencoderTask(model, config, table, dataset_fingerprint=data.fingerprint)
     # The body stands as people do when clips begin: those of training, whatever the split.
     rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
     model = presets.build_config(preset, num_vertices=len(make_body(rest).vertices))
     codec = MotionCodec(axes, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
-    return text_motion.MeshAutoencoderTask(model, config, table, data.fingerprint, codec)
+    return text_motion.MeshAutoencoderTask(model, config, table, codec, dataset_fingerprint=data.fingerprint)
 
 
 def denoiser_task(
@@ -285,7 +286,8 @@ def denoiser_task(
     fingerprint = data.fingerprint
     if codec.autoencoder is not None:
         fingerprint += f" in the latent of {weights_digest(codec.params)}"
-    return text_motion.TextMotionTask(model, config, presets.find_preset(preset).diffusion, table, pooled, fingerprint)
+    schedule = presets.find_preset(preset).diffusion
+    return text_motion.TextMotionTask(model, config, table, schedule, pooled, dataset_fingerprint=fingerprint)
 
 
 def control_task(
@@ -299,8 +301,9 @@ def control_task(
     table = table._replace(frames=(table.frames, positions))
     fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
     return text_motion.ControlTask(
-        base.config, config, base.schedule, table, pooled, base.params, codec, tuple(joints), fingerprint
-    )
+        base.config, config, table, base.schedule, pooled, base.params, codec, tuple(joints),
+        dataset_fingerprint=fingerprint,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------------------- training
@@ -319,6 +322,7 @@ def of_this_training(found, task: Task, files: ModelFiles):
     return found
 
 
+_DENOISERS = (ACMDMConfig.family, MaskedACMDMConfig.family)
 _AUTOENCODERS = {AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.family: "mesh-autoencoder"}
 """Recipe of each family of autoencoders."""
 
@@ -330,8 +334,7 @@ def _of_meshes(preset: presets.Preset) -> bool:
 
 def is_text_preset(name: str) -> bool:
     """Say whether a preset, with or without a branch, is one that this file trains."""
-    families = (ACMDMConfig.family, MaskedACMDMConfig.family, *_AUTOENCODERS)
-    return presets.find_preset(preset_and_branch(name)[0]).family in families
+    return presets.find_preset(preset_and_branch(name)[0]).family in (*_DENOISERS, *_AUTOENCODERS)
 
 
 def train_text_model(
@@ -485,27 +488,16 @@ def find_text_model(dataset: str, preset: str | None = None, *, control: bool = 
     wanted, branch = (None, "") if preset is None else preset_and_branch(preset)
     wanted = wanted and presets.find_preset(wanted).name
     branches = (branch,) if branch else (CONTROL, PELVIS) if control else ("",)
+    denoisers = [name for name, known in presets.PRESETS.items() if known.family in _DENOISERS]
+    names = [wanted] if wanted else [name + form for name in denoisers for form in ("", *presets.FORMS)]
     for folder in text_model_folders(dataset):
-        newest = sorted(folder.glob("*.safetensors"), key=lambda path: -path.stat().st_mtime)
-        found = {path: _denoiser(path.name.removesuffix(".safetensors")) for path in newest}
         for branch in branches:
-            for path, (name, ending) in found.items():
-                if name and ending == branch and wanted in (None, name):
-                    return path
+            if found := [path for name in names if (path := folder / f"{name}{branch}.safetensors").is_file()]:
+                return max(found, key=lambda path: path.stat().st_mtime)
     name = (wanted or DEFAULT_PRESET) + branches[0]
     raise ValueError(
         f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
     )
-
-
-def _denoiser(name: str) -> tuple[str, str]:
-    """Return preset and branch of a file's name; "" for a state, the judge, an autoencoder or another paper's model."""
-    try:
-        preset, branch = preset_and_branch(name)
-        made = presets.find_preset(preset).family in (ACMDMConfig.family, MaskedACMDMConfig.family)
-    except ValueError:
-        made = False
-    return (preset, branch) if made else ("", "")
 
 
 DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"

@@ -22,11 +22,10 @@ from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
 from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
-from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoderConfig
-from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, smooth_l1, variational_loss
+from f3amd_lib.networks.motion_autoencoder import smooth_l1, variational_loss
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.motion_codec import MotionCodec
-from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
+from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 
 
@@ -100,22 +99,10 @@ class TextMotionTraining:
 
 
 @frozen_tree("clips")
-class AutoencoderTask(Task):
-    """A motion autoencoder to train on windows of clips that are long enough.
-
-    Attributes:
-      model_config: the autoencoder.
-      config: how to train it.
-      clips: normalised positions.
-      dataset_fingerprint: of the data they come from.
-    """
+class AutoencoderTask(ClipsTask):
+    """A motion autoencoder to train on windows of clips that are long enough; clips are normalised positions."""
 
     name = part = "autoencoder"
-
-    model_config: AutoencoderConfig
-    config: TextMotionTraining
-    clips: ClipTable
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw windows [B, window, J, 3] from clips of at least that length."""
@@ -161,8 +148,7 @@ class MeshAutoencoderTask(AutoencoderTask):
 
     name = "mesh autoencoder"
 
-    model_config: MeshAutoencoderConfig
-    codec: MotionCodec | None = None
+    codec: MotionCodec
 
     def terms(self, params, batch, key, training=True) -> dict:
         """Return L1, summed over a frame, mean over frames (ACMDM's released code); arguments as above."""
@@ -253,26 +239,20 @@ def draw_captioned(key, clips: ClipTable, pooled, config: TextMotionTraining, wi
 
 
 @frozen_tree("clips", "pooled")
-class TextMotionTask(Task):
-    """A denoiser of text and motion to train.
+class TextMotionTask(ClipsTask):
+    """A denoiser of text and motion to train, an `ACMDM` or a `MaskedACMDM`.
+
+    Clips are positions or latents, [N, J, C] in network units.
 
     Attributes:
-      model_config: an `ACMDMConfig` or `MaskedACMDMConfig`.
-      config: how to train it.
       schedule: the noise schedule of its preset.
-      clips: positions or latents, [N, J, C] in network units.
-      pooled: embeddings of their captions, [C, W].
-      dataset_fingerprint: of the data, and of the autoencoder where the states are its latents.
+      pooled: embeddings of the clips' captions, [C, W].
     """
 
     name, part = "text and motion", "denoiser"
 
-    model_config: ACMDMConfig
-    config: TextMotionTraining
     schedule: NoiseSchedule
-    clips: ClipTable
     pooled: Any
-    dataset_fingerprint: str = ""
 
     def draw(self, state: TrainingState, key):
         """Draw (states, condition) and the key of the loss."""
@@ -334,33 +314,23 @@ def control_loss(
 
 
 @frozen_tree("clips", "pooled", "base", "codec")
-class ControlTask(Task):
-    """A control branch to train beside a frozen denoiser.
+class ControlTask(TextMotionTask):
+    """A control branch to train beside a frozen denoiser, whose config and schedule it has.
+
+    Clips are states as the denoiser was trained on, [N, J, C], and the normalised positions that each row stands for,
+    [N, frames of a state, J, 3].
 
     Attributes:
-      model_config: of the denoiser, which is that of the branch.
-      config: how to train it.
-      schedule: of the denoiser.
-      clips: states as the denoiser was trained on, [N, J, C], and the normalised positions that each row stands for,
-        [N, frames of a state, J, 3].
-      pooled: embeddings of their captions, [C, W].
       base: the denoiser's weights; no gradient reaches them.
       codec: between states and motion, frozen as well.
       joints: numbers of the joints that may be controlled.
-      dataset_fingerprint: of data, autoencoder and denoiser.
     """
 
-    name, part = "control branch", "denoiser"
+    name = "control branch"
 
-    model_config: ACMDMConfig
-    config: TextMotionTraining
-    schedule: NoiseSchedule
-    clips: ClipTable
-    pooled: Any
     base: Any
     codec: MotionCodec
     joints: tuple[int, ...]
-    dataset_fingerprint: str = ""
 
     def identity(self) -> dict:
         """Return all that decides the weights, as JSON has it."""
