@@ -158,7 +158,7 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
 
 
 def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
-    """Walk as `samplers.sample_ddpm` does, with its noise [N, B, T, C] given."""
+    """Walk as the sampler "ddpm" does, with its noise [N, B, T, C] given."""
     context = network.encode(condition)
     levels = jnp.asarray(sigmas, noise.dtype)
     x_noisy = levels[0] * noise
