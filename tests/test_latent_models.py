@@ -110,8 +110,8 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
     made, asked = [], []
 
-    def written(targets, motion, scene, trained, *, overwrite):
-        made.append((trained.name, motion))
+    def written(targets, scene, trained, *, overwrite):
+        made.append((trained.name, scene.characters[0].motion))
 
     def follow(predict, schedule, noise, times):
         asked.append((noise.shape, list(times)))

@@ -345,7 +345,7 @@ def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
     if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
-        return f"CPU, {counted_cores(record)}"
+        return f"CPU, {counted_cores(record)}" if "cores" in record else "CPU"
     kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
 
