@@ -274,7 +274,7 @@ def recipe_errors(*errors):
 def gradient(values):
     return {
         "gradient_norm": [
-            {"sigma": sigma, "value": value}
+            {"model": "F3AMD-FNO-96", "sigma": sigma, "value": value}
             for sigma, value in zip((0.01, 0.1, 1.0, 10.0, 50.0, 128.0), values, strict=True)
         ]
     }

@@ -97,7 +97,7 @@ def tables(run: str) -> dict[str, list[dict]]:
             "x0_by_sigma": [{"model": model, "sigma": s, "x0_error": 1.0} for model in models for s in levels[model]]
         }
     if what == "gradient_norm":
-        return {what: [figure | {"sigma": sigma} for sigma in measure.SIGMAS]}
+        return {what: [figure | {"model": "F3AMD-FNO-96", "sigma": sigma} for sigma in measure.SIGMAS]}
     if what == "recipes":
         return {what: [{"recipe": one, "steps": n, "joint_error_cm": 1.0} for one in RECIPES for n in (8, 1)]}
     assert command == "claims", nearest_hint(what, measure.MEASUREMENTS)

@@ -135,7 +135,7 @@ def test_markdown_has_a_title_the_table_and_the_note():
     assert text.startswith("**Table 5.** Motion quality by steps, windows of 32 frames.\n")
     assert NOTE in text and "absolute values do not compare" in text
     assert text.count(f"| {LABEL} ") == 4 and "20.00 ± 1.00" in text
-    assert "published were not run" in quality_markdown(6, QUALITY, LABEL)
+    assert "published are not on record here" in quality_markdown(6, QUALITY, LABEL)
     assert "windows of" not in quality_markdown(3, QUALITY, LABEL).splitlines()[0]
 
 

@@ -166,7 +166,7 @@ OF_TEXT = tuple(name for name in SCHEMAS if name.startswith("text_"))
 """Tables of text to motion. Each row also names `trained`, the model that was (a smaller one of ours may stand in for
 the paper's), and `windows`, the motions that it was trained on."""
 
-OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma")
+OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm")
 """Tables that say how well a network does: it must have passed the gate (`reports.gate`)."""
 
 PUBLISHED_CAMDM = "CAMDM published"

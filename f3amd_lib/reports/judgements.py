@@ -740,12 +740,15 @@ def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
     return within(Figure.of(worst[1] / worst[0]), bounds), " against ".join(f"{number_text(one)}x" for one in worst)
 
 
-def gradient_growth(evidence: Evidence, bounds) -> Finding:
-    """Judge the mean gradient norm at the highest third of noise levels over that at the lowest."""
-    table = evidence.table("gradient_norm").sort_values("sigma")
+def gradient_growth(evidence: Evidence, model, bounds) -> Finding:
+    """Judge the mean gradient norm at the highest third of noise levels over that at the lowest.
+
+    A network that hardly looks at its noise has one gradient for all levels: it has to pass the gate.
+    """
+    table = evidence.rows("gradient_norm", model=model.model).sort_values("sigma")
     third = len(table) // 3
     if third < 1:
-        raise NotMeasured("gradient_norm.csv has no three noise levels")
+        raise NotMeasured(f"gradient_norm.csv has no three noise levels of {model.model}")
     norms = table["value"].to_numpy(np.float64)
     low, high = (float(np.exp(np.log(some).mean())) for some in (norms[:third], norms[-third:]))
     gain = Figure.of(high / low)
