@@ -66,14 +66,18 @@ def test_a_question_ends_where_its_phase_does_and_the_sampler_asks_there(task, n
     asked = []
 
     def answer(teacher, target, x_noisy, sigma, sigma_next, sigma_edge):
-        asked.append(np.stack([sigma, sigma_next, sigma_edge]))
+        asked.append(jnp.stack([sigma, sigma_next, sigma_edge]))
         return jnp.zeros_like(x_noisy)
 
+    @jax.jit
+    def question(drawn, key):
+        student.terms(student.teacher, drawn, key)
+        return asked.pop()
+
     monkeypatch.setattr(consistency_task, "consistency_answer", answer)
-    (batch, target), key = student.draw(initial_state(student), jax.random.key(0))
-    for number in range(6):
-        student.terms(student.teacher, (batch, target), jax.random.fold_in(key, number))
-    sigma, sigma_next, sigma_edge = np.concatenate(asked, axis=1)
+    drawn, key = jax.jit(student.draw)(initial_state(student), jax.random.key(0))
+    answers = [question(drawn, jax.random.fold_in(key, number)) for number in range(6)]
+    sigma, sigma_next, sigma_edge = np.concatenate(answers, axis=1)
     grid = levels.grid(8).astype(np.float32)
     place = np.searchsorted(-grid, -sigma)
     assert set(place) == set(range(8))

@@ -105,6 +105,7 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
 SHIPPED = PRETRAINED_DIR / "bandai" / "text"
 
 
+@pytest.mark.slow
 def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_guidance(tmp_path, monkeypatch):
     """`f3amd text ... --model motionpcm --steps 1`: the caption alone to one jump from level 999 to 0."""
     monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
@@ -186,6 +187,7 @@ def data(tmp_path, monkeypatch):
     return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
 
 
+@pytest.mark.slow
 def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_used(data, tmp_path, monkeypatch):
     """A loop that trains nothing: weights of ones, whose moving average is twos."""
     tasks = {}

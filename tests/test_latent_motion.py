@@ -351,6 +351,7 @@ def test_a_target_is_the_guided_teachers_step_and_then_the_targets_jump(start):
         np.testing.assert_allclose(one(drawn.target), wanted, rtol=2e-3, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_each_player_learns_from_its_own_loss_alone(batch, start):
     """Algorithm 1's signs: the student raises the score of what it makes; the heads lower it, and raise the data's.
 

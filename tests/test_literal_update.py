@@ -59,6 +59,7 @@ def test_a_network_that_uses_its_input_shows_it(model_that):
     assert one(table, "literal", 8, "seed_spread") < 0.2 * one(table, "rescaled", 8, "seed_spread")
 
 
+@pytest.mark.slow
 def test_the_walks_are_those_of_the_samplers_by_name():
     trained, windows = tiny_trained(), tiny_windows()
     walks, _ = walk_windows(trained, windows, (4,), seed=3, **FEW)

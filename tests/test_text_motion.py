@@ -258,7 +258,8 @@ def changed(before, after):
     }
 
 
-@pytest.mark.parametrize("variational", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("variational", [False, True])
 def test_an_autoencoder_learns(variational):
     config = dataclasses.replace(AUTOENCODER, variational=variational)
     settings = recipe(num_steps=40, window=16, gradient_clip=1.0, weight_decay=0.0)
