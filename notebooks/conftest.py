@@ -1,4 +1,4 @@
-"""How nbval runs notebooks: compiled quickly, but less so for those that train toys in many steps."""
+"""How nbval runs notebooks: compiled quickly, and not as quickly where toys train in many steps."""
 
 import os
 from importlib.metadata import version

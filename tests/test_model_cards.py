@@ -90,9 +90,7 @@ def test_page_of_results_shows_what_is_on_record(tmp_path):
     copy = tmp_path / "results.md"
     copy.write_text(page.read_text(encoding="utf-8"), encoding="utf-8")
     model_cards.write_measured_table(copy, model_cards.committed_quality("bandai"))
-    assert copy.read_text(encoding="utf-8") == page.read_text(encoding="utf-8"), (
-        "write the table anew: f3amd cards"
-    )
+    assert copy.read_text(encoding="utf-8") == page.read_text(encoding="utf-8"), "write the table anew: f3amd cards"
     copy.write_text("no marks", encoding="utf-8")
     with pytest.raises(ValueError, match="no `<!-- measured: begin -->`"):
         model_cards.write_measured_table(copy, model_cards.committed_quality("bandai"))

@@ -241,8 +241,20 @@ def test_what_notebook_15_says_of_length_follows_from_the_record():
     # CAMDM after an eighth of the windows, so in less time: ahead, but for the seam.
     camdm = table.query("run == 'CAMDM-seed0' and windows == 200_000 and steps in [0, 8]")
     camdm = camdm.set_index("metric")["value"]
-    ours = {"trajectory_error": 0.065, "joint_acceleration": 2.5, "foot_sliding": 0.75, "IRD": 3.0, "x0_error_ratio": 0.92}
-    theirs = {"trajectory_error": 0.053, "joint_acceleration": 2.2, "foot_sliding": 0.61, "IRD": 8.1, "x0_error_ratio": 0.64}
+    ours = {
+        "trajectory_error": 0.065,
+        "joint_acceleration": 2.5,
+        "foot_sliding": 0.75,
+        "IRD": 3.0,
+        "x0_error_ratio": 0.92,
+    }
+    theirs = {
+        "trajectory_error": 0.053,
+        "joint_acceleration": 2.2,
+        "foot_sliding": 0.61,
+        "IRD": 8.1,
+        "x0_error_ratio": 0.64,
+    }
     assert most[list(ours)].to_dict() == pytest.approx(ours, rel=0.02)
     assert camdm[list(theirs)].to_dict() == pytest.approx(theirs, rel=0.03)
     steps = read_table(repository_root() / "paper_figures/synthetic/laptop/records/training_time.csv")[0]
