@@ -59,7 +59,7 @@ bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=option
 	  $(PYTHON) -m f3amd_lib bench --data $(DATA) --profile $(PROFILE) $(BENCH)
 
 # Optional: benchmarks and tests that need one of these say so and go on without.
-bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more)
+bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more; docs/commands.md)
 	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
 	  -q -r requirements-bench.txt
 

@@ -210,6 +210,12 @@ def test_every_lock_entry_is_hashed():
     assert bad == []
 
 
+@pytest.mark.parametrize("path", sorted(ROOT.glob("requirements-*.txt")), ids=lambda path: path.name)
+def test_no_list_beside_the_lock_says_where_packages_come_from(path):
+    text = path.read_text(encoding="utf-8")
+    assert "://" not in text and "index-url" not in text
+
+
 def test_the_lock_says_nothing_of_where_packages_came_from():
     assert "://" not in LOCK_TEXT
     assert "--find" not in LOCK_TEXT
