@@ -61,14 +61,15 @@ def _importable(name: str) -> bool:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_compiled_programs():
-    """Forget compiled programs between files once there are many.
+    """Forget compiled programs between files once there are some 800.
 
-    Each holds memory maps, of which Linux gives a process 65,530. A worker that asks for one more dies of it, in
-    the middle of whatever it compiles.
+    Each keeps the MLIR context that it was lowered in, and the more contexts live, the slower the next one is built:
+    from 8 ms for the first programs to 45 ms after 5,000. Each holds memory maps, too, of which Linux gives a process
+    65,530: a worker that asks for one more dies of it.
     """
     yield
     maps = Path("/proc/self/maps")
-    if "jax" in sys.modules and maps.exists() and maps.read_text().count("\n") > 15_000:
+    if "jax" in sys.modules and maps.exists() and maps.read_text().count("\n") > 3_000:
         sys.modules["jax"].clear_caches()
 
 

@@ -334,8 +334,8 @@ def lively_network(**changes):
     network = make_network(**changes)
     graph, state = nnx.split(network)
     leaves, tree = jax.tree.flatten(state)
-    keys = jax.random.split(jax.random.key(5), len(leaves))
-    moved = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    rng = np.random.default_rng(5)
+    moved = [jax.device_put(np.asarray(leaf) + 0.05 * rng.standard_normal(leaf.shape, np.float32)) for leaf in leaves]
     return nnx.merge(graph, jax.tree.unflatten(tree, moved))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.fft
 from builders import refused
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks.spectral import (
@@ -19,6 +20,9 @@ from f3amd_lib.networks.spectral import (
     fourier_matrices,
     spectral_convolution,
 )
+
+# One program for each shape, where operation after operation is a dozen.
+spectral_convolution, cosine_convolution = jax.jit(spectral_convolution), jax.jit(cosine_convolution)
 
 
 def draw(*shape, seed=0):
@@ -113,7 +117,7 @@ def test_eq02_initial_weights_keep_the_variance(variant, num_frames):
     layer = SpectralConvolution(64, 64, modes, variant, rank=32, initial_gain=1.0, rngs=nnx.Rngs(params=0))
     # Of a complex weight, the real part alone acts on bins 0 and T / 2: half of their variance.
     halved = {"cosine": 0.0}.get(variant, (2 - num_frames % 2) / num_frames / 2)
-    variance = layer(draw(256, num_frames, 64)).var()
+    variance = Compiled(layer)(draw(256, num_frames, 64)).var()
     assert variance == pytest.approx(1.0 - halved, abs=0.03)
 
 
@@ -184,7 +188,7 @@ def test_table_8_cosine_layer_equals_scipys_transform(num_frames, modes):
     spectrum = scipy.fft.dct(z.astype(np.float64), norm="ortho", axis=1)
     mixed[:, :modes] = np.einsum("bkc,kcd->bkd", spectrum[:, :modes], weight)
     expected = scipy.fft.idct(mixed, norm="ortho", axis=1)
-    np.testing.assert_allclose(layer(z), expected, atol=1e-5)
+    np.testing.assert_allclose(Compiled(layer)(z), expected, atol=1e-5)
 
 
 def test_table_8_cosine_layer_equals_its_dense_matrix():
@@ -220,7 +224,7 @@ def test_eq02_unit_gains_equal_the_dense_layer(num_frames, modes):
     dense = SpectralConvolution(3, 4, modes, rngs=nnx.Rngs(params=0))
     weighted = SpectralConvolution(3, 4, modes, "weighted", initial_gain=1.0, rngs=nnx.Rngs(params=0))
     z = draw(2, num_frames, 3)
-    np.testing.assert_allclose(weighted(z), dense(z), atol=1e-6)
+    np.testing.assert_allclose(Compiled(weighted)(z), Compiled(dense)(z), atol=1e-6)
 
 
 def test_eq02_gains_start_at_seven_tenths_and_scale_one_mode_each():
@@ -246,7 +250,7 @@ def test_eq02_factors_of_a_kernel_of_rank_eight_equal_the_dense_layer(num_frames
     layer.second_real[...] = jnp.asarray(second.real)
     layer.second_imag[...] = jnp.asarray(second.imag)
     z = draw(2, num_frames, 12)
-    got, expected = layer(z), fft_convolution(z, dense.real, dense.imag)
+    got, expected = Compiled(layer)(z), fft_convolution(z, dense.real, dense.imag)
     tolerance = 1e-5 * np.abs(expected).max()
     np.testing.assert_allclose(got, expected, atol=tolerance)
     dense_layer = spectral_convolution(jnp.asarray(z), dense.real, dense.imag)
@@ -286,7 +290,7 @@ def test_eq03_convolution_equals_flax(kernel_size, num_frames):
     layer = TemporalConvolution(3, 4, kernel_size, rngs=nnx.Rngs(params=0))
     layer.bias[...] = jnp.asarray(draw(4, seed=3))
     z = draw(2, num_frames, 3)
-    np.testing.assert_allclose(layer(z), flax_convolution(layer)(z), atol=1e-5)
+    np.testing.assert_allclose(Compiled(layer)(z), Compiled(flax_convolution(layer))(z), atol=1e-5)
 
 
 def test_eq03_convolution_by_hand():
@@ -320,6 +324,7 @@ def test_eq04_block_is_the_sum_of_both_branches(width_in, width_out):
     block = FNOBlock(width_in, width_out, 3, rngs=nnx.Rngs(params=0))
     z = draw(2, 8, width_in)
     weights = block.spectral.weight_real[...], block.spectral.weight_imag[...]
+    block = Compiled(block)
     expected = fft_convolution(z, *(np.asarray(w) for w in weights)) + block.local(z)
     got = block(z)
     assert got.shape == (2, 8, width_out)

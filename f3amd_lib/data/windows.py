@@ -7,6 +7,7 @@ Python loop over samples.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -167,6 +168,7 @@ def build_windows(
     )
 
 
+@functools.partial(jax.jit, static_argnames="earlier")
 def gather_windows(windows: WindowSet, index, yaw, smoothing, *, earlier: int = 0) -> Batch:
     """Cut chosen windows, turned and made relative.
 

@@ -74,7 +74,8 @@ def _read(path: Path) -> tuple[dict, dict]:
     if not path.is_file():
         raise ValueError(f"{path}: no such weights file")
     try:
-        with safe_open(path, framework="flax") as file:
+        # In NumPy, here and below: JAX compiles a program for every shape that it is to convert.
+        with safe_open(path, framework="numpy") as file:
             header = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError, TypeError, MemoryError) as error:
@@ -122,7 +123,7 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
     for name, leaf in wanted.items():
         if arrays[name].shape != leaf.shape:
             raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {leaf.shape}")
-    leaves = [arrays[name].astype(leaf.dtype) for name, leaf in wanted.items()]
+    leaves = [jax.device_put(arrays[name].astype(leaf.dtype)) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
 
 
@@ -250,7 +251,9 @@ def _is_packed(leaf) -> bool:
 
 def _from_eight_bits(leaf):
     """Return the array that `_in_eight_bits` wrote, or one that is whole."""
-    return leaf["eight_bits"].astype(jnp.float32) * leaf["scale"] if _is_packed(leaf) else leaf
+    if not _is_packed(leaf):
+        return leaf
+    return jax.device_put(np.asarray(leaf["eight_bits"], np.float32) * np.asarray(leaf["scale"], np.float32))
 
 
 def packed_weights(params: Any, dtype) -> Any:

@@ -138,12 +138,18 @@ def frozen_tree(*data: str):
     return as_tree
 
 
+@jax.jit
+def _copied(tree):
+    """Return a tree of arrays of its own, copied by one program instead of one for each shape."""
+    return jax.tree.map(jnp.copy, tree)
+
+
 def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
     """Return the state before the first step, on every device of the mesh."""
     # Not compiled as a whole: that takes seconds for each network, and the programs of its layers are few.
     params, statistics = task.init(jax.random.fold_in(jax.random.key(task.config.seed), 0))
-    params = jax.tree.map(jnp.copy, params)  # a student begins with weights that stay its teacher's
-    ema = None if task.config.ema_decay is None else jax.tree.map(jnp.copy, params)
+    params = _copied(params)  # a student begins with weights that stay its teacher's
+    ema = None if task.config.ema_decay is None else _copied(params)
     state = TrainingState(params, ema, task.optimiser.init(params), jnp.zeros((), jnp.int32), statistics)
     return parallel.replicate(state, mesh)
 
@@ -291,7 +297,7 @@ def optimise(
     task = parallel.replicate(task, mesh)
     if state is not None:
         # The chunk donates its input; what the caller holds must stay alive.
-        state = jax.tree.map(jnp.copy, state)
+        state = _copied(state)
     elif checkpoint is not None and Path(checkpoint).exists():
         state = restore_state(checkpoint, task, mesh)
     else:
@@ -339,6 +345,6 @@ def _what_is_broken(done: int, terms: dict, state: TrainingState) -> str | None:
         terms = f" (terms: {', '.join(guilty)})" if guilty else ""
         return f"loss is not finite at step {done + first + 1}{terms}"
     # The loss of the last step is from before its update.
-    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params)):
         return f"weights are not finite after step {done + len(bad)}"
     return None
