@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.data.text_encoders import TextEmbeddings
@@ -20,7 +21,7 @@ SMALL = TextMotionConfig(
 
 @pytest.fixture(scope="module")
 def network():
-    return TextMotionNetwork(SMALL, rngs=nnx.Rngs(0))
+    return Compiled(TextMotionNetwork(SMALL, rngs=nnx.Rngs(0)))
 
 
 def test_the_halving_convolution_is_one_of_four_taps():
@@ -115,9 +116,9 @@ def test_a_batch_carries_the_captions_of_its_clips():
 
 
 def test_weights_go_back_into_the_network(network):
-    params = nnx.state(network)
+    params = nnx.state(network.network)
     motion = jax.random.normal(jax.random.key(0), (2, 8, 5))
-    again = network_with(SMALL, params).embed_motion(motion, jnp.array([8, 8]))
+    again = Compiled(network_with(SMALL, params)).embed_motion(motion, jnp.array([8, 8]))
     assert np.array_equal(again, network.embed_motion(motion, jnp.array([8, 8])))
 
 

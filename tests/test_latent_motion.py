@@ -192,7 +192,7 @@ def test_joints_count_in_the_loss_as_much_as_is_said(weight):
     statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
     task = LatentAutoencoderTask(config, recipe(joints_weight=weight), None, statistics)
     clips = normal(4, 2, 8, 23), jnp.ones((2, 8), bool)
-    terms = task.held_out_terms(task.init(jax.random.key(0))[0], None, clips, None)
+    terms = jax.jit(task.held_out_terms)(task.init(jax.random.key(0))[0], None, clips, None)
     assert terms["joints"] > 0.01
     assert terms["loss"] == pytest.approx(terms["features"] + weight * terms["joints"] + 1e-4 * terms["divergence"])
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable
@@ -149,14 +150,16 @@ def test_a_codec_goes_to_metres_and_back():
     np.testing.assert_allclose(moved, jnp.broadcast_to(shift / CODEC.axes.deviation, moved.shape), atol=1e-5)
     np.testing.assert_array_equal(CODEC.encode(NORMALISED, MASK), NORMALISED)
     codec = latent_codec()
-    state = codec.encode(NORMALISED, MASK)
+    state = jax.jit(codec.encode)(NORMALISED, MASK)
     assert state.shape == (CLIPS, 10, JOINTS, 4) and codec.frames_per_state == 4
     inside = np.asarray(state)[np.asarray(MASK[:, ::4])]
     np.testing.assert_allclose(inside.mean(axis=(0, 1)), 0.0, atol=1e-4)
     np.testing.assert_allclose(inside.std(axis=(0, 1)), 1.0, atol=1e-3)
     assert not np.any(np.asarray(state)[~np.asarray(MASK[:, ::4])])
-    model = network_with(AUTOENCODER, codec.params)
-    np.testing.assert_allclose(codec.decode(state, MASK)[0], model.decode(model.encode(NORMALISED[:1]))[0], atol=1e-4)
+    model = Compiled(network_with(AUTOENCODER, codec.params))
+    np.testing.assert_allclose(
+        jax.jit(codec.decode)(state, MASK)[0], model.decode(model.encode(NORMALISED[:1]))[0], atol=1e-4
+    )
 
 
 def test_times_are_one_a_sample_or_one_a_block():

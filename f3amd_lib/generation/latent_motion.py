@@ -219,8 +219,8 @@ def latent_motions(trained: LatentModel, pooled, num_frames, key, *, draw: Calla
     if lengths.max() > trained.most_frames:
         raise ValueError(f"{trained.name} makes up to {trained.most_frames} frames, got {lengths.max()}")
     mask = frame_mask(lengths, int(lengths.max()))
-    made = positions_from_redundant((draw or latent_sampler(trained, **how))(pooled, mask, key))
-    return np.asarray(made) * np.asarray(mask)[..., None, None]
+    vectors = (draw or latent_sampler(trained, **how))(pooled, mask, key)
+    return positions_from_redundant(np.asarray(vectors)) * np.asarray(mask)[..., None, None]
 
 
 def reconstruction(trained: LatentModel, vectors, mask) -> tuple[np.ndarray, np.ndarray]:

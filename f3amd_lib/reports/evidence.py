@@ -275,7 +275,8 @@ class Evidence:
         # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
         wanted = [(column, value) for column, value in row.items() if column != "dataset" or self.printed]
         if wanted:
-            table = table[np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])]
+            which = np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])
+            table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
             network = asked_network(row["model"])
             self.trained.append((network, row.get("window_frames", 32)))
@@ -296,7 +297,7 @@ class Evidence:
           NotMeasured: if there is no such row; the message says which.
         """
         found = self.rows(name, device, **row)
-        if value in found:
+        if value in found and found[value].isna().any():
             found = found[found[value].notna()]
         if len(found) and value in found:
             bounds = ["value", "low", "high"] if value == "value" else [value]
