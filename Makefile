@@ -112,7 +112,7 @@ site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80
 # From nothing each time, so that no page outlives its source. A warning is an error.
 site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html
 	rm -rf docs/_build
-	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -W --keep-going -c docs -d docs/_build/doctrees \
+	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_lib steer --overwrite --out docs/_build/html/steer.html
 	$(PYTHON) docs/check_links.py docs/_build/html
