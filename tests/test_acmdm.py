@@ -31,9 +31,13 @@ def config_of(family=ACMDMConfig, **settings):
 def stirred(network, seed=0):
     """The network with random weights in place of its zeros."""
     graph, state = nnx.split(network)
-    rng = np.random.default_rng(seed)
-    noise = lambda leaf: 0.2 * rng.standard_normal(leaf.shape, np.float32)
-    return nnx.merge(graph, jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf) + noise(leaf)), state))
+    return nnx.merge(graph, _stirred(state, seed))
+
+
+@jax.jit
+def _stirred(state, seed):
+    keys = iter(jax.random.split(jax.random.key(seed), len(jax.tree.leaves(state))))
+    return jax.tree.map(lambda leaf: leaf + 0.2 * jax.random.normal(next(keys), leaf.shape), state)
 
 
 def fresh(config, seed=0):
