@@ -160,6 +160,18 @@ def network_of(config: NetworkConfig) -> nnx.Module:
     return nnx.merge(graph, jax.tree.map(lambda leaf: leaf, state))
 
 
+def stirred(network, seed: int = 0, scale: float = 0.2):
+    """The network with random weights in place of its zeros."""
+    graph, state = nnx.split(network)
+    return nnx.merge(graph, _stirred(state, seed, scale))
+
+
+@jax.jit
+def _stirred(state, seed, scale):
+    keys = iter(jax.random.split(jax.random.key(seed), len(jax.tree.leaves(state))))
+    return jax.tree.map(lambda leaf: leaf + scale * jax.random.normal(next(keys), leaf.shape), state)
+
+
 def evaluate(network, x_noisy, sigma, condition):
     """Encode and denoise, compiled once per form of the network and shape."""
     network = Compiled(network)

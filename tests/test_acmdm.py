@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import stirred
 from flax import nnx
 
 from f3amd_lib.networks import presets
@@ -26,18 +27,6 @@ BATCH = 2
 
 def config_of(family=ACMDMConfig, **settings):
     return family(**{**SIZE, **settings})
-
-
-def stirred(network, seed=0):
-    """The network with random weights in place of its zeros."""
-    graph, state = nnx.split(network)
-    return nnx.merge(graph, _stirred(state, seed))
-
-
-@jax.jit
-def _stirred(state, seed):
-    keys = iter(jax.random.split(jax.random.key(seed), len(jax.tree.leaves(state))))
-    return jax.tree.map(lambda leaf: leaf + 0.2 * jax.random.normal(next(keys), leaf.shape), state)
 
 
 def fresh(config, seed=0):

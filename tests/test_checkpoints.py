@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import struct
 
 import jax
 import jax.numpy as jnp
@@ -177,6 +178,17 @@ def test_safetensors_of_another_project_are_refused_by_name(tmp_path):
     path = tmp_path / "theirs.safetensors"
     save_file({"weight": np.zeros(3, np.float32)}, path)
     refused(r"theirs\.safetensors: not written by this project", load_model, path)
+
+
+@pytest.mark.parametrize(
+    ("header", "says"), [({}, "not written by this project"), ({"format": checkpoints.FORMAT}, "not a whole")]
+)
+def test_a_type_that_numpy_does_not_know_is_no_bare_error(tmp_path, header, says):
+    entry = {"x": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}
+    text = json.dumps({"__metadata__": header} | entry).encode()
+    path = tmp_path / "theirs.safetensors"
+    path.write_bytes(struct.pack("<Q", len(text)) + text + bytes(4))
+    refused(rf"theirs\.safetensors: {says}", checkpoints.describe, path)
 
 
 def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):

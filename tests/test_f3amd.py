@@ -16,6 +16,7 @@ from builders import (
     network_of,
     refused,
     same_tree,
+    stirred,
     tiny_config,
     tiny_normaliser,
 )
@@ -332,11 +333,7 @@ def test_a_wider_decoder_has_a_second_layer(coder):
 def lively_network(**changes):
     """A network whose every path is open: residual blocks start closed, with an output of zero."""
     network = make_network(**changes)
-    graph, state = nnx.split(network)
-    leaves, tree = jax.tree.flatten(state)
-    rng = np.random.default_rng(5)
-    moved = [jax.device_put(np.asarray(leaf) + 0.05 * rng.standard_normal(leaf.shape, np.float32)) for leaf in leaves]
-    return nnx.merge(graph, jax.tree.unflatten(tree, moved))
+    return stirred(network, 5, scale=0.05)
 
 
 def a_walk(yaw):

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_acmdm import BATCH, condition, config_of, fresh, normal, stirred
+from builders import stirred
+from test_acmdm import BATCH, condition, config_of, fresh, normal
 
 from f3amd_lib.data.text_motions import AxisNormaliser
 from f3amd_lib.diffusion.flow import solve

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import stirred
 from compiled import Compiled
 from flax import nnx
-from test_acmdm import BATCH, condition, config_of, fresh, normal, stirred
+from test_acmdm import BATCH, condition, config_of, fresh, normal
 
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas

@@ -42,8 +42,6 @@ from f3amd_lib.motion.skeleton import mirror
 SPAN = WINDOW + HISTORY
 SIZES = {"window": WINDOW, "num_history": HISTORY}
 
-gather = jax.jit(gather_windows)
-
 # Every batch here is handed on as numpy arrays, which saves compiling each test's own arithmetic.
 _sample = jax.jit(sample_windows, static_argnums=2)
 _fit = jax.jit(fit_normaliser)
@@ -65,7 +63,7 @@ def train(packed):
 
 def all_windows(windows, yaw=0.0, smoothing=0) -> Batch:
     count = windows.num_windows
-    batch = gather(windows, jnp.arange(count), jnp.full(count, yaw), jnp.full(count, smoothing, jnp.int32))
+    batch = gather_windows(windows, jnp.arange(count), jnp.full(count, yaw), jnp.full(count, smoothing, jnp.int32))
     return jax.tree.map(np.asarray, batch)
 
 

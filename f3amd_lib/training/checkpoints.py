@@ -77,8 +77,10 @@ def _read(path: Path) -> tuple[dict, dict]:
         # In NumPy, here and below: JAX compiles a program for every shape that it is to convert.
         with safe_open(path, framework="numpy") as file:
             header = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, ValueError, TypeError, MemoryError) as error:
+            # Others' files may hold types that NumPy does not know, and need not be read at all.
+            names = file.keys() if header.get("format") == FORMAT else ()
+            arrays = {name: file.get_tensor(name) for name in names}
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, MemoryError) as error:
         raise ValueError(
             f"{path}: not a whole safetensors file ({error}); it was cut short or damaged, delete it or restore a copy"
         ) from None
