@@ -11,6 +11,7 @@ from builders import packed_from, refused
 
 from f3amd_lib.experiments import campaign
 from f3amd_lib.experiments.campaign import Run, queue, run_campaign
+from f3amd_lib.experiments.denoising import held_out_condition, input_use
 from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -114,9 +115,16 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     assert record["batch_size"] == 4 and set(table["steps"]) == {0, 1, 8}
     weights = table.groupby(["run", "windows"])["weights"].unique()
     assert weights.map(len).eq(1).all() and len(set(weights.map(lambda values: values[0]))) == 3
+    held_out = PreparedData(packed, 32, 10).windows("validation")
     for each, windows in snapshots:
         kept = checkpoints.load_model(tmp_path / "whole" / "runs" / each.name / f"{windows}.safetensors")
         assert kept.record["training"]["seed"] == each.seed
+        # How far its answers move with its input is asked of these weights (kept with eight bits of precision).
+        uses = input_use(kept, held_out_condition(held_out, kept)).set_index("metric")["value"]
+        found = table.query("run == @each.name and windows == @windows and steps == 8").set_index("metric")["value"]
+        assert found[uses.index].to_numpy() == pytest.approx(uses.to_numpy(), rel=0.02) and uses.min() > 0.0
+    uses = table[table["metric"] == "use_of_x"].groupby("run")["value"].first()
+    assert uses.max() > 1.1 * uses.min(), "two networks of equal use would hide a row of the wrong one"
     once = measured.copy()
     assert len(once) == 2 * len(snapshots) and len(set(once)) == len(snapshots)
     # Stopped at once, then after the first snapshot, then to the end.
