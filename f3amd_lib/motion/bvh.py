@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
@@ -118,11 +118,7 @@ def write_bvh(path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY",
     Raises:
       ValueError: if the file exists and `overwrite` is false, or for a bad order.
     """
-    path = Path(path)
-    with whole_file(path, overwrite=overwrite) as temporary:
-        text = format_bvh(motion, scale=scale, order=order)
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-    return path
+    return write_whole(path, format_bvh(motion, scale=scale, order=order), overwrite=overwrite)
 
 
 def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> str:
@@ -143,9 +139,7 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
     rotations = motion.needed_rotations("a BVH file")
     skeleton, lines, depth_first = motion.skeleton, ["HIERARCHY"], []
-    children = [[] for _ in skeleton.names]
-    for child, parent in enumerate(skeleton.parents[1:], 1):
-        children[parent].append(child)
+    children = skeleton.children
     offset_line = lambda offset: "OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset)
     steps = [(0, 0, False)]  # a stack, not a recursion: chains of thousands of joints can be written
     while steps:
