@@ -661,9 +661,7 @@ def measure(
     other_window = profile.window != motion.numbers().window
     of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
     if (other_window or published) and not (names and set(names) <= of_windows):
-        raise ValueError(
-            "--window is for quality, trained and walking, --published for quality alone: measure them by name"
-        )
+        raise ValueError("--window is for quality, trained and walking, --published for quality: measure these by name")
     for name in names or MEASUREMENTS:
         with _measuring(name, profile):
             log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **_given(published=published)))

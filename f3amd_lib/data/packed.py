@@ -143,10 +143,8 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
             skipped.append((clip.name, reason))
             continue
         if kept and motion.skeleton != kept[0][1]:
-            raise ValueError(
-                f"{clip.name}: its skeleton differs from that of {kept[0][0].name} (names, parents "
-                "or bone lengths); a data set needs one skeleton: retarget or remove the file"
-            )
+            what = f"its skeleton differs from that of {kept[0][0].name} in names, parents or bone lengths"
+            raise ValueError(f"{clip.name}: {what}; a data set needs one: retarget or remove the file")
         rotations = rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16)
         root = motion.root_position.astype(np.float32)
         kept.append((clip, motion.skeleton, root, rotations, lowest_toe_height(motion)))

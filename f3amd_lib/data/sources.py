@@ -286,18 +286,16 @@ def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
     published, folder = _SETS[name], pooch.os_cache("f3amd")
     if "url" not in published:
-        raise ValueError(
-            f"data set {name!r} is downloaded from nowhere; set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
-        )
+        how = f"set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
+        raise ValueError(f"data set {name!r} is downloaded from nowhere; {how}")
     pooch.get_logger().setLevel("WARNING")
     url, digest, file = published["url"], published.get("hash"), published["file"]
     try:
         return pooch.retrieve(url, digest, fname=file, path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
-        raise ValueError(
-            f"data set {name!r} could not be downloaded from {url} ({type(error).__name__}: {error}); fetch "
-            f"it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip file or its folder"
-        ) from error
+        what = f"{url}: data set {name!r} could not be downloaded ({type(error).__name__}: {error})"
+        how = f"fetch it by other means and set {DATA_DIR_VARIABLE} to the zip file or its folder"
+        raise ValueError(f"{what}; {how}") from error
 
 
 def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:

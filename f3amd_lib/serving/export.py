@@ -115,10 +115,8 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         raise ValueError(f"batch must be a whole number of characters, at least 1, got {batch!r}")
     sigmas = np.asarray(sigmas, np.float64)
     if sigmas.ndim != 1 or len(sigmas) < 2 or not np.isfinite(sigmas).all():
-        raise ValueError(
-            f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}; "
-            "take them from a noise schedule's grid"
-        )
+        what = f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}"
+        raise ValueError(f"{what}; take them from a noise schedule's grid")
     config = network.config
     shape = (batch, config.window, config.channels)
     inputs = {name: part.shape for name, part in config.condition_shapes(batch)._asdict().items()} | {"noise": shape}
@@ -200,11 +198,10 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
     """
     settings = _find_target(target)
     if settings["driver"] == "local-task" and _has_loop(program):
-        raise ValueError(
-            f"the program has a loop (stablehlo.while), and on {target} IREE's local-task driver "
-            "returns NaN or garbage from such programs now and then: export it with unroll=True, "
-            "and give it its noise instead of a random key"
+        what = (
+            f"the program has a loop (stablehlo.while), from which IREE returns NaN or garbage now and then on {target}"
         )
+        raise ValueError(f"{what}: export it with unroll=True, and give it its noise instead of a random key")
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
     # Tiles are faster, but some programs do not compile in them.

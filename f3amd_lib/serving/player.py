@@ -246,10 +246,8 @@ def _check_in_step(character: Character, first: Motion) -> None:
 def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
     for frame in scene.boundaries:
         if frame not in range(1, num_frames):
-            raise ValueError(
-                f"boundary {frame} of scene {scene.title!r} is no frame between 1 and {num_frames - 1}, "
-                "where a new window could begin"
-            )
+            what = f"no frame between 1 and {num_frames - 1}, where a new window could begin"
+            raise ValueError(f"boundary {frame} of scene {scene.title!r} is {what}")
     return sorted({int(frame) for frame in scene.boundaries})
 
 
@@ -316,10 +314,8 @@ def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[di
             raise ValueError(f"{label}: {error}") from None
         fps = getattr(character.path, "fps", motion.fps)
         if len(path) != num_frames or abs(fps - motion.fps) > 1e-6:
-            raise ValueError(
-                f"{label}: the target path has {len(path)} frames at {fps:g} a second, the motion "
-                f"{num_frames} at {motion.fps:g}"
-            )
+            there = f"{len(path)} frames at {fps:g} a second, the motion {num_frames} at {motion.fps:g}"
+            raise ValueError(f"{label}: the target path has {there}")
         pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
     about = {"name": label, "color": character.color, "ghost": ghost}
     return about | {"contacts": has_contacts, "path": character.path is not None}, pieces

@@ -57,9 +57,7 @@ def steer_page(
     """
     check_known(runtime, RUNTIMES, "runtime")
     if trained.diffusion.sampler != "ddim":
-        raise ValueError(
-            f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
-        )
+        raise ValueError(f"{trained.name} is sampled by {trained.diffusion.sampler!r}, the page walks by 'ddim' alone")
     card = model_card(trained, num_steps)
     if missing := [style for style in trained.styles if style not in trained.start_poses]:
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
