@@ -108,14 +108,12 @@ class PackedMotion:
         """
         if not 0 <= clip < self.num_clips:
             raise ValueError(f"clip must be 0 to {self.num_clips - 1}, got {clip}")
-        start, stop = int(self.clip_start[clip]), int(self.clip_start[clip + 1])
-        return Motion(
-            skeleton=self.skeleton,
-            root_position=self.root_position[start:stop].astype(np.float64),
-            rotations=matrix_from_rotation_6d(self.rotation_6d[start:stop].astype(np.float64)),
-            fps=FPS,
-            name=self.clip_names[clip],
+        frames = slice(*self.clip_start[clip : clip + 2])
+        root_position, rotation_6d = (
+            array[frames].astype(np.float64) for array in (self.root_position, self.rotation_6d)
         )
+        rotations = matrix_from_rotation_6d(rotation_6d)
+        return Motion(self.skeleton, root_position, rotations, FPS, self.clip_names[clip])
 
 
 def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:

@@ -466,14 +466,10 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     for item in sorted(listed, key=lambda item: item.name):
         loader = _bvh_loader(archive, members[item.name], item.size_and_crc, sha256_prefix=item.sha256_prefix)
         clips.append(Clip(item.name, item.style, item.content, splits[item.name], loader))
-    return _dataset(
-        "bandai",
-        clips,
-        [(item.name, item.sha256_prefix) for item in listed],
-        primary=lambda style: style.startswith("2-"),
-        mirror=lambda style: True,
-        notes=[f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known],
-    )
+    content = [(item.name, item.sha256_prefix) for item in listed]
+    notes = [f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known]
+    of_part_2 = lambda style: style.startswith("2-")
+    return _dataset("bandai", clips, content, primary=of_part_2, mirror=lambda style: True, notes=notes)
 
 
 _100STYLE_URL = _SETS["100style"]["url"]

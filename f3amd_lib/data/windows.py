@@ -128,8 +128,7 @@ def build_windows(
         raise ValueError(f"the model does not know the style {min(missing)!r} of this data set")
     check_known(split, SPLITS, "split")
     mirrored = split == "train" if mirrored is None else mirrored
-    frames, paths, starts, room, labels = [], [], [], [], []
-    offset = 0
+    frames, paths, columns, offset = [], [], [], 0
     for clip in np.flatnonzero(np.asarray(packed.clip_split) == SPLITS.index(split)):
         motion = packed.motion(int(clip))
         style = int(packed.clip_style[clip])
@@ -139,24 +138,16 @@ def build_windows(
         for take in takes:
             world = features.world_frames(take)
             first = np.arange(0, len(world) - (num_history + window) + 1, stride)
-            starts.append(offset + first)
-            room.append(first)
-            labels.append(np.full(len(first), style))
+            columns.append([offset + first, first, np.full(len(first), style)])
             frames.append(world.astype(np.float32))
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
             offset += len(world)
-    if not sum(len(first) for first in starts):
+    if not any(len(first) for first, _, _ in columns):
         raise ValueError(f"data set {packed.dataset!r} has no {split} clip of at least {num_history + window} frames")
-    return WindowSet(
-        window=window,
-        num_history=num_history,
-        frames=jnp.asarray(np.concatenate(frames)),
-        paths=jnp.asarray(np.concatenate(paths, axis=1)),
-        starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
-        room=jnp.asarray(np.concatenate(room).astype(np.int32)),
-        styles=jnp.asarray(np.concatenate(labels).astype(np.int32)),
-        one_hot=jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])],
-    )
+    starts_room_styles = (jnp.asarray(column, jnp.int32) for column in np.concatenate(columns, axis=1))
+    one_hot = jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])]
+    frames, paths = jnp.asarray(np.concatenate(frames)), jnp.asarray(np.concatenate(paths, axis=1))
+    return WindowSet(window, num_history, frames, paths, *starts_room_styles, one_hot)
 
 
 @functools.partial(jax.jit, static_argnames="earlier")

@@ -105,11 +105,8 @@ class MotionGenerator:
             origin = history[:, -1, jnp.array([0, 2])]
             # Start where the character is and bend back to the line.
             position = bend_path(target - target_before[:, None, :], target_before - origin)
-            condition = Condition(
-                history=normaliser.normalise(center_window(history, origin)),
-                path=normaliser.normalise_path(path_condition(position, yaw)),
-                style=style,
-            )
+            path = normaliser.normalise_path(path_condition(position, yaw))
+            condition = Condition(normaliser.normalise(center_window(history, origin)), path, style)
             if key.ndim:
                 keys = jax.vmap(jax.random.fold_in, (0, None))(key, number)
                 x0_hat = self.sample_window_each(keys, condition)

@@ -155,10 +155,7 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         depth_first.append(joint)
         channels = [f"{axis}position" for axis in "XYZ" if depth == 0] + [f"{axis}rotation" for axis in order]
         lines += [f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"]
-        lines += [
-            f"{inner}{offset_line(skeleton.offsets[joint])}",
-            f"{inner}CHANNELS {len(channels)} {' '.join(channels)}",
-        ]
+        lines += [inner + offset_line(skeleton.offsets[joint]), f"{inner}CHANNELS {len(channels)} {' '.join(channels)}"]
         steps += [(joint, depth, True), *((child, depth + 1, False) for child in reversed(children[joint]))]
     lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
     with warnings.catch_warnings():
@@ -460,12 +457,7 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, firs
             line = [line for line, _ in _rows_with_lines(rows, first_line)][frame]
             what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame {frame}"
             raise _Broken(line, f"{what}; bones must be rigid: bake the motion to rotations before exporting")
-    skeleton = Skeleton(
-        names=tuple(joint.name for joint in joints[root:]),
-        parents=tuple(max(parent - root, -1) for parent in parents[root:]),
-        offsets=offsets[root:],
-        end_sites=tuple(
-            (joint - root, tuple(scale * value for value in offset)) for joint, offset in end_sites if joint >= root
-        ),
-    )
+    tips = [(joint - root, [scale * value for value in offset]) for joint, offset in end_sites if joint >= root]
+    names, parents = [joint.name for joint in joints[root:]], [max(parent - root, -1) for parent in parents[root:]]
+    skeleton = Skeleton(names, parents, offsets[root:], tips)
     return Motion(skeleton, root_position, rotations[:, root:], fps=1.0 / frame_time, name=name)

@@ -68,12 +68,8 @@ class Skeleton:
             raise ValueError("skeleton offsets must be finite")
 
     def __eq__(self, other):
-        return (
-            isinstance(other, Skeleton)
-            and self.names == other.names
-            and self.parents == other.parents
-            and np.allclose(self.offsets, other.offsets, atol=1e-3)
-        )
+        alike = isinstance(other, Skeleton) and (self.names, self.parents) == (other.names, other.parents)
+        return alike and np.allclose(self.offsets, other.offsets, atol=1e-3)
 
     def __hash__(self):
         return hash((self.names, self.parents))
