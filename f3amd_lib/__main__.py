@@ -4,8 +4,6 @@ A function a command: its parameters are the options, its docstring is their hel
 imported inside, so that `f3amd --help` is quick.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import logging

@@ -12,8 +12,6 @@
 Source: the released data set of Guo et al. 2022 and its README.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -6,8 +6,6 @@ Bandai's clips by more than 0.5 mm (`tests/test_packed.py`); it is a plain `.npz
 and small enough to carry to another machine.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -13,8 +13,6 @@ folder. Archives are read in place. Every file is checked before it is parsed, s
 is refused by name and none of its numbers get used.
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 import hashlib

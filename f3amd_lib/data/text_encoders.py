@@ -12,8 +12,6 @@ as safetensors.
 round are one to its pooled vector; the token vectors keep their order.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import re

@@ -5,8 +5,6 @@ start. A batch is a gather, a random turn and a subtraction, all inside the jitt
 Python loop over samples.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 What a user asks for is checked here, once; `generation.text_to_motion` has the samplers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import jax

@@ -18,8 +18,6 @@ do not see each other; they may walk through one another, unless their paths are
 apart (`min_distance`). Then everybody's path depends on who else is there.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

@@ -21,8 +21,6 @@ Capture Editing", SCA 2002 (plan, root, legs), with least squares in place of th
 stretched bones.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -19,8 +19,6 @@ Source: ours; the running-out is inertialisation (D. Bollo, GDC 2018), the sprin
 the same in JavaScript (`serving/web/motion.js`), and a test holds both together.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

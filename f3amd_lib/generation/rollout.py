@@ -5,8 +5,6 @@ noise, denoise in a few steps, keep the last frames as the next history. All rou
 jitted scan.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax

@@ -1,7 +1,5 @@
 """A rollout that begins where a motion of the user's ends: `f3amd rollout --start my.bvh`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames, turn_frames, world_frames

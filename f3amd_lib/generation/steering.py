@@ -14,8 +14,6 @@ line over the window, as in every rollout. A page does the same in JavaScript (`
 holds both together.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

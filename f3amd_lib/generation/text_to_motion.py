@@ -4,8 +4,6 @@ All of it is one call of `flow.solve` on a `predict(state, time)`; what differs 
 positions or latents in network units; `training.motion_codec` makes metres of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 
 import jax

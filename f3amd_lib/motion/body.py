@@ -8,8 +8,6 @@ without end sites.
 Source: ours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -6,8 +6,6 @@ file, line and remedy when a file is broken. Files hold centimetres and degrees;
 metres and rotation matrices.
 """
 
-from __future__ import annotations
-
 import collections
 import io
 import re

@@ -3,8 +3,6 @@
 Bone by bone from the root down, each in closed form, so that positions that come from the skeleton are met exactly.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module

@@ -1,7 +1,5 @@
 """Motion as a table that any program reads: a row for each frame and joint."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

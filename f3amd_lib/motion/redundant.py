@@ -21,8 +21,6 @@ bone tell where the body faces in the world.
 Source: Guo et al. 2022 (HumanML3D), section 3 and its released processing.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -13,8 +13,6 @@ nothing else of f3amd_lib, so that it can be copied out alone and shipped beside
 An artefact is a program: load only those that you trust, as with any other.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.metadata

@@ -9,8 +9,6 @@ device, and has no loop of random bits. What is written here is loaded by `artef
 nothing of this library.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -6,8 +6,6 @@ glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of 
 Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -21,8 +21,6 @@ Differences of smooth motion are small, which lets zlib shorten them. Joints com
 those of a crowd to a few.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import html

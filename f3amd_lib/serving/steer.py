@@ -5,8 +5,6 @@ our own modules (`serving/web`). All of it is gzipped and in base64, so that the
 of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html
