@@ -302,10 +302,12 @@ def _generate(generator, settings, in_turn, out: Path, overwrite, progress) -> C
         _, _, *wanted = asked_of(range(num_characters))
         planned = keep_apart(*wanted, min_distance=settings["min_distance"], fps=_FPS)
     beginning = asked_of(range(chunk))
-    settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
+    # In tenths of a millimetre and milliradian: last bits of the same path may differ between machines.
+    tenths = np.rint(1e4 * np.column_stack([array[0] for array in beginning[2:]])).astype("<i8")
+    settings[_FIRST_PATH] = hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
     if first_path not in (None, settings[_FIRST_PATH]):
         what = "holds a crowd whose first character walks another path than this call's"
-        raise ValueError(f"{out}: {what}; give the paths that it was begun with, {_WAY_OUT}")
+        raise ValueError(f"{out}: {what}; go on with the version that began it, {_WAY_OUT}")
     if finished == 0:
         _write_settings(out, settings, 0)
         _lay_out(out, settings)
@@ -364,15 +366,6 @@ def _whole(name: str, value, least: int) -> int:
     if int(value) != value or value < least:
         raise ValueError(f"{name} must be a whole number of {least} or more, got {value}")
     return int(value)
-
-
-def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
-    """Return a digest of one path, [F, 2] and [F], in tenths of a millimetre and milliradian.
-
-    The same path worked out on another machine may differ in its last bits.
-    """
-    tenths = np.rint(1e4 * np.column_stack([position, yaw])).astype("<i8")
-    return hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
 
 
 def _paces(generator: MotionGenerator, characters: range, style_index, seed: int):
