@@ -98,9 +98,7 @@ def start_feet(skeleton: Skeleton, history, floor: float | None = None) -> Feet:
         floor, False, np.zeros(2, bool), np.zeros(2, int), path[0][:, [0, 2]], path[0], zero, zero, zero,
         path[0], np.zeros(2), path[0, :, 1], 0.0, zero,
     )  # fmt: skip
-    for frame in history:
-        feet = lock_frame(skeleton, feet, frame, locking=False)[0]
-    return feet
+    return lock_frames(skeleton, feet, history, locking=False)[0]
 
 
 def lock_frame(skeleton: Skeleton, feet: Feet, frame, *, locking: bool = True) -> tuple[Feet, np.ndarray]:

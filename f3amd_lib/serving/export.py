@@ -196,9 +196,7 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
     """
     settings = _find_target(target)
     if settings["driver"] == "local-task" and _has_loop(program):
-        what = (
-            f"the program has a loop (stablehlo.while), from which IREE returns NaN or garbage now and then on {target}"
-        )
+        what = f"the program has a loop (stablehlo.while), of which IREE makes NaN or garbage now and then on {target}"
         raise ValueError(f"{what}: export it with unroll=True, and give it its noise instead of a random key")
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
@@ -212,12 +210,8 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
             # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
             # process that holds both dies when it ends.
             command = [sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile", str(source), "-o"]
-            command += [str(compiled), "--iree-input-type=stablehlo"]
-            command += [
-                f"--iree-hal-target-backends={settings['backend']}",
-                "--iree-vm-bytecode-module-strip-source-map",
-                *flags,
-            ]
+            command += [str(compiled), "--iree-input-type=stablehlo", "--iree-vm-bytecode-module-strip-source-map"]
+            command += [f"--iree-hal-target-backends={settings['backend']}", *flags]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode == 0:
                 return compiled.read_bytes(), flags
