@@ -58,7 +58,7 @@ def read_caption_line(line: str, where: str) -> tuple[str, float, float]:
     """
     parts = line.rstrip("\n").split("#")
     if len(parts) != 4:
-        raise ValueError(f"{where}: {len(parts)} parts between # where caption#words#begin#end has 4; mend the line")
+        raise ValueError(f"{where}: has {len(parts)} parts where caption#words#begin#end has 4; mend the line")
     try:
         begin, end = (0.0 if math.isnan(float(word)) else float(word) for word in parts[2:])
     except ValueError:

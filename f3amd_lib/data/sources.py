@@ -292,7 +292,7 @@ def _download(name: str) -> str:
         return pooch.retrieve(url, digest, fname=file, path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         what = f"{url}: data set {name!r} could not be downloaded ({type(error).__name__}: {error})"
-        how = f"fetch it by other means and set {DATA_DIR_VARIABLE} to the zip file or its folder"
+        how = f"fetch it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip or its folder"
         raise ValueError(f"{what}; {how}") from error
 
 

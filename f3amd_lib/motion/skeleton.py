@@ -145,8 +145,8 @@ class Skeleton:
             for child in self.children[joint]:
                 error += np.abs(candidates * self.offsets[child] - self.offsets[twin[child]]).sum(1)
             if error.min() > 2e-3 * max(len(self.children[joint]), 1):
-                off = f"{1000 * error.min():.1f} mm off the mirror images of their twins"
-                raise ValueError(f"bones below {self.names[joint]!r} are {off}: skeleton cannot be mirrored")
+                what = f"are no mirror images of their twins (off by {1000 * error.min():.1f} mm)"
+                raise ValueError(f"bones below {self.names[joint]!r} {what}: skeleton cannot be mirrored")
             tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
             parent = self.parents[joint]
             inherited = [k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])]
