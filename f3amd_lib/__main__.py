@@ -4,8 +4,6 @@ A function a command: its parameters are the options, its docstring is their hel
 imported inside, so that `f3amd --help` is quick.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import logging
@@ -110,12 +108,10 @@ class Model:
 
 def data(motion: Data) -> None:
     """Open a data set, build its packed cache, say what is in it."""
-    import numpy as np
-
     from f3amd_lib.data.sources import SPLITS
 
     packed = motion.open()[0].packed
-    counts = np.bincount(np.asarray(packed.clip_split), minlength=3)
+    splits = packed.clip_split.tolist()
     facts = {
         "data set": packed.dataset,
         "terms": packed.licence,
@@ -124,7 +120,7 @@ def data(motion: Data) -> None:
         "frames": f"{packed.num_frames} at 30 fps",
         "joints": packed.skeleton.num_joints,
         "styles": ", ".join(packed.styles),
-        "split": ", ".join(f"{count} {split}" for count, split in zip(counts, SPLITS, strict=True)),
+        "split": ", ".join(f"{splits.count(number)} {split}" for number, split in enumerate(SPLITS)),
     }
     for name, fact in facts.items():
         log.info("%-12s %s", name, fact)
@@ -142,17 +138,16 @@ def dataset(
       fps: frames per second to write.
       out: folder to write to; must be empty or not there yet.
     """
-    from f3amd_lib.data.humanml3d import captioned_motions, read_caption_table, write_humanml3d
-    from f3amd_lib.data.sources import SPLITS, open_dataset
+    from f3amd_lib.data import humanml3d, sources
 
-    written = captioned_motions(open_dataset(data, path=source), read_caption_table(captions), fps=fps)
-    folder = write_humanml3d(out, written)
+    opened = sources.open_dataset(data, path=source)
+    written = humanml3d.captioned_motions(opened, humanml3d.read_caption_table(captions), fps=fps)
+    folder = humanml3d.write_humanml3d(out, written)
     for clip, reason in written.skipped:
         log.info("left out     %s: %s", clip, reason)
-    log.info("split        %s", ", ".join(f"{written.splits.count(split)} {split}" for split in SPLITS))
-    log.info(
-        "joints       %d, so vectors of %d numbers", written.skeleton.num_joints, 12 * written.skeleton.num_joints - 1
-    )
+    joints, counts = written.skeleton.num_joints, [f"{written.splits.count(split)} {split}" for split in sources.SPLITS]
+    log.info("split        %s", ", ".join(counts))
+    log.info("joints       %d, so vectors of %d numbers", joints, 12 * joints - 1)
     log.info("terms        %s", written.licence)
     log.info("wrote        %s: %d clips", folder, written.num_clips)
 
@@ -202,8 +197,7 @@ def train(
       teacher: file of the teacher of a MotionPCM student, such as the one that ships, instead of training one.
     """
     from f3amd_lib.experiments.learning_curves import train_family
-    from f3amd_lib.training import parallel
-    from f3amd_lib.training.pipeline import model_files
+    from f3amd_lib.training import parallel, pipeline
 
     if teacher is not None and not (preset and all(name.startswith(("MotionPCM", "MotionLCM")) for name in preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
@@ -221,7 +215,7 @@ def train(
     runs = train_family(prepared, profile, list(preset) or [profile.preset], folder=out, budget_s=budget, mesh=mesh)
     status = 0
     for name, state in runs:
-        files = model_files(profile, name, folder=out)
+        files = pipeline.model_files(profile, name, folder=out)
         log.info("%-12s %s", name, files.state if state == "unfinished" else files.model)
         status = UNFINISHED if state == "unfinished" else status
     return status
@@ -230,9 +224,8 @@ def train(
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
     """Train models of text to motion, or their judge; what is finished is left as it is."""
     from f3amd_lib.data.text_encoders import load_text_encoder
-    from f3amd_lib.measures.text_judge import load_judge, save_judge, train_judge
-    from f3amd_lib.training import latent_models, text_models
-    from f3amd_lib.training.evaluator_task import EvaluatorTraining
+    from f3amd_lib.measures import text_judge
+    from f3amd_lib.training import evaluator_task, latent_models, text_models
 
     preset_of = lambda name: text_models.preset_and_branch(name)[0]
     is_latent = lambda name: name != text_models.JUDGE and latent_models.is_latent_preset(preset_of(name))
@@ -250,12 +243,12 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
         elif name != text_models.JUDGE:
             done = text_models.train_text_model(data, encoder, profile, name, window=motion.window, **how)
         elif files.model.exists():
-            done = load_judge(files.model)
+            done = text_judge.load_judge(files.model)
         else:
-            training = EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
-            done = train_judge(data, encoder, training, checkpoint=files.state, stop_at=stop_at)
+            training = evaluator_task.EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
+            done = text_judge.train_judge(data, encoder, training, checkpoint=files.state, stop_at=stop_at)
             if done is not None:
-                save_judge(files.model, done)
+                text_judge.save_judge(files.model, done)
         log.info("%-12s %s", name, files.state if done is None else files.model)
         if done is None:
             return UNFINISHED
@@ -358,22 +351,19 @@ def text(
     import jax
     import numpy as np
 
-    from f3amd_lib.data.text_encoders import check_captions, embed_captions, load_text_encoder
+    from f3amd_lib.data import text_encoders
     from f3amd_lib.generation import captioned_motion
-    from f3amd_lib.motion.inverse_kinematics import fitted
-    from f3amd_lib.motion.skeleton import Motion
-    from f3amd_lib.serving.player import Character, Scene
-    from f3amd_lib.training.checkpoints import file_kind
-    from f3amd_lib.training.latent_models import KIND, find_latent_model, is_latent_preset, load_latent_model
-    from f3amd_lib.training.text_models import find_text_model, load_text_model
+    from f3amd_lib.motion import inverse_kinematics, skeleton
+    from f3amd_lib.serving import player
+    from f3amd_lib.training import checkpoints, latent_models, text_models
 
     captions = [caption, *then]
-    check_captions(captions)
+    text_encoders.check_captions(captions)
     captioned_motion.check_solver(steps, guidance)
     if weights is None:
-        latent = model is not None and (model.lower() == "motionpcm" or is_latent_preset(model))
+        latent = model is not None and (model.lower() == "motionpcm" or latent_models.is_latent_preset(model))
     else:
-        latent = file_kind(weights) == KIND  # the file itself says whose it is
+        latent = checkpoints.file_kind(weights) == latent_models.KIND  # the file itself says whose it is
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
     if latent and (then or control):
@@ -383,17 +373,19 @@ def text(
     Model(overwrite=overwrite).check_free(*targets)
     preset = model or (captioned_motion.STREAM_PRESET if then else None)
     if latent:
-        trained = load_latent_model(weights or find_latent_model(data, model, steps))
+        found = weights or latent_models.find_latent_model(data, model, steps)
+        trained = latent_models.load_latent_model(found)
     else:
-        trained = load_text_model(weights or find_text_model(data, preset, control=control is not None))
+        found = weights or text_models.find_text_model(data, preset, control=control is not None)
+        trained = text_models.load_text_model(found)
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
     log.info("terms        %s", trained.record.get("dataset_licence"))
-    encoder = load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
+    encoder = text_encoders.load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
     pooled = captioned_motion.told_captions(trained, encoder, captions, any_words=any_words)
     key, how, points, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, None, ()
     if then or getattr(trained, "starts", ()):
         windows = captioned_motion.told_windows(trained, seconds)
-        starts = embed_captions(list(trained.starts), encoder).pooled
+        starts = text_encoders.embed_captions(list(trained.starts), encoder).pooled
         counts = [windows] * len(captions)
         positions = captioned_motion.stream_motions(trained, pooled, counts, key, starts=starts, **how)
         each = windows * captioned_motion.window_frames(trained)
@@ -406,13 +398,14 @@ def text(
             how["control"] = captioned_motion.control_of(trained, which, frames, points, num_frames)
         positions = captioned_motion.draw_motions(trained, pooled, num_frames, key, **how)[0]
     title = ", then ".join(captions)
-    motion, residual = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, title))
+    made = skeleton.Motion.from_positions(trained.skeleton, positions, trained.fps, title)
+    motion, residual = inverse_kinematics.fitted(made)
     log.info("bones        joints moved by %.1f cm on average, %.1f cm at most, so that bones keep their lengths",
              100 * residual.mean(), 100 * residual.max())  # fmt: skip
     if points is not None:
         missed = 100 * np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
         log.info("control      %s is %.1f cm away on average, %.1f cm at most", joint, missed.mean(), missed.max())
-    scene = Scene([Character(motion, name=name)], title=title, boundaries=boundaries)
+    scene = player.Scene([player.Character(motion, name=name)], title=title, boundaries=boundaries)
     _write_shown(targets, scene, trained, overwrite=overwrite)
 
 
@@ -427,11 +420,11 @@ def _motion_formats(given: str) -> list[str]:
 
 def _write_motion(path: Path, motion, credit: str, overwrite: bool) -> None:
     """Write a motion as .bvh, .glb or .csv."""
-    from f3amd_lib.motion.bvh import write_bvh
-    from f3amd_lib.motion.motion_csv import write_motion_csv
-    from f3amd_lib.serving.gltf import write_glb
+    from f3amd_lib.motion import bvh, motion_csv
+    from f3amd_lib.serving import gltf
 
-    writers = {".bvh": write_bvh, ".csv": write_motion_csv, ".glb": functools.partial(write_glb, credit=credit)}
+    write_glb = functools.partial(gltf.write_glb, credit=credit)
+    writers = {".bvh": bvh.write_bvh, ".csv": motion_csv.write_motion_csv, ".glb": write_glb}
     writers[path.suffix](path, motion, overwrite=overwrite)
 
 
@@ -473,8 +466,8 @@ def crowd(
       raw: draw and write them as the network made them; the folder holds that in any case.
       out: folder to write to.
     """
-    from f3amd_lib.generation.crowd import generate_crowd
-    from f3amd_lib.generation.crowd_planning import MIN_DISTANCE
+    from f3amd_lib.generation.crowd import MIN_DISTANCE, generate_crowd
+    from f3amd_lib.generation.generated import generated_credit
 
     if plan is not None and len(plan) > 1:
         raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
@@ -495,12 +488,13 @@ def crowd(
     window = None if raw else generator.trained.config.window
     lock = bool(drawn or formats) and not raw and _has_legs(made.skeleton)
     shown = lambda character: _finished(made.motion(character), window, lock)
+    credit = generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
     if pictures:
-        _crowd_pictures(made, shown, *drawn)
+        _crowd_pictures(made, shown, credit, *drawn)
     for file in drawn:
         log.info("wrote        %s", file)
     if formats:
-        _crowd_motions(made, shown, motions, formats)
+        _crowd_motions(made, shown, credit, motions, formats)
         log.info("wrote        %s: everybody as %s", motions, ", ".join(formats))
 
 
@@ -517,14 +511,7 @@ def _finished(motion, window: int | None, lock: bool):
     return lock_feet(motion) if lock else motion
 
 
-def _crowd_credit(crowd) -> str:
-    from f3amd_lib.generation.generated import generated_credit
-
-    made_by = crowd.settings["model"]
-    return generated_credit(made_by["name"], made_by["dataset_credit"], made_by["dataset_licence"])
-
-
-def _crowd_motions(crowd, shown, folder: Path, formats) -> None:
+def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
     """Write a file a character and format, one after the other, so that no crowd is too large: NUMBER_STYLE.bvh.
 
     Files of an earlier crowd are removed first; what else lies there stays.
@@ -535,24 +522,22 @@ def _crowd_motions(crowd, shown, folder: Path, formats) -> None:
         if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
             file.unlink()
     for character in range(len(crowd)):
-        motion = shown(character)
-        name = f"{character:0{digits}d}_{crowd.style(character)}"
+        motion, name = shown(character), f"{character:0{digits}d}_{crowd.style(character)}"
         for ending in formats:
-            _write_motion(folder / f"{name}{ending}", motion, _crowd_credit(crowd), False)
+            _write_motion(folder / f"{name}{ending}", motion, credit, False)
 
 
-def _crowd_pictures(crowd, shown, still: Path, page: Path) -> None:
+def _crowd_pictures(crowd, shown, credit: str, still: Path, page: Path) -> None:
     """Draw a crowd half way through, and write a page that plays up to 100 of it; `shown` gives a motion by number."""
-    from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure
-    from f3amd_lib.drawing.style import save_figure
+    from f3amd_lib.drawing import pictures, style
     from f3amd_lib.serving.player import Character, Scene, write_player
 
     name = crowd.settings["model"]["name"]
     motions = [shown(k) for k in range(min(100, len(crowd)))]
-    colors = crowd_colors([motion.name for motion in motions])
+    colors = pictures.crowd_colors([motion.name for motion in motions])
     characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
-    write_player(page, Scene(characters, title=name), strip=False, credit=_crowd_credit(crowd))
-    save_figure(crowd_figure({name: (motions, colors)}, crowd.num_frames // 2), still)
+    write_player(page, Scene(characters, title=name), strip=False, credit=credit)
+    style.save_figure(pictures.crowd_figure({name: (motions, colors)}, crowd.num_frames // 2), still)
 
 
 def export(
@@ -568,14 +553,15 @@ def export(
       out: folder to write to.
     """
     if "onnx" in target:
-        from f3amd_lib.serving.onnx_export import export_onnx
-        from f3amd_lib.serving.onnx_text import export_text_onnx, load_text_or_latent
+        from f3amd_lib.serving import onnx_export, onnx_text
 
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
         how = {"num_steps": model.steps, "batch": characters, "weights": stored, "overwrite": model.overwrite}
-        captioned = model.weights and load_text_or_latent(model.weights)
-        folder = export_text_onnx(captioned, out, **how) if captioned else export_onnx(model.load(), out, **how)
+        if captioned := model.weights and onnx_text.load_text_or_latent(model.weights):
+            folder = onnx_text.export_text_onnx(captioned, out, **how)
+        else:
+            folder = onnx_export.export_onnx(model.load(), out, **how)
     else:
         from f3amd_lib.serving.export import export_model
 
@@ -673,9 +659,7 @@ def measure(
     other_window = profile.window != motion.numbers().window
     of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
     if (other_window or published) and not (names and set(names) <= of_windows):
-        raise ValueError(
-            "--window is for quality, trained and walking, --published for quality alone: measure them by name"
-        )
+        raise ValueError("--window is for quality, trained and walking, --published for quality: measure these by name")
     for name in names or MEASUREMENTS:
         with _measuring(name, profile):
             log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **_given(published=published)))
@@ -760,9 +744,8 @@ def sweep(
     import pandas as pd
 
     from f3amd_lib.experiments import campaign as long_queue
+    from f3amd_lib.experiments import measure, runner
     from f3amd_lib.experiments import sweep as engine
-    from f3amd_lib.experiments.measure import protocol_of
-    from f3amd_lib.experiments.runner import Records
     from f3amd_lib.ground.records import run_record
 
     profile = motion.numbers()
@@ -779,9 +762,9 @@ def sweep(
             held.enter_context(locked(place / f".{name}.lock", f"doing {name}"))
         prepared, _ = motion.open()  # so that workers find the cache, and the classifier below
         if not set(names).isdisjoint(engine.THROUGH_CLASSIFIER):
-            protocol_of(prepared, profile, "sweep")
+            measure.protocol_of(prepared, profile, "sweep")
         record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
-        costs, ended = Records(results / "records", record, {"sweep": ["leg"]}), {}
+        costs, ended = runner.Records(results / "records", record, {"sweep": ["leg"]}), {}
         try:
             for leg, told in engine.run_sweep(work, legs, workers=workers, scheduler=scheduler):
                 ended[leg.name] = told["state"]

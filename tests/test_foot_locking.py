@@ -305,8 +305,8 @@ def test_all_characters_of_a_rollout_are_locked(walk):
         positions = locked.motion(character).positions
         assert floor_penetration(positions, skeleton, FLOOR) < 0.1
     # Told of a floor 5 cm lower, the second one stays as it was.
-    told = lock_rollout(rollout, floor=[FLOOR, FLOOR - 0.05])
-    assert floor_penetration(told.motion(1).positions, skeleton, FLOOR) > 4.9
+    told = lock_feet(rollout.motion(1, with_history=True), floor=FLOOR - 0.05)
+    assert floor_penetration(told.positions, skeleton, FLOOR) > 4.9
 
 
 def test_a_rollout_says_that_its_feet_are_locked(walk):

@@ -22,7 +22,7 @@ from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.serving import player
-from f3amd_lib.serving.player import Character, Scene, player_page, rollout_scene, show_player, write_player
+from f3amd_lib.serving.player import Character, Scene, player_page, rollout_scene, write_player
 from f3amd_lib.serving.web_page import FOLDER
 
 FRAMES = 40
@@ -341,7 +341,7 @@ def test_boundaries_that_are_no_frames_are_refused(boundaries):
         player_page(Scene(wandering_motion(FRAMES), title="Walk", boundaries=boundaries))
 
 
-# --------------------------------------------------------------------------------- files, notebooks
+# -------------------------------------------------------------------------------------------- files
 
 
 def test_a_film_strip_stands_beside_the_page(tmp_path):
@@ -372,7 +372,6 @@ def test_pictures_leave_out_contacts_and_facing_of_an_unknown_rig(tmp_path):
     assert "toe in contact" in [text.get_text() for text in legend.get_texts()]
     path = write_player(tmp_path / "pole.html", [pole, known])
     assert Image.open(path.with_suffix(".png")).width > 500
-    assert show_player(pole).strip is not None
     with Image.open(write_gif(tmp_path / "pole.gif", [pole, known])) as moving:
         assert moving.n_frames > 3
     assert write_film_strip(tmp_path / "strip.png", pole).exists()
@@ -385,26 +384,6 @@ def test_a_strip_that_cannot_be_drawn_leaves_no_page_behind(tmp_path, monkeypatc
     monkeypatch.setattr(player, "scenes_strip", refuse)
     refused("no strip of this", write_player, tmp_path / "new" / "walk.html", wandering_motion(FRAMES))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_notebook_gets_an_iframe_and_an_image(monkeypatch):
-    motion = wandering_motion(FRAMES)
-    shown = show_player(motion, title='A "quoted" <title>', height=300)
-    (attributes,) = [found for tag, found in Elements(shown.iframe).tags if tag == "iframe"]
-    assert attributes["sandbox"] == "allow-scripts allow-downloads"
-    assert attributes["srcdoc"] == player_page(motion, title='A "quoted" <title>', autoplay=False)
-    assert attributes["title"] == 'Motion player: A "quoted" <title>'
-    assert "height:300px" in attributes["style"]
-    displayed = []
-    monkeypatch.setattr("IPython.display.display", lambda one, **raw: displayed.append(one))
-    shown._ipython_display_()
-    html, image = displayed
-    assert html["text/html"] == shown.iframe
-    assert image._repr_mimebundle_()[0]["image/png"]
-    displayed.clear()
-    show_player(motion, strip=False)._ipython_display_()
-    assert len(displayed) == 1
-    refused("height must be 200 or more", show_player, motion, height=20)
 
 
 def test_the_page_is_made_of_files_that_are_installed():

@@ -5,8 +5,6 @@ the clip (how fast, how high the hands go). All words stand in `captions.toml`; 
 gets follows from its name alone. Some phrases are held out: no training caption has them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from pathlib import Path

@@ -15,12 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module, finite_array
-from f3amd_lib.motion.rotations import (
-    matrix_from_rotation_6d,
-    matrix_from_yaw,
-    rotation_6d_from_matrix,
-    rotation_6d_from_yaw,
-)
+from f3amd_lib.motion import rotations
 from f3amd_lib.motion.skeleton import Motion, Skeleton, forward_kinematics
 
 
@@ -31,8 +26,8 @@ def num_channels(skeleton: Skeleton) -> int:
 
 def world_frames(motion: Motion) -> np.ndarray:
     """Turn a motion into world frames, [T, C], float64."""
-    rotation_6d = rotation_6d_from_matrix(np.asarray(motion.needed_rotations("a frame of features"), np.float64))
-    flat = rotation_6d.reshape(motion.num_frames, -1)
+    matrices = np.asarray(motion.needed_rotations("a frame of features"), np.float64)
+    flat = rotations.rotation_6d_from_matrix(matrices).reshape(motion.num_frames, -1)
     return np.concatenate([np.asarray(motion.root_position, np.float64), flat], axis=-1)
 
 
@@ -52,13 +47,13 @@ def motion_from_frames(skeleton: Skeleton, frames, fps: float = 30.0, name: str 
     """
     label = f"frames of {skeleton.num_joints} joints"
     root_position, rotation_6d = split_frames(finite_array(label, frames, ("frame", num_channels(skeleton))))
-    return Motion(skeleton, root_position, matrix_from_rotation_6d(rotation_6d), fps, name)
+    return Motion(skeleton, root_position, rotations.matrix_from_rotation_6d(rotation_6d), fps, name)
 
 
 def frame_positions(skeleton: Skeleton, frames):
     """Return global joint positions [..., J, 3] of frames [..., C]; FK of Eqs 10, 12, 13."""
     root_position, rotation_6d = split_frames(frames)
-    return forward_kinematics(skeleton, root_position, matrix_from_rotation_6d(rotation_6d))
+    return forward_kinematics(skeleton, root_position, rotations.matrix_from_rotation_6d(rotation_6d))
 
 
 def frame_yaw(skeleton: Skeleton, frames):
@@ -75,7 +70,7 @@ def frame_yaw(skeleton: Skeleton, frames):
     if skeleton.parents[left] != 0 or skeleton.parents[right] != 0:
         raise ValueError("facing needs hip joints that are children of the root joint")
     across_local = (skeleton.offsets[left] - skeleton.offsets[right]).astype(frames.dtype)
-    root = matrix_from_rotation_6d(frames[..., 3:9])
+    root = rotations.matrix_from_rotation_6d(frames[..., 3:9])
     across = xp.einsum("...ab,b->...a", root, across_local)
     return xp.arctan2(-across[..., 2], across[..., 0])
 
@@ -84,7 +79,7 @@ def orthonormalise(frames):
     """Return frames with every 6D block pulled back onto a rotation, [..., C]."""
     xp = array_module(frames)
     root_position, rotation_6d = split_frames(frames)
-    clean = rotation_6d_from_matrix(matrix_from_rotation_6d(rotation_6d))
+    clean = rotations.rotation_6d_from_matrix(rotations.matrix_from_rotation_6d(rotation_6d))
     return xp.concatenate([root_position, clean.reshape(*frames.shape[:-1], -1)], axis=-1)
 
 
@@ -102,7 +97,7 @@ def center_window(frames, origin):
 def turn_frames(frames, yaw):
     """Turn frames [..., T, C] about the origin's +Y axis by yaw [...] radians (section 3.2)."""
     xp = array_module(frames)
-    matrix = matrix_from_yaw(yaw)
+    matrix = rotations.matrix_from_yaw(yaw)
     # Root position and the two columns of the root's rotation are three vectors to turn.
     vectors = frames[..., :9].reshape(*frames.shape[:-1], 3, 3)
     turned = xp.einsum("...ab,...tvb->...tva", matrix, vectors)
@@ -120,7 +115,7 @@ def path_condition(position, yaw):
       [..., T, 8]: displacement, then yaw in 6D.
     """
     xp = array_module(position, yaw)
-    return xp.concatenate([position, rotation_6d_from_yaw(yaw)], axis=-1)
+    return xp.concatenate([position, rotations.rotation_6d_from_yaw(yaw)], axis=-1)
 
 
 def bend_path(displacement, drift):

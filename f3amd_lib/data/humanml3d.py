@@ -12,8 +12,6 @@
 Source: the released data set of Guo et al. 2022 and its README.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -34,7 +32,7 @@ from f3amd_lib.data.text_motions import (
     TextMotions,
     text_motions,
 )
-from f3amd_lib.ground.files import read_toml, whole_file, whole_folder
+from f3amd_lib.ground.files import read_toml, whole_folder
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.redundant import CONTACT_STEP, grouped_statistics, redundant_from_positions
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
@@ -60,9 +58,7 @@ def read_caption_line(line: str, where: str) -> tuple[str, float, float]:
     """
     parts = line.rstrip("\n").split("#")
     if len(parts) != 4:
-        raise ValueError(
-            f"{where}: has {len(parts)} parts between # where caption#words#begin#end has 4; mend the line"
-        )
+        raise ValueError(f"{where}: has {len(parts)} parts where caption#words#begin#end has 4; mend the line")
     try:
         begin, end = (0.0 if math.isnan(float(word)) else float(word) for word in parts[2:])
     except ValueError:
@@ -237,7 +233,7 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
         raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
     with whole_folder(folder) as temporary:
         for part in ("new_joints", "new_joint_vecs", "texts"):
-            (temporary / part).mkdir(parents=True, exist_ok=True)
+            (temporary / part).mkdir()
         training = []
         for number, name in enumerate(data.names):
             clip = data.clip(number)
@@ -247,26 +243,23 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
             _write(temporary / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
             if data.splits[number] == "train":
                 training.append(vectors)
-        mean, deviation = grouped_statistics(np.concatenate(training))
-        np.save(temporary / "Mean.npy", mean)
-        np.save(temporary / "Std.npy", deviation)
-        names = np.array(data.names)
-        members = {split: names[np.equal(data.splits, split)].tolist() for split in SPLITS}
+        for file, numbers in zip(("Mean.npy", "Std.npy"), grouped_statistics(np.concatenate(training)), strict=True):
+            np.save(temporary / file, numbers)
+        members = {split: [data.names[k] for k in np.flatnonzero(np.equal(data.splits, split))] for split in SPLITS}
         for split, file in _SPLIT_FILES.items():
             _write(temporary / file, members[split])
         _write(temporary / "train_val.txt", members["train"] + members["validation"])
         _write(temporary / "all.txt", data.names)
         skeleton = data.skeleton
         described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
-        described |= {"fps": data.fps, "name": data.name, "licence": data.licence, "credit": data.credit}
+        described |= {name: getattr(data, name) for name in ("fps", "name", "licence", "credit")}
         described["pairs"] = dict(zip(data.names, data.pairs, strict=True))
         _write(temporary / "skeleton.json", [json.dumps(described, indent=1)])
     return folder
 
 
 def _write(path: Path, lines) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
 def read_caption_table(path) -> dict[str, tuple[str, ...]]:

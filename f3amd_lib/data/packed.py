@@ -6,8 +6,6 @@ Bandai's clips by more than 0.5 mm (`tests/test_packed.py`); it is a plain `.npz
 and small enough to carry to another machine.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -108,14 +106,12 @@ class PackedMotion:
         """
         if not 0 <= clip < self.num_clips:
             raise ValueError(f"clip must be 0 to {self.num_clips - 1}, got {clip}")
-        start, stop = int(self.clip_start[clip]), int(self.clip_start[clip + 1])
-        return Motion(
-            skeleton=self.skeleton,
-            root_position=self.root_position[start:stop].astype(np.float64),
-            rotations=matrix_from_rotation_6d(self.rotation_6d[start:stop].astype(np.float64)),
-            fps=FPS,
-            name=self.clip_names[clip],
+        frames = slice(*self.clip_start[clip : clip + 2])
+        root_position, rotation_6d = (
+            array[frames].astype(np.float64) for array in (self.root_position, self.rotation_6d)
         )
+        rotations = matrix_from_rotation_6d(rotation_6d)
+        return Motion(self.skeleton, root_position, rotations, FPS, self.clip_names[clip])
 
 
 def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
@@ -143,10 +139,8 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
             skipped.append((clip.name, reason))
             continue
         if kept and motion.skeleton != kept[0][1]:
-            raise ValueError(
-                f"{clip.name}: its skeleton differs from that of {kept[0][0].name} (names, parents "
-                "or bone lengths); a data set needs one skeleton: retarget or remove the file"
-            )
+            what = f"its skeleton differs from that of {kept[0][0].name} in names, parents or bone lengths"
+            raise ValueError(f"{clip.name}: {what}; a data set needs one: retarget or remove the file")
         rotations = rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16)
         root = motion.root_position.astype(np.float32)
         kept.append((clip, motion.skeleton, root, rotations, lowest_toe_height(motion)))

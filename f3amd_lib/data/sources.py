@@ -13,8 +13,6 @@ folder. Archives are read in place. Every file is checked before it is parsed, s
 is refused by name and none of its numbers get used.
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 import hashlib
@@ -286,18 +284,16 @@ def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
     published, folder = _SETS[name], pooch.os_cache("f3amd")
     if "url" not in published:
-        raise ValueError(
-            f"data set {name!r} is downloaded from nowhere; set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
-        )
+        how = f"set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
+        raise ValueError(f"data set {name!r} is downloaded from nowhere; {how}")
     pooch.get_logger().setLevel("WARNING")
     url, digest, file = published["url"], published.get("hash"), published["file"]
     try:
         return pooch.retrieve(url, digest, fname=file, path=folder, progressbar=True)
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
-        raise ValueError(
-            f"data set {name!r} could not be downloaded from {url} ({type(error).__name__}: {error}); fetch "
-            f"it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip file or its folder"
-        ) from error
+        what = f"{url}: data set {name!r} could not be downloaded ({type(error).__name__}: {error})"
+        how = f"fetch it by other means and set the environment variable {DATA_DIR_VARIABLE} to the zip or its folder"
+        raise ValueError(f"{what}; {how}") from error
 
 
 def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:
@@ -468,14 +464,10 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     for item in sorted(listed, key=lambda item: item.name):
         loader = _bvh_loader(archive, members[item.name], item.size_and_crc, sha256_prefix=item.sha256_prefix)
         clips.append(Clip(item.name, item.style, item.content, splits[item.name], loader))
-    return _dataset(
-        "bandai",
-        clips,
-        [(item.name, item.sha256_prefix) for item in listed],
-        primary=lambda style: style.startswith("2-"),
-        mirror=lambda style: True,
-        notes=[f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known],
-    )
+    content = [(item.name, item.sha256_prefix) for item in listed]
+    notes = [f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known]
+    of_part_2 = lambda style: style.startswith("2-")
+    return _dataset("bandai", clips, content, primary=of_part_2, mirror=lambda style: True, notes=notes)
 
 
 _100STYLE_URL = _SETS["100style"]["url"]

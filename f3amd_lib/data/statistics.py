@@ -1,7 +1,5 @@
 """Plain numbers that describe a clip: how far, how fast, which way, how high above the floor."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Motion

@@ -12,8 +12,6 @@ as safetensors.
 round are one to its pooled vector; the token vectors keep their order.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import re
@@ -66,9 +64,8 @@ class TextEncoder:
         pieces, pooled = self.embed(captions)
         for caption, piece in zip(captions, pieces, strict=True):
             if len(piece) > MOST_TOKENS:
-                raise ValueError(
-                    f"caption {caption!r} has {len(piece)} word pieces of at most {MOST_TOKENS}; say it shorter"
-                )
+                what = f"has {len(piece)} word pieces of at most {MOST_TOKENS}"
+                raise ValueError(f"caption {caption!r} {what}; say it shorter")
         return _padded(pieces, pooled)
 
 
@@ -131,9 +128,7 @@ def load_wordllama() -> TextEncoder:
     """
     found = importlib.util.find_spec("wordllama")
     if found is None:
-        raise ImportError(
-            'the text encoder wordllama is not installed; install it: pip install "wordllama>=0.2.2,<0.2.3"'
-        )
+        raise ImportError('the text encoder wordllama is not installed: pip install "wordllama>=0.2.2,<0.2.3"')
     from safetensors.numpy import load_file
     from tokenizers import Tokenizer
 
@@ -142,9 +137,7 @@ def load_wordllama() -> TextEncoder:
         vectors = load_file(folder / "weights" / "l2_supercat_256.safetensors")["embedding.weight"].astype(np.float32)
         tokenizer = Tokenizer.from_file(str(folder / "tokenizers" / "l2_supercat_tokenizer_config.json"))
     except Exception as error:  # tokenizers raises Exception itself
-        raise ValueError(
-            f"{folder}: wordllama's files are not those of version 0.2 ({error}); install it again"
-        ) from error
+        raise ValueError(f"{folder}: not the files of wordllama 0.2 ({error}); install it again") from error
     vectors = vectors / np.linalg.norm(vectors, axis=-1).mean()
 
     def embed(captions):
@@ -152,9 +145,8 @@ def load_wordllama() -> TextEncoder:
         for caption, pieces in zip(captions, encoded, strict=True):
             # What the vocabulary does not know is spelled out in bytes.
             if strange := [piece for piece in pieces.tokens if re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece)]:
-                raise ValueError(
-                    f"caption {caption!r} holds characters unknown to wordllama ({strange[0]}); use English"
-                )
+                what = f"holds characters unknown to wordllama ({strange[0]})"
+                raise ValueError(f"caption {caption!r} {what}; use English")
         pieces = [vectors[pieces.ids] for pieces in encoded]
         return pieces, [piece.mean(axis=0) for piece in pieces]
 

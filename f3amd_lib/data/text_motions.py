@@ -22,13 +22,7 @@ from f3amd_lib.data.captions import CAPTIONED, compose_captions, other_side, pla
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.redundant import (
-    CONTACT_STEP,
-    canonical_start,
-    essential_features,
-    joint_features,
-    redundant_from_positions,
-)
+from f3amd_lib.motion import redundant
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 
 FPS = 20.0
@@ -106,7 +100,7 @@ class TextMotions:
     licence: str = ""
     credit: str = ""
     skipped: tuple[tuple[str, str], ...] = ()
-    contact_step: float = CONTACT_STEP
+    contact_step: float = redundant.CONTACT_STEP
 
     @classmethod
     def joined(cls, clips, **attributes) -> TextMotions:
@@ -175,15 +169,15 @@ class TextMotions:
 
         A clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        return self._of_each(partial(redundant_from_positions, contact_step=self.contact_step))
+        return self._of_each(partial(redundant.redundant_from_positions, contact_step=self.contact_step))
 
     def essential_features(self) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
-        return self._of_each(essential_features)
+        return self._of_each(redundant.essential_features)
 
     def joint_features(self) -> np.ndarray:
         """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
-        return self._of_each(partial(joint_features, contact_step=self.contact_step))
+        return self._of_each(partial(redundant.joint_features, contact_step=self.contact_step))
 
     def _of_each(self, features) -> np.ndarray:
         clips = (self.clip(number) for number in range(self.num_clips))
@@ -208,7 +202,7 @@ def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
       **attributes: other attributes of `TextMotions`.
     """
     canonical = (
-        (name, captions, split, pair, canonical_start(skeleton, motion.positions).astype(np.float32))
+        (name, captions, split, pair, redundant.canonical_start(skeleton, motion.positions).astype(np.float32))
         for name, motion, captions, split, pair in clips
     )
     # The tips of limbs would need rotations.

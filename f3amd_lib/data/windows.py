@@ -5,8 +5,6 @@ start. A batch is a gather, a random turn and a subtraction, all inside the jitt
 Python loop over samples.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,16 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from f3amd_lib.data.features import (
-    Normaliser,
-    bend_path,
-    center_window,
-    frame_yaw,
-    orthonormalise,
-    path_condition,
-    turn_frames,
-    world_frames,
-)
+from f3amd_lib.data import features
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.names import check_known
@@ -98,7 +87,7 @@ def _smooth(signal: np.ndarray, width: float, of: Callable = np.asarray) -> np.n
 
 def _path_variants(skeleton: Skeleton, frames: np.ndarray) -> np.ndarray:
     """Return x, z, sin yaw, cos yaw under each smoothing, [3, T, 4]."""
-    yaw = np.unwrap(frame_yaw(skeleton, frames))[:, None]
+    yaw = np.unwrap(features.frame_yaw(skeleton, frames))[:, None]
     # The facing is smoothed as a direction, as in CAMDM: the mean of two angles may lie the long way round.
     facing = lambda angle: np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
     variants = []
@@ -137,8 +126,7 @@ def build_windows(
         raise ValueError(f"the model does not know the style {min(missing)!r} of this data set")
     check_known(split, SPLITS, "split")
     mirrored = split == "train" if mirrored is None else mirrored
-    frames, paths, starts, room, labels = [], [], [], [], []
-    offset = 0
+    frames, paths, columns, offset = [], [], [], 0
     for clip in np.flatnonzero(np.asarray(packed.clip_split) == SPLITS.index(split)):
         motion = packed.motion(int(clip))
         style = int(packed.clip_style[clip])
@@ -146,26 +134,18 @@ def build_windows(
         if mirrored and packed.styles[style] in packed.mirror_styles:
             takes.append(mirror(motion))
         for take in takes:
-            world = world_frames(take)
+            world = features.world_frames(take)
             first = np.arange(0, len(world) - (num_history + window) + 1, stride)
-            starts.append(offset + first)
-            room.append(first)
-            labels.append(np.full(len(first), style))
+            columns.append([offset + first, first, np.full(len(first), style)])
             frames.append(world.astype(np.float32))
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
             offset += len(world)
-    if not sum(len(first) for first in starts):
+    if not any(len(first) for first, _, _ in columns):
         raise ValueError(f"data set {packed.dataset!r} has no {split} clip of at least {num_history + window} frames")
-    return WindowSet(
-        window=window,
-        num_history=num_history,
-        frames=jnp.asarray(np.concatenate(frames)),
-        paths=jnp.asarray(np.concatenate(paths, axis=1)),
-        starts=jnp.asarray(np.concatenate(starts).astype(np.int32)),
-        room=jnp.asarray(np.concatenate(room).astype(np.int32)),
-        styles=jnp.asarray(np.concatenate(labels).astype(np.int32)),
-        one_hot=jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])],
-    )
+    starts_room_styles = (jnp.asarray(column, jnp.int32) for column in np.concatenate(columns, axis=1))
+    one_hot = jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])]
+    frames, paths = jnp.asarray(np.concatenate(frames)), jnp.asarray(np.concatenate(paths, axis=1))
+    return WindowSet(window, num_history, frames, paths, *starts_room_styles, one_hot)
 
 
 @functools.partial(jax.jit, static_argnames="earlier")
@@ -189,7 +169,7 @@ def gather_windows(windows: WindowSet, index, yaw, smoothing, *, earlier: int = 
     span = start[:, None] + jnp.arange(num_history + windows.window)[None, :]
     frames = windows.frames[span]
     last = num_history - 1
-    frames = turn_frames(center_window(frames, frames[:, last, jnp.array([0, 2])]), yaw)
+    frames = features.turn_frames(features.center_window(frames, frames[:, last, jnp.array([0, 2])]), yaw)
     track = windows.paths[smoothing[:, None], span]
     shift = track[..., :2] - track[:, last : last + 1, :2]
     # (x, z) turned by yaw: x' = x cos + z sin, z' = z cos - x sin
@@ -197,7 +177,7 @@ def gather_windows(windows: WindowSet, index, yaw, smoothing, *, earlier: int = 
     x, z = shift[..., 0], shift[..., 1]
     position = jnp.stack([x * cosine + z * sine, z * cosine - x * sine], axis=-1)
     facing = wrap_angle(jnp.arctan2(track[..., 2], track[..., 3]) + yaw[:, None])
-    path = path_condition(position, facing)[:, num_history:]
+    path = features.path_condition(position, facing)[:, num_history:]
     style = windows.one_hot[windows.styles[index]]
     return Batch(frames[:, :num_history], frames[:, num_history:], path, style)
 
@@ -270,11 +250,11 @@ def restart_from(batch: Batch, history) -> Batch:
     remains = jnp.maximum(1.0 - frame / _POSE_RECOVERY, 0.0) * jnp.ones(channels)
     remains = remains.at[:, plane].set(1.0 - frame / num_frames)
     drift = error[:, plane]
-    future = center_window(batch.future, drift) + remains * error[:, None, :]
-    position = bend_path(batch.path[..., :2], -drift)
+    future = features.center_window(batch.future, drift) + remains * error[:, None, :]
+    position = features.bend_path(batch.path[..., :2], -drift)
     return batch._replace(
-        history=center_window(history, history[:, -1, plane]),
-        future=orthonormalise(future),
+        history=features.center_window(history, history[:, -1, plane]),
+        future=features.orthonormalise(future),
         path=jnp.concatenate([position, batch.path[..., 2:]], axis=-1),
     )
 
@@ -289,7 +269,7 @@ def mean_poses(windows: WindowSet) -> jax.Array:
 
 
 @jax.jit
-def fit_normaliser(windows: WindowSet, key) -> Normaliser:
+def fit_normaliser(windows: WindowSet, key) -> features.Normaliser:
     """Measure mean and deviation of each channel over randomly turned training windows.
 
     Deviations are kept above 0.02, so that a joint which hardly moves does not turn rounding of the
@@ -305,7 +285,7 @@ def fit_normaliser(windows: WindowSet, key) -> Normaliser:
         mean = mean.at[pair].set(0.0)
         deviation = deviation.at[pair].set(jnp.sqrt(jnp.mean(flat[:, pair] ** 2)))
     deviation = jnp.maximum(deviation, 0.02)
-    return Normaliser(mean, deviation, deviation[0])
+    return features.Normaliser(mean, deviation, deviation[0])
 
 
 def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: int = 8) -> dict:
@@ -330,8 +310,8 @@ def starting_poses(packed: PackedMotion, *, num_history: int = 10, num_poses: in
         for clip in chosen[spread]:
             motion = packed.motion(int(clip))
             start = max(0, motion.num_frames // 2 - num_history)
-            frames = world_frames(motion.slice(start, start + num_history))
-            frames = center_window(frames, frames[-1, [0, 2]])
-            cuts.append(turn_frames(frames, -frame_yaw(motion.skeleton, frames[-1])))
+            frames = features.world_frames(motion.slice(start, start + num_history))
+            frames = features.center_window(frames, frames[-1, [0, 2]])
+            cuts.append(features.turn_frames(frames, -features.frame_yaw(motion.skeleton, frames[-1])))
         starts[name] = np.stack(cuts).astype(np.float32)
     return starts

@@ -18,8 +18,6 @@ War", GDC 2018 (offsets instead of cross-fades, a quintic in time), without its 
 result is linear in the offset.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 What a user asks for is checked here, once; `generation.text_to_motion` has the samplers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import jax
@@ -78,10 +76,8 @@ def told_windows(trained: TextModel, seconds: float) -> int:
 def window_frames(trained: TextModel) -> int:
     """Return the frames of motion that one window of a stream adds; ValueError if the model is for no stream."""
     if not trained.starts:
-        raise ValueError(
-            f"{trained.name} makes whole motions, a stream needs the prefix form: --model {STREAM_PRESET}, after "
-            f"f3amd train --preset {STREAM_PRESET} --data bandai"
-        )
+        how = f"--model {STREAM_PRESET}, after f3amd train --preset {STREAM_PRESET} --data bandai"
+        raise ValueError(f"{trained.name} makes whole motions, a stream needs the prefix form: {how}")
     given = len(next(iter(trained.starts.values())))
     return (trained.config.window - given) * trained.codec.frames_per_state
 
@@ -218,9 +214,7 @@ def draw_motions(
             raise ValueError(f"{trained.name} has no control branch: leave --control out, or name a model of ACMDM")
         return latent_motions(trained, pooled, num_frames, key, draw=draw, num_steps=num_steps, guidance=guidance)
     if trained.starts:
-        raise ValueError(
-            f"{trained.name} goes on from earlier frames: use it for a stream (--then), or another --model"
-        )
+        raise ValueError(f"{trained.name} goes on from earlier frames: stream it (--then), or name another --model")
     how = {"guidance": guidance, "num_steps": num_steps, "controlled": control is not None, "mesh": mesh}
     draw = draw or motion_drawer(trained, **how)
     lengths = np.broadcast_to(num_frames, len(pooled))

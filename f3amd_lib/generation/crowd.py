@@ -18,15 +18,13 @@ do not see each other; they may walk through one another, unless their paths are
 apart (`min_distance`). Then everybody's path depends on who else is there.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,18 +32,17 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from f3amd_lib.data.features import center_window, motion_from_frames, turn_frames
+from f3amd_lib.data.features import center_window, motion_from_frames, split_frames, turn_frames
 from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.generation.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
-from f3amd_lib.ground.arrays import finite_array
-from f3amd_lib.ground.files import locked, whole_file
-from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.ground.files import locked, write_whole
+from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
 
 PATHS = tuple(name for name in NAMES if name != "complex")
-"""Names that the paths of a crowd are drawn from by default: those that face where they go."""
+"""Names that the paths of a crowd are drawn from: those that face where they go."""
 
 FORMAT = "f3amd-crowd-1"
 
@@ -61,8 +58,6 @@ _SLOWEST = 0.3  # m/s; a path has to be walked, even by one who stood in the sta
 _TEMPLATE_SPEED = 1.2  # m/s, the speed that the sizes of the named paths are made for
 _TEMPLATE_SECONDS = 60.0  # within which a character may enter a path: three laps of the longest
 _SPACING = 1.0  # metres; neighbours start about 1.7 times as far apart
-
-PathMaker = Callable[[range, np.ndarray, int, int], tuple[np.ndarray, np.ndarray]]
 
 
 def _draws(characters: range, count: int, seed: int, purpose: int) -> np.ndarray:
@@ -87,29 +82,26 @@ def _templates(names: tuple[str, ...], num_frames: int, seed: int):
     return np.stack([path.position for path in made]), np.stack([path.yaw for path in made])
 
 
-def crowd_paths(
-    characters: range, pace: np.ndarray, num_frames: int, seed: int, *, names: Sequence[str] = PATHS
-) -> tuple[np.ndarray, np.ndarray]:
+def crowd_paths(characters: range, pace: np.ndarray, num_frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Give each character a path of its own, for many characters at once.
 
-    Each walks a stretch of a named path, entered at a random time of its first minute, to the left
+    Each walks a stretch of a path of `PATHS`, entered at a random time of its first minute, to the left
     or mirrored to the right, turned to a random side. The path is scaled so that it is walked at
     the character's pace with the turns of a walk: a runner's circle is wider. Starting places lie
     on a sunflower's spiral, about 1.7 m apart, however many there are.
 
     Args:
       characters: their numbers.
-      pace: of each, [n], m/s; the mean one where a path stops and goes ("complex").
+      pace: of each, [n], m/s.
       num_frames: F.
       seed: of all choices.
-      names: of `paths.NAMES`; each character draws one.
 
     Returns:
       (position [n, F, 2] in metres, yaw [n, F] in radians), both float64.
 
     Source: ours.
     """
-    positions, yaws = _templates(tuple(names), num_frames, seed)
+    positions, yaws = _templates(PATHS, num_frames, seed)
     which, enter, side, facing = _draws(characters, 4, seed, _WAYS).T
     which = (which * len(positions)).astype(int)[:, None]
     late = (enter * (positions.shape[1] - num_frames + 1)).astype(int)
@@ -221,9 +213,8 @@ class Crowd:
 
 def generate_crowd(
     generator: MotionGenerator, num_characters: int, num_frames: int, out, *,
-    styles: str | Sequence[str] | None = None, paths: str | Sequence[str] | PathMaker = PATHS,
-    min_distance: float | None = None, seed: int = 0, chunk: int | None = None, overwrite: bool = False,
-    progress: bool = False,
+    styles: Sequence[str] | None = None, min_distance: float | None = None, seed: int = 0, chunk: int | None = None,
+    overwrite: bool = False, progress: bool = False,
 ) -> Crowd:  # fmt: skip
     """Animate any number of characters, and write them to a folder chunk by chunk.
 
@@ -236,9 +227,6 @@ def generate_crowd(
       num_frames: F, at 30 fps.
       out: folder to write to (see the module's table); new, empty, or of this call when stopped.
       styles: names, taken in turn; by default all that the model knows and has starting poses for.
-      paths: name or names of paths to draw from (see `crowd_paths`), or a function of its first
-        four arguments and with its result. A call that goes on must give the first character the
-        path that it had.
       min_distance: metres that paths keep from each other at every frame, all planned before the
         first chunk is made (see `crowd_planning`); None lets characters walk through one another.
       seed: of paths, starting poses and noise, 0 or more.
@@ -250,9 +238,8 @@ def generate_crowd(
       The crowd, as from `read_crowd`.
 
     Raises:
-      ValueError: for counts below 1 (2 frames), an unknown style or path, paths of a wrong shape, a
-        folder with anything else in it (a crowd of another call, for one), or too little room on
-        the disk.
+      ValueError: for counts below 1 (2 frames), an unknown style, a folder with anything else in it (a
+        crowd of another call, for one), or too little room on the disk.
       ArithmeticError: if the model generates a number that is not finite.
     """
     trained, skeleton = generator.trained, generator.trained.skeleton
@@ -261,7 +248,6 @@ def generate_crowd(
     if chunk is None:
         chunk = default_chunk(num_frames, trained.config.channels)
     chunk = min(_whole("chunk", chunk, 1), num_characters)
-    styles = [styles] if isinstance(styles, str) else styles
     if styles is None:
         styles = [style for style in trained.styles if style in trained.start_poses]
     in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
@@ -269,8 +255,6 @@ def generate_crowd(
         raise ValueError("a crowd needs at least one style")
     if without := [style for style in styles if style not in trained.start_poses]:
         raise ValueError(f"no starting pose is stored for style {without[0]!r}; leave it out")
-    make_paths, path_names = _path_maker(paths)
-
     settings = {
         "format": FORMAT,
         "num_characters": num_characters,
@@ -278,7 +262,7 @@ def generate_crowd(
         "fps": _FPS,
         "seed": seed,
         "chunk": chunk,
-        "paths": path_names,
+        "paths": PATHS,
         "min_distance": min_distance,
         "styles": list(trained.styles),
         "styles_in_turn": hashlib.sha256(in_turn.tobytes()).hexdigest()[:12],
@@ -296,33 +280,34 @@ def generate_crowd(
     settings = json.loads(json.dumps(settings))
     out = Path(out)
     with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):
-        return _generate(generator, settings, make_paths, in_turn, min_distance, out, overwrite, progress)
+        return _generate(generator, settings, in_turn, out, overwrite, progress)
 
 
-def _generate(generator, settings, make_paths, in_turn, min_distance, out: Path, overwrite, progress) -> Crowd:
+def _generate(generator, settings, in_turn, out: Path, overwrite, progress) -> Crowd:
     """Make what is still missing of a crowd; the folder is ours alone."""
     trained = generator.trained
     num_characters, num_frames, seed, chunk = (settings[of] for of in ("num_characters", "num_frames", "seed", "chunk"))
     finished, first_path = _look_into(out, settings, overwrite)
     _check_room(out, settings)
+    planned = None
 
     def asked_of(part: range):
         style_index = in_turn[np.arange(part.start, part.stop) % len(in_turn)]
         pace, pose = _paces(generator, part, style_index, seed)
-        made = make_paths(part, pace, num_frames, seed)
-        shape = (len(part), num_frames)
-        position = finite_array("the paths' position", made[0], (*shape, 2))
-        return style_index, pose, position, finite_array("the paths' yaw", made[1], shape)
+        if planned is None:
+            return style_index, pose, *crowd_paths(part, pace, num_frames, seed)
+        return style_index, pose, *(array[part.start : part.stop] for array in planned)
 
-    if min_distance is not None:
+    if settings["min_distance"] is not None:
         _, _, *wanted = asked_of(range(num_characters))
-        planned = keep_apart(*wanted, min_distance=min_distance, fps=_FPS)
-        make_paths = lambda part, *_: tuple(array[part.start : part.stop] for array in planned)
+        planned = keep_apart(*wanted, min_distance=settings["min_distance"], fps=_FPS)
     beginning = asked_of(range(chunk))
-    settings[_FIRST_PATH] = _path_digest(*(array[0] for array in beginning[2:]))
+    # In tenths of a millimetre and milliradian: last bits of the same path may differ between machines.
+    tenths = np.rint(1e4 * np.column_stack([array[0] for array in beginning[2:]])).astype("<i8")
+    settings[_FIRST_PATH] = hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
     if first_path not in (None, settings[_FIRST_PATH]):
         what = "holds a crowd whose first character walks another path than this call's"
-        raise ValueError(f"{out}: {what}; give the paths that it was begun with, {_WAY_OUT}")
+        raise ValueError(f"{out}: {what}; go on with the version that began it, {_WAY_OUT}")
     if finished == 0:
         _write_settings(out, settings, 0)
         _lay_out(out, settings)
@@ -336,21 +321,16 @@ def _generate(generator, settings, make_paths, in_turn, min_distance, out: Path,
             history = _starting_poses(generator, style_index, position, yaw, pose)
             # The last chunk is filled up with its last character, so that nothing compiles twice.
             number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
-            row = number - first
-            keys = jax.vmap(jax.random.fold_in, (None, 0))(noise, number)
+            row, keys = number - first, jax.vmap(jax.random.fold_in, (None, 0))(noise, number)
             frames = generator.generate(position[row], yaw[row], style_index[row], history[row], keys)
             frames = frames[: len(characters)]
             if not np.isfinite(frames).all():
                 worst = first + int(np.argwhere(~np.isfinite(frames))[0][0])
                 what = f"{trained.name} generated a number that is not finite for character {worst}"
                 raise ArithmeticError(f"{what}; its weights or its noise levels are broken")
-            rows = {
-                "root": frames[..., :3],
-                "rotations": frames[..., 3:].reshape(*frames.shape[:2], -1, 6),
-                "path": np.concatenate([position, yaw[..., None]], axis=-1),
-                "styles": style_index,
-            }
-            for name, values in rows.items():
+            root, rotations = split_frames(frames)
+            path = np.concatenate([position, yaw[..., None]], axis=-1)
+            for name, values in zip(_ARRAYS, (root, rotations, path, style_index), strict=True):
                 _write_rows(out, name, settings, first, values)
             _write_settings(out, settings, characters.stop)
             bar.update(len(characters))
@@ -386,28 +366,6 @@ def _whole(name: str, value, least: int) -> int:
     if int(value) != value or value < least:
         raise ValueError(f"{name} must be a whole number of {least} or more, got {value}")
     return int(value)
-
-
-def _path_maker(paths) -> tuple[PathMaker, list[str] | str]:
-    """Return what makes the paths, and how to call it in the settings."""
-    if callable(paths):
-        kind = paths if hasattr(paths, "__qualname__") else type(paths)
-        return paths, f"{kind.__module__}.{kind.__qualname__}"
-    names = [paths] if isinstance(paths, str) else list(paths)
-    if not names:
-        raise ValueError("a crowd needs at least one path to draw from")
-    for name in names:
-        check_known(name, NAMES, "path")
-    return functools.partial(crowd_paths, names=names), names
-
-
-def _path_digest(position: np.ndarray, yaw: np.ndarray) -> str:
-    """Return a digest of one path, [F, 2] and [F], in tenths of a millimetre and milliradian.
-
-    The same path worked out on another machine may differ in its last bits.
-    """
-    tenths = np.rint(1e4 * np.column_stack([position, yaw])).astype("<i8")
-    return hashlib.sha256(tenths.tobytes()).hexdigest()[:12]
 
 
 def _paces(generator: MotionGenerator, characters: range, style_index, seed: int):
@@ -467,8 +425,7 @@ def _read_settings(folder: Path) -> dict:
 
 def _write_settings(folder: Path, settings: dict, finished: int) -> None:
     text = json.dumps(settings | {"num_finished": finished}, indent=1, ensure_ascii=False)
-    with whole_file(folder / _SETTINGS, overwrite=True) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_whole(folder / _SETTINGS, text + "\n")
 
 
 def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | None]:

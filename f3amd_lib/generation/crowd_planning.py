@@ -16,8 +16,6 @@ than their paths; `closest_approach` measures that as well.
 Source: ours. The paper does not say how the characters of its Figure 1 keep apart.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter1d
 from scipy.spatial import cKDTree

@@ -21,8 +21,6 @@ Capture Editing", SCA 2002 (plan, root, legs), with least squares in place of th
 stretched bones.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -343,14 +341,14 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
 # ----------------------------------------------------------------------------------- of a rollout
 
 
-def lock_rollout(rollout: Rollout, floor=None) -> Rollout:
+def lock_rollout(rollout: Rollout) -> Rollout:
     """Lock the feet of all characters of a rollout; blend it before, if at all, not after.
+
+    The floor is where the lowest toe rests in a character's history, which is real motion, and where none does, as for
+    `lock_feet`.
 
     Args:
       rollout: as the network made it, or blended.
-      floor: height of a resting toe, metres, one number or one a character. By default that of the
-        lowest toe that rests in a character's history, which is real motion, and where none does,
-        as for `lock_feet`.
 
     Returns:
       The rollout with other frames; its `feet_locked` says so. The history, which counts as the past of
@@ -361,14 +359,11 @@ def lock_rollout(rollout: Rollout, floor=None) -> Rollout:
     """
     if rollout.feet_locked:
         raise ValueError("the feet of this rollout are locked already")
-    count, before = len(rollout.styles), rollout.history.shape[1]
-    if floor is None:
-        past = frame_positions(rollout.skeleton, np.asarray(rollout.history, np.float64))
-        height = toe_positions(past, rollout.skeleton)[..., 1]
-        resting = contact_labels(rollout.skeleton, past)
-        floors = [one[rests].min() if rests.any() else None for one, rests in zip(height, resting, strict=True)]
-    else:
-        floors = np.broadcast_to(np.asarray(floor, np.float64), (count,))
-    locked = [lock_feet(rollout.motion(k, with_history=True), floor=floors[k]) for k in range(count)]
-    frames = [world_frames(motion)[before:] for motion in locked]
+    past = frame_positions(rollout.skeleton, np.asarray(rollout.history, np.float64))
+    height, resting = toe_positions(past, rollout.skeleton)[..., 1], contact_labels(rollout.skeleton, past)
+    frames = []
+    for character, (toes, rests) in enumerate(zip(height, resting, strict=True)):
+        floor = toes[rests].min() if rests.any() else None
+        locked = lock_feet(rollout.motion(character, with_history=True), floor=floor)
+        frames.append(world_frames(locked)[rollout.history.shape[1] :])
     return dataclasses.replace(rollout, frames=np.asarray(frames, rollout.frames.dtype), feet_locked=True)

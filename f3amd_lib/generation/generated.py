@@ -1,7 +1,5 @@
 """What a rollout made: a value that blending, foot locking, measures and pictures take."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

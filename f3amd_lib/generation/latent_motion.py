@@ -4,8 +4,6 @@ All draw a latent; `decode_latent` makes redundant vectors of it, and `motion.re
 does all of it for a model as its file has it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

@@ -6,8 +6,6 @@ gradient back through all of the sampler's steps to the noise. That costs hundre
 Source: Karunratanakul et al. 2024 (DNO); settings of its released code. ACMDM Appendix F uses it on Euler's 10 steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -19,8 +19,6 @@ Source: ours; the running-out is inertialisation (D. Bollo, GDC 2018), the sprin
 the same in JavaScript (`serving/web/motion.js`), and a test holds both together.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 
@@ -100,9 +98,7 @@ def start_feet(skeleton: Skeleton, history, floor: float | None = None) -> Feet:
         floor, False, np.zeros(2, bool), np.zeros(2, int), path[0][:, [0, 2]], path[0], zero, zero, zero,
         path[0], np.zeros(2), path[0, :, 1], 0.0, zero,
     )  # fmt: skip
-    for frame in history:
-        feet = lock_frame(skeleton, feet, frame, locking=False)[0]
-    return feet
+    return lock_frames(skeleton, feet, history, locking=False)[0]
 
 
 def lock_frame(skeleton: Skeleton, feet: Feet, frame, *, locking: bool = True) -> tuple[Feet, np.ndarray]:

@@ -5,8 +5,6 @@ noise, denoise in a few steps, keep the last frames as the next history. All rou
 jitted scan.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax
@@ -50,9 +48,7 @@ class MotionGenerator:
     ):  # fmt: skip
         self.trained = trained
         if num_steps > MOST_STEPS:
-            raise ValueError(
-                f"num_steps must be at most {MOST_STEPS}, got {num_steps}: more changes nothing but the time"
-            )
+            raise ValueError(f"num_steps must be at most {MOST_STEPS}, got {num_steps}: more only take longer")
         self.num_steps = num_steps
         schedule = schedule or trained.diffusion
         self.sampler = sampler or schedule.sampler
@@ -107,11 +103,8 @@ class MotionGenerator:
             origin = history[:, -1, jnp.array([0, 2])]
             # Start where the character is and bend back to the line.
             position = bend_path(target - target_before[:, None, :], target_before - origin)
-            condition = Condition(
-                history=normaliser.normalise(center_window(history, origin)),
-                path=normaliser.normalise_path(path_condition(position, yaw)),
-                style=style,
-            )
+            path = normaliser.normalise_path(path_condition(position, yaw))
+            condition = Condition(normaliser.normalise(center_window(history, origin)), path, style)
             if key.ndim:
                 keys = jax.vmap(jax.random.fold_in, (0, None))(key, number)
                 x0_hat = self.sample_window_each(keys, condition)
@@ -157,14 +150,9 @@ class MotionGenerator:
         shape = (batch, rounds, window)
         targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
         before = np.concatenate([start[None], targets[:-1, :, -1]])
-        frames = self._run(
-            jnp.asarray(history, jnp.float32),
-            jnp.asarray(targets, jnp.float32),
-            jnp.asarray(np.moveaxis(yaw.reshape(shape), 1, 0), jnp.float32),
-            jnp.asarray(before, jnp.float32),
-            jax.nn.one_hot(style_index, len(self.trained.styles)),
-            key,
-        )
+        arrays = (history, targets, np.moveaxis(yaw.reshape(shape), 1, 0), before)
+        style = jax.nn.one_hot(style_index, len(self.trained.styles))
+        frames = self._run(*(jnp.asarray(array, jnp.float32) for array in arrays), style, key)
         return np.asarray(frames)[:, :num_frames]
 
     def rollout(
@@ -211,22 +199,15 @@ class MotionGenerator:
         if num_frames < 2:
             raise ValueError("a path needs at least 2 frames")
         indices = np.array([trained.style_index(style) for style in styles])
-        position = np.stack([path.position for path in paths]).astype(np.float64)
-        yaw = np.stack([np.unwrap(path.yaw) for path in paths]).astype(np.float64)
+        position, yaw = (np.stack([getattr(path, name) for path in paths]) for name in ("position", "yaw"))
         start = path_start(position)
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
             history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
         shape = (batch, config.num_history, num_channels(trained.skeleton))
         history = finite_array("history", history, shape, np.float32)
-        rollout = Rollout(
-            skeleton=trained.skeleton,
-            frames=self.generate(position, yaw, indices, history, jax.random.key(seed)),
-            history=history,
-            paths=tuple(paths),
-            styles=tuple(styles),
-            window=config.window,
-        )
+        frames = self.generate(position, yaw, indices, history, jax.random.key(seed))
+        rollout = Rollout(trained.skeleton, frames, history, tuple(paths), tuple(styles), config.window)
         rollout = blend_rollout(rollout, blend_frames)
         return lock_rollout(rollout) if lock_feet else rollout
 

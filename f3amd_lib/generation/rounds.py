@@ -4,8 +4,6 @@ A round draws noise, encodes the condition once and walks down all noise levels.
 way back to metres come after it.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec

@@ -1,7 +1,5 @@
 """A rollout that begins where a motion of the user's ends: `f3amd rollout --start my.bvh`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames, turn_frames, world_frames
@@ -30,25 +28,19 @@ def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tupl
     """
     motion, frames = resample(motion, 30.0), trained.config.num_history
     if motion.num_frames < frames:
-        seconds = frames / 30.0
-        raise ValueError(
-            f"{motion.name}: {motion.num_frames} frames at 30 fps; a start needs {frames}, {seconds:.1f} s"
-        )
+        needed = f"{frames}, {frames / 30.0:.1f} s"
+        raise ValueError(f"{motion.name}: {motion.num_frames} frames at 30 fps; a start needs {needed}")
     motion = motion.slice(motion.num_frames - frames, motion.num_frames)
     if motion.skeleton == trained.skeleton:
         note = f"{motion.name}: the model's own skeleton, taken as it is"
     else:
         pose = next(iter(trained.start_poses.values()))[0]
         made = retarget(motion, motion_from_frames(trained.skeleton, pose))
-        note = (
-            f"{motion.name}: another skeleton ({motion.skeleton.num_joints} joints, the model's has "
-            f"{trained.skeleton.num_joints}), retargeted by role; legs scaled by {made.scale:.2f}, joints off by "
-            f"{made.error.mean():.1f} cm on average"
-        )
+        joints = f"{motion.skeleton.num_joints} joints, the model's has {trained.skeleton.num_joints}"
+        off = f"legs scaled by {made.scale:.2f}, joints off by {made.error.mean():.1f} cm on average"
+        note = f"{motion.name}: another skeleton ({joints}), retargeted by role; {off}"
         motion = made.motion
     world = world_frames(motion)
-    start = path_start(np.asarray(path.position, np.float64))
-    turned = turn_frames(
-        center_window(world, world[-1, [0, 2]]), np.float64(path.yaw[0]) - frame_yaw(trained.skeleton, world)[-1]
-    )
-    return center_window(turned, -start)[None].astype(np.float32), note
+    turn = path.yaw[0] - frame_yaw(trained.skeleton, world)[-1]
+    turned = turn_frames(center_window(world, world[-1, [0, 2]]), turn)
+    return center_window(turned, -path_start(path.position))[None].astype(np.float32), note

@@ -14,8 +14,6 @@ line over the window, as in every rollout. A page does the same in JavaScript (`
 holds both together.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
@@ -129,11 +127,9 @@ class Steering:
         positions, headings = move_target(self.target, speed, direction, window)[1:]
         origin = self.history[:, -1, [0, 2]]
         line = bend_path(positions - self.target.position[:, None], self.target.position - origin)
-        condition = Condition(
-            history=normaliser.normalise(jnp.asarray(center_window(self.history, origin), jnp.float32)),
-            path=normaliser.normalise_path(jnp.asarray(path_condition(line, headings), jnp.float32)),
-            style=jnp.asarray(style, jnp.float32),
-        )
+        given = (center_window(self.history, origin), path_condition(line, headings), style)
+        history, path, style = (jnp.asarray(array, jnp.float32) for array in given)
+        condition = Condition(normaliser.normalise(history), normaliser.normalise_path(path), style)
         x0_hat = normaliser.denormalise(self._sample(condition, jnp.asarray(noise, jnp.float32)))
         future = center_window(orthonormalise(np.asarray(x0_hat, np.float64)), -origin)
         future = blend_seams(future, window, self.blend_frames, history=self.history)[:, : self.hop]

@@ -4,8 +4,6 @@ All of it is one call of `flow.solve` on a `predict(state, time)`; what differs 
 positions or latents in network units; `training.motion_codec` makes metres of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 
 import jax
@@ -43,13 +41,8 @@ def control_prediction(
     base: ACMDM, branch: ControlBranch, condition: TextCondition, control: Control, text_scale=2.5, control_scale=1.75
 ) -> Predict:
     """Return the prediction under caption and control, guided in two directions (ACMDM section 3.2; released code)."""
-    return guided_twice(
-        controlled(base, branch, condition, control),
-        controlled(base, branch, condition.without_text(), control),
-        controlled(base, branch, condition, control.dropped()),
-        text_scale,
-        control_scale,
-    )
+    told = [(condition, control), (condition.without_text(), control), (condition, control.dropped())]
+    return guided_twice(*(controlled(base, branch, *both) for both in told), text_scale, control_scale)
 
 
 def without_padding(state, mask):

@@ -1,7 +1,5 @@
 """Which joint is the knee: roles of joints by the few names we know and by the tree between them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.motion.skeleton import Skeleton

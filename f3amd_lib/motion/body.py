@@ -8,8 +8,6 @@ without end sites.
 Source: ours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from f3amd_lib.ground.arrays import array_module
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
 from f3amd_lib.motion.curves import unit
-from f3amd_lib.motion.skeleton import Skeleton, forward_kinematics, walk_tree
+from f3amd_lib.motion.skeleton import Skeleton, walk_tree
 
 LEG = 0.85
 """Length of thigh and shank that the radii of `body.toml` are for, metres."""
@@ -143,11 +141,10 @@ def capsule_mesh(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
 
 def make_body(skeleton: Skeleton) -> Body:
     """Return the body of a skeleton: 42 vertices a limb, 1,050 for Bandai's 21 joints, 1,134 for the walker's 23."""
-    rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
     vertices, faces, joints, count = [], [], [], 0
     for capsule in body_capsules(skeleton):
         own, triangles = capsule_mesh(capsule)
-        vertices.append(rest[capsule.joint] + own)
+        vertices.append(skeleton.rest_positions[capsule.joint] + own)
         faces.append(count + triangles)
         joints += [capsule.joint] * len(own)
         count += len(own)
@@ -168,8 +165,7 @@ def pose_body(body: Body, skeleton: Skeleton, root_position, rotations):
       Vertices, [..., V, 3], metres; numpy in, numpy out, JAX in, JAX out.
     """
     xp = array_module(root_position, rotations)
-    rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
     positions, turned = walk_tree(skeleton, root_position, rotations)
-    local = body.vertices[:, None] - rest[body.joints]  # [V, K, 3]
+    local = body.vertices[:, None] - skeleton.rest_positions[body.joints]  # [V, K, 3]
     moved = xp.einsum("...vkab,vkb->...vka", turned[..., body.joints, :, :], local) + positions[..., body.joints, :]
     return xp.sum(body.weights[..., None] * moved, axis=-2)

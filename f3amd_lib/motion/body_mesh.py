@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 from f3amd_lib.ground.arrays import array_module
 from f3amd_lib.motion.body import Body, make_body, pose_body
 from f3amd_lib.motion.inverse_kinematics import fit_rotations
-from f3amd_lib.motion.skeleton import Skeleton, forward_kinematics
+from f3amd_lib.motion.skeleton import Skeleton
 
 
 class MeshLists(NamedTuple):
@@ -83,21 +83,17 @@ def standing(skeleton: Skeleton, poses) -> Skeleton:
     return dataclasses.replace(skeleton, offsets=offsets.astype(np.float32), end_sites=())  # as files keep them
 
 
-def _rest(skeleton: Skeleton) -> np.ndarray:
-    return forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
-
-
 def body_distances(skeleton: Skeleton, body: Body) -> np.ndarray:
     """Return how far vertices are from each other along the body, [V, V], metres, whatever the pose.
 
     Straight within what one joint carries; from limb to limb by way of the joints between them.
     """
-    rest, carrier = _rest(skeleton), body.joints[:, 0]
-    points = np.concatenate([body.vertices, rest])
+    carrier = body.joints[:, 0]
+    points = np.concatenate([body.vertices, skeleton.rest_positions])
     graph = np.full((len(points), len(points)), np.inf)
     for joint in range(skeleton.num_joints):
-        ends = [joint, *(child for child, parent in enumerate(skeleton.parents) if parent == joint)]
-        rigid = np.concatenate([np.flatnonzero(carrier == joint), len(carrier) + np.array(ends)])
+        ends = len(carrier) + np.array([joint, *skeleton.children[joint]])
+        rigid = np.concatenate([np.flatnonzero(carrier == joint), ends])
         # A distance of nothing would be no edge at all.
         graph[np.ix_(rigid, rigid)] = np.maximum(cdist(points[rigid], points[rigid]), 1e-9)
     joints = len(carrier) + np.arange(skeleton.num_joints)
@@ -113,12 +109,12 @@ def joint_weights(skeleton: Skeleton, body: Body) -> np.ndarray:
 
     A joint is the mean of least weights of what it carries, or, where that is nothing, of what its parent carries.
     """
-    rest, weights = _rest(skeleton), np.zeros((skeleton.num_joints, len(body.vertices)))
+    weights = np.zeros((skeleton.num_joints, len(body.vertices)))
     for joint in range(skeleton.num_joints):
         carrier = joint
         while not np.any(own := body.joints[:, 0] == carrier):
             carrier = skeleton.parents[carrier]
-        local = body.vertices[own] - rest[joint]
+        local = body.vertices[own] - skeleton.rest_positions[joint]
         sides = np.concatenate([local.T, np.ones((1, len(local)))])
         weights[joint, own] = np.linalg.lstsq(sides, [0.0, 0.0, 0.0, 1.0])[0]
     return weights

@@ -6,8 +6,6 @@ file, line and remedy when a file is broken. Files hold centimetres and degrees;
 metres and rotation matrices.
 """
 
-from __future__ import annotations
-
 import collections
 import io
 import re
@@ -17,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
@@ -118,11 +116,7 @@ def write_bvh(path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY",
     Raises:
       ValueError: if the file exists and `overwrite` is false, or for a bad order.
     """
-    path = Path(path)
-    with whole_file(path, overwrite=overwrite) as temporary:
-        text = format_bvh(motion, scale=scale, order=order)
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-    return path
+    return write_whole(path, format_bvh(motion, scale=scale, order=order), overwrite=overwrite)
 
 
 def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> str:
@@ -143,9 +137,7 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
     rotations = motion.needed_rotations("a BVH file")
     skeleton, lines, depth_first = motion.skeleton, ["HIERARCHY"], []
-    children = [[] for _ in skeleton.names]
-    for child, parent in enumerate(skeleton.parents[1:], 1):
-        children[parent].append(child)
+    children = skeleton.children
     offset_line = lambda offset: "OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset)
     steps = [(0, 0, False)]  # a stack, not a recursion: chains of thousands of joints can be written
     while steps:
@@ -161,10 +153,7 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
         depth_first.append(joint)
         channels = [f"{axis}position" for axis in "XYZ" if depth == 0] + [f"{axis}rotation" for axis in order]
         lines += [f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"]
-        lines += [
-            f"{inner}{offset_line(skeleton.offsets[joint])}",
-            f"{inner}CHANNELS {len(channels)} {' '.join(channels)}",
-        ]
+        lines += [inner + offset_line(skeleton.offsets[joint]), f"{inner}CHANNELS {len(channels)} {' '.join(channels)}"]
         steps += [(joint, depth, True), *((child, depth + 1, False) for child in reversed(children[joint]))]
     lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
     with warnings.catch_warnings():
@@ -466,12 +455,7 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, firs
             line = [line for line, _ in _rows_with_lines(rows, first_line)][frame]
             what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame {frame}"
             raise _Broken(line, f"{what}; bones must be rigid: bake the motion to rotations before exporting")
-    skeleton = Skeleton(
-        names=tuple(joint.name for joint in joints[root:]),
-        parents=tuple(max(parent - root, -1) for parent in parents[root:]),
-        offsets=offsets[root:],
-        end_sites=tuple(
-            (joint - root, tuple(scale * value for value in offset)) for joint, offset in end_sites if joint >= root
-        ),
-    )
+    tips = [(joint - root, [scale * value for value in offset]) for joint, offset in end_sites if joint >= root]
+    names, parents = [joint.name for joint in joints[root:]], [max(parent - root, -1) for parent in parents[root:]]
+    skeleton = Skeleton(names, parents, offsets[root:], tips)
     return Motion(skeleton, root_position, rotations[:, root:], fps=1.0 / frame_time, name=name)

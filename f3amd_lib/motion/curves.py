@@ -1,7 +1,5 @@
 """Curves and directions that paths, walker and foot locking share."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 

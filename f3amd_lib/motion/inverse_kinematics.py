@@ -3,8 +3,6 @@
 Bone by bone from the root down, each in closed form, so that positions that come from the skeleton are met exactly.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module
@@ -38,8 +36,8 @@ def fit_rotations(skeleton: Skeleton, positions):
         above = start if parent < 0 else turned[parent]
         offset = skeleton.offsets[joint].astype(positions.dtype)
         placed.append(positions[:, 0] if parent < 0 else placed[parent] + xp.sum(above * offset, axis=-1))
-        children = [child for child, its in enumerate(skeleton.parents) if its == joint]
-        bones = np.array([child for child in children if np.linalg.norm(skeleton.offsets[child]) > _NO_LENGTH], int)
+        children = np.array(skeleton.children[joint], int)
+        bones = children[np.linalg.norm(skeleton.offsets[children], axis=-1) > _NO_LENGTH]
         wanted = positions[:, bones] - placed[joint][:, None]
         wanted = xp.sum(wanted[..., None] * above[:, None], axis=-2)  # in the parent's frame
         local.append(_aimed(skeleton.offsets[bones].astype(positions.dtype), wanted) if len(bones) else start)

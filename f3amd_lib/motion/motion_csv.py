@@ -1,14 +1,12 @@
 """Motion as a table that any program reads: a row for each frame and joint."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.skeleton import Motion
 
 
@@ -29,7 +27,7 @@ def write_motion_csv(path, motion: Motion, *, overwrite: bool = False) -> Path:
     Raises:
       ValueError: for a file that is there.
     """
-    path, (frames, joints) = Path(path), motion.positions.shape[:2]
+    frames, joints = motion.positions.shape[:2]
     number = np.repeat(np.arange(frames), joints)
     columns = {"frame": number, "seconds": number / motion.fps, "joint": np.tile(motion.skeleton.names, frames)}
     columns |= dict(zip("xyz", motion.positions.reshape(-1, 3).T, strict=True))
@@ -37,6 +35,4 @@ def write_motion_csv(path, motion: Motion, *, overwrite: bool = False) -> Path:
     if motion.rotations is not None:
         turns = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_quat(scalar_first=True)
     columns |= {f"q{axis}": turns[:, k] for k, axis in enumerate("wxyz")}
-    with whole_file(path, overwrite=overwrite) as unfinished:
-        pd.DataFrame(columns).to_csv(unfinished, index=False, float_format="%.6f")
-    return path
+    return write_whole(path, pd.DataFrame(columns).to_csv(index=False, float_format="%.6f"), overwrite=overwrite)

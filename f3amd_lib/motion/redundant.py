@@ -21,21 +21,13 @@ bone tell where the body faces in the world.
 Source: Guo et al. 2022 (HumanML3D), section 3 and its released processing.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.ground.arrays import array_module, finite_array
-from f3amd_lib.motion.rotations import (
-    matrix_from_yaw,
-    rotation_6d_from_matrix,
-    shortest_turn,
-    wrap_angle,
-    yaw_from_direction,
-)
+from f3amd_lib.motion import rotations
 from f3amd_lib.motion.skeleton import Skeleton
 
 FACING_SMOOTHING = 20.0
@@ -80,7 +72,7 @@ def smoothed_yaw(skeleton: Skeleton, positions, smoothing: float = FACING_SMOOTH
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     if smoothing:
         forward = gaussian_filter1d(forward, smoothing, axis=0, mode="nearest")
-    return yaw_from_direction(forward)
+    return rotations.yaw_from_direction(forward)
 
 
 def canonical_start(skeleton: Skeleton, positions) -> np.ndarray:
@@ -98,7 +90,7 @@ def canonical_start(skeleton: Skeleton, positions) -> np.ndarray:
     """
     positions = finite_array("positions", positions, ("frame", skeleton.num_joints, 3))
     start = positions[0, 0] * [1.0, 0.0, 1.0] + [0.0, positions[..., 1].min(), 0.0]
-    return (positions - start) @ matrix_from_yaw(smoothed_yaw(skeleton, positions[:1], 0.0)[0])
+    return (positions - start) @ rotations.matrix_from_yaw(smoothed_yaw(skeleton, positions[:1], 0.0)[0])
 
 
 def essential_features(skeleton: Skeleton, positions) -> np.ndarray:
@@ -121,10 +113,11 @@ def _first_parts(skeleton: Skeleton, positions, smoothing: float):
         raise ValueError("redundant vectors need at least 2 frames: a step leads to the next one")
     yaw = smoothed_yaw(skeleton, positions, smoothing)
     yaw[0] = 0.0
-    turned = matrix_from_yaw(yaw)  # `rows @ turned` is the way from the world to the root's view
+    turned = rotations.matrix_from_yaw(yaw)  # `rows @ turned` is the way from the world to the root's view
     velocity = (np.diff(positions[:, :1], axis=0) @ turned[1:])[:, 0, ::2]
     local = (positions[:-1, 1:] - positions[:-1, :1] * [1.0, 0.0, 1.0]) @ turned[:-1]
-    parts = [-0.5 * wrap_angle(np.diff(yaw))[:, None], velocity, positions[:-1, 0, 1:2], local.reshape(len(local), -1)]
+    turn = -0.5 * rotations.wrap_angle(np.diff(yaw))[:, None]
+    parts = [turn, velocity, positions[:-1, 0, 1:2], local.reshape(len(local), -1)]
     return np.concatenate(parts, axis=-1), turned
 
 
@@ -149,7 +142,7 @@ def redundant_from_positions(
     step = np.diff(np.asarray(positions, np.float64), axis=0)
     parts = [
         first,
-        rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1])),
+        rotations.rotation_6d_from_matrix(_bone_rotations(skeleton, positions[:-1], turned[:-1])),
         step @ turned[:-1],
         np.sum(step[:, _feet(skeleton)] ** 2, axis=-1) < contact_step,
     ]
@@ -195,7 +188,7 @@ def _bone_rotations(skeleton: Skeleton, positions, turned) -> np.ndarray:
     bones, rest = positions[:, 1:] - positions[:, parents], skeleton.offsets[1:]
     point = (np.linalg.norm(rest, axis=-1) < 1e-9) | (np.linalg.norm(bones, axis=-1).min(axis=0) < 1e-9)
     straight = np.eye(3)[1]  # a bone without length counts as upright
-    in_world = shortest_turn(*(np.where(point[:, None], straight, vectors) for vectors in (rest, bones)))
+    in_world = rotations.shortest_turn(*(np.where(point[:, None], straight, vectors) for vectors in (rest, bones)))
     goes_on = np.array([parent > 0 and parent not in parents[:bone] for bone, parent in enumerate(parents)])
     begin = np.swapaxes(turned, -1, -2)[:, None]
     before = np.where(goes_on[:, None, None], in_world[:, parents - 1], begin)
@@ -221,7 +214,7 @@ def positions_from_redundant(vectors):
     def summed(steps):  # the first frame stands where it is, each other one a step further
         return xp.cumsum(xp.concatenate([xp.zeros_like(steps[..., :1, :]), steps[..., :-1, :]], axis=-2), axis=-2)
 
-    turned = xp.swapaxes(matrix_from_yaw(-2.0 * summed(turn)[..., 0]), -1, -2)
+    turned = xp.swapaxes(rotations.matrix_from_yaw(-2.0 * summed(turn)[..., 0]), -1, -2)
     arriving = xp.concatenate([turned[..., 1:, :, :], turned[..., :1, :, :]], axis=-3)
     flat = xp.concatenate([velocity[..., :1], 0.0 * height, velocity[..., 1:]], axis=-1)
     ground = summed((flat[..., None, :] @ arriving)[..., 0, :])

@@ -9,8 +9,6 @@ the reference has it.
 Source: ours; the fit is that of W. Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

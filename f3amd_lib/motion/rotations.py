@@ -5,8 +5,6 @@ data pipeline (numpy) and the losses (JAX). Matrices act on column vectors. +Y i
 with yaw 0 faces +Z, a positive yaw is a turn to its left (towards +X).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -29,11 +29,6 @@ _SIDES = ("Left", "Right"), ("left", "right"), ("_L", "_R"), ("_l", "_r")
 _TWINS = {own: other for pair in _SIDES for own, other in (pair, pair[::-1])}
 
 
-def _other_side(name: str) -> str:
-    """Return the name of the joint on the other side of the body; a middle joint's own."""
-    return re.sub("Left|Right|left|right|_[LRlr]$", lambda found: _TWINS[found[0]], name)
-
-
 @dataclass(frozen=True, eq=False)
 class Skeleton:
     """A tree of joints with rigid bones.
@@ -73,12 +68,8 @@ class Skeleton:
             raise ValueError("skeleton offsets must be finite")
 
     def __eq__(self, other):
-        return (
-            isinstance(other, Skeleton)
-            and self.names == other.names
-            and self.parents == other.parents
-            and np.allclose(self.offsets, other.offsets, atol=1e-3)
-        )
+        alike = isinstance(other, Skeleton) and (self.names, self.parents) == (other.names, other.parents)
+        return alike and np.allclose(self.offsets, other.offsets, atol=1e-3)
 
     def __hash__(self):
         return hash((self.names, self.parents))
@@ -90,10 +81,9 @@ class Skeleton:
 
     def index(self, name: str) -> int:
         """Return a joint's index by name; ValueError lists the names if there is none."""
-        try:
-            return self.names.index(name)
-        except ValueError:
-            raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}") from None
+        if name not in self.names:
+            raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}")
+        return self.names.index(name)
 
     def role(self, role: str) -> int:
         """Return the joint that plays a role: head, or left_ or right_ hip, toe, clavicle, shoulder or wrist."""
@@ -112,6 +102,16 @@ class Skeleton:
         return self.role("left_toe"), self.role("right_toe")
 
     @functools.cached_property
+    def children(self) -> tuple[list[int], ...]:
+        """The joints that hang on each joint."""
+        return tuple(np.flatnonzero(np.equal(self.parents, joint)).tolist() for joint in range(self.num_joints))
+
+    @functools.cached_property
+    def rest_positions(self) -> np.ndarray:
+        """Joint positions [J, 3], metres, of the root at the origin and all rotations the identity."""
+        return forward_kinematics(self, np.zeros(3), np.broadcast_to(np.eye(3), (self.num_joints, 3, 3)))
+
+    @functools.cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
         """Joints by depth: level 0 is the root. Kinematics walks levels, not joints."""
         depth = []
@@ -122,7 +122,7 @@ class Skeleton:
     @functools.cached_property
     def mirror_permutation(self) -> tuple[int, ...]:
         """For each joint the index of its left-right twin (itself for middle joints)."""
-        twins = [_other_side(name) for name in self.names]
+        twins = [re.sub("Left|Right|left|right|_[LRlr]$", lambda found: _TWINS[found[0]], name) for name in self.names]
         for name, twin in zip(self.names, twins, strict=True):
             if twin not in self.names:
                 raise ValueError(f"joint {name!r} has no twin {twin!r}: it cannot be mirrored")
@@ -141,15 +141,12 @@ class Skeleton:
         twin = self.mirror_permutation
         frames = np.zeros((self.num_joints, 3))
         for joint in range(self.num_joints):
-            children = [c for c, parent in enumerate(self.parents) if parent == joint]
             error = np.zeros(4)
-            for child in children:
+            for child in self.children[joint]:
                 error += np.abs(candidates * self.offsets[child] - self.offsets[twin[child]]).sum(1)
-            if error.min() > 2e-3 * max(len(children), 1):
-                raise ValueError(
-                    f"bones below {self.names[joint]!r} are not mirror images of their twins "
-                    f"(off by {1000 * error.min():.1f} mm): skeleton cannot be mirrored"
-                )
+            if error.min() > 2e-3 * max(len(self.children[joint]), 1):
+                what = f"are no mirror images of their twins (off by {1000 * error.min():.1f} mm)"
+                raise ValueError(f"bones below {self.names[joint]!r} {what}: skeleton cannot be mirrored")
             tied = [k for k in range(4) if error[k] <= error.min() + 1e-3]
             parent = self.parents[joint]
             inherited = [k for k in tied if parent >= 0 and np.array_equal(candidates[k], frames[parent])]

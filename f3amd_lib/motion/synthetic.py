@@ -15,8 +15,6 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 +Z and the character's left is +X.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import make_dataclass
 from pathlib import Path

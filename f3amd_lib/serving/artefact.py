@@ -13,8 +13,6 @@ nothing else of f3amd_lib, so that it can be copied out alone and shipped beside
 An artefact is a program: load only those that you trust, as with any other.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.metadata
@@ -226,10 +224,8 @@ def _load_jax(folder: Path, manifest: dict) -> _Program:
         exported = export.deserialize(blob)
     except Exception as error:  # JAX promises no type
         made_by = manifest["record"]["versions"]["jax"]
-        raise ValueError(
-            f"{folder / JAX_EXPORT}: JAX {jax.__version__} cannot read what JAX {made_by} exported "
-            f"({error}); install that version, or export again"
-        ) from None
+        what = f"JAX {jax.__version__} cannot read what JAX {made_by} exported ({error})"
+        raise ValueError(f"{folder / JAX_EXPORT}: {what}; install that version, or export again") from None
     inputs = [jax.ShapeDtypeStruct(tuple(item["shape"]), np.float32) for item in manifest["inputs"]]
     # Compiled ahead of the first call, so that a call does nothing but run.
     compiled = jax.jit(exported.call).lower(*inputs).compile()
@@ -246,15 +242,12 @@ def _load_iree(folder: Path, manifest: dict, target: str, driver: str | None) ->
     try:
         from iree import runtime
     except ImportError as error:
-        raise ImportError(
-            f"runtime 'iree' needs IREE's runtime ({error}): make bench-tools, or pip install \"f3amd_lib[bench]\", "
-            f"or iree-base-runtime=={made_by} alone"
-        ) from None
+        how = f'make bench-tools, or pip install "f3amd_lib[bench]", or iree-base-runtime=={made_by} alone'
+        raise ImportError(f"runtime 'iree' needs IREE's runtime ({error}): {how}") from None
     if made_by != iree_version():
-        raise ValueError(
-            f"{folder}: target {target} was compiled by IREE {made_by}, and this is IREE {iree_version()}: "
-            f"install iree-base-runtime=={made_by}, compile it again, or pass runtime='jax'"
-        )
+        what = f"target {target} was compiled by IREE {made_by}, and this is IREE {iree_version()}"
+        how = f"install iree-base-runtime=={made_by}, compile it again, or pass runtime='jax'"
+        raise ValueError(f"{folder}: {what}: {how}")
     _check_cpu(folder, target, compiled.get("cpu"))
     content = _read(folder, compiled["file"], manifest)
     config = runtime.Config(device=_iree_device(driver or compiled["driver"]))
@@ -294,10 +287,8 @@ def _check_cpu(folder: Path, target: str, wanted: dict | None) -> None:
     machine, missing = platform.machine(), sorted(set(wanted["features"]) - set(cpu_features()))
     if machine != wanted["machine"] or missing:
         lacks = f"lacks {', '.join(missing)}" if missing else f"is {machine}"
-        raise ValueError(
-            f"{folder}: target {target} was compiled for another CPU ({wanted['machine']}), and "
-            f"this one {lacks}: compile it here, or pass runtime='jax'"
-        )
+        what = f"target {target} was compiled for another CPU ({wanted['machine']}), and this one {lacks}"
+        raise ValueError(f"{folder}: {what}: compile it here, or pass runtime='jax'")
 
 
 @functools.cache

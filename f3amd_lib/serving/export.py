@@ -9,8 +9,6 @@ device, and has no loop of random bits. What is written here is loaded by `artef
 nothing of this library.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -18,14 +16,14 @@ import importlib.util
 import json
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +35,7 @@ from jax.extend.mlir.dialects import stablehlo
 
 from f3amd_lib.diffusion.samplers import ddpm_step
 from f3amd_lib.generation.rounds import sample_round
-from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.files import read_toml, whole_folder
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.networks.conditioning import Condition
@@ -49,31 +47,17 @@ _ENTRY = "main"
 """What JAX calls the program's one public function."""
 
 
-class Target(NamedTuple):
-    """What IREE compiles for, and how.
-
-    Attributes:
-      backend: IREE's name of the code generator.
-      driver: IREE's name of what runs it.
-      flags: of the compiler.
-      tiling: further ones, with which some programs do not compile.
-    """
-
-    backend: str
-    driver: str
-    flags: list[str]
-    tiling: Sequence[str] = ()
-
-
 TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
 """Targets by name. "cuda-sm_NN" is a generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
 
 
-def _find_target(name: str) -> Target:
+def _find_target(name: str) -> dict:
+    """Return a target as `targets.toml` has it, with `backend`, IREE's name of the code generator."""
     if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
-        return Target("cuda", "cuda", [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"])
+        flags = [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"]
+        return {"backend": "cuda", "driver": "cuda", "flags": flags}
     check_known(name, [*TARGETS, "cuda-sm_80"], "target")
-    return Target(name, **TARGETS[name])
+    return {"backend": name, **TARGETS[name]}
 
 
 @dataclass(frozen=True)
@@ -129,10 +113,8 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         raise ValueError(f"batch must be a whole number of characters, at least 1, got {batch!r}")
     sigmas = np.asarray(sigmas, np.float64)
     if sigmas.ndim != 1 or len(sigmas) < 2 or not np.isfinite(sigmas).all():
-        raise ValueError(
-            f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}; "
-            "take them from a noise schedule's grid"
-        )
+        what = f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}"
+        raise ValueError(f"{what}; take them from a noise schedule's grid")
     config = network.config
     shape = (batch, config.window, config.channels)
     inputs = {name: part.shape for name, part in config.condition_shapes(batch)._asdict().items()} | {"noise": shape}
@@ -213,16 +195,14 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
         return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
     """
     settings = _find_target(target)
-    if settings.driver == "local-task" and _has_loop(program):
-        raise ValueError(
-            f"the program has a loop (stablehlo.while), and on {target} IREE's local-task driver "
-            "returns NaN or garbage from such programs now and then: export it with unroll=True, "
-            "and give it its noise instead of a random key"
-        )
+    if settings["driver"] == "local-task" and _has_loop(program):
+        what = f"the program has a loop (stablehlo.while), of which IREE makes NaN or garbage now and then on {target}"
+        raise ValueError(f"{what}: export it with unroll=True, and give it its noise instead of a random key")
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
     # Tiles are faster, but some programs do not compile in them.
-    ways = [[*settings.flags, *tiling] for tiling in dict.fromkeys((tuple(settings.tiling), ()))]
+    tiling = settings.get("tiling", [])
+    ways = [[*settings["flags"], *tiling], settings["flags"]] if tiling else [settings["flags"]]
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / artefact.STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
@@ -230,8 +210,8 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
             # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
             # process that holds both dies when it ends.
             command = [sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile", str(source), "-o"]
-            command += [str(compiled), "--iree-input-type=stablehlo", f"--iree-hal-target-backends={settings.backend}"]
-            command += ["--iree-vm-bytecode-module-strip-source-map", *flags]
+            command += [str(compiled), "--iree-input-type=stablehlo", "--iree-vm-bytecode-module-strip-source-map"]
+            command += [f"--iree-hal-target-backends={settings['backend']}", *flags]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode == 0:
                 return compiled.read_bytes(), flags
@@ -277,11 +257,11 @@ def save_artefact(
         compiled[target] = {
             "file": file,
             "entry": _ENTRY,
-            "driver": settings.driver,
+            "driver": settings["driver"],
             "iree_version": artefact.iree_version(),
             "flags": flags,
             "compile_seconds": round(time.perf_counter() - started, 1),
-            "cpu": host if settings.backend == "llvm-cpu" else None,
+            "cpu": host if settings["backend"] == "llvm-cpu" else None,
         }
     if trained is not None:
         scales = trained.normaliser._asdict()
@@ -290,9 +270,11 @@ def save_artefact(
         files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
     manifest = _manifest(exported, name, files, compiled, trained)
     files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
-    with _whole_folder(folder) as temporary:
+    with whole_folder(folder) as temporary:
         for file, content in files.items():
             (temporary / file).write_bytes(content)
+        if folder.exists():  # an artefact, see `_check_free`
+            shutil.rmtree(folder)
     return folder
 
 
@@ -333,23 +315,6 @@ def _check_free(folder: Path, overwrite: bool) -> None:
     others = sorted({item.name for item in folder.iterdir()} - ours)
     if others:
         raise ValueError(f"{folder}: holds {others[0]}, which is no part of the artefact; it is not overwritten")
-
-
-@contextlib.contextmanager
-def _whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that takes the place of `folder` at the end, if the block ends well."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
-        new, earlier = Path(temporary) / "new", Path(temporary) / "earlier"
-        new.mkdir()
-        yield new
-        if folder.exists():
-            folder.rename(earlier)
-        try:
-            new.rename(folder)
-        except OSError:
-            earlier.rename(folder)
-            raise
 
 
 def export_model(

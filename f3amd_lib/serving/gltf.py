@@ -6,8 +6,6 @@ glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of 
 Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import make_body
-from f3amd_lib.motion.skeleton import Motion, forward_kinematics
+from f3amd_lib.motion.skeleton import Motion
 
 _COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
 _KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
@@ -80,14 +78,11 @@ def write_glb(path, motion: Motion, *, credit: str = "", overwrite: bool = False
     root = np.asarray(motion.root_position, np.float64)
     times = file.put(np.arange(motion.num_frames) / motion.fps, "f4")
     for joint, name in enumerate(skeleton.names):
-        children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
         place = root[0] if joint == 0 else skeleton.offsets[joint]
-        document.nodes.append(
-            gltf.Node(name=name, translation=place.tolist(), rotation=turns[0, joint].tolist(), children=children)
-        )
-    rest = forward_kinematics(skeleton, np.zeros(3), np.broadcast_to(np.eye(3), (skeleton.num_joints, 3, 3)))
+        turn, children = turns[0, joint].tolist(), skeleton.children[joint]
+        document.nodes.append(gltf.Node(name=name, translation=place.tolist(), rotation=turn, children=children))
     inverse = np.tile(np.eye(4), (skeleton.num_joints, 1, 1))
-    inverse[:, :3, 3] = -rest
+    inverse[:, :3, 3] = -skeleton.rest_positions
     joints = list(range(skeleton.num_joints))
     document.skins.append(gltf.Skin(joints=joints, skeleton=0, inverseBindMatrices=file.put(inverse, "f4")))
     padding = ((0, 0), (0, 4 - body.joints.shape[1]))

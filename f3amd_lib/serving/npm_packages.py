@@ -3,8 +3,6 @@
 Nothing of them is committed, and npm itself is not needed: an archive comes from its public registry by address.
 """
 
-from __future__ import annotations
-
 import tarfile
 import tomllib
 from pathlib import Path

@@ -13,8 +13,6 @@ Beside the program lies a card, JSON: shapes, scales of the features, skeleton, 
 program is from JAX; and a worked example in Python and one in C#.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path

@@ -13,8 +13,6 @@ lines:
 What an autoencoder makes of a latent is not exported, nor is the text encoder: the card says which one it was.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,9 +1,8 @@
-"""Motion that a reader can turn around: a player as one HTML page, for browsers and notebooks.
+"""Motion that a reader can turn around: a player as one HTML page.
 
-`player_page` makes the page, `write_player` writes it, `show_player` shows it in a notebook. The page is whole:
-scripts, style and all motion stand in it, a content security policy forbids it any request, and it works offline and
-inside an iframe. It is drawn with three.js (MIT, `web/three.min.js`), of which each page carries 220 kB; the scripts
-beside it are ours.
+`player_page` makes the page, `write_player` writes it. The page is whole: scripts, style and all motion stand in it, a
+content security policy forbids it any request, and it works offline and inside an iframe. It is drawn with three.js
+(MIT, `web/three.min.js`), of which each page carries 220 kB; the scripts beside it are ours.
 
 How motion is stored (`"version": 2`). The page holds a JSON object with titles, skeletons, frame rate and, under
 `tracks`, the numbers: base64 of one zlib stream. Inflated, the stream holds for each character of each scene, in the
@@ -22,8 +21,6 @@ Differences of smooth motion are small, which lets zlib shorten them. Joints com
 those of a crowd to a few.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import html
@@ -39,7 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.pictures import film_strip
-from f3amd_lib.drawing.style import save_figure, show_figure
+from f3amd_lib.drawing.style import save_figure
 from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -198,60 +195,6 @@ def scenes_strip(scenes):
     return film_strip([one.motion for one in firsts], paths=[one.path for one in firsts], titles=titles)
 
 
-class Player:
-    """A player that a notebook shows when it is a cell's last value, with its film strip below.
-
-    The page runs in an iframe of its own that may run scripts and nothing else: it sees neither the
-    notebook nor the network. The film strip is an image of its own, for viewers that show no iframe
-    (a notebook on a code host, a printed one).
-    """
-
-    def __init__(self, page: str, height: int, strip):
-        self.page = page
-        self.height = height
-        self.strip = strip
-
-    @property
-    def iframe(self) -> str:
-        """The player as an HTML element to put into another page."""
-        titled = re.search(r"<title>(.*?)</title>", self.page, re.S)[1]
-        return (
-            f'<iframe title="Motion player: {titled}" sandbox="allow-scripts allow-downloads" loading="lazy" '
-            f'style="width:100%;height:{self.height}px;border:1px solid #8a8a8a;border-radius:6px" '
-            f'srcdoc="{html.escape(self.page, quote=True)}"></iframe>'
-        )
-
-    def _ipython_display_(self) -> None:
-        from IPython.display import display
-
-        plain = "Motion player (shown by viewers that run HTML)"
-        display({"text/html": self.iframe, "text/plain": plain}, raw=True)
-        if self.strip is not None:
-            display(self.strip)
-
-
-def show_player(scenes, *, height: int = 480, strip: bool = True, autoplay: bool = False, **options) -> Player:
-    """Show the player in a notebook, with a film strip as an image below it.
-
-    Args:
-      scenes, options: as for `player_page`.
-      height: of the player, CSS pixels.
-      strip: show the film strip (`scenes_strip`).
-      autoplay: start at once. A notebook with many players rests easier without.
-
-    Returns:
-      What Jupyter displays; as a cell's last value it shows itself.
-
-    Raises:
-      ValueError: as for `player_page`, or a height under 200.
-    """
-    if not height >= 200:
-        raise ValueError(f"height must be 200 or more pixels, got {height}")
-    page = player_page(scenes, autoplay=autoplay, **options)
-    image = show_figure(scenes_strip(scenes), dpi=70, colors=128) if strip else None
-    return Player(page, int(height), image)
-
-
 # ---------------------------------------------------------------------------------- what comes in
 
 
@@ -301,10 +244,8 @@ def _check_in_step(character: Character, first: Motion) -> None:
 def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
     for frame in scene.boundaries:
         if frame not in range(1, num_frames):
-            raise ValueError(
-                f"boundary {frame} of scene {scene.title!r} is no frame between 1 and {num_frames - 1}, "
-                "where a new window could begin"
-            )
+            what = f"no frame between 1 and {num_frames - 1}, where a new window could begin"
+            raise ValueError(f"boundary {frame} of scene {scene.title!r} is {what}")
     return sorted({int(frame) for frame in scene.boundaries})
 
 
@@ -371,10 +312,8 @@ def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[di
             raise ValueError(f"{label}: {error}") from None
         fps = getattr(character.path, "fps", motion.fps)
         if len(path) != num_frames or abs(fps - motion.fps) > 1e-6:
-            raise ValueError(
-                f"{label}: the target path has {len(path)} frames at {fps:g} a second, the motion "
-                f"{num_frames} at {motion.fps:g}"
-            )
+            there = f"{len(path)} frames at {fps:g} a second, the motion {num_frames} at {motion.fps:g}"
+            raise ValueError(f"{label}: the target path has {there}")
         pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
     about = {"name": label, "color": character.color, "ghost": ghost}
     return about | {"contacts": has_contacts, "path": character.path is not None}, pieces

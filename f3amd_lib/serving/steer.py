@@ -5,8 +5,6 @@ our own modules (`serving/web`). All of it is gzipped and in base64, so that the
 of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html
@@ -57,9 +55,7 @@ def steer_page(
     """
     check_known(runtime, RUNTIMES, "runtime")
     if trained.diffusion.sampler != "ddim":
-        raise ValueError(
-            f"{trained.name} is sampled by {trained.diffusion.sampler!r}, and the page walks by 'ddim' alone"
-        )
+        raise ValueError(f"{trained.name} is sampled by {trained.diffusion.sampler!r}, the page walks by 'ddim' alone")
     card = model_card(trained, num_steps)
     if missing := [style for style in trained.styles if style not in trained.start_poses]:
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")

@@ -5,8 +5,6 @@ the browser their names in an import map, and start one of them. Browsers of 202
 Firefox 113, Safari 16.4).
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib
