@@ -95,10 +95,7 @@ def time_group(
     Raises:
       ValueError: for candidates of several groups.
     """
-    groups = {candidate.group for candidate in candidates}
-    if len(groups) != 1:
-        raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
-    ((window, characters, precision),) = groups
+    ((window, characters, precision),) = {candidate.group for candidate in candidates}
     ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:
