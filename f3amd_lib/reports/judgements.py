@@ -185,16 +185,6 @@ def _ranged(figures: Sequence[Figure], bounds: tuple[float, float], unit: str, *
     return majority(verdicts), text
 
 
-def stated_range(low: float, high: float) -> tuple[float, float]:
-    """Return the bounds of a range of factors as the paper states it, with some slack."""
-    return low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)
-
-
-def stated_saving(low: float, high: float) -> tuple[float, float]:
-    """Return the bounds of a range of time saved, %, as the paper states it, with some slack."""
-    return low - SAVING_SLACK, high + SAVING_SLACK
-
-
 def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
     """Return the bounds of "about figure / over times", a factor above 1."""
     factor = figure / over
@@ -206,6 +196,16 @@ def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
 def equal_range(slack: float) -> tuple[float, float]:
     """Return the bounds of ratios that count as 1, as far below as above."""
     return 1.0 / (1.0 + slack), 1.0 + slack
+
+
+RANGES = {
+    "within": lambda low, high: (low, high),
+    "stated": lambda low, high: (low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)),
+    "about": stated_factor,
+    "alike": equal_range,
+    "saving": lambda low, high: (low - SAVING_SLACK, high + SAVING_SLACK),
+}
+"""Range of a statement, as `claims.toml` names it -> function that makes bounds of its numbers, with slack."""
 
 
 # -------------------------------------------------------------------------------------- words
