@@ -821,7 +821,7 @@ def snapshots(root, rows):
     record = {"dataset": "bandai", "profile": "laptop", "seed": 0, "device_platform": "cpu", "cores": 2}
     write_table(root / "bandai" / "laptop" / "records" / "campaign.csv", pd.DataFrame(table), record)
     evidence = [recorded_evidence(root, "bandai", "laptop"), *snapshot_evidence(root, "bandai", "laptop")]
-    return claims.judge_claim(claims.load_claims()["Q10"], {"bandai": evidence})
+    return claims.judge_claim(claims.load_claims("f3amd")["Q10"], {"bandai": evidence})
 
 
 def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_path):
