@@ -34,7 +34,6 @@ from f3amd_lib.reports import theory
 from f3amd_lib.reports.evidence import (
     SCHEMAS,
     Evidence,
-    NoTable,
     NotMeasured,
     Setting,
     Source,
@@ -55,7 +54,6 @@ PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
 _MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
-_SYNTHETIC = "synthetic (procedural, no real motion)"
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Statement:
       figure: what was found, or why nothing was.
       reasons: why no verdict is drawn from it -> the models of which that is true.
       sources: tables that it rests on.
-      no_table: it was not measured because a whole table is missing.
+      known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
     """
 
     says: str
@@ -82,7 +80,7 @@ class Statement:
     figure: str = ""
     reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sources: tuple[Source, ...] = ()
-    no_table: bool = False
+    known: int = 0
 
     def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor=()) -> Statement:
         """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
@@ -90,11 +88,11 @@ class Statement:
         try:
             verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
-            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
+            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), known=gap.known)
         reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
         verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
-        sources = tuple(dict.fromkeys(evidence.sources))
-        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources)
+        known, sources = 2 if verdict == judging.UNJUDGED else 3, tuple(dict.fromkeys(evidence.sources))
+        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources, known=known)
 
 
 @dataclass(frozen=True)
@@ -261,17 +259,10 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
 
 
-def _says_more(statement: Statement) -> int:
-    """Rank what is known of a statement: a verdict, a figure without one, a row that is missing, a table that is."""
-    if statement.verdict == judging.UNMEASURED:
-        return 0 if statement.no_table else 1
-    return 2 if statement.verdict == judging.UNJUDGED else 3
-
-
 def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
-    """Take each statement from the evidence that says most, of equals the first."""
+    """Take each statement from the evidence that knows most of it, of equals the first."""
     judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
-    return _seen(max(statements, key=_says_more) for statements in judged)
+    return _seen(max(statements, key=lambda statement: statement.known) for statements in judged)
 
 
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
@@ -289,7 +280,7 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
     if claim.computed:
         return Judgement(claim, paper, (), "computed")
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
-    dataset = max(tried, key=lambda data: max((_says_more(s) for s in tried[data] if not s.remark), default=0))
+    dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
     ours = tried[dataset]
     nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
     return Judgement(claim, ours, paper, "" if nothing else dataset)
@@ -344,7 +335,7 @@ def _row(judgement: Judgement) -> dict:
     said["decided_by"] = claim.decided_by
     judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
     judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
-    dataset = _SYNTHETIC if judgement.dataset == "synthetic" else judgement.dataset
+    dataset = judgement.dataset + (" (procedural, no real motion)" if judgement.dataset == "synthetic" else "")
     hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
     record = "; ".join(dict.fromkeys(map(str, sources)))
     return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}

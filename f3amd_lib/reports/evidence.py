@@ -29,9 +29,13 @@ from f3amd_lib.networks import presets
 class NotMeasured(LookupError):
     """A figure that a claim needs is not among the records; the message says which."""
 
+    known = 1
+
 
 class NoTable(NotMeasured):
     """The whole table is not there: the least that can be said."""
+
+    known = 0
 
 
 def known(look: Callable, *arguments, **named):
