@@ -15,7 +15,7 @@ import collections
 import contextlib
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import nbformat
@@ -58,7 +58,7 @@ def find_notebooks(folder) -> list[Path]:
     return found
 
 
-def select_notebooks(notebooks: Iterable[Path], only: Iterable[str] = ()) -> list[Path]:
+def select_notebooks(notebooks: Sequence[Path], only: Iterable[str] = ()) -> list[Path]:
     """Keep the notebooks that are asked for, in their own order.
 
     Args:
@@ -69,7 +69,6 @@ def select_notebooks(notebooks: Iterable[Path], only: Iterable[str] = ()) -> lis
     Raises:
       ValueError: if something asked for is not there, with the nearest name.
     """
-    notebooks = list(notebooks)
     chosen = set()
     for wanted in only:
         stem = wanted.removesuffix(".ipynb")
@@ -129,9 +128,7 @@ def _duration(seconds: float) -> str:
 def _usual_seconds(results: Path) -> dict[str, float]:
     """Return how long each notebook took in the last whole run, if there was one."""
     summary = results / "tables" / "run_summary.csv"
-    if not summary.is_file():
-        return {}
-    return pd.read_csv(summary, index_col="notebook")["seconds"].to_dict()
+    return pd.read_csv(summary, index_col="notebook")["seconds"].to_dict() if summary.is_file() else {}
 
 
 def what_to_open(results: Path) -> list[str]:

@@ -158,11 +158,11 @@ def judge(root, tables, claim_id):
     for name, table in tables.items():
         write_table(root / "bandai" / "laptop" / "records" / f"{name}.csv", pd.DataFrame(table), record)
     evidence = [recorded_evidence(root, "bandai", "laptop")]
-    return claims.judge_claim(claims.find_claim(claim_id, PAPER), {"bandai": evidence})
+    return claims.judge_claim(claims.load_claims(PAPER)[claim_id], {"bandai": evidence})
 
 
 def test_every_claim_has_an_oracle_and_a_nonsense():
-    assert list(CASES) == [claim.id for claim in claims.load_claims(PAPER)] == list(claims.load_commands(PAPER))
+    assert list(CASES) == list(claims.load_claims(PAPER)) == list(claims.load_commands(PAPER))
 
 
 @pytest.mark.parametrize("wanted", [HOLDS, FAILS])
@@ -221,7 +221,7 @@ PAPERS_OWN = {
 
 @pytest.mark.parametrize("claim_id", PAPERS_OWN)
 def test_what_the_papers_own_tables_say(claim_id):
-    statements = claims.find_claim(claim_id, PAPER).judge(paper_evidence(PAPER))
+    statements = claims.load_claims(PAPER)[claim_id].judge(paper_evidence(PAPER))
     verdict, figure = PAPERS_OWN[claim_id]
     assert combine(s.verdict for s in statements if not s.optional) == verdict
     assert figure in [s.figure for s in statements]

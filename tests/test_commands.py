@@ -108,7 +108,7 @@ OUT_OF_REACH = {"E11": ("IREE, GPU",)}
 """Statements that nothing here can measure: `bench` runs IREE on a CPU alone."""
 
 
-@pytest.mark.parametrize("claim", claims.load_claims(), ids=lambda claim: claim.id)
+@pytest.mark.parametrize("claim", claims.load_claims().values(), ids=lambda claim: claim.id)
 def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
     """All that the commands would write, and nothing else, is enough to judge every statement."""
     left: dict[tuple, list] = {}
@@ -131,7 +131,7 @@ def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
 
 
 def test_every_claim_has_a_command_that_the_ledger_prints():
-    page = claims.ledger_markdown()
+    page = claims.ledger_markdown(claims.judge_claims())
     for claim_id, runs in claims.load_commands().items():
         part = page.split(f"### {claim_id} ·")[1].split("\n### ")[0]
         assert all(run in part for run in runs), claim_id
@@ -165,7 +165,7 @@ def test_a_command_is_understood(run, monkeypatch):
             assert (given or []) + [PUBLISHED_CAMDM] * len(extra) == models
 
 
-OF_TEXT = [(paper, claim.id) for paper in ("acmdm", "motionpcm") for claim in claims.load_claims(paper)]
+OF_TEXT = [(paper, claim_id) for paper in ("acmdm", "motionpcm") for claim_id in claims.load_claims(paper)]
 
 
 def told(part, key: str) -> set[str]:
@@ -243,5 +243,7 @@ def test_another_claims_command_leaves_gaps(tmp_path):
     record = {"dataset": "bandai", "profile": "gpu", "seed": 0, "device_platform": "gpu", "device_kind": "Test"}
     for name, rows in tables(run).items():
         write_table(tmp_path / "bandai" / "gpu" / "records" / f"{name}.csv", pd.DataFrame(rows), record)
-    judgement = claims.judge_claim(claims.find_claim("Q12"), {"bandai": [recorded_evidence(tmp_path, "bandai", "gpu")]})
+    judgement = claims.judge_claim(
+        claims.load_claims()["Q12"], {"bandai": [recorded_evidence(tmp_path, "bandai", "gpu")]}
+    )
     assert judgement.verdict == UNMEASURED and "CAMDM-96" in judgement.ours[0].figure

@@ -74,13 +74,9 @@ def test_a_sleep_of_known_length():
     assert timing.rounds == 5
 
 
-@pytest.mark.parametrize("wrong", [{"min_rounds": 0}, {"fewest_rounds": 0}, {"warmup": 0}, {"min_seconds": -1.0}])
-def test_counts_that_would_time_nothing_are_refused(wrong):
-    refused("at least", take_turns, {"a": lambda: None}, **wrong)
-
-
-def test_nothing_to_time_is_refused():
-    refused("nothing to time", take_turns, {})
+@pytest.mark.parametrize("counts", [{"min_rounds": 0}, {"fewest_rounds": 0}, {"warmup": 0}, {"min_seconds": -1.0}])
+def test_one_round_is_timed_at_least(counts):
+    assert take_turns({"a": lambda: None}, **({"min_rounds": 3} | counts))["a"].rounds >= 1
 
 
 def test_machine_is_described_for_a_record():
@@ -114,9 +110,8 @@ def test_matmul_probe_has_the_type_of_its_precision():
     assert matmul_probe("float32", size=8)[0]().dtype == "float32"
 
 
-def test_unknown_precision_and_size_are_refused():
+def test_unknown_precision_is_refused():
     refused("tf32", matmul_precision, "fp8")
-    refused("size", matmul_probe, size=0)
 
 
 def test_fast_flags_start_jax_with_as_many_devices():

@@ -254,7 +254,6 @@ def test_bad_input_is_refused():
         lambda: make(network, products="onedn"): "did you mean 'onednn'",
         lambda: prepare(module, SIGMAS, "ddmp"): "unknown PyTorch sampler 'ddmp'.*'ddpm'",
         lambda: prepare(module, SIGMAS, runtime="onx"): "unknown PyTorch runtime 'onx'.*'onnx'",
-        lambda: prepare(module, SIGMAS[:1]): r"at least one step, got shape \(1,\)",
     }.items():
         refused(message, call)
 
@@ -264,8 +263,6 @@ def test_wrong_shapes_are_refused_by_name():
     module, condition = torch_camdm.torch_camdm(network), make_condition()
     given = torch_camdm.torch_condition(condition)
     run = torch_camdm.torch_round(module, SIGMAS)
-    for name in ("noise", "step_noise"):
-        refused(f"^{name} must have shape", run, given, **{name: torch.zeros((2, WINDOW, CHANNELS + 1))})
     refused("condition path must have shape", run, given._replace(path=given.path[..., :7]))
 
 

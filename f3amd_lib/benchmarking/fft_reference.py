@@ -42,19 +42,14 @@ def framework_convolution(z, kernel, bias):
     Returns:
       [B, T, D1], zeros beyond the ends of the window.
     """
-    before = (len(kernel) - 1) // 2
-    return bias + jax.lax.conv_general_dilated(
-        z, kernel, (1,), [(before, len(kernel) - 1 - before)],
-        dimension_numbers=("NWC", "WIO", "NWC"),
-    )  # fmt: skip
+    return bias + jax.lax.conv_general_dilated(z, kernel, (1,), "SAME", dimension_numbers=("NWC", "WIO", "NWC"))
 
 
 class _FFTBlock(nnx.Module):
     """An `FNOBlock` by fast Fourier transforms, with the weights of another."""
 
     def __init__(self, block: FNOBlock):
-        self.spectral, self.local_first = block.spectral, block.local_first
-        self.local_second = block.local_second
+        self.spectral, self.local_first, self.local_second = block.spectral, block.local_first, block.local_second
 
     def __call__(self, z, key=None):
         weights = self.spectral.weight_real[...], self.spectral.weight_imag[...]

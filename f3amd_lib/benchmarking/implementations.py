@@ -106,8 +106,16 @@ def _network(workload: Workload):
     return cast_network(network, PRECISIONS[workload.precision][1])
 
 
-def compile_round(workload: Workload, run: Callable, sharding=None) -> Round:
-    """Compile `run(condition, key)` ahead of time in the workload's precision, for a random condition."""
+def jit_round(workload: Workload, network, sample: Callable = sample_round, sharding=None) -> Round:
+    """Compile a network's round ahead of time in the workload's precision, for a random condition.
+
+    Args:
+      workload: what is asked for.
+      network: a denoiser of its config.
+      sample: as `generation.rounds.sample_round`.
+      sharding: of the condition; on one device by default.
+    """
+    run = lambda condition, key: sample(network, condition, workload.sigmas, key, sampler=workload.sampler)
     dtype = PRECISIONS[workload.precision][1]
     condition = jax.device_put(random_condition(workload.config, workload.characters), sharding)
     given = jax.tree.map(lambda leaf: leaf.astype(dtype), condition), jax.random.key(0)
@@ -120,19 +128,13 @@ def compile_round(workload: Workload, run: Callable, sharding=None) -> Round:
     return Round(call, seconds, None if accessed is None else int(accessed))
 
 
-def _jit(workload: Workload, form=lambda network: network, sample=sample_round, sharding=None) -> Round:
-    network, sigmas = form(_network(workload)), workload.sigmas
-    run = lambda condition, key: sample(network, condition, sigmas, key, sampler=workload.sampler)
-    return compile_round(workload, run, sharding)
-
-
 def _all_devices(workload: Workload) -> Round:
     devices = jax.local_devices()
     if len(devices) < 2:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
     mesh = Mesh(np.array(devices), ("characters",))
     sharding = NamedSharding(mesh, PartitionSpec("characters"))
-    return _jit(workload, sample=partial(sample_round_on_devices, mesh=mesh), sharding=sharding)
+    return jit_round(workload, _network(workload), partial(sample_round_on_devices, mesh=mesh), sharding)
 
 
 def _check_outside_of_jax(workload: Workload, framework: str) -> None:
@@ -182,9 +184,9 @@ def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas"
 
 
 IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Workload], Round]]] = {
-    "jit": ("jax", _jit),
+    "jit": ("jax", lambda workload: jit_round(workload, _network(workload))),
     "jit, all devices": ("jax", _all_devices),
-    "jit, FFT": ("jax", partial(_jit, form=fft_reference)),
+    "jit, FFT": ("jax", lambda workload: jit_round(workload, fft_reference(_network(workload)))),
     "IREE": ("iree", _iree),
     "PyTorch": ("torch", _torch),
     "PyTorch, oneDNN": ("torch", partial(_torch, products="onednn")),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import jax
@@ -61,7 +61,7 @@ def _circumstances() -> dict:
 
 def measure_synthesis_time(
     prepared: PreparedData, profile: Profile, suites: Iterable[str] | None = None, *,
-    characters: Iterable[int] | None = None, again: bool = False,
+    characters: Collection[int] | None = None, again: bool = False,
 ) -> Path:  # fmt: skip
     """Time rounds of the family in every implementation there is (see `benchmarking.synthesis`).
 
@@ -81,7 +81,6 @@ def measure_synthesis_time(
       ValueError: for an unknown suite.
     """
     suites = check_suites(suites or DEFAULT_SUITES[profile.name])
-    wanted = None if characters is None else set(characters)
     folder = results_dir(profile.dataset, profile.name) / "records"
     turns = {"fewest_rounds": _FEWEST_ROUNDS, **_TURNS.get(profile.name, {})}
     path = folder / "synthesis_ways.csv"
@@ -98,7 +97,7 @@ def measure_synthesis_time(
         (suite, candidates)
         for suite in suites
         for candidates in plan(suite).values()
-        if wanted is None or candidates[0].characters in wanted
+        if characters is None or candidates[0].characters in characters
         if not all(is_done(suite, candidate) for candidate in candidates)
     ]
     with tqdm(todo, unit="group") as bar:

@@ -19,7 +19,7 @@ from f3amd_lib.benchmarking import implementations
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, row_label
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,8 @@ class Candidate:
     precision: str = "float32"
 
     def __str__(self) -> str:
-        steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
-        characters = f"{self.characters} character{'s' if self.characters > 1 else ''}"
-        return f"{self.model}, {steps}, {characters}, {self.window} frames, {self.implementation}, {self.precision}"
+        characters = f"{self.characters} character{'s' if self.characters > 1 else ''}, {self.window} frames"
+        return f"{row_label(self.model, self.steps)}, {characters}, {self.implementation}, {self.precision}"
 
     @property
     def group(self) -> tuple[int, int, str]:
@@ -65,12 +64,10 @@ def plan(suite: str) -> dict[tuple, list[Candidate]]:
     check_suites([suite])
     groups: dict[tuple, dict[Candidate, None]] = {}
     for block in SUITES[suite]:
+        unusual = {key: block[key] for key in ("window", "precision") if key in block}
         for implementation, counts in block["characters"].items():
             for characters, model, steps in itertools.product(counts, block["models"], block["steps"]):
-                candidate = Candidate(
-                    model, steps, characters, implementation,
-                    block.get("window", 32), block.get("precision", "float32"),
-                )  # fmt: skip
+                candidate = Candidate(model, steps, characters, implementation, **unusual)
                 groups.setdefault(candidate.group, {})[candidate] = None
     return {group: list(candidates) for group, candidates in groups.items()}
 
@@ -95,10 +92,7 @@ def time_group(
     Raises:
       ValueError: for candidates of several groups.
     """
-    groups = {candidate.group for candidate in candidates}
-    if len(groups) != 1:
-        raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
-    ((window, characters, precision),) = groups
+    ((window, characters, precision),) = {candidate.group for candidate in candidates}
     ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:

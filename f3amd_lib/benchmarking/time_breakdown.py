@@ -6,13 +6,15 @@ saves without a part is what the part costs, as far as costs add up.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from flax import nnx
 
-from f3amd_lib.benchmarking.implementations import Workload, compile_round
+from f3amd_lib.benchmarking.implementations import Workload, jit_round
 from f3amd_lib.benchmarking.machine import device_name
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.generation.rounds import sample_round
@@ -97,16 +99,11 @@ def time_breakdown(workload: Workload, *, progress: bool = False, **turns) -> pd
     """
     network = presets.build_from_config(workload.config, jax.random.key(0))
     shape = workload.characters, workload.config.window, workload.config.channels
-    noise = jax.random.normal(jax.random.key(1), shape)
-
-    def call(network, noise=None):
-        run = lambda condition, key: sample_round(
-            network, condition, workload.sigmas, key, noise=noise, sampler=workload.sampler
-        )
-        return compile_round(workload, run).call
-
-    calls = {"nothing": call(network)} | {part: call(without(network, part)) for part in PARTS[:-1]}
-    calls["noise"] = call(network, noise)
+    given_noise = partial(sample_round, noise=jax.random.normal(jax.random.key(1), shape))
+    ready = {"nothing": jit_round(workload, network)}
+    ready |= {part: jit_round(workload, without(network, part)) for part in PARTS[:-1]}
+    ready["noise"] = jit_round(workload, network, given_noise)
+    calls = {part: done.call for part, done in ready.items()}
     timings = take_turns(calls, progress=progress, **turns)
     whole = timings["nothing"].median
     rows = [

@@ -69,18 +69,8 @@ def take_turns(
       progress: show a bar.
 
     Returns:
-      Name -> timing, in the order of `candidates`.
-
-    Raises:
-      ValueError: for no candidates, or counts that would time nothing.
+      Name -> timing, in the order of `candidates`. Each has one round at least, whatever the counts.
     """
-    if not candidates:
-        raise ValueError("there is nothing to time")
-    if min(min_rounds, fewest_rounds, warmup) < 1 or not min_seconds >= 0:
-        raise ValueError(
-            "min_rounds, fewest_rounds and warmup must be at least 1 and min_seconds at least 0, "
-            f"got {min_rounds}, {fewest_rounds}, {warmup} and {min_seconds}"
-        )
 
     def timed(call) -> float:
         started = clock()
@@ -102,8 +92,8 @@ def take_turns(
                 if enough and len(rounds) >= min(fewest_rounds, min_rounds):
                     del waiting[name]
                     bar.update()
-    quantiles = {name: map(float, np.quantile(rounds, (0.5, 0.05, 0.95))) for name, rounds in seconds.items()}
-    return {
-        name: Timing(*quantiles[name], *median_interval(rounds), len(rounds), first[name])
-        for name, rounds in seconds.items()
-    }
+    timings = {}
+    for name, rounds in seconds.items():
+        quantiles = map(float, np.quantile(rounds, (0.5, 0.05, 0.95)))
+        timings[name] = Timing(*quantiles, *median_interval(rounds), len(rounds), first[name])
+    return timings

@@ -52,8 +52,7 @@ class _Linear(nn.Module):
 
     def __init__(self, kernel: torch.Tensor, bias: torch.Tensor):
         super().__init__()
-        self.kernel = nn.Parameter(kernel.contiguous(), requires_grad=False)
-        self.bias = nn.Parameter(bias, requires_grad=False)
+        self.kernel, self.bias = nn.Parameter(kernel.contiguous()), nn.Parameter(bias)
 
     def forward(self, rows):
         return torch.mm(rows, self.kernel).add_(self.bias)
@@ -74,7 +73,7 @@ class _PackedLinear(nn.Module):
         super().__init__()
         # Not a parameter: the packed form is opaque, and a module could not save it.
         self.packed = torch.ops.mkldnn._reorder_linear_weight(kernel.T.contiguous(), None)
-        self.bias = nn.Parameter(bias, requires_grad=False)
+        self.bias = nn.Parameter(bias)
 
     def forward(self, rows):
         return torch.ops.mkldnn._linear_pointwise(rows, self.packed, self.bias, "none", [], "")
@@ -86,14 +85,16 @@ class _PackedLinear(nn.Module):
         return torch.ops.mkldnn._linear_pointwise.binary(rows, residual, self.packed, self.bias, "add")
 
 
-class _LayerNorm(nn.Module):
-    def __init__(self, layer):
-        super().__init__()
-        self.scale = nn.Parameter(_tensor(layer.scale), requires_grad=False)
-        self.bias = nn.Parameter(_tensor(layer.bias), requires_grad=False)
+def _rows_layer(kind: type, *layers):
+    """Return JAX's linear layers side by side as one of a kind in PyTorch."""
+    kernels, biases = zip(*((_tensor(layer.kernel), _tensor(layer.bias)) for layer in layers), strict=True)
+    return kind(torch.cat(kernels, dim=1), torch.cat(biases))
 
-    def forward(self, rows):
-        return functional.layer_norm(rows, self.scale.shape, self.scale, self.bias, _LAYER_NORM_EPSILON)
+
+def _layer_norm(layer) -> nn.LayerNorm:
+    norm = nn.LayerNorm(layer.scale.shape, eps=_LAYER_NORM_EPSILON)
+    norm.load_state_dict({"weight": _tensor(layer.scale), "bias": _tensor(layer.bias)})
+    return norm
 
 
 class _Block(nn.Module):
@@ -103,16 +104,11 @@ class _Block(nn.Module):
         super().__init__()
         attention = block.attention
         self.num_heads = attention.num_heads
-        asked = (attention.query, attention.key, attention.value)
-        self.query_key_value = linear(
-            torch.cat([_tensor(layer.kernel) for layer in asked], dim=1),
-            torch.cat([_tensor(layer.bias) for layer in asked]),
-        )
-        self.attention_output = linear(_tensor(attention.output.kernel), _tensor(attention.output.bias))
-        self.attention_norm = _LayerNorm(block.attention_norm)
-        self.hidden = linear(_tensor(block.hidden.kernel), _tensor(block.hidden.bias))
-        self.output = linear(_tensor(block.output.kernel), _tensor(block.output.bias))
-        self.output_norm = _LayerNorm(block.output_norm)
+        self.query_key_value = _rows_layer(linear, attention.query, attention.key, attention.value)
+        self.attention_output = _rows_layer(linear, attention.output)
+        self.attention_norm = _layer_norm(block.attention_norm)
+        self.hidden, self.output = _rows_layer(linear, block.hidden), _rows_layer(linear, block.output)
+        self.output_norm = _layer_norm(block.output_norm)
 
     def forward(self, z, num_tokens: int):
         """Map z [B * num_tokens, D] to the same shape; `z` may be overwritten."""
@@ -140,16 +136,13 @@ class TorchCAMDM(nn.Module):
         config = network.config
         self.config, self.products = config, products
         packed = {"blas": _Linear, "onednn": _PackedLinear}[products]
-        make = lambda kind, layer: kind(_tensor(layer.kernel), _tensor(layer.bias))
         # Packing pays in the large products only.
-        self.noise_first = make(_Linear, network.noise_first)
-        self.noise_second = make(_Linear, network.noise_second)
-        self.style = nn.Parameter(_tensor(network.style.kernel), requires_grad=False)
-        self.path = nn.ModuleList([make(_Linear, layer) for layer in network.path])
-        self.history = make(_Linear, network.history)
-        self.future = make(_Linear, network.future)
+        plain = lambda layer: _rows_layer(_Linear, layer)
+        self.noise_first, self.noise_second = plain(network.noise_first), plain(network.noise_second)
+        self.history, self.future, self.output = plain(network.history), plain(network.future), plain(network.output)
+        self.style = nn.Parameter(_tensor(network.style.kernel))
+        self.path = nn.ModuleList(map(plain, network.path))
         self.blocks = nn.ModuleList([_Block(block, packed) for block in network.blocks])
-        self.output = make(_Linear, network.output)
         code = position_code(0, config.num_tokens, config.latent_width, base=POSITION_BASE)
         self.register_buffer("code", torch.tensor(code, dtype=torch.float32))
 
@@ -194,9 +187,8 @@ class TorchCAMDM(nn.Module):
         Returns:
           x0_hat, [B, T, C].
         """
-        config = self.config
-        window, channels, width = config.window, config.channels, config.latent_width
-        num_tokens, batch = config.num_tokens, len(x_scaled)
+        batch, window, channels = x_scaled.shape
+        num_tokens, width = self.code.shape
         future = self.future(x_scaled.reshape(-1, channels)).view(batch, window, width)
         future = future.add_(self.code[-window:])
         noise = noise_token[:, None].expand(batch, 1, width)
@@ -225,7 +217,7 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     torch.set_num_threads(usable_cores())
-    return TorchCAMDM(network, products).eval()
+    return TorchCAMDM(network, products).eval().requires_grad_(False)
 
 
 def torch_condition(condition: Condition) -> Condition:
@@ -302,26 +294,21 @@ def torch_round(
       `run(condition, generator=None, *, noise=None, step_noise=None) -> [B, T, C]`. The condition
       is one of `torch_condition`; the generator is PyTorch's. In place of drawn numbers `noise`
       [B, T, C] starts the walk and `step_noise` [N, B, T, C] is added by DDPM's steps. It raises
-      ValueError for shapes that do not fit, and RuntimeError where `torch.compile` does not work.
+      ValueError for a condition that does not fit, and RuntimeError where `torch.compile` does not work.
 
     Raises:
       ImportError: if ONNX Runtime is asked for and not installed.
-      ValueError: for an unknown sampler or runtime, or sigmas that make no step.
+      ValueError: for an unknown sampler or runtime.
     """
     for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
         check_known(given, known, f"PyTorch {what}")
     config, device, sigmas = module.config, module.code.device, np.array(sigmas, np.float32)
-    if sigmas.ndim != 1 or len(sigmas) < 2:
-        raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")
     scales, features = tell_levels(config, sigmas[:-1])
     denoise = RUNTIMES[runtime](module)
 
     @torch.inference_mode()
     def run(condition, generator=None, *, noise=None, step_noise=None):
         shape = (len(condition.history), config.window, config.channels)
-        for name, given, wanted in (("noise", noise, shape), ("step_noise", step_noise, (len(scales), *shape))):
-            if given is not None and given.shape != wanted:
-                raise ValueError(f"{name} must have shape {wanted}, got {tuple(given.shape)}")
         draw = lambda: torch.randn(shape, generator=generator, device=device)
         context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features).to(device))
         x_noisy = sigmas[0] * (draw() if noise is None else noise)

@@ -119,19 +119,10 @@ def drawn_points(motion: Motion, frames: np.ndarray) -> np.ndarray:
     return np.concatenate([positions, np.stack(tips, axis=1)], axis=1)
 
 
-def head_center(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
-    """Where to draw a head: a little beyond the head joint, away from its parent, [F, 3]."""
-    joints = head_and_parent(skeleton)
-    if joints is None:
-        return None
-    head, neck = np.moveaxis(points[:, joints], 1, 0)
-    along = head - neck
-    length = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
-    return head + 0.07 * along / length
-
-
 def body_lines(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Lines of a body in one frame; the head is one of a millimetre, which a round cap makes a disc.
+    """Lines of a body in one frame.
+
+    The head is one of a millimetre, which a round cap makes a disc, a little beyond its joint, away from the parent.
 
     Args:
       points: [J + tips, 3], a frame of `drawn_points`.
@@ -141,9 +132,11 @@ def body_lines(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, list
     """
     bones = bones_of(skeleton)
     lines, sides = [points[[parent, child]] for parent, child, _ in bones], [side for *_, side in bones]
-    head = head_center(skeleton, points[None])
-    if head is not None:
-        lines, sides = [*lines, head + [[0.0, 0.0, 0.0], [0.0, 0.001, 0.0]]], [*sides, "head"]
+    if (joints := head_and_parent(skeleton)) is not None:
+        head, neck = points[joints]
+        along = head - neck
+        middle = head + 0.07 * along / max(np.linalg.norm(along, axis=-1), 1e-6)
+        lines, sides = [*lines, middle + [[0.0, 0.0, 0.0], [0.0, 0.001, 0.0]]], [*sides, "head"]
     return np.array(lines), sides
 
 

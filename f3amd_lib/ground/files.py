@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import time
@@ -174,15 +175,9 @@ def set_aside(paths: Iterable[Path], name: str) -> str | None:
       What the names begin with now, such as "quality.old1"; None if there was no file.
     """
     present = [path for path in paths if path.exists()]
-    if not present:
-        return None
-
-    def aside(path: Path, number: int) -> Path:
-        return path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
-
-    number = 1
-    while any(aside(path, number).exists() for path in present):
-        number += 1
+    aside = lambda path, number: path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
+    free = (number for number in itertools.count(1) if not any(aside(path, number).exists() for path in present))
+    number = next(free)
     for path in present:
         path.rename(aside(path, number))
-    return f"{name}.old{number}"
+    return f"{name}.old{number}" if present else None

@@ -75,12 +75,14 @@ class Profile:
         return 32 * self.rollout_rounds
 
 
-# Type of a field -> what its values are instances of, and what they are called.
+_is_name = lambda value: isinstance(value, str)
+_are_names = lambda value: isinstance(value, (list, tuple)) and all(map(_is_name, value))
+# Type of a field -> what its values are, what they are called, and what makes them of that type.
 _KINDS = {
-    "int": (numbers.Integral, "a whole number"),
-    "float": (numbers.Real, "a finite number"),
-    "str": (str, "a name"),
-    "tuple[str, ...]": ((list, tuple), "a list of names"),
+    "int": (lambda value: isinstance(value, numbers.Integral), "a whole number", int),
+    "float": (lambda value: isinstance(value, numbers.Real) and math.isfinite(value), "a finite number", float),
+    "str": (_is_name, "a name", str),
+    "tuple[str, ...]": (_are_names, "a list of names", tuple),
 }
 
 
@@ -114,20 +116,15 @@ def _checked(key: str, value, annotation: str):
     kind, *rest = annotation.split(" | ")
     if value is None and rest:
         return None
-    accepted, called = _KINDS[kind]
-    fits = isinstance(value, accepted) and not isinstance(value, bool)
-    if fits and kind == "float":
-        fits = math.isfinite(value)
-    elif fits and kind == "tuple[str, ...]":
-        fits = all(isinstance(item, str) for item in value)
-    if not fits or value == "":
+    fits, called, convert = _KINDS[kind]
+    if isinstance(value, bool) or not fits(value) or value == "":
         called += " or None" if rest else ""
         raise ValueError(f"{key} must be {called}, got {value!r} ({type(value).__name__})")
     if key == "seed":
         return checked_seed(value)
     if kind in ("int", "float") and value <= 0:
         raise ValueError(f"{key} must be above 0, got {value!r}")
-    return {"int": int, "float": float, "str": str}.get(kind, tuple)(value)
+    return convert(value)
 
 
 def _check_names(dataset: str, profile: str) -> None:

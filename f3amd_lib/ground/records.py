@@ -118,7 +118,7 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
             raise ValueError(f"{path}: the record has no {key!r}; make it with run_record")
     record_path = path.with_suffix(".json")
     if path.exists() or record_path.exists():
-        _refuse_foreign(path, record_path, record)
+        _refuse_foreign(path, record)
 
     text = frame.to_csv(index=False, lineterminator="\n")
     description = {"file": path.name, "rows": len(frame), "columns": [str(column) for column in frame.columns]}
@@ -144,21 +144,22 @@ def read_table(path) -> tuple[pd.DataFrame, dict]:
       ValueError: if the record is missing or broken, or the CSV is not the one it describes.
     """
     path = Path(path)
-    record_path = path.with_suffix(".json")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such table")
-    record = _read_record(path, record_path)
+    record = _read_record(path)
     # Bytes that are no text cannot have the checksum of a text.
     text = path.read_text(encoding="utf-8", errors="replace")
     if _text_hash(text) != (record.get("table") or {}).get("sha256"):
         raise ValueError(
-            f"{path}: not the table that {record_path.name} describes (it was changed, or a run "
-            "died while writing); measure it again"
+            f"{path}: not the table that {path.stem}.json describes (it was changed, or a run died while writing); "
+            "measure it again"
         )
     return pd.read_csv(io.StringIO(text), **_EXACT_FLOATS), record
 
 
-def _read_record(path: Path, record_path: Path) -> dict:
+def _read_record(path: Path) -> dict:
+    """Return the record beside a table; ValueError if it is missing or broken."""
+    record_path = path.with_suffix(".json")
     if not record_path.exists():
         raise ValueError(
             f"{path}: has no run record {record_path.name} beside it, so nothing says what its numbers were measured on"
@@ -173,11 +174,11 @@ def _read_record(path: Path, record_path: Path) -> dict:
     return record
 
 
-def _refuse_foreign(path: Path, record_path: Path, record: dict) -> None:
+def _refuse_foreign(path: Path, record: dict) -> None:
     """Let a table be written again only by a run on the same data set in the same profile."""
-    if not record_path.exists():
+    if not path.with_suffix(".json").exists():
         raise ValueError(f"{path}: there is a file without a run record; move it away first")
-    there = _read_record(path, record_path)
+    there = _read_record(path)
     for key in ("dataset", "profile"):
         if there.get(key) != record[key]:
             raise ValueError(
@@ -210,10 +211,8 @@ def _plain(value):
         return f".../{value.name}" if text.startswith("/") or value.drive else text
     if isinstance(value, str):
         return _shorten(value)
-    if isinstance(value, np.ndarray) and value.ndim:
-        return _plain(value.tolist())
     if isinstance(value, (np.generic, np.ndarray)):
-        value = value.item()
+        return _plain(value.tolist())
     if value is None or isinstance(value, (bool, int, float)):
         # JSON has no NaN; a figure that is undefined is null.
         return None if isinstance(value, float) and not np.isfinite(value) else value
@@ -222,13 +221,13 @@ def _plain(value):
 
 def _shorten(text: str) -> str:
     """Replace the folders of this machine: repository, temporary, working and home folder."""
-    folders = [
-        (str(_REPOSITORY), "."),
-        (str(Path.cwd()), "."),
-        (tempfile.gettempdir(), "<tmp>"),
-        (os.path.expanduser("~"), "~"),
-    ]
-    for folder, short in sorted(folders, key=lambda pair: -len(pair[0])):
+    folders = {
+        os.path.expanduser("~"): "~",
+        tempfile.gettempdir(): "<tmp>",
+        str(Path.cwd()): ".",
+        str(_REPOSITORY): ".",
+    }
+    for folder, short in sorted(folders.items(), key=lambda pair: -len(pair[0])):
         if len(folder) > 1:
             text = text.replace(f"{folder}{os.sep}", f"{short}/")
             if text.endswith(folder):
@@ -300,7 +299,7 @@ def stale_reason(name: str, record: dict, reference: dict) -> str:
 def folder_reason(path, record: dict) -> str:
     """Return the `stale_reason` of a table beside the quality table that lies in its folder; "" without one."""
     reference = Path(path).with_name("quality.json")
-    return stale_reason(Path(path).stem, record, _read_record(path, reference)) if reference.exists() else ""
+    return stale_reason(Path(path).stem, record, _read_record(reference)) if reference.exists() else ""
 
 
 def set_aside_table(path) -> Path:
@@ -346,7 +345,7 @@ def _described_rows(path: Path) -> tuple[pd.DataFrame, dict] | None:
     The table with all rows is kept under another name; None where its beginning is not what the record describes.
     """
     try:
-        record = _read_record(path, path.with_suffix(".json"))
+        record = _read_record(path)
         rows, digest = record["table"]["rows"], record["table"]["sha256"]
         text = "".join(f"{line}\n" for line in path.read_text(encoding="utf-8").split("\n")[: rows + 1])
     except (OSError, ValueError, KeyError, TypeError):

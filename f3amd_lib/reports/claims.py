@@ -34,7 +34,6 @@ from f3amd_lib.reports import theory
 from f3amd_lib.reports.evidence import (
     SCHEMAS,
     Evidence,
-    NoTable,
     NotMeasured,
     Setting,
     Source,
@@ -55,7 +54,6 @@ PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
 _MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
-_SYNTHETIC = "synthetic (procedural, no real motion)"
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Statement:
       figure: what was found, or why nothing was.
       reasons: why no verdict is drawn from it -> the models of which that is true.
       sources: tables that it rests on.
-      no_table: it was not measured because a whole table is missing.
+      known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
     """
 
     says: str
@@ -82,21 +80,19 @@ class Statement:
     figure: str = ""
     reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sources: tuple[Source, ...] = ()
-    no_table: bool = False
+    known: int = 0
 
     def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor=()) -> Statement:
         """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
-        evidence.sources.clear()
-        evidence.trained.clear()
-        evidence.told.clear()
+        evidence.forget()
         try:
             verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
-            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), no_table=isinstance(gap, NoTable))
+            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), known=gap.known)
         reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
         verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
-        sources = tuple(dict.fromkeys(evidence.sources))
-        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources)
+        known, sources = 2 if verdict == judging.UNJUDGED else 3, tuple(dict.fromkeys(evidence.sources))
+        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources, known=known)
 
 
 @dataclass(frozen=True)
@@ -137,13 +133,6 @@ class Claim:
 
 _KINDS = judging.KINDS | theory.KINDS
 _MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
-_RANGES = {
-    "within": lambda low, high: (low, high),
-    "stated": judging.stated_range,
-    "about": judging.stated_factor,
-    "alike": judging.equal_range,
-    "saving": judging.stated_saving,
-}
 
 
 def _read_models(value, families: Mapping, where: str) -> Setting | judging.Family | list[Setting]:
@@ -162,8 +151,8 @@ def _read_models(value, families: Mapping, where: str) -> Setting | judging.Fami
 
 def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     where = f"{where}, {entry.get('says')!r}"
-    check_entry({key: entry[key] for key in ("says", "kind") if key in entry}, where, ("says", "kind"))
-    parameters = dict(entry)
+    check_entry(entry, where, ("says", "kind"), entry)
+    parameters, thresholds = dict(entry), about.get("thresholds", {})
     says = parameters.pop("says")
     kind = find_entry(_KINDS, parameters.pop("kind"), "kind of judgement", where)
     optional, remark = (parameters.pop(key, False) for key in ("optional", "remark"))
@@ -172,16 +161,13 @@ def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     for key, known in (("metric", METRICS), ("table", SCHEMAS)):
         if key in parameters:
             find_entry(known, parameters[key], key, where)
-    ranges = [key for key in _RANGES if key in parameters]
+    ranges = [key for key in judging.RANGES if key in parameters]
     if len(ranges) > 1:
         raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
+    number = lambda bound: find_entry(thresholds, bound, "threshold", where) if isinstance(bound, str) else bound
     for key in ranges:
         value = parameters.pop(key)
-        bounds = [
-            find_entry(about.get("thresholds", {}), bound, "threshold", where) if isinstance(bound, str) else bound
-            for bound in (value if isinstance(value, list) else [value])
-        ]
-        parameters["bounds"] = _RANGES[key](*bounds)
+        parameters["bounds"] = judging.RANGES[key](*map(number, value if isinstance(value, list) else [value]))
     try:
         inspect.signature(kind).bind(None, **parameters)
     except TypeError as error:
@@ -189,8 +175,8 @@ def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     return Statement(says, functools.partial(kind, **parameters), optional or remark, remark)
 
 
-def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
-    """Return the claims of a file, checked.
+def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
+    """Return the claims of a file by their ids, checked.
 
     Args:
       about: the file as read: groups, thresholds, families and claims.
@@ -212,7 +198,7 @@ def read_claims(about: Mapping, paper: str, where: str) -> list[Claim]:
         fields["poor"] = tuple((one.model, one.window) for one in _read_models(entry.get("poor", []), {}, here))
         statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
         claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
-    return list(claims.values())
+    return claims
 
 
 @functools.cache
@@ -222,7 +208,7 @@ def load_commands(paper: str = "f3amd") -> dict[str, tuple[str, ...]]:
     Raises:
       ValueError: for a claim without a command, or a command of an unknown claim.
     """
-    where, known = f"{paper}/commands.toml", {claim.id: [] for claim in load_claims(paper)}
+    where, known = f"{paper}/commands.toml", {claim_id: [] for claim_id in load_claims(paper)}
     for entry in load_paper_file("commands", paper)["command"]:
         check_entry(entry, where, ("run", "claims"))
         for claim_id in entry["claims"]:
@@ -233,18 +219,9 @@ def load_commands(paper: str = "f3amd") -> dict[str, tuple[str, ...]]:
 
 
 @functools.cache
-def load_claims(paper: str = "f3amd") -> list[Claim]:
-    """Return the claims of a paper, in the order of its file; ValueError as `read_claims`."""
+def load_claims(paper: str = "f3amd") -> dict[str, Claim]:
+    """Return the claims of a paper by their ids, in the order of its file; ValueError as `read_claims`."""
     return read_claims(load_paper_file("claims", paper), paper, f"{paper}/claims.toml")
-
-
-def find_claim(claim_id: str, paper: str = "f3amd") -> Claim:
-    """Return a claim by its id.
-
-    Raises:
-      ValueError: for an unknown id, with the nearest one.
-    """
-    return find_entry({claim.id: claim for claim in load_claims(paper)}, claim_id, "claim", f"{paper}/claims.toml")
 
 
 # ------------------------------------------------------------------------------------------ judging
@@ -282,17 +259,10 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
 
 
-def _says_more(statement: Statement) -> int:
-    """Rank what is known of a statement: a verdict, a figure without one, a row that is missing, a table that is."""
-    if statement.verdict == judging.UNMEASURED:
-        return 0 if statement.no_table else 1
-    return 2 if statement.verdict == judging.UNJUDGED else 3
-
-
 def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
-    """Take each statement from the evidence that says most, of equals the first."""
+    """Take each statement from the evidence that knows most of it, of equals the first."""
     judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
-    return _seen(max(statements, key=_says_more) for statements in judged)
+    return _seen(max(statements, key=lambda statement: statement.known) for statements in judged)
 
 
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
@@ -310,7 +280,7 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
     if claim.computed:
         return Judgement(claim, paper, (), "computed")
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
-    dataset = max(tried, key=lambda data: max((_says_more(s) for s in tried[data] if not s.remark), default=0))
+    dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
     ours = tried[dataset]
     nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
     return Judgement(claim, ours, paper, "" if nothing else dataset)
@@ -337,7 +307,7 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
     for data in datasets:
         snapshots = [late for name in profiles for late in snapshot_evidence(root, data, name)]
         evidences[data] = [recorded_evidence(root, data, name) for name in profiles] + snapshots
-    return [judge_claim(claim, evidences) for claim in load_claims(paper)]
+    return [judge_claim(claim, evidences) for claim in load_claims(paper).values()]
 
 
 # ------------------------------------------------------------------------------------------ writing
@@ -365,58 +335,58 @@ def _row(judgement: Judgement) -> dict:
     said["decided_by"] = claim.decided_by
     judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
     judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
-    dataset = _SYNTHETIC if judgement.dataset == "synthetic" else judgement.dataset
+    dataset = judgement.dataset + (" (procedural, no real motion)" if judgement.dataset == "synthetic" else "")
     hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
     record = "; ".join(dict.fromkeys(map(str, sources)))
     return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}
 
 
-def ledger(judgements: Sequence[Judgement] | None = None) -> pd.DataFrame:
+def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
     """Return the claims ledger as a table.
 
     Args:
-      judgements: from `judge_claims`; judged from the committed records by default.
+      judgements: from `judge_claims`.
 
     Returns:
       One row a claim: id, group, claim, where, decided_by, verdict, ours (figures with their
       intervals, or why there are none), paper_says, paper_verdict and paper_figure (the same rule
       on the paper's own tables), dataset, hardware, record (file and the first digits of its
       SHA-256).
-
-    Raises:
-      ValueError: as `judge_claims`.
     """
-    return pd.DataFrame(map(_row, judge_claims() if judgements is None else judgements))
+    return pd.DataFrame(map(_row, judgements))
+
+
+def _found(statement: Statement) -> str:
+    """Return in one text what was found of a statement, its verdict, and why it has none."""
+    if statement.verdict == judging.UNMEASURED:
+        return f"{judging.UNMEASURED} ({statement.figure})"
+    text = f"{statement.figure} · {statement.verdict}" if statement.verdict else statement.figure
+    why = "; ".join(f"{reason}: {', '.join(models)}" for reason, models in statement.reasons.items())
+    return f"{text} ({why})" if why else text
 
 
 def statement_table(judgement: Judgement) -> pd.DataFrame:
     """Return the statements behind a judgement: statement, ours, the paper's tables."""
-    rows: dict[str, dict] = {}
+    sides = {"ours": judgement.ours, "the paper's tables": judgement.paper}
+    found = {column: {one.says: _found(one) for one in statements} for column, statements in sides.items()}
+    rows = []
     for statement in judgement.claim.statements:
-        says = f"({statement.says})" if statement.remark else statement.says
-        rows[statement.says] = {"statement": says, "ours": "", "the paper's tables": ""}
-    for column, statements in (("ours", judgement.ours), ("the paper's tables", judgement.paper)):
-        for found in statements:
-            text = f"{found.figure} · {found.verdict}" if found.verdict else found.figure
-            why = "; ".join(f"{reason}: {', '.join(models)}" for reason, models in found.reasons.items())
-            text += f" ({why})" if why else ""
-            rows[found.says][column] = (
-                f"{judging.UNMEASURED} ({found.figure})" if found.verdict == judging.UNMEASURED else text
-            )
-    return pd.DataFrame(row for row in rows.values() if row["ours"] or row["the paper's tables"])
+        texts = {column: known.get(statement.says, "") for column, known in found.items()}
+        if any(texts.values()):
+            rows.append({"statement": f"({statement.says})" if statement.remark else statement.says} | texts)
+    return pd.DataFrame(rows)
 
 
 _TEXTS = read_toml(Path(__file__).with_name("claims_page.toml"))
 """Head of the page, and what it says where `[page]` of a paper's claims does not."""
 
 
-def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
+def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     """Render the ledger of one paper as Markdown: counts, a table for each group, then every statement.
 
     Args:
-      judgements: from `judge_claims`, at least one; judged from the committed records by default.
+      judgements: from `judge_claims`, at least one.
     """
-    judgements = judge_claims() if judgements is None else judgements
     frame, paper = ledger(judgements), judgements[0].claim.paper
     counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
     counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
@@ -432,9 +402,9 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
         **{key: text.strip().format(**fields) for key, text in words.items()},
     )  # fmt: skip
     parts = [head, markdown_table(counted.reset_index())]
-    paper_text = frame["paper_verdict"] + ": " + frame["paper_figure"]
     frame["ours"] = frame["verdict"] + ": " + frame["ours"]
-    frame["the paper's tables"] = paper_text.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
+    printed = frame["paper_verdict"] + ": " + frame["paper_figure"]
+    frame["the paper's tables"] = printed.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
     frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
     short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
     for group in frame["group"].unique():
@@ -452,8 +422,7 @@ def ledger_markdown(judgements: Sequence[Judgement] | None = None) -> str:
 
 def ledger_path(paper: str = "f3amd") -> Path:
     """Return where a paper's ledger is committed; its accepted verdicts lie beside it as JSON."""
-    name = "claims.md" if paper == "f3amd" else f"claims_{paper}.md"
-    return repository_root() / "paper_figures" / name
+    return repository_root() / "paper_figures" / ("claims.md" if paper == "f3amd" else f"claims_{paper}.md")
 
 
 def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
@@ -488,13 +457,12 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
     return changes + [f"{name}: is no claim any more" for name in accepted if name not in known]
 
 
-def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, accept: bool = False) -> list[str]:
+def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
     """Write the ledger as Markdown, and accept its verdicts if asked to.
 
     Args:
-      path: where to, ending in .md; `paper_figures/claims.md` by default. The accepted verdicts lie
-        beside it as JSON.
-      judgements: from `judge_claims`; judged from the committed records by default.
+      path: where to, ending in .md. The accepted verdicts lie beside it as JSON.
+      judgements: from `judge_claims`.
       accept: take changed verdicts for right and write them down.
 
     Returns:
@@ -503,9 +471,7 @@ def write_ledger(path=None, judgements: Sequence[Judgement] | None = None, *, ac
     Raises:
       ValueError: if the name does not end in .md.
     """
-    path = named_file(ledger_path() if path is None else path, ".md", "ledgers")
-    judgements = judge_claims() if judgements is None else judgements
-    frame = ledger(judgements)
+    path, frame = named_file(path, ".md", "ledgers"), ledger(judgements)
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if changes and not accept:
         return changes

@@ -16,6 +16,7 @@ import ast
 import functools
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import compact_table
 
 _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
+_KINDS = ("functions", "tests", "notebooks", "cells", "figures")
 
 # A mark without a number may stand in LaTeX, where \bar\alpha_t holds alpha_t too and does not mean it.
 _MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|(?<!\\bar\\)(?<!\w)({marks})(?!\w))"
@@ -100,9 +102,15 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
       names joined by ", ", "" where there are none.
     """
     root = Path(root) if root is not None else repository_root()
-    kinds = ("functions", "tests", "notebooks", "cells", "figures")
-    equations = load_paper_file("paper", paper).get("equation", ())
-    places = {entry["label"]: {kind: [] for kind in kinds} for entry in equations}
+    places = _places(root, paper, course)
+    rows = pd.DataFrame(load_paper_file("paper", paper).get("equation", ()), columns=["label", "section", "what"])
+    joined = {kind: [", ".join(found[kind]) for found in places.values()] for kind in _KINDS}
+    return rows.rename(columns={"label": "equation"}).assign(**joined)
+
+
+def _places(root: Path, paper: str, course: bool) -> dict[str, dict[str, list[str]]]:
+    """Return for each equation of a paper where it lives, by `_KINDS`."""
+    places = {label: {kind: [] for kind in _KINDS} for label in equation_labels(paper)}
     for path in sorted((root / "f3amd_lib").rglob("*.py")):
         module = path.relative_to(root / "f3amd_lib").with_suffix("").as_posix()
         if module.startswith("reports/"):  # what draws and lists implements nothing
@@ -126,8 +134,7 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
             for label in section.equations if section.number else ():
                 places[label]["cells"].append(section.number)
                 places[label]["figures"] += section.figures
-    rows = pd.DataFrame(equations, columns=["label", "section", "what"]).rename(columns={"label": "equation"})
-    return rows.assign(**{kind: [", ".join(found[kind]) for found in places.values()] for kind in kinds})
+    return places
 
 
 # Papers have sources in common: a file is parsed once for all of them.
@@ -251,37 +258,31 @@ def equations_markdown(*, root=None) -> str:
 
 
 def _paper_markdown(root: Path, paper: str) -> str:
-    about, rows = load_paper_file("paper", paper), equation_map(root=root, paper=paper, course=True)
-    reasons = [f"*cited only:* {entry['cited_only']}" if "cited_only" in entry else "" for entry in about["equation"]]
-    functions = [_code(names) or reason for names, reason in zip(rows["functions"], reasons, strict=True)]
-    links = [_section_links(root, cells) for cells in rows["cells"]]
-    table = rows[["equation", "section", "what"]].rename(columns={"what": "what it says"})
-    table = table.assign(functions=functions, tests=rows["tests"].map(_first_tests), notebooks=links)
-    return f"## {about['name']}\n\n{compact_table(table)}"
+    about, rows = load_paper_file("paper", paper), []
+    for entry, found in zip(about["equation"], _places(root, paper, course=True).values(), strict=True):
+        functions = ", ".join(f"`{name.replace(': ', '.')}`" for name in found["functions"])
+        reason = f"*cited only:* {entry['cited_only']}" if "cited_only" in entry else ""
+        row = {"equation": entry["label"], "section": entry["section"], "what it says": entry["what"]}
+        row |= {"functions": functions or reason, "tests": _first_tests(found["tests"])}
+        rows.append(row | {"notebooks": ", ".join(_section_link(root, cell) for cell in found["cells"])})
+    return f"## {about['name']}\n\n{compact_table(pd.DataFrame(rows))}"
 
 
-def _code(names: str) -> str:
-    return ", ".join(f"`{name}`" for name in names.replace(": ", ".").split(", ") if name)
-
-
-def _first_tests(names: str) -> str:
+def _first_tests(names: Iterable[str]) -> str:
     """Return the first test of each file, and how many more it has."""
     files: dict[str, list[str]] = {}
-    for name in filter(None, names.split(", ")):
+    for name in names:
         file, test = name.split(": ")
         files.setdefault(f"`tests/{file}.py`", []).append(f"`{test}`")
     texts = (f"{file}: {first}" + (f" and {len(more)} more" if more else "") for file, (first, *more) in files.items())
     return "; ".join(texts)
 
 
-def _section_links(root: Path, cells: str) -> str:
-    """Return sections as links to their notebooks: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
-    links = []
-    for cell in filter(None, cells.split(", ")):
-        folder = root / "notebooks" / ("course" if cell[0] == "C" else "")
-        (path,) = folder.glob(f"{int(cell.lstrip('C').split('.')[0]):02d}_*.ipynb")
-        links.append(f"[{cell}](/{path.relative_to(root).as_posix()})")
-    return ", ".join(links)
+def _section_link(root: Path, cell: str) -> str:
+    """Return a section as a link to its notebook: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
+    folder = root / "notebooks" / ("course" if cell[0] == "C" else "")
+    (path,) = folder.glob(f"{int(cell.lstrip('C').split('.')[0]):02d}_*.ipynb")
+    return f"[{cell}](/{path.relative_to(root).as_posix()})"
 
 
 def running_times(*, root=None) -> pd.DataFrame:

@@ -29,9 +29,13 @@ from f3amd_lib.networks import presets
 class NotMeasured(LookupError):
     """A figure that a claim needs is not among the records; the message says which."""
 
+    known = 1
+
 
 class NoTable(NotMeasured):
     """The whole table is not there: the least that can be said."""
+
+    known = 0
 
 
 def known(look: Callable, *arguments, **named):
@@ -218,21 +222,25 @@ class Evidence:
 
     Attributes:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
-      sources: the tables that were looked into, in that order and as often; whoever asks clears the list first.
-      trained: (model, window) of the trained networks whose quality was looked up; cleared likewise.
-      told: of text to motion, model -> (what was trained in its place, motions it saw); cleared likewise.
+      sources: the tables that were looked into since `forget`, in that order and as often.
+      trained: (model, window) of the trained networks whose quality was looked up since then.
+      told: of text to motion, model -> (what was trained in its place, motions it saw), since then.
     """
 
     def __init__(self, framework: str, load: Callable):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
         self.framework = framework
-        self.sources: list[Source] = []
-        self.trained: list[tuple[str, int]] = []
-        self.told: dict[str, tuple[str, int]] = {}
         self._load = functools.cache(load)
         # A ledger asks for thousands of figures, by few devices and values.
         self._of_device = functools.cache(self._of_device)
         self._holding = functools.cache(self._holding)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was looked up; whoever wants to know what a rule looks up calls this first."""
+        self.sources: list[Source] = []
+        self.trained: list[tuple[str, int]] = []
+        self.told: dict[str, tuple[str, int]] = {}
 
     @property
     def printed(self) -> bool:
@@ -258,8 +266,7 @@ class Evidence:
         table = self._of_device(name, device)
         if device is not None and table.empty:
             raise NotMeasured(f"{self.called(name)} no rows of a {device}")
-        sha256 = record.get("table", {}).get("sha256", "")[:12]
-        self.sources.append(Source(path, sha256, _hardware(record, device)))
+        self.sources.append(Source(path, record.get("table", {}).get("sha256", "")[:12], _hardware(record, device)))
         return table
 
     def _of_device(self, name: str, device: str | None) -> pd.DataFrame:
@@ -278,8 +285,7 @@ class Evidence:
             which = np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])
             table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
-            network = asked_network(row["model"])
-            self.trained.append((network, row.get("window_frames", 32)))
+            self.trained.append((asked_network(row["model"]), row.get("window_frames", 32)))
         if name in OF_TEXT and not self.printed:
             self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
         return table
@@ -315,8 +321,7 @@ class Evidence:
 
     def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
         """Return the time of a round in ms; by default in the framework of this evidence."""
-        framework = framework or self.framework
-        row = setting.columns | {"framework": framework, "characters": characters}
+        row = setting.columns | {"framework": framework or self.framework, "characters": characters}
         return self.figure("synthesis_time", device, **row)
 
     def counts(self, setting: Setting, device: str, framework: str | None = None) -> set[int]:
@@ -349,13 +354,6 @@ def _hardware(record: Mapping, device: str | None) -> str:
         return f"CPU, {counted_cores(record)}" if "cores" in record else "CPU"
     kind = str(record.get("device_kind"))
     return kind if kind != "cpu" else "GPU"
-
-
-def _foreign_unit(name: str, table: pd.DataFrame) -> pd.Series:
-    if name != "quality" or "unit" not in table:
-        return pd.Series(False, index=table.index)
-    wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
-    return wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
 
 
 def _with_interval_of_median(table: pd.DataFrame) -> pd.DataFrame:
@@ -391,11 +389,12 @@ def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] =
     undefined = {bound: float("nan") for bound in ("low", "high") if bound not in table}  # nothing was repeated
     table = table[table["value"].notna()].assign(**undefined)
     astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
-    for fault, rows in (
-        ("a figure that is infinite or outside its interval", astray),
-        ("two rows", table.duplicated(keys)),
-        ("another unit than the paper", _foreign_unit(name, table)),
-    ):
+    faults = {"a figure that is infinite or outside its interval": astray, "two rows": table.duplicated(keys)}
+    if name == "quality" and "unit" in table:
+        wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
+        unlike = wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
+        faults["another unit than the paper"] = unlike
+    for fault, rows in faults.items():
         if rows.any():
             raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")
     for model in table["model"].unique() if "model" in table else ():

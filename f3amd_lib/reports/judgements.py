@@ -23,9 +23,9 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 
 import numpy as np
 import pandas as pd
@@ -185,16 +185,6 @@ def _ranged(figures: Sequence[Figure], bounds: tuple[float, float], unit: str, *
     return majority(verdicts), text
 
 
-def stated_range(low: float, high: float) -> tuple[float, float]:
-    """Return the bounds of a range of factors as the paper states it, with some slack."""
-    return low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)
-
-
-def stated_saving(low: float, high: float) -> tuple[float, float]:
-    """Return the bounds of a range of time saved, %, as the paper states it, with some slack."""
-    return low - SAVING_SLACK, high + SAVING_SLACK
-
-
 def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
     """Return the bounds of "about figure / over times", a factor above 1."""
     factor = figure / over
@@ -206,6 +196,16 @@ def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
 def equal_range(slack: float) -> tuple[float, float]:
     """Return the bounds of ratios that count as 1, as far below as above."""
     return 1.0 / (1.0 + slack), 1.0 + slack
+
+
+RANGES = {
+    "within": lambda low, high: (low, high),
+    "stated": lambda low, high: (low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)),
+    "about": stated_factor,
+    "alike": equal_range,
+    "saving": lambda low, high: (low - SAVING_SLACK, high + SAVING_SLACK),
+}
+"""Range of a statement, as `claims.toml` names it -> function that makes bounds of its numbers, with slack."""
 
 
 # -------------------------------------------------------------------------------------- words
@@ -429,14 +429,13 @@ def training_ratio(
     """Judge the training time (or another column) of one model over another's, at the largest shared batch."""
     rows = evidence.rows("training_time", "GPU", window_frames=over.window)
     sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
-    shared = set.intersection(*sizes)
-    if not shared:
-        where = f"{evidence.called('training_time')} no batch size of both"
-        raise NotMeasured(f"{where} {over.model} and {under.model}, GPU")
-    batch = int(max(shared))
-    rows = [{"model": setting.model, "window_frames": over.window, "batch_size": batch} for setting in (over, under)]
-    found = ratio(*(evidence.figure("training_time", "GPU", column, **row) for row in rows))
-    return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=batch)
+    if not (shared := set.intersection(*sizes)):
+        gap = f"no batch size of both {over.model} and {under.model}, GPU"
+        raise NotMeasured(f"{evidence.called('training_time')} {gap}")
+    row = {"window_frames": over.window, "batch_size": int(max(shared))}
+    times = [evidence.figure("training_time", "GPU", column, model=one.model, **row) for one in (over, under)]
+    found = ratio(*times)
+    return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=row["batch_size"])
 
 
 def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
@@ -487,10 +486,15 @@ def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> list[str
     """Return those of the nine metrics that all settings have."""
     kept = [metric for metric in NINE_METRICS if _has(evidence, settings, metric)]
     if len(kept) < LEAST_METRICS:
-        for setting in settings:  # the reason is that of the first gap
-            for metric in NINE_METRICS:
-                evidence.quality(setting, metric)
+        for asked in product(settings, NINE_METRICS):  # the reason is that of the first gap
+            evidence.quality(*asked)
     return kept
+
+
+def _by_metric(verdicts: Mapping[str, str], text: str, heading: str, notes: Sequence[str]) -> Finding:
+    """Sum verdicts by metric up: how many hold, in the place of {} in `text`, and under a heading the notes, if any."""
+    held = f"{list(verdicts.values()).count(HOLDS)} of {len(verdicts)}"
+    return majority(verdicts.values()), text.format(held) + (heading + ", ".join(notes) if notes else "")
 
 
 def _spread(evidence: Evidence, settings: Sequence[Setting], metric: str) -> tuple[Figure, Setting, Setting]:
@@ -519,10 +523,9 @@ def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) ->
 def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
     """Judge, metric by metric, whether a model is worse than another."""
     metrics = _shared_metrics(evidence, [model, against])
-    verdicts = [ordered(_harm(evidence, model, against, metric)) for metric in metrics]
-    better = [metric for metric, verdict in zip(metrics, verdicts, strict=True) if verdict == FAILS]
-    text = f"worse in {verdicts.count(HOLDS)} of {len(verdicts)}"
-    return majority(verdicts), text + (f", better in {_list_text(better)}" if better else "")
+    verdicts = {metric: ordered(_harm(evidence, model, against, metric)) for metric in metrics}
+    better = [metric for metric, verdict in verdicts.items() if verdict == FAILS]
+    return _by_metric(verdicts, "worse in {}", ", better in ", better)
 
 
 def worst_in(evidence: Evidence, model, models) -> Finding:
@@ -534,14 +537,13 @@ def worst_in(evidence: Evidence, model, models) -> Finding:
 
 def alike(evidence: Evidence, models, bounds) -> Finding:
     """Judge, metric by metric, whether the largest value of several models over the least lies in a range."""
-    verdicts, texts = [], []
+    verdicts, apart = {}, []
     for metric in _shared_metrics(evidence, models):
         spread, largest, least = _spread(evidence, models, metric)
-        verdicts.append(within(spread, bounds))
-        if verdicts[-1] != HOLDS:
-            texts.append(f"{metric} {number_text(spread.value)}x ({largest.model} over {least.model})")
-    text = f"alike in {verdicts.count(HOLDS)} of {len(verdicts)}"
-    return majority(verdicts), text + (f"; apart: {', '.join(texts)}" if texts else "")
+        verdicts[metric] = within(spread, bounds)
+        if verdicts[metric] != HOLDS:
+            apart.append(f"{metric} {number_text(spread.value)}x ({largest.model} over {least.model})")
+    return _by_metric(verdicts, "alike in {}", "; apart: ", apart)
 
 
 def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
@@ -572,10 +574,9 @@ def better_at_each_width(evidence: Evidence, better, worse, widths, metric, wind
         for kind in (better, worse):
             evidence.quality(Setting(f"{kind}-{widths[0]}", window=window), metric)
         raise NotMeasured(f"{evidence.called('quality')} no width of both families with {metric}")
-    texts = []
-    for verdict, word in ((HOLDS, "yes at"), (FAILS, "no at"), (OPEN, "open at")):
-        if chosen := [width for width, found in verdicts.items() if found == verdict]:
-            texts.append(f"{word} D = {_list_text(chosen)}")
+    words = {HOLDS: "yes", FAILS: "no", OPEN: "open"}
+    by_verdict = {word: [width for width in verdicts if verdicts[width] == verdict] for verdict, word in words.items()}
+    texts = (f"{word} at D = {_list_text(widths)}" for word, widths in by_verdict.items() if widths)
     return majority(verdicts.values()), ", ".join(texts)
 
 
@@ -589,16 +590,14 @@ def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple
 def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
     """Judge, metric by metric, whether no model of a family is much worse with longer windows."""
     pairs = _window_pairs(evidence, models, window)
-    metrics = _shared_metrics(evidence, [setting for pair in pairs for setting in pair])
-    verdicts, texts = [], []
-    for metric in metrics:
+    verdicts, worst = {}, []
+    for metric in _shared_metrics(evidence, [setting for pair in pairs for setting in pair]):
         harms = {longer.model: _harm(evidence, longer, usual, metric) for longer, usual in pairs}
-        verdicts.append(every(within(harm, bounds) for harm in harms.values()))
-        worst = max(harms, key=lambda model: harms[model].value)
-        if verdicts[-1] != HOLDS:
-            texts.append(f"{metric} {_change_text(harms[worst])} ({worst})")
-    text = f"{verdicts.count(HOLDS)} of {len(metrics)} metrics"
-    return majority(verdicts), text + (f"; worse: {', '.join(texts)}" if texts else "")
+        verdicts[metric] = every(within(harm, bounds) for harm in harms.values())
+        if verdicts[metric] != HOLDS:
+            model, harm = max(harms.items(), key=lambda each: each[1].value)
+            worst.append(f"{metric} {_change_text(harm)} ({model})")
+    return _by_metric(verdicts, "{} metrics", "; worse: ", worst)
 
 
 def window_gain(evidence: Evidence, models, window, metric) -> Finding:
@@ -618,27 +617,25 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=
     metrics = _shared_metrics(evidence, [model, *fewer])
     value = evidence.quality
     changes = {(name, one): ratio(value(one, name), value(model, name)) for name in metrics for one in fewer}
-    verdicts = [every(within(changes[name, one], bounds) for one in fewer) for name in metrics]
-    metric, setting = max(changes, key=lambda key: abs(np.log(changes[key].value)))
-    largest = f"{metric} {figure_text(_in_percent(changes[metric, setting]))} %"
+    verdicts = {name: every(within(changes[name, one], bounds) for one in fewer) for name in metrics}
+    (metric, setting), change = max(changes.items(), key=lambda each: abs(np.log(each[1].value)))
     at = f"{setting.steps} step{'s' if setting.steps > 1 else ''}"
-    text = f"{verdicts.count(HOLDS)} of {len(metrics)} metrics; largest change: {largest} at {at}"
-    spread = max((evidence.quality(one, "diversity") for one in (model, *fewer)), key=lambda figure: figure.value)
+    largest = f"{metric} {figure_text(_in_percent(change))} % at {at}"
+    verdict, text = _by_metric(verdicts, "{} metrics", "; largest change: ", [largest])
+    spread = max((value(one, "diversity") for one in (model, *fewer)), key=lambda figure: figure.value)
     if spread.high < least_diversity:
         return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
-    return majority(verdicts), text
+    return verdict, text
 
 
 def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     """Write the largest change of a metric from each number of steps to the next (a remark)."""
     settings = [Setting(model.model, count) for count in steps]
     metrics = _shared_metrics(evidence, settings)
-    texts = []
     value = lambda setting, metric: evidence.quality(setting, metric).value
-    for first, second in pairwise(settings):
-        largest = max(abs(value(second, metric) / value(first, metric) - 1.0) for metric in metrics)
-        texts.append(f"{first.steps} to {second.steps} {100.0 * largest:.2g} %")
-    return REMARK, ", ".join(texts)
+    change = lambda one, other: max(abs(value(other, metric) / value(one, metric) - 1.0) for metric in metrics)
+    pairs = pairwise(settings)
+    return REMARK, ", ".join(f"{one.steps} to {other.steps} {100.0 * change(one, other):.2g} %" for one, other in pairs)
 
 
 def moved_by_inputs(evidence: Evidence, model) -> Finding:
@@ -647,9 +644,8 @@ def moved_by_inputs(evidence: Evidence, model) -> Finding:
     A model that moves with the level makes other motion with other numbers of steps, even if it ignores its input.
     """
     inputs = {"use_of_x": "the noisy input", "use_of_sigma": "the noise level alone"}
-    figures = {name: evidence.figure("input_use", model=model.model, metric=key) for key, name in inputs.items()}
-    parts = [f"{figure_text(value, ' cm')} with {name}" for name, value in figures.items()]
-    return REMARK, ", ".join(parts)
+    moved = lambda metric: figure_text(evidence.figure("input_use", model=model.model, metric=metric), " cm")
+    return REMARK, ", ".join(f"{moved(metric)} with {name}" for metric, name in inputs.items())
 
 
 def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
@@ -658,7 +654,7 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
     Looked at are `metrics` and those of the nine that are better low. Rounds follow one another, so
     that these intervals are narrower than those of free repeats.
     """
-    verdicts, texts = [], []
+    verdicts, texts = {}, []
     low_ones = {*metrics, *(metric for metric, (_, better) in NINE_METRICS.items() if better == "down")}
     for metric, rows in evidence.rows("quality_by_round", **model.columns).groupby("metric", sort=False):
         values = rows.sort_values("round")["value"].to_numpy(np.float64)
@@ -667,11 +663,11 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
             continue
         late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
         growth = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
-        verdicts.append(within(growth, bounds))
+        verdicts[metric] = within(growth, bounds)
         texts.append(f"{metric} {_change_text(growth)}")
     if not verdicts:
         raise NotMeasured(f"{evidence.called('quality_by_round')} no {model} over 8 rounds or more")
-    return majority(verdicts), f"{verdicts.count(HOLDS)} of {len(verdicts)}: {', '.join(texts)}"
+    return _by_metric(verdicts, "{}", ": ", texts)
 
 
 def _order_score(rows: pd.DataFrame) -> float:

@@ -36,6 +36,7 @@ from f3amd_lib.training.text_models import JUDGE, load_text_model
 log = logging.getLogger("f3amd")
 
 _CARDS = read_toml(Path(__file__).with_name("cards.toml"))
+_OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
 
 
 def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
@@ -65,10 +66,12 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
 def _filled(name: str, path: Path, trained, params, **fields) -> str:
     """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
     record = trained.record
+    non_commercial = "NC" in re.split(r"[\s-]+", record["dataset_licence"])
     return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(params)),
-        weights_type=describe(path).get("weights", "bfloat16"), terms=_terms(record), date=record["date_utc"][:10],
+        weights_type=describe(path).get("weights", "bfloat16"), date=record["date_utc"][:10],
+        terms=": **non-commercial use only**" if non_commercial else "",
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
         cores=counted_cores(record), **fields,
@@ -181,7 +184,7 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     """
     trained = load_latent_model(path)
     training, phases = _text_training(path, trained, trained.training, "motionpcm"), trained.training["num_phases"]
-    shown = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance", "sampling_seconds"]
+    shown = [*_OF_JUDGE, "sampling_seconds"]
     rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
             for name, table in tables.items() if "steps" in table]  # fmt: skip
     measured = "Not measured yet."
@@ -189,7 +192,7 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
         own = own.assign(text=own["value"].map("{:.3g}".format))
         wide = own.drop_duplicates(["steps", "metric"]).pivot(index="steps", columns="metric", values="text")
         wide = wide[[metric for metric in shown if metric in wide]].fillna("–")
-        wide.columns = [METRICS[metric].title for metric in wide.columns]
+        wide = wide.rename(columns=lambda metric: METRICS[metric].title)
         measured = _CARDS["measured"]["latent"].format(table=markdown_table(wide.reset_index()))
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
     if (table := tables.get("text_pcm3")) is not None:
@@ -221,16 +224,11 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     judge = load_judge(path)
     digest, measured = weights_digest(judge.params), "Not measured yet."
     if seen is not None and seen[1]["judge_weights"] == digest:
-        table, shown = seen[0], ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
-        wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), shown]
-        wide.columns = [METRICS[metric].title for metric in shown]
-        repeats, as_text = seen[1]["settings"]["repeats"], markdown_table(wide.reset_index(), digits=3)
-        measured = _CARDS["measured"]["judge"].format(repeats=repeats, table=as_text)
+        table, titles = seen[0], {name: METRICS[name].title for name in _OF_JUDGE}
+        wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), _OF_JUDGE]
+        as_text = markdown_table(wide.rename(columns=titles).reset_index())
+        measured = _CARDS["measured"]["judge"].format(repeats=seen[1]["settings"]["repeats"], table=as_text)
     return _filled("judge_card", path, judge, judge.params, digest=digest, measured=measured)
-
-
-def _terms(record: dict) -> str:
-    return ": **non-commercial use only**" if "NC" in re.split(r"[\s-]+", record["dataset_licence"]) else ""
 
 
 def checksums(folder: Path) -> str:
@@ -271,12 +269,6 @@ def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def committed_latent_tables(dataset: str) -> dict[str, pd.DataFrame]:
-    """Return what is on record of MotionPCM's models, by table."""
-    folder = repository_root() / "paper_figures" / dataset / "laptop" / "records"
-    return {path.stem: read_table(path)[0] for path in sorted(folder.glob("text_pcm*.csv"))}
-
-
 def card_of(path: Path) -> str:
     """Return the card of a shipped file, `<data set>/NAME` or `<data set>/text/NAME`, from committed results."""
     if path.parent.name != "text":
@@ -285,7 +277,10 @@ def card_of(path: Path) -> str:
     if path.stem == JUDGE:
         return judge_card(path, committed_table(dataset, "text_judge"))
     if is_latent_preset(path.stem):
-        return latent_model_card(path, committed_latent_tables(dataset))
+        records = repository_root() / "paper_figures" / dataset / "laptop" / "records"
+        return latent_model_card(
+            path, {file.stem: read_table(file)[0] for file in sorted(records.glob("text_pcm*.csv"))}
+        )
     hands, _ = committed_table(dataset, "hands") or (None, None)
     return text_model_card(path, hands)
 

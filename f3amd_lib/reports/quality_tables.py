@@ -112,32 +112,23 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
         metric, unit = unlike[["metric", "unit"]].iloc[0]
         theirs = about["unit"][metric]
         raise ValueError(f"{metric} is in {unit or 'no unit'} here and in {theirs or 'no unit'} in the paper")
-    measured = ours.set_index(_KEYS)[["value", "low", "high"]].to_dict("index")
-    systems = {key[:3] for key in measured}
-    rows: list[dict] = []
-
-    def line(model: str, frames: int, steps: int, source: str, figures: Mapping[str, dict]) -> None:
-        named = {"line": len(rows) // len(FIGURES), "model": model, "window_frames": frames, "steps": steps}
-        for metric in FIGURES:
-            rows.append({**named, "source": source, "metric": metric, **about.loc[metric], **figures[metric]})
-
-    def our_line(model: str, frames: int, steps: int) -> None:
-        gap = "" if (model, frames, steps) in systems else NOT_MEASURED
-        figures = {}
-        for metric in FIGURES:
-            figure = measured.get((model, frames, steps, metric), dict.fromkeys(("value", "low", "high"), np.nan))
-            figures[metric] = {"printed": gap if np.isnan(figure["value"]) else figure_text(**figure)} | figure
-        line(model, frames, steps, dataset_label, figures)
-
+    lines = []
     for frames in paper["window_frames"].unique():
         unmade = ours[(ours["steps"] == 0) & (ours["window_frames"] == frames)]
-        for model in dict.fromkeys(["real", *unmade["model"]]):
-            our_line(model, int(frames), 0)
-    for (model, frames, steps), printed in paper.groupby(_KEYS[:3], sort=False):
-        figures = printed.set_index("metric")[["printed", "value"]].assign(low=np.nan, high=np.nan).to_dict("index")
-        line(model, int(frames), int(steps), PAPER_SOURCE, figures)
-        our_line(presets.find_preset(model).name, int(frames), int(steps))
-    return pd.DataFrame(rows)
+        lines += [(model, frames, 0, dataset_label) for model in dict.fromkeys(["real", *unmade["model"]])]
+    for model, *setting in paper[_KEYS[:3]].drop_duplicates().itertuples(index=False):
+        lines += [(model, *setting, PAPER_SOURCE), (presets.find_preset(model).name, *setting, dataset_label)]
+    rows = pd.DataFrame(lines, columns=[*_KEYS[:3], "source"]).rename_axis("line").reset_index()
+    rows = rows.merge(about.loc[list(FIGURES)].reset_index(), how="cross")
+    values = ["value", "low", "high"]
+    ours = ours.assign(source=dataset_label, printed=[figure_text(*each) for each in ours[values].to_numpy(float)])
+    known = pd.concat([paper.assign(source=PAPER_SOURCE), ours])[[*_KEYS, "source", "printed", *values]]
+    rows = rows.merge(known, how="left", on=[*_KEYS, "source"], validate="many_to_one")
+    systems = set(ours[_KEYS[:3]].itertuples(index=False, name=None))
+    asked = rows[_KEYS[:3]].itertuples(index=False, name=None)
+    gaps = pd.Series("" if system in systems else NOT_MEASURED for system in asked)
+    undefined = rows["value"].isna() & (rows["source"] == dataset_label)
+    return rows.assign(printed=rows["printed"].mask(undefined, gaps))
 
 
 def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
