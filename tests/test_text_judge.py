@@ -113,10 +113,5 @@ def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):
     other.identity = "another"
     with pytest.raises(ValueError, match="reads captions of one vector a word"):
         text_judge.judge_motions(judge, other, real, {})
-    short = {"short": lambda repeat: ([real.clip(0)], ["a walk"])}
-    with pytest.raises(ValueError, match="short gave 1 motions and 1 captions for 8 clips"):
-        text_judge.judge_motions(judge, OneVectorAWord(), real, short, group=4)
-    with pytest.raises(ValueError, match="has 3 frames; the judge needs 4"):
-        judge.embed_motions([real.clip(0)[:3]])
     with pytest.raises(ValueError, match=r"positions must be \[frame, 23, 3\]"):
         judge.embed_motions([real.clip(0)[:, 1:]])
