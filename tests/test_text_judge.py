@@ -112,6 +112,6 @@ def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):
     other = OneVectorAWord()
     other.identity = "another"
     with pytest.raises(ValueError, match="reads captions of one vector a word"):
-        text_judge.judge_motions(judge, other, real, {})
+        text_judge.judge_motions(judge, other, real, {}, repeats=1, bar=0.0)
     with pytest.raises(ValueError, match=r"positions must be \[frame, 23, 3\]"):
         judge.embed_motions([real.clip(0)[:, 1:]])

@@ -33,12 +33,6 @@ from f3amd_lib.training import checkpoints
 from f3amd_lib.training.evaluator_task import EvaluatorTask, EvaluatorTraining, embedded_captions
 from f3amd_lib.training.optimise import optimise
 
-SIGHT = 0.9
-"""Least R-precision at 3 of real held-out motion, below which the judge is not asked."""
-
-REPEATS = 20
-"""Times that every figure is measured."""
-
 _BATCH = 64
 
 
@@ -223,7 +217,7 @@ def text_figures(
 def judge_motions(
     judge: TextJudge, encoder: TextEncoder, real: TextMotions,
     systems: dict[str, Callable[[int], tuple[Sequence[np.ndarray], Sequence[str]]]],
-    *, repeats: int = REPEATS, seed: int = 0, group: int = text_metrics.GROUP, bar: float = SIGHT,
+    *, repeats: int, bar: float, seed: int = 0, group: int = text_metrics.GROUP,
 ) -> pd.DataFrame:  # fmt: skip
     """Measure systems beside real motion, with intervals over repeats.
 
