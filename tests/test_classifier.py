@@ -30,8 +30,8 @@ from f3amd_lib.measures.classifier_windows import (
     NUM_CHANNELS,
     classifier_frames,
     classifier_joints,
-    classifier_windows,
     mirror_channels,
+    side_by_side,
 )
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
@@ -185,23 +185,20 @@ def test_mirrored_channels_show_the_mirrored_motion():
 def test_windows_lie_side_by_side_and_the_rest_is_left():
     motion = walk(seconds=130 / 30)
     frames = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
-    windows = classifier_windows(motion.positions, SYNTHETIC_SKELETON)
+    windows = side_by_side(frames, 60)
     assert windows.shape == (2, 60, NUM_CHANNELS) and windows.dtype == np.float32
     np.testing.assert_allclose(windows[1], frames[60:120], atol=1e-6)
     many = np.stack([motion.positions, walk(8, seconds=130 / 30).positions])
-    both = classifier_windows(many, SYNTHETIC_SKELETON)
+    both = side_by_side(classifier_frames(many, SYNTHETIC_SKELETON), 60)
     assert both.shape == (2, 2, 60, NUM_CHANNELS)
     np.testing.assert_array_equal(both[0], windows)
 
 
-def test_motion_that_cannot_be_cut_is_refused():
+def test_motion_that_is_shorter_than_a_window_or_not_finite_gives_none():
     positions = np.array(walk(seconds=59 / 30).positions)
-    refused("59 frames do not fill .* needs 60", classifier_windows, positions, SYNTHETIC_SKELETON)
-    refused(r"\[\.\.\., T, 23, 3\].*\(59, 22, 3\)", classifier_windows, positions[:, 1:], SYNTHETIC_SKELETON)
+    assert side_by_side(classifier_frames(positions, SYNTHETIC_SKELETON), 60).shape == (0, 60, NUM_CHANNELS)
     positions[40, 3, 1] = np.nan
-    refused("not finite at frame 40, joint 'Chest3'$", classifier_windows, positions, SYNTHETIC_SKELETON)
-    with pytest.raises(ValueError, match=r"frame 40, joint 'Chest3' of motion \[1\]"):
-        classifier_windows(np.stack([np.zeros_like(positions), positions]), SYNTHETIC_SKELETON)
+    refused("not finite at frame 40, joint 3$", classifier_frames, positions, SYNTHETIC_SKELETON)
 
 
 # ------------------------------------------------------------------------------------- network
@@ -367,15 +364,13 @@ def test_a_windows_features_depend_on_nothing_else(trained, monkeypatch):
     np.testing.assert_allclose(trained.features(windows), features, rtol=1e-5, atol=1e-5)
 
 
-def test_primary_styles_are_the_classes_unless_others_are_asked_for(packed):
-    fewer = dataclasses.replace(packed, primary_styles=("Runner", "Zombie"))
-    how = {"num_steps": 1, "batch_size": 2, "seed": 0}
-    assert module._asked_for(fewer, **how)[0] == ("Runner", "Zombie")
-    asked, *_ = module._asked_for(fewer, **how, styles=["Zombie", "ArmsOverhead"])
+def test_primary_styles_are_the_classes(packed):
+    fewer = dataclasses.replace(packed, primary_styles=("Zombie", "ArmsOverhead"))
+    asked, *_ = module._asked_for(fewer, num_steps=1, batch_size=2, seed=0)
     assert asked == ("Zombie", "ArmsOverhead")
-    takes = module._collect(fewer, asked, ("train",), WINDOW)
-    assert takes.styles.tolist() == [0, 0, 1, 1]
-    assert [STYLES[packed.clip_style[clip]] for clip in takes.clips] == [
+    _, labels, clips = module._collect(fewer, asked, ("train",), WINDOW)
+    assert labels.tolist() == [0, 0, 1, 1]
+    assert [STYLES[packed.clip_style[clip]] for clip in clips] == [
         *("Zombie", "Zombie", "ArmsOverhead", "ArmsOverhead")
     ]
 
@@ -403,18 +398,20 @@ def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
 
 def test_windows_start_every_stride_within_a_clip_and_short_clips_give_none():
     uneven = three_styles(seconds=(1.0, 0.5, 1.4, 1.4))
-    takes = module._collect(uneven, STYLES, ("train",), WINDOW)
-    assert takes.length.tolist() == [30, 30, 30]  # the clips of 15 frames are left out
-    starts, take = takes.starts(10)
-    assert starts.tolist() == [0, 10, 30, 40, 60, 70]
-    assert takes.styles[take].tolist() == [0, 0, 1, 1, 2, 2]
-    held_out = module._collect(uneven, STYLES, ("validation", "test"), WINDOW)
-    assert held_out.length.tolist() == [42] * 6
-    windows, styles, clips = held_out.side_by_side()
-    assert windows.shape == (12, WINDOW, NUM_CHANNELS)
-    np.testing.assert_array_equal(windows[3], held_out.frames[62:82])
-    assert styles.tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
-    assert clips.tolist() == [2, 2, 3, 3, 6, 6, 7, 7, 10, 10, 11, 11]
+    frames, styles, clips = module._collect(uneven, STYLES, ("train",), WINDOW)
+    assert [len(part) for part in frames] == [30, 30, 30]  # the clips of 15 frames are left out
+    assert styles.tolist() == [0, 1, 2] and clips.tolist() == [0, 4, 8]
+    assert np.array_equal(module._starts([30, 30, 30], WINDOW, 10), [[0, 10], [30, 40], [60, 70]])
+    frames, styles, clips = module._collect(uneven, STYLES, ("validation", "test"), WINDOW)
+    assert [len(part) for part in frames] == [42] * 6
+    np.testing.assert_array_equal(side_by_side(frames[1], WINDOW)[1], frames[1][20:40])
+    assert styles.tolist() == [0, 0, 1, 1, 2, 2] and clips.tolist() == [2, 3, 6, 7, 10, 11]
+
+
+def test_references_tell_style_and_clip_of_each_window(trained):
+    known = trained.references["held_out"]
+    assert known.styles.tolist() == [0] * 8 + [1] * 8 + [2] * 8
+    assert known.clips.tolist() == np.repeat([2, 3, 6, 7, 10, 11], 4).tolist()
 
 
 def test_a_style_without_clips_long_enough_is_named():
@@ -423,12 +420,8 @@ def test_a_style_without_clips_long_enough_is_named():
 
 
 def test_what_cannot_be_trained_is_refused(packed):
-    unknown = "unknown style of data set 'tiny': 'Zomby'; did you mean 'Zombie'"
-    refused(unknown, train_classifier, packed, styles=("Runner", "Zomby"), **TRAINING)
-    refused("at least two styles", train_classifier, packed, styles=("Runner",), **TRAINING)
-    refused("each named once", train_classifier, packed, styles=("Runner", "Runner"), **TRAINING)
-    refused("at least 1 step and batches of 2", train_classifier, packed, **{**TRAINING, "batch_size": 1})
-    refused("unknown size of a style classifier 'widht'", train_classifier, packed, widht=3, **TRAINING)
+    one = dataclasses.replace(packed, primary_styles=("Runner",))
+    refused("'tiny': a style classifier needs at least two styles, got 1", train_classifier, one, **TRAINING)
 
 
 # ------------------------------------------------------------------------------------ refusals
@@ -449,14 +442,6 @@ def test_motion_of_another_body_is_refused(trained):
     longer = dataclasses.replace(SYNTHETIC_SKELETON, offsets=1.1 * SYNTHETIC_SKELETON.offsets)
     refused("23 joints of 'tiny'.*bone lengths", trained.windows_of, walk().positions, longer)
     refused("here 6 joints", trained.windows_of, np.zeros((60, 6, 3)), SKELETON)
-
-
-def test_windows_of_the_wrong_kind_are_refused(trained):
-    windows = np.zeros((3, WINDOW, NUM_CHANNELS))
-    for wrong in (windows[:, :-1], windows[..., :-1], windows[:0], np.zeros(3)):
-        refused(r"must be \[\.\.\., 20, 45\]", trained.features, wrong)
-    windows[2, 0, 0] = np.nan
-    refused("window 2 is not finite", trained.predict, windows)
 
 
 def test_unknown_styles_and_references_are_refused(trained):
@@ -513,7 +498,7 @@ def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, m
         (dataclasses.replace(packed, fingerprint="1" * 64), BRIEF),
         (packed, {**BRIEF, "num_steps": 4}),
         (packed, {**BRIEF, "seed": 1}),
-        (packed, {**BRIEF, "styles": STYLES[:2]}),
+        (dataclasses.replace(packed, primary_styles=STYLES[:2]), BRIEF),
         (packed, {**BRIEF, "hidden_width": 25}),
     )
     for data, settings in others:

@@ -220,12 +220,10 @@ def test_fid_and_emd_order_graded_corruptions(name):
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
-def test_bad_input_is_refused(name):
+def test_a_strength_out_of_range_is_refused(name):
     for strength in (-0.1, 1.5, np.nan):
         refused("strength must lie between 0 .* and 1", corrupt, name, wandering_motion(), strength=strength)
-    refused("only a Motion can be corrupted, got ndarray", corrupt, name, wandering_motion().positions)
 
 
-def test_unknown_names_and_other_misuse_are_refused():
+def test_unknown_names_are_refused():
     refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", wandering_motion())
-    refused("1 frame cannot be shuffled", shuffled_frames, wandering_motion(1))

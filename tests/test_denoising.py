@@ -1,6 +1,5 @@
 """Figures about one window, on denoisers whose answers are known."""
 
-import dataclasses
 import math
 
 import jax
@@ -8,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from builders import refused, tiny_camdm, tiny_trained, tiny_windows
+from builders import tiny_camdm, tiny_trained, tiny_windows
 from scipy.stats import norm
 
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
@@ -35,7 +35,7 @@ def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
     trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy)
     windows = tiny_windows()
     table = denoising.x0_error_by_sigma(trained, windows, SIGMAS)
-    batch = denoising.held_out_batch(windows, trained)
+    batch = spread_windows(windows, denoising.WINDOWS)
     x0, _ = network_inputs(batch, trained.normaliser)
     np.testing.assert_allclose(table["x0_error"], float(np.sqrt(np.mean(x0**2))), rtol=1e-5)
     use = denoising.noise_use(MotionGenerator(trained, 1), windows)
@@ -67,7 +67,7 @@ def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
     trained = model_that(lambda x_noisy, sigma: x_noisy)
     generator = MotionGenerator(trained, 1)
-    batch = denoising.held_out_batch(tiny_windows(), trained, 4)
+    batch = spread_windows(tiny_windows(), 4)
     x0, _ = network_inputs(batch, trained.normaliser)
 
     def shifted(key, condition):
@@ -85,7 +85,7 @@ def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch)
     windows = tiny_windows()
     trained = model_that(lambda x_noisy, sigma: x_noisy)
     generator = MotionGenerator(trained, 1)
-    batch = denoising.held_out_batch(windows, trained)
+    batch = spread_windows(windows, denoising.WINDOWS)
     x0, _ = network_inputs(batch, trained.normaliser)
     monkeypatch.setattr(generator, "sample", lambda key, condition: x0)
     quality = denoising.window_quality(generator, windows)
@@ -93,12 +93,6 @@ def test_the_truth_has_no_joint_error_and_the_real_seam(model_that, monkeypatch)
     for name in ("seam_cm", "joint_acceleration_cm"):
         assert quality[name] == pytest.approx(quality[f"real_{name}"], rel=1e-3)
     assert quality["real_seam_cm"] > 1.0
-
-
-def test_windows_of_other_sizes_are_refused():
-    trained = tiny_trained()
-    longer = dataclasses.replace(trained.config, window=trained.config.window + 2)
-    refused("built for", denoising.held_out_batch, tiny_windows(), dataclasses.replace(trained, config=longer))
 
 
 # ------------------------------------------------------------------------- use of x, use of sigma

@@ -11,10 +11,10 @@ from builders import HISTORY, WINDOW, refused, tiny_camdm, tiny_packed, tiny_tra
 from helpers.seed_histories import seed_condition, walk_seed_histories
 
 from f3amd_lib.data.features import frame_positions
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import literal_update, measure
-from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, walk_windows, window_figures
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
@@ -63,7 +63,7 @@ def test_a_network_that_uses_its_input_shows_it(model_that):
 def test_the_walks_are_those_of_the_samplers_by_name():
     trained, windows = tiny_trained(), tiny_windows()
     walks, _ = walk_windows(trained, windows, (4,), seed=3, **FEW)
-    x0, condition = network_inputs(held_out_batch(windows, trained, 3), trained.normaliser)
+    x0, condition = network_inputs(spread_windows(windows, 3), trained.normaliser)
     network, grid = trained.network(), trained.diffusion.grid(4)
     noise = jax.random.normal(jax.random.split(jax.random.key(3), 2)[1], x0.shape)
     for update, name in UPDATES.items():
@@ -99,7 +99,8 @@ def test_figures_by_hand():
 
 @pytest.mark.slow
 def test_a_single_seed_has_no_spread():
-    refused("num_seeds must be at least 2", walk_windows, tiny_trained(), tiny_windows(), num_seeds=1)
+    walks, real = walk_windows(tiny_trained(), tiny_windows(), (1,), num_windows=2, num_seeds=1)
+    refused("at least 2 seeds", window_figures, walks, real)
 
 
 @pytest.fixture
@@ -215,4 +216,3 @@ def test_walks_from_seed_histories_need_no_data_and_have_no_error():
     )(noise)
     joints = frame_positions(trained.skeleton, trained.normaliser.denormalise(x))
     np.testing.assert_allclose(walks["rescaled", 8][0], joints, atol=1e-4)
-    refused("num_seeds must be at least 2", walk_seed_histories, trained, num_seeds=1)

@@ -19,9 +19,9 @@ from builders import (
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import frame_positions
+from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.experiments import measure, posterior
-from f3amd_lib.experiments.denoising import held_out_batch
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn
@@ -144,7 +144,7 @@ def test_a_blind_network_has_no_spread_and_one_error(model_that):
     table = posterior.answer_spread(trained, windows, (0.1, 100.0), num_windows=8, num_draws=3)
     by = table.set_index(["quantity", "sigma"])["value"]
     assert by["answer spread"].max() < 1e-3
-    batch = held_out_batch(windows, trained, 8)
+    batch = spread_windows(windows, 8)
     blind = trained.normaliser.denormalise(np.zeros(batch.future.shape, np.float32))
     error = np.sum((poses(blind) - poses(batch.future)) ** 2, axis=-1)
     assert by["error"].to_numpy() == pytest.approx(2 * [100 * np.sqrt(error.mean())], rel=1e-3)
@@ -158,7 +158,7 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
     draws = 6
     table = posterior.answer_spread(trained, windows, (0.05,), num_windows=8, num_draws=draws)
     by = table.set_index("quantity")
-    batch = held_out_batch(windows, trained, 8)
+    batch = spread_windows(windows, 8)
     x0, _ = network_inputs(batch, trained.normaliser)
     keys = jax.random.split(jax.random.key(0), draws)
     noise = np.stack([jax.random.normal(key, x0.shape) for key in keys])
@@ -184,7 +184,7 @@ def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
 
 
 def test_one_draw_has_no_spread():
-    with pytest.raises(ValueError, match="at least 2 draws of noise, got 1"):
+    with pytest.raises(ValueError, match="at least 2 seeds"):
         posterior.answer_spread(tiny_trained(), tiny_windows(), (1.0,), num_draws=1)
 
 

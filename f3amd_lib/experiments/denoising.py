@@ -25,21 +25,13 @@ from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
 
 CM = 100.0
 
-
-def held_out_batch(windows: WindowSet, trained: TrainedModel, num_samples: int = 512) -> Batch:
-    """Return windows spread evenly over a held-out set, unturned, with the path as captured."""
-    config = trained.config
-    if (windows.window, windows.num_history) != (config.window, config.num_history):
-        raise ValueError(
-            f"{trained.name} takes {config.num_history} + {config.window} frames, but the windows "
-            f"were built for {windows.num_history} + {windows.window}"
-        )
-    return spread_windows(windows, num_samples)
+WINDOWS = 512
+"""Held-out windows that are looked at, spread evenly."""
 
 
 def held_out_condition(windows: WindowSet, trained: TrainedModel, num_conditions: int = 32):
     """Return the conditions of windows spread evenly over a held-out set, in network units."""
-    return network_inputs(held_out_batch(windows, trained, num_conditions), trained.normaliser)[1]
+    return network_inputs(spread_windows(windows, num_conditions), trained.normaliser)[1]
 
 
 def root_mean_square(squares, scale: float = CM) -> dict:
@@ -70,7 +62,7 @@ def x0_error_by_sigma(trained: TrainedModel, windows: WindowSet, sigmas, *, seed
       the error of the noisy input itself, which is sigma. Where x0_error does not fall below its
       value at high sigma although sigma does, the network does not use its input.
     """
-    batch = held_out_batch(windows, trained)
+    batch = spread_windows(windows, WINDOWS)
     x0, condition = network_inputs(batch, trained.normaliser)
     denoise = trained.denoiser(condition)
     noise, rows = jax.random.normal(jax.random.key(seed), x0.shape), []
@@ -120,7 +112,7 @@ def window_quality(generator: MotionGenerator, windows: WindowSet, *, seed: int 
       mean joint step from the last history frame to the first of the window, and its real value.
     """
     trained = generator.trained
-    batch = held_out_batch(windows, trained)
+    batch = spread_windows(windows, WINDOWS)
     _, condition = network_inputs(batch, trained.normaliser)
     x0_hat = generator.sample(jax.random.key(seed), condition)
     predicted = trained.joint_positions(x0_hat)

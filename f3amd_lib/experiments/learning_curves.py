@@ -103,9 +103,8 @@ def snapshot(
 
 
 def learning_curve(
-    prepared: PreparedData, preset: str, *, network: Mapping | None = None, seed: int = 0, progress: bool = False,
-    **settings,
-) -> pd.DataFrame:  # fmt: skip
+    prepared: PreparedData, preset: str, *, network: Mapping | None = None, seed: int = 0, **settings
+) -> pd.DataFrame:
     """Train a preset for a short while and watch its loss.
 
     Args:
@@ -113,7 +112,6 @@ def learning_curve(
       preset: see `presets.find_preset`.
       network: fields of the preset's network to change.
       seed: of weights and batches.
-      progress: show a bar of the steps.
       **settings: fields of `TrainingConfig` in place of `SHORT_RUN`'s.
 
     Returns:
@@ -131,7 +129,7 @@ def learning_curve(
     state = initial_state(task)
     before = held_out_terms(task, state, held_out)["loss"]
     rows = [{"model": preset, "step": 0, "loss": float("nan"), "held_out_loss": before}]
-    _, history = optimise(task, state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=progress)
+    _, history = optimise(task, state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=False)
     rows += [{"model": preset, **{name: row[name] for name in ("step", "loss", "held_out_loss")}} for row in history]
     return pd.DataFrame(rows)
 

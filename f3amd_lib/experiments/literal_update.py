@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.data.windows import WindowSet, spread_windows
 from f3amd_lib.diffusion.samplers import walk
-from f3amd_lib.experiments.denoising import CM, held_out_batch
+from f3amd_lib.experiments.denoising import CM
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.networks.conditioning import Condition
@@ -54,11 +54,8 @@ def walk_windows(
 
     Returns:
       (the walks, joints as captured [B, T, J, 3], metres).
-
-    Raises:
-      ValueError: for windows of another length, or fewer than 2 seeds, which have no spread.
     """
-    batch = held_out_batch(windows, trained, num_windows)
+    batch = spread_windows(windows, num_windows)
     _, condition = network_inputs(batch, trained.normaliser)
     real = frame_positions(trained.skeleton, np.asarray(batch.future))
     return walk_conditions(trained, condition, steps, spacing=spacing, num_seeds=num_seeds, seed=seed), real
@@ -76,12 +73,7 @@ def walk_conditions(
 
     Returns:
       The walks.
-
-    Raises:
-      ValueError: for fewer than 2 seeds, which have no spread.
     """
-    if num_seeds < 2:
-        raise ValueError(f"num_seeds must be at least 2 for a spread over seeds, got {num_seeds}")
     # One compiled evaluation serves every update and number of steps.
     denoise = trained.denoiser(condition)
     grids = {number: trained.diffusion.grid(number, spacing).astype(np.float32) for number in steps}

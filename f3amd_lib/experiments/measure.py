@@ -220,10 +220,8 @@ def measure_quality(
     if published is not None:
         trained[PUBLISHED] = published_model(published, packed)
     if not trained:
-        log.warning(
-            "no trained model of %s at %s: only real motion is measured; name models with --model",
-            profile.dataset, profile.name,
-        )  # fmt: skip
+        where = profile.dataset, profile.name
+        log.warning("no trained model of %s at %s: only real motion is measured; name models with --model", *where)
     todo = [(model, 0) for model in REFERENCE_MODELS]
     for name, model in trained.items():
         levels = len(getattr(model.config, "noise_levels", ()))

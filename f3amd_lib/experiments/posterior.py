@@ -26,9 +26,9 @@ from scipy.spatial.distance import cdist
 from tqdm import tqdm
 
 from f3amd_lib.data.features import frame_positions, frame_yaw
-from f3amd_lib.data.windows import WindowSet, gather_windows
+from f3amd_lib.data.windows import WindowSet, gather_windows, spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
-from f3amd_lib.experiments.denoising import CM, held_out_batch, root_mean_square
+from f3amd_lib.experiments.denoising import CM, root_mean_square
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.measures.distributions import diversity_variance
 from f3amd_lib.motion.skeleton import Skeleton
@@ -158,9 +158,7 @@ def continuation_spread(
                     apart = {part: float(squares[part][row, near].mean()) for part in squares}
                     neighbours[name].append((candidates[near], apart))
     if not any(neighbours.values()):
-        raise ValueError(
-            f"no style of the windows has two windows of {gap} frames in the pool that do not overlap: take more data"
-        )
+        raise ValueError(f"no style has two windows of {gap} frames in the pool that do not overlap: take more data")
 
     @jax.jit
     def continuations(pool, index):
@@ -208,13 +206,11 @@ def answer_spread(
       relative to the root; "x0 error" is that of the features in network units.
 
     Raises:
-      ValueError: for fewer than 2 draws, or windows of other lengths than the model's.
+      ValueError: for fewer than 2 draws.
 
     Source: ours.
     """
-    if num_draws < 2:
-        raise ValueError(f"a spread needs at least 2 draws of noise, got {num_draws}")
-    batch = held_out_batch(windows, trained, num_windows)
+    batch = spread_windows(windows, num_windows)
     x0, condition = network_inputs(batch, trained.normaliser)
     network = trained.network()
 

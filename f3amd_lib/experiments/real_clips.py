@@ -8,7 +8,6 @@ has them: the IRD of a real walker is a step, not zero, and "a walking person" i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.root_paths import RootPath, path_from_motion, tangent_yaw
+from f3amd_lib.motion.root_paths import RootPath, path_from_motion
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Motion
 
@@ -95,15 +94,6 @@ def sideways_share(path: RootPath) -> float:
     return float(np.mean(np.abs(off[moving]) > np.pi / 4))
 
 
-def facing_ahead(path: RootPath) -> RootPath:
-    """Return the same line, walked facing where it goes.
-
-    Args:
-      path: any path; while it stands still it keeps the last direction.
-    """
-    return replace(path, yaw=tangent_yaw(path.position))
-
-
 def own_path(motion: Motion, frames: int = 41) -> RootPath:
     """Return the line that a real motion may be said to follow: its own path without the sway.
 
@@ -149,10 +139,7 @@ def follow_clip(
     whole = packed.motion(clip)
     end = num_history + num_frames
     if whole.num_frames < end:
-        raise ValueError(
-            f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for at most "
-            f"{max(0, whole.num_frames - num_history)} frames after the history"
-        )
+        raise ValueError(f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for fewer")
     history = world_frames(whole)[None, :num_history].astype(np.float32)
     return history, own_path(whole).slice(num_history, end), whole.slice(num_history, end)
 

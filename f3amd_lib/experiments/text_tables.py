@@ -28,31 +28,17 @@ from f3amd_lib.generation.text_to_motion import continue_prefix, sample_control,
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures import text_metrics
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
-from f3amd_lib.measures.text_metrics import (
-    control_errors,
-    foot_skating_ratio,
-    laplacian_surface_distance,
-    multimodality,
-)
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.acmdm import TextCondition
 from f3amd_lib.networks.acmdm_control import Control
+from f3amd_lib.training import text_models
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.evaluator_task import EvaluatorTraining
 from f3amd_lib.training.latent_models import LatentModel, is_latent_preset, train_latent_model
-from f3amd_lib.training.text_models import (
-    CONTROL,
-    JUDGE,
-    PELVIS,
-    TextModel,
-    controlled_joints,
-    preset_and_branch,
-    shipped_for,
-    text_model_files,
-    train_text_model,
-)
+from f3amd_lib.training.text_models import CONTROL, PELVIS, TextModel, train_text_model
 
 PAPERS = {
     "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),
@@ -110,10 +96,8 @@ class Bench:
 
         def system(repeat: int):
             told, pooled = self.captions(repeat)
-            if make is None:
-                made = [self.real.clip(number) for number in range(len(lengths))]
-            else:
-                made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
+            key = jax.random.fold_in(jax.random.key(self.seed), repeat)
+            made = map(self.real.clip, range(len(lengths))) if make is None else make(pooled, lengths, key)
             return [motion[:length] for motion, length in zip(made, lengths, strict=True)], told
 
         return self._seen(system, self.settings["repeats"])
@@ -124,8 +108,8 @@ class Bench:
 
         def watched(repeat: int):
             motions, told = system(repeat)
-            share = np.mean([foot_skating_ratio(self.real.skeleton, motion, self.real.fps) for motion in motions])
-            skating.append({"metric": "foot_skating", "value": share})
+            shares = [text_metrics.foot_skating_ratio(self.real.skeleton, each, self.real.fps) for each in motions]
+            skating.append({"metric": "foot_skating", "value": np.mean(shares)})
             return motions, told
 
         table = self.judged({"made": watched}, repeats)
@@ -152,7 +136,7 @@ class Bench:
             motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
             embedded = self.judge.embed_motions(motions)
             made.append(embedded[: len(clips) // count * count].reshape(-1, count, embedded.shape[-1]))
-        far = multimodality(np.swapaxes(np.concatenate(made), 0, 1), np.random.default_rng([self.seed, 4]))
+        far = text_metrics.multimodality(np.swapaxes(np.concatenate(made), 0, 1), np.random.default_rng([self.seed, 4]))
         return pd.DataFrame([{"metric": "multimodality", "value": far}])
 
     def look(self, motions, told) -> dict[str, float]:
@@ -237,7 +221,7 @@ def mesh_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, fi
 
     def make(pooled, lengths, key):
         made = draw_motions(trained, pooled, lengths, key, draw=draw, mesh=True)
-        each = (laplacian_surface_distance(one[:length], mesh.body.vertices, mesh.body.faces).mean()
+        each = (text_metrics.laplacian_surface_distance(one[:length], mesh.body.vertices, mesh.body.faces).mean()
                 for one, length in zip(made, lengths, strict=True))  # fmt: skip
         apart.append({"metric": "LSD", "value": float(np.mean(list(each)))})
         return mesh.joints(made)
@@ -313,7 +297,7 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
       {"text_table3": means over the five numbers of frames, "text_control": each of them}.
     """
     real, section = bench.real, row["section"]
-    joints = controlled_joints(real.skeleton) if trained.branch is None else trained.controlled
+    joints = text_models.controlled_joints(real.skeleton) if trained.branch is None else trained.controlled
     num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
 
     def asked_of(joints, frames):
@@ -339,7 +323,7 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
             generator = np.random.default_rng([bench.seed, number, joint])
             asked = asked_of([joint], asked_frames(generator, lengths, how_many))
             made = draw(asked, jax.random.fold_in(key, number))
-            figures = control_errors(made, wanted, asked)
+            figures = text_metrics.control_errors(made, wanted, asked)
             if len(clips) == real.num_clips:
                 figures |= bench.look([one[:length] for one, length in zip(made, lengths, strict=True)], told)
             named = {"joint": name.replace("_", " "), "frames": frames}
@@ -437,10 +421,10 @@ def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, f
 
     The one that ships must know these very motions and this encoder. None where `stop_at` comes first.
     """
-    files = text_model_files(profile, JUDGE, folder=folder)
+    files = text_models.text_model_files(profile, text_models.JUDGE, folder=folder)
     if files.model.exists():
         return load_judge(files.model)
-    if shipped := shipped_for(files.model.stem, data, encoder, load_judge):
+    if shipped := text_models.shipped_for(files.model.stem, data, encoder, load_judge):
         return shipped
     # A check of the way needs no judge that sees.
     training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
@@ -512,7 +496,7 @@ def measure_text_table(
     records = Records(results_dir(profile.dataset, profile.name) / "records", record, tables, again=asked)
 
     def trained(preset: str) -> TextModel | LatentModel | None:
-        base = preset_and_branch(preset)[0]
+        base = text_models.preset_and_branch(preset)[0]
         if is_latent_preset(base):  # these see clips of a length of their own
             return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
         form = presets.find_preset(base)

@@ -33,10 +33,10 @@ from flax import nnx
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
-from f3amd_lib.ground.names import check_known, refuse_unknown
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
-from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, classifier_windows, mirror_channels
+from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, mirror_channels, side_by_side
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.attention import dropout
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
@@ -79,19 +79,9 @@ class ClassifierConfig(CheckedConfig):
     feature_width: int = 512
     dropout: float = 0.5
 
-    def __post_init__(self):
-        super().__post_init__()
-        if not self.widths:
-            raise ValueError("a style classifier must have widths, got none")
 
-    def to_dict(self) -> dict:
-        """Return the sizes as JSON values; files of classifiers have no family."""
-        return dataclasses.asdict(self) | {"widths": list(self.widths)}
-
-
-def _batch_norm(width: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
-    # Short trainings need statistics that follow; 0.9 is PyTorch's default, thus CAMDM's.
-    return nnx.BatchNorm(width, momentum=0.9, epsilon=1e-5, rngs=rngs)
+# Short trainings need statistics that follow; 0.9 is PyTorch's default, thus CAMDM's.
+_batch_norm = functools.partial(nnx.BatchNorm, momentum=0.9, epsilon=1e-5)
 
 
 class _ConvolutionBlock(nnx.Module):
@@ -99,7 +89,7 @@ class _ConvolutionBlock(nnx.Module):
 
     def __init__(self, width_in: int, width_out: int, *, rngs: nnx.Rngs):
         self.convolution = TemporalConvolution(width_in, width_out, 3, rngs=rngs)
-        self.norm = _batch_norm(width_out, rngs)
+        self.norm = _batch_norm(width_out, rngs=rngs)
         self.shortcut = nnx.Linear(width_in, width_out, rngs=rngs)
 
     def __call__(self, z, training: bool):
@@ -119,9 +109,9 @@ class StyleNetwork(nnx.Module):
         widths = (NUM_CHANNELS, *config.widths)
         self.blocks = nnx.List(_ConvolutionBlock(*pair, rngs=rngs) for pair in itertools.pairwise(widths))
         self.hidden = nnx.Linear(config.window * widths[-1], config.hidden_width, rngs=rngs)
-        self.hidden_norm = _batch_norm(config.hidden_width, rngs)
+        self.hidden_norm = _batch_norm(config.hidden_width, rngs=rngs)
         self.feature = nnx.Linear(config.hidden_width, config.feature_width, rngs=rngs)
-        self.feature_norm = _batch_norm(config.feature_width, rngs)
+        self.feature_norm = _batch_norm(config.feature_width, rngs=rngs)
         self.classes = nnx.Linear(config.feature_width, config.num_styles, rngs=rngs)
 
     def __call__(self, windows, key=None):
@@ -222,7 +212,7 @@ class StyleClassifier:
         return self.styles.index(style)
 
     def windows_of(self, positions, skeleton: Skeleton) -> np.ndarray:
-        """Cut motion into the windows that the classifier sees (see `classifier_windows`).
+        """Cut motion into the windows that the classifier sees (see `classifier_frames`).
 
         Args:
           positions: global joint positions, [..., T, J, 3], metres, at 30 fps.
@@ -232,31 +222,21 @@ class StyleClassifier:
           [..., T // window, window, 45], metres.
 
         Raises:
-          ValueError: for another skeleton, motion that is too short, or numbers not finite.
+          ValueError: for another skeleton, or numbers not finite.
         """
         if skeleton != self.skeleton:
             raise ValueError(
                 f"this style classifier was trained on the {self.skeleton.num_joints} joints of "
-                f"{self.record.get('dataset', 'its data')!r}; features of another skeleton "
-                f"(here {skeleton.num_joints} joints: other names, parents or bone lengths) do not "
-                "compare. Train one on that data with `obtain_classifier`"
+                f"{self.record['dataset']!r}, features of another skeleton (here {skeleton.num_joints} joints: "
+                "other names, parents or bone lengths) do not compare; train one on its data"
             )
-        return classifier_windows(positions, skeleton, window=self.config.window)
+        return side_by_side(classifier_frames(positions, skeleton), self.config.window)
 
     def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
         """Return what `features` and `predict` return, with one run of the network for both."""
         windows = np.asarray(windows, np.float32)
-        expected = (self.config.window, NUM_CHANNELS)
-        if windows.shape[-2:] != expected or windows.size == 0:
-            raise ValueError(
-                f"windows must be [..., {expected[0]}, {expected[1]}] and at least one, got "
-                f"{windows.shape}; cut them with `windows_of`"
-            )
-        bad = ~np.isfinite(windows).all(axis=(-1, -2))
-        if bad.any():
-            raise ValueError(f"window {int(np.argmax(bad))} is not finite")
-        several = windows.shape[:-2]
-        features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *expected))
+        several, one = windows.shape[:-2], windows.shape[-2:]
+        features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *one))
         return features.reshape(*several, -1), np.argmax(scores, axis=-1).reshape(several)
 
     def features(self, windows) -> np.ndarray:
@@ -267,9 +247,6 @@ class StyleClassifier:
 
         Returns:
           [..., feature_width], float32, without unit.
-
-        Raises:
-          ValueError: for another shape, no windows, or numbers not finite.
         """
         return self.features_and_classes(windows)[0]
 
@@ -281,9 +258,6 @@ class StyleClassifier:
 
         Returns:
           Indices into `styles`, [...].
-
-        Raises:
-          ValueError: for another shape, no windows, or numbers not finite.
         """
         return self.features_and_classes(windows)[1]
 
@@ -333,38 +307,14 @@ def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BA
 # --------------------------------------------------------------------------------------- training
 
 
-class _Takes(NamedTuple):
-    """The clips of some styles and splits, as frames put end to end; K clips, sorted by style.
+def _collect(
+    packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, ...], window: int
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return the clips of styles and splits, sorted by style; one shorter than a window holds none to give.
 
-    Attributes:
-      window: frames of a window.
-      frames: [N, 45], metres, float32.
-      first, length, styles, clips: [K], first frame, number of frames, style index and clip number.
+    Returns:
+      (frames of each clip, [T, 45], metres, float32; its style's index; its number in the data set), K of each.
     """
-
-    window: int
-    frames: np.ndarray
-    first: np.ndarray
-    length: np.ndarray
-    styles: np.ndarray
-    clips: np.ndarray
-
-    def starts(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (first frame, take) of each window, [W]; sorted by style."""
-        count = (self.length - self.window) // stride + 1
-        take = np.repeat(np.arange(len(count)), count)
-        place = np.arange(len(take)) - np.repeat(np.cumsum(count) - count, count)
-        return self.first[take] + stride * place, take
-
-    def side_by_side(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return windows that do not overlap, [W, window, 45], with style and clip of each."""
-        starts, take = self.starts(self.window)
-        windows = self.frames[starts[:, None] + np.arange(self.window)]
-        return windows, self.styles[take], self.clips[take]
-
-
-def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, ...], window: int) -> _Takes:
-    """Collect the clips of styles and splits; one shorter than a window holds none to give."""
     chosen = []
     for number, style in enumerate(styles):
         usable = np.asarray(packed.clip_style) == packed.styles.index(style)
@@ -372,15 +322,19 @@ def _collect(packed: PackedMotion, styles: tuple[str, ...], splits: tuple[str, .
         usable &= np.diff(packed.clip_start) >= window
         if not usable.any():
             raise ValueError(
-                f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip "
-                f"of at least {window} frames; add clips, or leave the style out with `styles`"
+                f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip of at least {window} "
+                "frames; add clips, or leave the style out"
             )
         chosen += [(number, clip) for clip in np.flatnonzero(usable)]
     labels, clips = np.array(chosen, np.int32).T
     positions = (packed.motion(int(clip)).positions for clip in clips)
-    frames = [classifier_frames(each, packed.skeleton).astype(np.float32) for each in positions]
-    length = np.array([len(part) for part in frames])
-    return _Takes(window, np.concatenate(frames), np.cumsum(length) - length, length, labels, clips)
+    return [classifier_frames(each, packed.skeleton).astype(np.float32) for each in positions], labels, clips
+
+
+def _starts(lengths: list[int], window: int, stride: int) -> list[np.ndarray]:
+    """Return the first frames of each clip's windows, in the frames of all clips put end to end."""
+    clips = zip(np.cumsum(lengths), lengths, strict=True)
+    return [np.arange(end - length, end - window + 1, stride) for end, length in clips]
 
 
 @dataclass(frozen=True)
@@ -405,12 +359,6 @@ class ClassifierTraining:
     schedule: str = "cosine to 0"
     stride: int = 10
 
-    def __post_init__(self):
-        if self.num_steps < 1 or self.batch_size < 2:
-            raise ValueError(
-                f"a style classifier needs at least 1 step and batches of 2, got {self.num_steps} and {self.batch_size}"
-            )
-
     def optimiser(self) -> optax.GradientTransformation:
         """Return Adam, at a rate that falls to zero."""
         return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.num_steps))
@@ -419,7 +367,7 @@ class ClassifierTraining:
 def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining) -> dict:
     """Return all but the data that decides a classifier's weights, as its record tells it."""
     return {
-        "classifier": network.to_dict(),
+        "classifier": dataclasses.asdict(network),
         "classifier_training": dataclasses.asdict(config),
         "classifier_styles": styles,
     }
@@ -483,24 +431,19 @@ class StyleTask(Task):
 
 
 def _asked_for(
-    packed: PackedMotion, *, num_steps: int, batch_size: int, seed: int, styles=None, **sizes
+    packed: PackedMotion, *, num_steps: int, batch_size: int, seed: int, **sizes
 ) -> tuple[tuple[str, ...], ClassifierConfig, ClassifierTraining]:
-    """Return the classes, those asked for or the primary ones, the network's sizes and its training."""
-    chosen = tuple(packed.primary_styles if styles is None else styles)
-    for style in chosen:
-        check_known(style, packed.styles, f"style of data set {packed.dataset!r}:")
-    if len(set(chosen)) != len(chosen) or len(chosen) < 2:
+    """Return the classes, which are the primary styles, the network's sizes and its training."""
+    styles = tuple(packed.primary_styles)
+    if len(styles) < 2:
         raise ValueError(
-            f"a style classifier needs at least two styles, each named once; got {len(chosen)} "
-            f"({', '.join(chosen[:5])})"
+            f"data set {packed.dataset!r}: a style classifier needs at least two styles, got {len(styles)}"
         )
-    refuse_unknown(sizes, ClassifierConfig, "size of a style classifier")
-    config = ClassifierConfig(len(chosen), **sizes)
-    return chosen, config, ClassifierTraining(num_steps, batch_size, seed)
+    return styles, ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
 
 
 def train_classifier(
-    packed: PackedMotion, *, num_steps: int = 600, batch_size: int = 128, seed: int = 0, styles=None,
+    packed: PackedMotion, *, num_steps: int = 600, batch_size: int = 128, seed: int = 0,
     profile: Profile | str = "none", progress: bool = True, **sizes,
 ) -> StyleClassifier:  # fmt: skip
     """Train a style classifier on a data set's training clips and try it on the held-out ones.
@@ -511,8 +454,8 @@ def train_classifier(
     the windows of styles that may be mirrored are, as in the training of the generators, and clips
     are held out.
 
-    By default the classes are the primary styles, so that every answer is a style that is
-    evaluated, and each style has held-out clips enough to say how well it is recognised. A clip
+    The classes are the primary styles, so that every answer is a style that is evaluated, and each
+    style has held-out clips enough to say how well it is recognised. A clip
     shorter than a window (60 frames) holds none and is left out; Bandai's primary styles have none
     so short, and a window padded by still or repeated frames would be no real motion.
 
@@ -520,7 +463,6 @@ def train_classifier(
       packed: the data.
       num_steps, batch_size: optimiser steps, and windows in each.
       seed: of weights, batches and dropout.
-      styles: labels to tell apart, instead of the primary ones.
       profile: what the run record names.
       progress: show a progress bar.
       **sizes: fields of `ClassifierConfig` to change.
@@ -529,28 +471,30 @@ def train_classifier(
       The classifier, weights rounded to bfloat16 and then measured.
 
     Raises:
-      ValueError: for an unknown style or size, fewer than two styles, a style without a training
-        or a held-out clip of 60 frames, or a skeleton without one of `CLASSIFIER_JOINTS`.
+      ValueError: for fewer than two styles, a style without a training or a held-out clip of 60
+        frames, or a skeleton without one of `CLASSIFIER_JOINTS`.
       TrainingDiverged: if the loss stops being a number.
 
     Source: CAMDM's evaluation code (its classifier).
     """
-    asked = {"num_steps": num_steps, "batch_size": batch_size, "seed": seed, "styles": styles}
-    styles, config, training = _asked_for(packed, **asked, **sizes)
-    takes = {split: _collect(packed, styles, members, config.window) for split, members in _SPLITS.items()}
-    starts, take = takes["train"].starts(training.stride)
-    count = np.bincount(takes["train"].styles[take], minlength=len(styles))
+    styles, config, training = _asked_for(packed, num_steps=num_steps, batch_size=batch_size, seed=seed, **sizes)
+    window = config.window
+    takes = {split: _collect(packed, styles, members, window) for split, members in _SPLITS.items()}
+    frames, labels, _ = takes["train"]
+    starts = _starts([len(part) for part in frames], window, training.stride)
+    count = np.bincount(np.repeat(labels, [len(each) for each in starts]), minlength=len(styles))
     task = StyleTask(
-        packed.fingerprint, styles, config, training, frames=jnp.asarray(takes["train"].frames),
-        starts=jnp.asarray(starts, jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
+        packed.fingerprint, styles, config, training, frames=jnp.asarray(np.concatenate(frames)),
+        starts=jnp.asarray(np.concatenate(starts), jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
         count=jnp.asarray(count, jnp.int32), mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
     )  # fmt: skip
     state, _ = optimise(task, chunk=max(1, min(20, num_steps // 10)), progress=progress)
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(leaf.dtype), state.params)
     references = {}
-    for split, part in takes.items():
-        windows, labels, clips = part.side_by_side()
-        features, scores = _answers(config, params, state.statistics, windows)
+    for split, (frames, *of_clips) in takes.items():
+        windows = [side_by_side(part, window) for part in frames]
+        labels, clips = (np.repeat(each, [len(cut) for cut in windows]) for each in of_clips)
+        features, scores = _answers(config, params, state.statistics, np.concatenate(windows))
         references[split] = ReferenceFeatures(features.astype(np.float16).astype(np.float32), labels, clips)
     right = np.argmax(scores, axis=-1) == labels  # of the last split, held out
     accuracy = {style: float(right[labels == number].mean()) for number, style in enumerate(styles)}
@@ -621,7 +565,7 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
     }
     metadata = {
         "kind": "style classifier",
-        "classifier": classifier.config.to_dict(),
+        "classifier": dataclasses.asdict(classifier.config),
         "styles": list(classifier.styles),
         **checkpoints.describe_skeleton(skeleton),
         "held_out_accuracy": classifier.held_out_accuracy,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.motion.curves import unit
-from f3amd_lib.motion.rotations import matrix_from_yaw, yaw_from_direction
-from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.measures.metrics import checked_positions
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
 
 _JOINTS = read_toml(Path(__file__).with_name("classifier_joints.toml"))
 _CONVENTIONS = _JOINTS["conventions"]
@@ -56,9 +56,8 @@ def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
     """Reduce joint positions to what the classifier sees: posture, without place and direction.
 
     Each frame is moved so that its hips are the origin and turned about the vertical so that its
-    own facing is +Z. Facing here is cross(a, +Y) with a = unit(left - right clavicle) + unit(left -
-    right hip): it takes in the shoulders, unlike `facing_yaw`, which serves paths and sees the hips
-    only. (CAMDM's code turns to +X, which is the same up to the order and sign of channels.)
+    own facing, shoulders among it (`facing_yaw`), is +Z. (CAMDM's code turns to +X, which is the
+    same up to the order and sign of channels.)
 
     Args:
       positions: global joint positions, [..., T, J, 3], metres.
@@ -68,56 +67,23 @@ def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
       [..., T, 45], metres, float64: x, y, z of each of `CLASSIFIER_JOINTS`.
 
     Raises:
-      ValueError: for shapes that do not fit the skeleton, numbers that are not finite, or a
-        skeleton without one of the joints.
+      ValueError: for a wrong shape, numbers that are not finite, or a skeleton without one of the
+        joints.
 
     Source: CAMDM's evaluation code (its feature extraction).
     """
-    positions = np.asarray(positions, np.float64)
-    if positions.ndim < 3 or positions.shape[-2:] != (skeleton.num_joints, 3):
-        raise ValueError(
-            f"positions must be [..., T, {skeleton.num_joints}, 3] in metres for this skeleton, got {positions.shape}"
-        )
-    if not np.all(np.isfinite(positions)):
-        place = [int(index) for index in np.argwhere(~np.isfinite(positions))[0]]
-        raise ValueError(
-            f"positions are not finite at frame {place[-3]}, joint {skeleton.names[place[-2]]!r}"
-            + (f" of motion {place[:-3]}" if len(place) > 3 else "")
-        )
-    body = positions[..., list(classifier_joints(skeleton)), :]
-    body = body - body[..., :1, :]
-    at = {joint: body[..., index, :] for index, joint in enumerate(CLASSIFIER_JOINTS)}
-    across = unit(at["left clavicle"] - at["right clavicle"])
-    across = across + unit(at["left hip"] - at["right hip"])
-    # cross(a, +Y) = (-a_z, 0, a_x)
-    forward = np.stack([-across[..., 2], np.zeros(across.shape[:-1]), across[..., 0]], axis=-1)
-    turned = body @ np.swapaxes(matrix_from_yaw(-yaw_from_direction(forward)), -1, -2)
-    return turned.reshape(*body.shape[:-2], NUM_CHANNELS)
+    positions = checked_positions(positions)
+    seen = list(classifier_joints(skeleton))
+    body = positions - positions[..., seen[:1], :]
+    turned = body[..., seen, :] @ np.swapaxes(matrix_from_yaw(-facing_yaw(skeleton, body, shoulders=True)), -1, -2)
+    return turned.reshape(*turned.shape[:-2], NUM_CHANNELS)
 
 
-def classifier_windows(positions, skeleton: Skeleton, *, window: int = 60) -> np.ndarray:
-    """Cut motion into windows side by side; what is left at the end is not used.
-
-    Args:
-      positions: global joint positions, [..., T, J, 3], metres, at 30 fps.
-      skeleton: J joints.
-      window: frames of each.
-
-    Returns:
-      [..., T // window, window, 45], metres, float32.
-
-    Raises:
-      ValueError: as `classifier_frames`, or if the motion is shorter than a window.
-    """
-    frames = classifier_frames(positions, skeleton)
+def side_by_side(frames: np.ndarray, window: int) -> np.ndarray:
+    """Cut frames [..., T, 45] into windows side by side, [..., T // window, window, 45], float32; the rest is left."""
     count = frames.shape[-2] // window
-    if count == 0:
-        raise ValueError(
-            f"{frames.shape[-2]} frames do not fill a window of the style classifier; it needs "
-            f"{window} ({window / 30:g} s)"
-        )
-    whole = frames[..., : count * window, :]
-    return whole.reshape(*whole.shape[:-2], count, window, NUM_CHANNELS).astype(np.float32)
+    whole = frames[..., : count * window, :].astype(np.float32)
+    return whole.reshape(*whole.shape[:-2], count, window, NUM_CHANNELS)
 
 
 def mirror_channels() -> tuple[np.ndarray, np.ndarray]:

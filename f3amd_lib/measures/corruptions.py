@@ -55,7 +55,7 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
     """Put whole frames, root and pose, in a random order: every pose is real, the motion is gone.
 
     Args:
-      motion: any motion of T >= 2 frames.
+      motion: any motion of T frames.
       seed: of the order. With the same seed, frames moved at a low strength are among those moved
         at a higher one.
       strength: share of frames that change places, in one random ring, so that each of them moves;
@@ -64,13 +64,8 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
     Returns:
       The motion, T frames.
 
-    Raises:
-      ValueError: for a single frame.
-
     Source: ours.
     """
-    if motion.num_frames < 2:
-        raise ValueError("a motion of 1 frame cannot be shuffled; at least 2 are needed")
     ring = np.random.default_rng(seed).permutation(motion.num_frames)
     ring = ring[: round(strength * motion.num_frames)]
     order = np.arange(motion.num_frames)
@@ -120,11 +115,9 @@ def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) 
       The broken motion, as many frames on the same skeleton.
 
     Raises:
-      ValueError: for an unknown name, a strength out of range, anything that is no `Motion`, and as the recipe itself.
+      ValueError: for an unknown name, or a strength out of range.
     """
     check_known(name, CORRUPTIONS, "corruption")
-    if not isinstance(motion, Motion):
-        raise ValueError(f"only a Motion can be corrupted, got {type(motion).__name__}")
     if not 0.0 <= strength <= 1.0:
         raise ValueError(f"strength must lie between 0 (as it was) and 1, got {strength}")
     return CORRUPTIONS[name](motion, seed, float(strength))

@@ -27,7 +27,7 @@ CONTACT_HEIGHT = 0.01
 _STILL = 1e-6  # metres; a mean root step or acceleration under a micrometre is none
 
 
-def _checked_positions(positions, least: int = 1) -> np.ndarray:
+def checked_positions(positions, least: int = 1) -> np.ndarray:
     """Return positions as float64, or say what is wrong with them."""
     positions = np.asarray(positions, dtype=np.float64)
     if positions.ndim < 3 or positions.shape[-1] != 3:
@@ -60,10 +60,10 @@ def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
 def _checked_target(target, num_frames: int, width: int) -> np.ndarray:
     """Return a path's positions (width 2) or yaws (width 1) as float64, [..., T, width]."""
     target = np.asarray(target, dtype=np.float64)
-    if target.ndim < 2 or target.shape[-1] != width:
-        raise ValueError(f"path must be a RootPath or [..., T, 2] (x, z), got {target.shape}")
-    if target.shape[-2] != num_frames:
-        raise ValueError(f"path has {target.shape[-2]} frames; it needs {num_frames}")
+    if target.ndim < 2 or target.shape[-2:] != (num_frames, width):
+        raise ValueError(
+            f"path must be a RootPath of {num_frames} frames or [..., {num_frames}, {width}], got {target.shape}"
+        )
     if not np.all(np.isfinite(target)):
         raise ValueError(f"path is not finite at index {np.argwhere(~np.isfinite(target))[0]}")
     return target
@@ -71,7 +71,7 @@ def _checked_target(target, num_frames: int, width: int) -> np.ndarray:
 
 def _root_and_target(positions, path, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the root on the ground and where it was wanted, [..., T, 2] each."""
-    root = _checked_positions(positions, least)[..., 0, [0, 2]]
+    root = checked_positions(positions, least)[..., 0, [0, 2]]
     return root, _checked_target(path.position if isinstance(path, RootPath) else path, root.shape[-2], 2)
 
 
@@ -92,14 +92,14 @@ def _ratio(numerator: np.ndarray, denominator: np.ndarray):
 
 def _joint_and_root_change(positions, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return mean lengths of the order-th differences: of all joints, and of the root's x and z."""
-    change = np.diff(_checked_positions(positions, least=order + 1), n=order, axis=-3)
+    change = np.diff(checked_positions(positions, least=order + 1), n=order, axis=-3)
     joints = np.linalg.norm(change, axis=-1).mean(axis=(-2, -1))
     return joints, np.linalg.norm(change[..., 0, [0, 2]], axis=-1).mean(axis=-1)
 
 
 def _toes_and_root_step(positions, toes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return toe positions [..., T, 2, 3], their steps on the ground [..., T - 1, 2] and the root's mean one."""
-    positions = _checked_positions(positions, least=2)
+    positions = checked_positions(positions, least=2)
     toe = positions[..., list(toes.toes if isinstance(toes, Skeleton) else toes), :]
     step = np.linalg.norm(np.diff(toe, axis=-3)[..., [0, 2]], axis=-1)
     root = np.linalg.norm(np.diff(positions[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
@@ -123,8 +123,7 @@ def seam_frames(num_frames: int, window: int) -> np.ndarray:
     frames = np.arange(window, num_frames, window)
     if len(frames) == 0:
         raise ValueError(
-            f"{num_frames} frames hold no boundary between windows of {window} frames; "
-            f"at least {window + 1} frames are needed"
+            f"{num_frames} frames hold no boundary between windows of {window} frames: take more than that"
         )
     return frames
 
@@ -283,7 +282,7 @@ def ird(positions, window: int):
     Source: paper section 4.4 (IRD), Eq. 10 as a metric. Our reading: the norm is that of each
     joint's displacement, averaged over joints ("mean Euclidean distance"), not of all stacked.
     """
-    positions = _checked_positions(positions)
+    positions = checked_positions(positions)
     seams = seam_frames(positions.shape[-3], window)
     jump = positions[..., seams, :, :] - positions[..., seams - 1, :, :]
     return 100.0 * np.linalg.norm(jump, axis=-1).mean(axis=(-2, -1))
@@ -309,7 +308,7 @@ def ird_excess(positions, window: int):
 
     Source: ours. Eq. 10 compares with standing still; this compares with going on.
     """
-    positions = _checked_positions(positions)
+    positions = checked_positions(positions)
     seams = seam_frames(positions.shape[-3], _checked_window(window, least=2))
     before, last, first = (positions[..., seams - back, :, :] for back in (2, 1, 0))
     return 100.0 * np.linalg.norm(first - 2.0 * last + before, axis=-1).mean(axis=(-2, -1))
