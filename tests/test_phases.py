@@ -22,7 +22,6 @@ from f3amd_lib.diffusion.phases import (
     sample_latent_consistency,
     shares,
     target_end,
-    visit,
 )
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 
@@ -248,9 +247,6 @@ def test_a_walk_is_its_jumps_and_draws_no_noise():
     for time, time_next in zip(times[:-1], times[1:], strict=True):
         state = jump(SCHEDULE, state, exact_noise(state, time), time, time_next)
     np.testing.assert_allclose(made, state, atol=2e-5)
-    states = visit(exact_noise, SCHEDULE, noise, times)
-    assert len(states) == 21
-    np.testing.assert_allclose(states[-1].x_noisy, made, atol=2e-5)
     # More steps come nearer to the flow.
     error = lambda steps: np.abs(follow(exact_noise, SCHEDULE, noise, ddim_times(1000, steps)) - exact).mean()
     exact = exact_flow(noise, 999, 0)

@@ -90,7 +90,7 @@ def test_a_finished_model_without_its_state_is_not_overwritten(trained_once, sam
     pipeline.train(prepared, profile, progress=False)
     kept = files.model.with_name(f"{profile.preset}.old1.safetensors")
     assert kept.read_bytes() == before and files.model.exists()
-    for path in dataclasses.astuple(files):
+    for path in files:
         path.unlink()
     files.state.with_name("elsewhere").rename(files.state)
     put_back(files)

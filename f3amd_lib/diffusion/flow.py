@@ -11,7 +11,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.diffusion.predictions import clean_estimate
+from f3amd_lib.diffusion.predictions import on_grid
 from f3amd_lib.diffusion.samplers import SAMPLERS, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import check_known
@@ -61,16 +61,10 @@ def solve(
         raise ValueError(f"the first step of {schedule.kind!r} sees noise alone: predict 'x0' or 'v' there, not 'eps'")
     times = jnp.asarray(network_time(schedule, np.append(schedule.times(num_steps), 1.0)))
     alphas, sigmas = jnp.asarray(alphas), jnp.asarray(sigmas)
-    visited = sigmas if endless else levels
-
-    def denoise(x_noisy, level):
-        # A walk asks at places of its grid alone.
-        place = jnp.argmin(jnp.abs(visited - level))
-        alpha, sigma = alphas[place], sigmas[place]
-        state = x_noisy if endless else alpha * x_noisy
-        return clean_estimate(objective, predict(state, times[place]), state, alpha, sigma)
-
-    return sample(sampler, denoise, visited[0] * noise, visited, alphas=alphas if endless else None, key=key)
+    denoise = on_grid(predict, objective, times, alphas, sigmas, None if endless else levels)
+    if endless:
+        return sample(sampler, denoise, sigmas[0] * noise, sigmas, alphas=alphas, key=key)
+    return sample(sampler, denoise, levels[0] * noise, levels, key=key)
 
 
 def integrate(velocity: Callable, noise, *, relative: float = 1e-3, absolute: float = 1e-6):

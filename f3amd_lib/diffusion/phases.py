@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.diffusion.predictions import clean_estimate
-from f3amd_lib.diffusion.samplers import Visited, ddim_step, sample, walk
+from f3amd_lib.diffusion.predictions import clean_estimate, on_grid
+from f3amd_lib.diffusion.samplers import ddim_step, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import array_module
 from f3amd_lib.ground.names import check_known
@@ -202,8 +202,6 @@ def hinge(real, fake):
 
 # ------------------------------------------------------------------------------------------------------------- sampling
 
-SPACINGS = ("trailing", "leading")
-
 
 def ddim_times(num_levels: int, num_steps: int, spacing: str = "trailing") -> np.ndarray:
     """Return the times that an N-step teacher visits, falling, the last 0, [N + 1].
@@ -217,7 +215,7 @@ def ddim_times(num_levels: int, num_steps: int, spacing: str = "trailing") -> np
     Raises:
       ValueError: for more steps than levels, or an unknown spacing.
     """
-    check_known(spacing, SPACINGS, "spacing")
+    check_known(spacing, ("trailing", "leading"), "spacing")
     if not 1 <= num_steps <= num_levels:
         raise ValueError(f"a teacher of {num_levels} levels takes 1 to {num_levels} steps, got {num_steps}")
     if spacing == "leading":
@@ -226,18 +224,6 @@ def ddim_times(num_levels: int, num_steps: int, spacing: str = "trailing") -> np
         times = np.rint(num_levels - np.arange(num_steps) * num_levels / num_steps).astype(int) - 1
     # With as many steps as levels the last one asked is level 0 itself.
     return np.append(times, 0)
-
-
-def _grid(predict: Callable, schedule: NoiseSchedule, times):
-    """Return (denoiser, sigmas, alphas) of a walk through level numbers for `samplers`."""
-    times = jnp.asarray(times)
-    alphas, sigmas = shares(schedule, times)
-
-    def denoise(state, sigma):
-        place = jnp.argmin(jnp.abs(sigmas - sigma))  # a walk asks at places of its grid alone
-        return clean_estimate("eps", predict(state, times[place]), state, alphas[place], sigmas[place])
-
-    return denoise, sigmas, alphas
 
 
 def follow(predict: Callable, schedule: NoiseSchedule, noise, times) -> jax.Array:
@@ -254,14 +240,9 @@ def follow(predict: Callable, schedule: NoiseSchedule, noise, times) -> jax.Arra
     Returns:
       State at the last time; at time 0 it still has a little noise, alpha_0 = 0.9996 in MotionPCM's schedule.
     """
-    denoise, sigmas, alphas = _grid(predict, schedule, times)
-    return sample("ddim", denoise, noise, sigmas, alphas=alphas)
-
-
-def visit(predict: Callable, schedule: NoiseSchedule, noise, times) -> list[Visited]:
-    """Return every state on the way of `follow`, worked out in plain Python, to be drawn."""
-    denoise, sigmas, alphas = _grid(predict, schedule, times)
-    return list(walk("ddim", denoise, noise, sigmas, alphas=alphas))
+    times = jnp.asarray(times)
+    alphas, sigmas = shares(schedule, times)
+    return sample("ddim", on_grid(predict, "eps", times, alphas, sigmas), noise, sigmas, alphas=alphas)
 
 
 LATENT_CONSISTENCY_TIMES = {1: (799,), 2: (699, 299), 4: (699, 399, 299, 299)}

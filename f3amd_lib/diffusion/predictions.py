@@ -37,6 +37,27 @@ def clean_estimate(objective: str, prediction, state, alpha, sigma):
     return (state + sigma * prediction) / (alpha + sigma)
 
 
+def on_grid(predict, objective: str, times, alphas, sigmas, levels=None) -> Denoiser:
+    """Return the denoiser of a network that is told times, on a walk that asks at places of its grid alone.
+
+    Args:
+      predict: `predict(state, time)`, the state alpha x0 + sigma eps.
+      objective: what it answers, of `OBJECTIVES`.
+      times, alphas, sigmas: what it is told, and shares of signal and noise, at each place, [N + 1].
+      levels: noise levels of the places where the walk is in the variance-exploding state; by default it is in the
+        state itself.
+    """
+    visited = sigmas if levels is None else levels
+
+    def denoise(x_noisy, level):
+        place = jnp.argmin(jnp.abs(visited - level))
+        alpha, sigma = alphas[place], sigmas[place]
+        state = x_noisy if levels is None else alpha * x_noisy
+        return clean_estimate(objective, predict(state, times[place]), state, alpha, sigma)
+
+    return denoise
+
+
 def from_noise(predict) -> Denoiser:
     """Return the denoiser of a network that predicts the noise, eps = (x_noisy - x0) / sigma (Ho et al. 2020)."""
     return lambda x_noisy, sigma: x_noisy - sigma * predict(x_noisy, sigma)

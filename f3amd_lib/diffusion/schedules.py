@@ -52,18 +52,9 @@ class NoiseSchedule:
         """Return kind and settings as JSON-ready values, for `schedule_from_dict`."""
         return {"kind": self.kind, **dict(self.settings)}
 
-    @property
-    def betas(self) -> np.ndarray:
-        """Share of signal power lost from one of K levels to the next, [K] float64."""
-        return 1.0 - self.alpha_bars / np.append(1.0, self.alpha_bars[:-1])
-
     def perturb(self, x0, noise, t):
         """Return z_t = alpha(t) x0 + sigma(t) noise; t broadcasts against x0."""
         return self.alpha(t) * x0 + self.sigma(t) * noise
-
-    def start(self, key, shape: tuple[int, ...]):
-        """Draw what is left of any data at t = 0: noise alone, float32."""
-        return jnp.float32(self.sigma(0.0)) * jax.random.normal(key, shape)
 
     def times(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
         """Return the times at which an N-step sampler asks the network.
@@ -210,7 +201,7 @@ def variance_preserving_linear(num_levels: int = 1000, beta_min: float = 0.1, be
 
     Args:
       num_levels: K.
-      beta_min, beta_max: rate at s = 0 and at s = 1 (not a share of one level, which `betas` is).
+      beta_min, beta_max: rate at s = 0 and at s = 1 (not a share of one level).
 
     Raises:
       ValueError: unless num_levels >= 1 is whole, 0 < beta_min <= beta_max, and beta_max is small

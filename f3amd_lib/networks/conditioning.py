@@ -18,9 +18,6 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks.attention import MultiHeadAttention, attend, check_num_heads, position_code
 from f3amd_lib.networks.config import NetworkConfig
 
-CONDITIONINGS = ("film", "concatenation", "adaln_zero", "cross_attention")
-"""The ways of Table 11 for c to enter a backbone block."""
-
 PATH_CHANNELS = 8
 """2D displacement (x, z) and yaw in 6D, per future frame (section 3.3)."""
 
@@ -184,7 +181,7 @@ class Concatenation(nnx.Module):
     The base block brings both together, so that only the output layer of Eq. 7 is left here.
     """
 
-    def __init__(self, width: int, *, zero_output: bool = False, rngs: nnx.Rngs):
+    def __init__(self, width: int, condition_width=None, *, zero_output: bool = False, rngs: nnx.Rngs):
         self.output = _output_layer(width, zero_output, rngs)
 
     def __call__(self, base, z, c):
@@ -200,7 +197,7 @@ class AdaLNZero(nnx.Module):
     as c enters by a linear layer alone in FiLM too (Eq. 5).
     """
 
-    def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):
+    def __init__(self, width: int, condition_width: int, *, zero_output: bool = True, rngs: nnx.Rngs):
         zeros = nnx.initializers.zeros_init()
         self.modulation = nnx.Linear(condition_width, 3 * width, kernel_init=zeros, rngs=rngs)
 
@@ -232,6 +229,12 @@ class CrossAttention(nnx.Module):
         return nnx.silu(self.output(z_tilde))
 
 
+CONDITIONINGS = {
+    "film": FiLM, "concatenation": Concatenation, "adaln_zero": AdaLNZero, "cross_attention": CrossAttention,
+}  # fmt: skip
+"""The ways of Table 11 for c to enter a backbone block."""
+
+
 def conditioning_layer(
     name: str, width: int, condition_width: int, *, num_heads: int = 1, zero_output: bool = False, rngs: nnx.Rngs
 ):
@@ -252,10 +255,5 @@ def conditioning_layer(
       ValueError: for an unknown name, with the nearest.
     """
     check_known(name, CONDITIONINGS, "conditioning")
-    if name == "concatenation":
-        return Concatenation(width, zero_output=zero_output, rngs=rngs)
-    if name == "adaln_zero":
-        return AdaLNZero(width, condition_width, rngs=rngs)
-    if name == "cross_attention":
-        return CrossAttention(width, condition_width, num_heads, zero_output=zero_output, rngs=rngs)
-    return FiLM(width, condition_width, zero_output=zero_output, rngs=rngs)
+    heads = {"num_heads": num_heads} if name == "cross_attention" else {}
+    return CONDITIONINGS[name](width, condition_width, **heads, zero_output=zero_output, rngs=rngs)

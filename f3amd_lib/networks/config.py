@@ -34,27 +34,22 @@ class CheckedConfig:
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            if field.type in _TYPES:
-                self._check(field.name, _TYPES[field.type])
-            elif field.type == "tuple[int, ...]":
-                sizes = tuple(getattr(self, field.name))
-                object.__setattr__(self, field.name, sizes)
-                if any(type(size) is not int or size < 1 for size in sizes):
-                    raise ValueError(f"{field.name} must be whole numbers above 0, got {sizes}")
+            name, value, wanted = field.name, getattr(self, field.name), _TYPES.get(field.type)
+            if field.type == "tuple[int, ...]":
+                value = tuple(value)
+                if any(type(size) is not int or size < 1 for size in value):
+                    raise ValueError(f"{name} must be whole numbers above 0, got {value}")
+            if wanted is float and type(value) is int:
+                value = float(value)
+            if wanted and type(value) is not wanted:
+                raise ValueError(f"{name} must be of type {wanted.__name__}, got {value!r}")
+            if name in self.choices:
+                check_known(value, self.choices[name], name)
+            if wanted in (int, float) and not (0 < value < math.inf or (value == 0 and name in self.may_be_zero)):
+                raise ValueError(f"{name} must be positive and finite, got {value!r}")
+            object.__setattr__(self, name, value)
         if getattr(self, "dropout", 0.0) >= 1.0:
             raise ValueError(f"dropout must be below 1, got {self.dropout}")
-
-    def _check(self, name: str, wanted: type) -> None:
-        value = getattr(self, name)
-        if wanted is float and type(value) is int:
-            value = float(value)
-            object.__setattr__(self, name, value)
-        if type(value) is not wanted:
-            raise ValueError(f"{name} must be of type {wanted.__name__}, got {value!r}")
-        if name in self.choices:
-            check_known(value, self.choices[name], name)
-        if wanted in (int, float) and not (0 < value < math.inf or (value == 0 and name in self.may_be_zero)):
-            raise ValueError(f"{name} must be positive and finite, got {value!r}")
 
     def to_dict(self) -> dict:
         """Return the family's name and the fields as JSON-ready values."""

@@ -130,9 +130,7 @@ def load_captioned_model(
         checkpoints.check_kind(metadata, kind)
         configs = {name: _config(metadata, what) for name, what in _CONFIG_OF.items()}
         weights, arrays = shapes(metadata, *configs.values())
-        weights = {
-            name: checkpoints.weights_shapes(config) for name, config in configs.items() if config is not None
-        } | weights
+        weights |= {name: checkpoints.weights_shapes(config) for name, config in configs.items() if config is not None}
         packed = {name: checkpoints.packed_shapes(shape, metadata["weights"]) for name, shape in weights.items()}
         return packed | arrays | {"offsets": jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)}
 

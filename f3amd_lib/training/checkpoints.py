@@ -247,17 +247,6 @@ def _in_eight_bits(leaf) -> dict | jax.Array:
     return {"eight_bits": eight_bits, "scale": scale.astype(jnp.float16)}
 
 
-def _is_packed(leaf) -> bool:
-    return isinstance(leaf, dict) and "eight_bits" in leaf
-
-
-def _from_eight_bits(leaf):
-    """Return the array that `_in_eight_bits` wrote, or one that is whole."""
-    if not _is_packed(leaf):
-        return leaf
-    return jax.device_put(np.asarray(leaf["eight_bits"], np.float32) * np.asarray(leaf["scale"], np.float32))
-
-
 def packed_weights(params: Any, dtype) -> Any:
     """Return weights as files keep them: in a type, or in 8 bits with scales (`jnp.int8`)."""
     eight = jnp.dtype(dtype) == jnp.int8
@@ -277,7 +266,11 @@ def packed_shapes(shapes: Any, weights: str | None) -> Any:
 
 def unpacked_weights(packed: Any) -> Any:
     """Return the weights that `packed_weights` packed."""
-    return jax.tree.map(_from_eight_bits, packed, is_leaf=_is_packed)
+    in_eight_bits = lambda leaf: isinstance(leaf, dict) and "eight_bits" in leaf
+    whole = lambda leaf: np.asarray(leaf["eight_bits"], np.float32) * np.asarray(leaf["scale"], np.float32)
+    return jax.tree.map(
+        lambda leaf: jax.device_put(whole(leaf)) if in_eight_bits(leaf) else leaf, packed, is_leaf=in_eight_bits
+    )
 
 
 def weights_shapes(config: NetworkConfig) -> Any:

@@ -22,7 +22,6 @@ from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
-from f3amd_lib.training.losses import loss_terms, total_loss
 from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep
 from f3amd_lib.training.recipe import paper_recipe
@@ -104,24 +103,21 @@ class ConsistencyTask(Task):
         x0, condition = network_inputs(batch, task.normaliser)
         if training:
             condition = task._disturbed(condition, key_history)
-        student, answering, teacher = (
-            network_with(task.model_config, weights) for weights in (params, target, self.teacher)
-        )
-        context = {id(network): network.encode(condition) for network in (student, answering, teacher)}
-        denoiser = lambda network: lambda x_noisy, sigma: network(x_noisy, sigma, context[id(network)])
+
+        def denoiser(weights):
+            network = network_with(task.model_config, weights)
+            context = network.encode(condition)
+            return lambda x_noisy, sigma: network(x_noisy, sigma, context)
+
+        student, answering, teacher = map(denoiser, (params, target, self.teacher))
         levels = jnp.asarray(config.diffusion.grid(self.num_teacher_steps), jnp.float32)
         point = jax.random.randint(key_point, (len(x0),), 0, self.num_teacher_steps)
         of_phase = self.num_teacher_steps // self.num_phases
         sigma, sigma_next, sigma_edge = (levels[n] for n in (point, point + 1, (point // of_phase + 1) * of_phase))
         x_noisy = add_noise(x0, sigma[:, None, None], jax.random.normal(key_noise, x0.shape))
-        answer = consistency_answer(denoiser(teacher), denoiser(answering), x_noisy, sigma, sigma_next, sigma_edge)
+        answer = consistency_answer(teacher, answering, x_noisy, sigma, sigma_next, sigma_edge)
         answer = jax.lax.stop_gradient(answer)
-        x0_hat = denoiser(student)(x_noisy, sigma)
-        metres, wanted = map(task.normaliser.denormalise, (x0_hat, answer))
-        terms = loss_terms(
-            task.skeleton, x0_hat, answer, metres, wanted, batch.history[:, -1], config.loss.ird_form
-        )  # fmt: skip
-        return {"loss": total_loss(terms, config.loss), **terms}
+        return task.compared(student(x_noisy, sigma), answer, task.normaliser.denormalise(answer), batch)
 
 
 def distil(

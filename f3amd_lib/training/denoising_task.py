@@ -214,10 +214,19 @@ class DenoisingTask(Task):
         x_noisy = add_noise(x0, sigma[:, None, None], noise)
         drops = training and self.model_config.dropout > 0
         x0_hat = model(x_noisy, sigma, model.encode(condition), key=key_dropout if drops else None)
+        return self.compared(x0_hat, x0, batch.future, batch, noise_weights(sigma, self.config) if training else None)
+
+    def compared(self, x0_hat, x0, future, batch: Batch, weights=None) -> dict:
+        """Return the loss terms of an answer, "loss" among them.
+
+        Args:
+          x0_hat, x0, future, weights: as of `loss_terms`.
+          batch: of the windows, which says what was before them.
+        """
+        future_hat, last_history = self.normaliser.denormalise(x0_hat), batch.history[:, -1]
         terms = loss_terms(
-            self.skeleton, x0_hat, x0, self.normaliser.denormalise(x0_hat), batch.future, batch.history[:, -1],
-            self.config.loss.ird_form, noise_weights(sigma, self.config) if training else None,
-        )  # fmt: skip
+            self.skeleton, x0_hat, x0, future_hat, future, last_history, self.config.loss.ird_form, weights
+        )
         return {"loss": total_loss(terms, self.config.loss), **terms}
 
     def _disturbed(self, condition: Condition, key) -> Condition:

@@ -25,7 +25,7 @@ from f3amd_lib.training import latent_motion
 from f3amd_lib.training.captioned_models import CaptionedModel, load_captioned_model, save_captioned_model, train_part
 from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
 from f3amd_lib.training.settings import profile_part_recipe
-from f3amd_lib.training.text_models import of_this_training, pooled_captions, text_model_files, text_model_folders
+from f3amd_lib.training.text_models import newest_weights, of_this_training, pooled_captions, text_model_files
 
 KIND = "latent motion model"
 """What a file of this module says that it holds."""
@@ -154,12 +154,7 @@ def find_latent_model(dataset: str, name: str, num_steps: int | None = None) -> 
       ValueError: as `named_model`, or if there is no file, saying how to train it.
     """
     name = named_model(name, num_steps)
-    for folder in text_model_folders(dataset):
-        if (path := folder / f"{name}.safetensors").is_file():
-            return path
-    raise ValueError(
-        f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
-    )
+    return newest_weights(dataset, [[name]], name)
 
 
 def _clips(part: TextMotions, encoder: TextEncoder, before: LatentModel | None, statistics, config):

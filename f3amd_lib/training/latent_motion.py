@@ -5,7 +5,6 @@ Each is a task of `training.optimise`. Settings of the paper and ours stand in `
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -328,9 +327,8 @@ class DistillationTask(TeacherTask):
         if config.adversarial_weight:
             parts["discriminator"] = config.optimiser(config.discriminator_rate, first_moment=0.0)
         if config.alternate:
-            parts = {
-                name: optax.conditionally_mask(part, functools.partial(_is_turn, name)) for name, part in parts.items()
-            }
+            turn = {"discriminator": lambda step: step % 2 == 0, "student": lambda step: step % 2 == 1}
+            parts = {name: optax.conditionally_mask(part, turn[name]) for name, part in parts.items()}
         branch = lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params)
         return optax.partition(parts, branch)
 
@@ -415,7 +413,3 @@ class DistillationTask(TeacherTask):
         teacher = network_with(self.model_config, self.teacher)
         critic = network_with(self.critic_config, heads)
         return critic(teacher.features(state, batch.critic_time, teacher.encode(batch.text)))
-
-
-def _is_turn(player: str, step):
-    return step % 2 == (1 if player == "student" else 0)

@@ -57,11 +57,6 @@ def _mean(values, weights):
     return jnp.mean(values)
 
 
-def _norm(difference):
-    """Euclidean length over the last axis, with a finite gradient at zero."""
-    return jnp.sqrt(jnp.sum(difference * difference, axis=-1) + 1e-12)
-
-
 def loss_terms(
     skeleton: Skeleton, x0_hat, x0, future_hat, future, last_history, ird_form: str = "literal", weights=None
 ) -> dict:
@@ -119,7 +114,8 @@ def loss_terms(
         "joint_velocity": mean_square(step_hat - step),
         "foot": mean_square(step_hat[:, :, toes] * contact[..., None]),
         "floor": _mean(below * below, weights),
-        "ird": _mean(_norm(seam), weights),
+        # With a finite gradient at zero.
+        "ird": _mean(jnp.sqrt(jnp.sum(seam * seam, axis=-1) + 1e-12), weights),
     }
 
 

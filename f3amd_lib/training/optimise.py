@@ -292,8 +292,6 @@ def optimise(
       TrainingDiverged: at the first loss or weight that is not finite; the checkpoint on disk
         is from before.
     """
-    if chunk < 1 or checkpoint_every < 1:
-        raise ValueError("chunk and checkpoint_every must be at least 1")
     task = parallel.replicate(task, mesh)
     if state is not None:
         # The chunk donates its input; what the caller holds must stay alive.

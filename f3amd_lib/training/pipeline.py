@@ -10,13 +10,13 @@ project lies in `f3amd_lib/pretrained/<data set>/` in the same form.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -114,8 +114,7 @@ def prepare(profile: Profile, *, path=None) -> PreparedData:
     return PreparedData(packed_dataset(dataset), profile.window, profile.num_history)
 
 
-@dataclass(frozen=True)
-class ModelFiles:
+class ModelFiles(NamedTuple):
     """Where one model lies.
 
     Attributes:
@@ -456,6 +455,5 @@ def find_model(dataset: str) -> Path:
 def _set_aside(files: ModelFiles) -> None:
     """Rename what lies there to the first free number, so that nothing a user made is lost."""
     name = files.model.name.removesuffix(".safetensors")
-    paths = (*dataclasses.astuple(files), files.history.with_suffix(".json"))
-    if kept := set_aside(paths, name):
+    if kept := set_aside((*files, files.history.with_suffix(".json")), name):
         log.warning("earlier files of %s are kept as %s", name, kept)

@@ -90,8 +90,8 @@ class TextModel(CaptionedModel):
     @property
     def controlled(self) -> dict[str, int]:
         """The joints that its control branch knows, by their names on the command line."""
-        every = controlled_joints(self.skeleton)
-        return {"pelvis": 0} if preset_and_branch(self.name)[1] == PELVIS else every
+        pelvis_alone = preset_and_branch(self.name)[1] == PELVIS
+        return {"pelvis": 0} if pelvis_alone else controlled_joints(self.skeleton)
 
     @property
     def most_frames(self) -> int:
@@ -327,11 +327,6 @@ _AUTOENCODERS = {AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.
 """Recipe of each family of autoencoders."""
 
 
-def _of_meshes(preset: presets.Preset) -> bool:
-    """Say whether a preset's states are of vertices."""
-    return bool(preset.latent) and presets.find_preset(preset.latent).family == MeshAutoencoderConfig.family
-
-
 def is_text_preset(name: str) -> bool:
     """Say whether a preset, with or without a branch, is one that this file trains."""
     return presets.find_preset(preset_and_branch(name)[0]).family in (*_DENOISERS, *_AUTOENCODERS)
@@ -366,7 +361,7 @@ def train_text_model(
     """
     base, branch = preset_and_branch(name)
     preset = presets.find_preset(base)
-    if branch and _of_meshes(preset):
+    if branch and preset.latent and presets.find_preset(preset.latent).family == MeshAutoencoderConfig.family:
         raise ValueError(f"{preset.name} has no control branch: its states are of vertices, not of joints")
     name = preset.name + branch
     data = data.cut(window) if window and window < data.lengths.max() else data
@@ -474,6 +469,25 @@ def text_model_folders(dataset: str) -> list[Path]:
     return [*own, PRETRAINED_DIR / dataset / "text"]
 
 
+def newest_weights(dataset: str, choices: list[list[str]], told: str) -> Path:
+    """Return the weights file of a data set that comes first: by folder, then by choice, of one choice the newest.
+
+    Args:
+      dataset: that models were trained on.
+      choices: names of models, each list as good as the one after it or better.
+      told: the name to train, where there is none of them.
+
+    Raises:
+      ValueError: if there is none, saying how to train it.
+    """
+    for folder in text_model_folders(dataset):
+        for names in choices:
+            if found := [path for name in names if (path := folder / f"{name}.safetensors").is_file()]:
+                return max(found, key=lambda path: path.stat().st_mtime)
+    how = f"f3amd train --preset {told} --data {dataset}"
+    raise ValueError(f"no trained {told} for data set {dataset!r}; train it: {how}")
+
+
 def find_text_model(dataset: str, preset: str | None = None, *, control: bool = False) -> Path:
     """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
 
@@ -485,19 +499,12 @@ def find_text_model(dataset: str, preset: str | None = None, *, control: bool = 
     Raises:
       ValueError: if there is none, saying how to train it.
     """
-    wanted, branch = (None, "") if preset is None else preset_and_branch(preset)
-    wanted = wanted and presets.find_preset(wanted).name
+    wanted, branch = preset_and_branch(preset or DEFAULT_PRESET)
+    wanted = presets.find_preset(wanted).name
     branches = (branch,) if branch else (CONTROL, PELVIS) if control else ("",)
     denoisers = [name for name, known in presets.PRESETS.items() if known.family in _DENOISERS]
-    names = [wanted] if wanted else [name + form for name in denoisers for form in ("", *presets.FORMS)]
-    for folder in text_model_folders(dataset):
-        for branch in branches:
-            if found := [path for name in names if (path := folder / f"{name}{branch}.safetensors").is_file()]:
-                return max(found, key=lambda path: path.stat().st_mtime)
-    name = (wanted or DEFAULT_PRESET) + branches[0]
-    raise ValueError(
-        f"no trained {name} for data set {dataset!r}; train it: f3amd train --preset {name} --data {dataset}"
-    )
+    names = [wanted] if preset else [name + form for name in denoisers for form in ("", *presets.FORMS)]
+    return newest_weights(dataset, [[name + branch for name in names] for branch in branches], wanted + branches[0])
 
 
 DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"
