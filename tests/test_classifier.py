@@ -444,6 +444,16 @@ def test_motion_of_another_body_is_refused(trained):
     refused("here 6 joints", trained.windows_of, np.zeros((60, 6, 3)), SKELETON)
 
 
+def test_windows_of_the_wrong_kind_are_refused(trained):
+    windows = np.zeros((3, WINDOW, NUM_CHANNELS))
+    for wrong in (windows[:, :-1], windows[..., :-1], np.zeros(3)):
+        refused(r"must be finite \[\.\.\., 20, 45\]", trained.features, wrong)
+    windows[2, 0, 0] = np.nan
+    refused("must be finite", trained.predict, windows)
+    positions = synthesize("Neutral", 1.0, 0).positions[: WINDOW - 1]
+    refused("does not fill a window of 20 frames", trained.windows_of, positions, trained.skeleton)
+
+
 def test_unknown_styles_and_references_are_refused(trained):
     assert trained.style_index("Runner") == 1
     refused("unknown style of the classifier 'runer'; did you mean 'Runner'", trained.style_index, "runer")

@@ -166,8 +166,11 @@ def test_drawn_windows_are_windows_of_each_style_each_once():
 # ----------------------------------------------------------------------------------------- styles
 
 
-def test_accuracy_is_the_share_of_right_answers():
+def test_accuracy_and_coverage_need_one_style_a_window():
     assert d.style_accuracy([0, 1, 2, 2], [0, 1, 1, 2]) == 75.0
+    refused("give one of each a window", d.style_accuracy, [0, 1], [0, 1, 1])
+    refused(r"\[S\] on both sides", d.style_coverage, [1, 2], [1, 2, 3])
+    refused(r"\[S\] on both sides", d.style_coverage, [1, 2], [0, 0])
 
 
 def test_coverage_of_half_the_styles_is_half():
@@ -239,7 +242,7 @@ def test_diversity_needs_two_whole_samples():
     refused("num_seeds, T, J, 3", d.diversity, samples()[0])
     broken = samples()
     broken[2, 5, 1, 0] = np.nan
-    refused("needs finite", d.diversity, broken)
+    refused("finite positions", d.diversity, broken)
 
 
 # -------------------------------------------------------------------------------------- intervals
@@ -300,7 +303,7 @@ def test_draws_of_a_size_do_not_depend_on_the_other_sizes():
 
 def test_sizes_that_a_cloud_does_not_hold_are_refused():
     refused("61 windows .* are wanted, of 60", d.settling_curve, cloud(60), cloud(80), [61])
-    refused("2 windows or more", d.settling_curve, cloud(60), cloud(80), [1])
+    refused("at least 2", d.settling_curve, cloud(60), cloud(80), [1])
 
 
 # ----------------------------------------------------------------------------------------- errors
@@ -314,7 +317,7 @@ def test_clouds_that_are_none_are_refused(distance):
     broken[7, 3] = np.nan
     refused("features is not finite", distance, broken, good)
     refused("reference is not finite", distance, good, broken)
-    refused("need 2 windows or more", distance, good[:1], good)
-    refused("reference must be .* no length 0", distance, good, good[:0])
-    refused(r"features must be \[window, feature\]", distance, good[0], good)
-    refused(r"\(50, 6\), \(50, 5\).* one classifier's", distance, good, good[:, :5])
+    refused("features holds 1 of at least 2 windows", distance, good[:1], good)
+    refused("reference holds 0 of", distance, good, good[:0])
+    refused(r"features must be \[N, D\]", distance, good[0], good)
+    refused("6 dimensions and the reference 5: .* same classifier", distance, good, good[:, :5])

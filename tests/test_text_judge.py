@@ -113,5 +113,10 @@ def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):
     other.identity = "another"
     with pytest.raises(ValueError, match="reads captions of one vector a word"):
         text_judge.judge_motions(judge, other, real, {}, repeats=1, bar=0.0)
+    short = {"short": lambda repeat: ([real.clip(0)], ["a walk"])}
+    with pytest.raises(ValueError, match="short: 1 motions, 1 captions for 8 clips"):
+        text_judge.judge_motions(judge, OneVectorAWord(), real, short, group=4, repeats=1, bar=0.0)
+    with pytest.raises(ValueError, match="has 3 frames; the judge needs 4"):
+        judge.embed_motions([real.clip(0)[:3]])
     with pytest.raises(ValueError, match=r"positions must be \[frame, 23, 3\]"):
         judge.embed_motions([real.clip(0)[:, 1:]])

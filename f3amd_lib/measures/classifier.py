@@ -222,7 +222,7 @@ class StyleClassifier:
           [..., T // window, window, 45], metres.
 
         Raises:
-          ValueError: for another skeleton, or numbers not finite.
+          ValueError: for another skeleton, motion that is too short, or numbers not finite.
         """
         if skeleton != self.skeleton:
             raise ValueError(
@@ -230,12 +230,17 @@ class StyleClassifier:
                 f"{self.record['dataset']!r}, features of another skeleton (here {skeleton.num_joints} joints: "
                 "other names, parents or bone lengths) do not compare; train one on its data"
             )
-        return side_by_side(classifier_frames(positions, skeleton), self.config.window)
+        windows = side_by_side(classifier_frames(positions, skeleton), self.config.window)
+        if windows.size == 0:
+            raise ValueError(f"motion {np.shape(positions)} does not fill a window of {self.config.window} frames")
+        return windows
 
     def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
         """Return what `features` and `predict` return, with one run of the network for both."""
         windows = np.asarray(windows, np.float32)
-        several, one = windows.shape[:-2], windows.shape[-2:]
+        several, one = windows.shape[:-2], (self.config.window, NUM_CHANNELS)
+        if windows.shape[-2:] != one or not np.isfinite(windows).all():
+            raise ValueError(f"windows must be finite [..., {one[0]}, {one[1]}], got {windows.shape}: see `windows_of`")
         features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *one))
         return features.reshape(*several, -1), np.argmax(scores, axis=-1).reshape(several)
 
@@ -247,6 +252,9 @@ class StyleClassifier:
 
         Returns:
           [..., feature_width], float32, without unit.
+
+        Raises:
+          ValueError: for another shape, or numbers not finite.
         """
         return self.features_and_classes(windows)[0]
 
@@ -258,6 +266,9 @@ class StyleClassifier:
 
         Returns:
           Indices into `styles`, [...].
+
+        Raises:
+          ValueError: for another shape, or numbers not finite.
         """
         return self.features_and_classes(windows)[1]
 

@@ -18,19 +18,29 @@ import pandas as pd
 from scipy.spatial.distance import cdist
 from scipy.special import stdtrit
 
-from f3amd_lib.ground.arrays import finite_array
-
 _MOST_PIVOTS = 10_000_000  # of the network simplex; POT's own 100,000 stops short of 2,000 windows
 
 
-def _two_clouds(features, reference) -> list[np.ndarray]:
-    """Return two feature clouds as float64, or say what is wrong with them."""
-    given = {"features": features, "reference": reference}
-    clouds = [finite_array(name, cloud, ("window", "feature")) for name, cloud in given.items()]
-    shapes = [cloud.shape for cloud in clouds]
-    if min(shapes)[0] < 2 or shapes[0][1] != shapes[1][1]:
-        raise ValueError(f"clouds {shapes} need 2 windows or more (pool styles) and one classifier's features")
-    return clouds
+def _cloud(features, what: str) -> np.ndarray:
+    """Return a feature cloud as float64, or say what is wrong with it."""
+    features = np.asarray(features, dtype=np.float64)
+    if features.ndim != 2 or features.shape[1] == 0:
+        raise ValueError(f"{what} must be [N, D], one row of features a window, got {features.shape}")
+    if len(features) < 2:
+        raise ValueError(f"{what} holds {len(features)} of at least 2 windows: generate more, or pool styles")
+    if not np.all(np.isfinite(features)):
+        raise ValueError(f"{what} is not finite at [window, feature] {np.argwhere(~np.isfinite(features))[0]}")
+    return features
+
+
+def _two_clouds(features, reference) -> tuple[np.ndarray, np.ndarray]:
+    features, reference = _cloud(features, "features"), _cloud(reference, "reference")
+    if features.shape[1] != reference.shape[1]:
+        raise ValueError(
+            f"features have {features.shape[1]} dimensions and the reference "
+            f"{reference.shape[1]}: both must come from the same classifier"
+        )
+    return features, reference
 
 
 def draw_per_style(clouds: Mapping, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -143,7 +153,10 @@ def earth_movers_distance(features, reference) -> float:
 
     features, reference = _two_clouds(features, reference)
     if len(features) != len(reference):
-        raise ValueError(f"{len(features)} windows against {len(reference)}: draw as many (see `draw_per_style`)")
+        raise ValueError(
+            f"{len(features)} windows against {len(reference)}: the earth mover's distance needs "
+            "as many on both sides (see `draw_per_style`)"
+        )
     weights = np.full(len(features), 1.0 / len(features))
     cost, log = ot.emd2(weights, weights, cdist(features, reference), numItermax=_MOST_PIVOTS, log=True)
     if log["warning"] is not None:
@@ -170,10 +183,17 @@ def style_coverage(generated_counts, target_counts) -> float:
     Returns:
       Percent, 0 to 100.
 
+    Raises:
+      ValueError: for unlike lengths, or no wanted window at all.
+
     Source: paper section 4.4 (Style Coverage). Our reading: counts are of 60-frame windows, and
     the wanted ones are those of the rollout's own length.
     """
-    return float(100.0 * np.minimum(generated_counts, target_counts).sum() / np.sum(target_counts))
+    generated = np.asarray(generated_counts, np.float64)
+    target = np.asarray(target_counts, np.float64)
+    if generated.shape != target.shape or not target.sum() > 0:
+        raise ValueError(f"counts must be [S] on both sides, some wanted, got {generated} and {target}")
+    return float(100.0 * np.minimum(generated, target).sum() / target.sum())
 
 
 def style_accuracy(predicted, asked) -> float:
@@ -188,10 +208,16 @@ def style_accuracy(predicted, asked) -> float:
       Percent, 0 to 100. It cannot tell more than the classifier: set its accuracy on held-out real
       windows beside it.
 
+    Raises:
+      ValueError: for unlike lengths, or no window.
+
     Source: CAMDM's paper; its released code stores the predictions, but holds no script for the
     figure.
     """
-    return float(100.0 * np.mean(np.equal(predicted, asked)))
+    predicted, asked = np.asarray(predicted), np.asarray(asked)
+    if predicted.shape != asked.shape or not asked.size:
+        raise ValueError(f"{predicted.shape} predicted styles and {asked.shape} asked: give one of each a window")
+    return float(100.0 * np.mean(predicted == asked))
 
 
 # -------------------------------------------------------------------------------------- diversity
@@ -219,8 +245,12 @@ def diversity_variance(positions) -> float:
     fixes.
     """
     positions = np.asarray(positions, dtype=np.float64)
-    if positions.ndim not in (4, 5) or positions.shape[-4] < 2 or not np.isfinite(positions).all():
-        raise ValueError(f"diversity needs finite [..., num_seeds, T, J, 3] of at least 2 seeds, got {positions.shape}")
+    if positions.ndim not in (4, 5) or positions.shape[-1] != 3 or 0 in positions.shape:
+        raise ValueError(
+            f"positions must be [num_seeds, T, J, 3] or [num_conditions, num_seeds, T, J, 3], got {positions.shape}"
+        )
+    if positions.shape[-4] < 2 or not np.all(np.isfinite(positions)):
+        raise ValueError("diversity needs finite positions of samples of at least 2 seeds")
     relative = positions - positions[..., :1, :]
     return float(relative.var(axis=-4, ddof=1).sum(axis=-1).mean())
 
@@ -266,8 +296,10 @@ def mean_and_interval(values) -> dict:
         raise ValueError(f"values must be [n], finite or NaN, got an array of {values.shape}")
     values = values[~np.isnan(values)]
     count = len(values)
-    mean = float(values.mean()) if count else np.nan
-    half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(count) if count > 1 else np.nan
+    mean = float(values.mean()) if count else float("nan")
+    half = float("nan")
+    if count > 1:
+        half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(count)
     return {"value": mean, "low": mean - half, "high": mean + half, "repeats": count}
 
 

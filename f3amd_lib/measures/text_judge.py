@@ -64,8 +64,11 @@ class TextJudge:
             start first, so that only the motion counts.
 
         Raises:
-          ValueError: for another number of joints, or numbers not finite.
+          ValueError: for another number of joints, fewer than 4 frames, or numbers not finite.
         """
+        for number, motion in enumerate(motions):
+            if len(motion) < text_motions.UNIT:
+                raise ValueError(f"motion {number} has {len(motion)} frames; the judge needs {text_motions.UNIT}")
         canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
         features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
         return in_batches(
@@ -235,7 +238,8 @@ def judge_motions(
       Columns system, metric, unit, better, value, low, high, repeats; "real" first.
 
     Raises:
-      ValueError: if the judge reads another encoder's vectors, or does not find real motion (`bar`).
+      ValueError: if the judge reads another encoder's vectors, does not find real motion (`bar`), or
+        a system gives another number of motions.
     """
     if encoder.identity != judge.text_encoder:
         raise ValueError(f"the judge reads captions of {judge.text_encoder}, got {encoder.identity}")
@@ -249,6 +253,8 @@ def judge_motions(
         made = {"real": (embedded, own)}
         for name, system in systems.items():
             motions, told = system(repeat)
+            if not len(motions) == len(told) == real.num_clips:
+                raise ValueError(f"{name}: {len(motions)} motions, {len(told)} captions for {real.num_clips} clips")
             made[name] = (judge.embed_motions(motions), judge.embed_texts(embed_captions(list(told), encoder)))
         for name, (motion, text) in made.items():
             # The same draw for every system.

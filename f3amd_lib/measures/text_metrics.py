@@ -55,6 +55,8 @@ def r_precision(text, motion, most: int = 3) -> np.ndarray:
       a judge that sees nothing scores 0.
     """
     text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
+    if text.shape != motion.shape or text.ndim != 3:
+        raise ValueError(f"texts {text.shape} and motions {motion.shape} must both be [groups, size, D]")
     distance = np.linalg.norm(text[:, :, None] - motion[:, None], axis=-1)
     own = np.diagonal(distance, axis1=1, axis2=2)
     rank = np.sum(distance <= own[..., None], axis=-1) - 1
@@ -77,12 +79,14 @@ def embedding_diversity(motion, generator: np.random.Generator, count: int = 300
     """Mean distance between two draws of motions without replacement; near that of real motion is good.
 
     Args:
-      motion: [N, D], at least 2.
+      motion: [N, D].
       generator: what draws.
       count: pairs; half of N where that is less.
     """
     motion = np.asarray(motion, np.float64)
     count = min(count, len(motion) // 2)
+    if count < 1:
+        raise ValueError(f"diversity needs at least 2 motions, got {len(motion)}")
     order = generator.permutation(len(motion))
     return float(np.linalg.norm(motion[order[:count]] - motion[order[count : 2 * count]], axis=-1).mean())
 
@@ -91,11 +95,15 @@ def multimodality(motion, generator: np.random.Generator, count: int = 10) -> fl
     """Mean distance between motions of one caption.
 
     Args:
-      motion: samples of each caption, at least 2, [captions, samples, D].
+      motion: samples of each caption, [captions, samples, D].
       generator: what draws.
       count: pairs of each caption.
     """
     motion = np.asarray(motion, np.float64)
+    if motion.ndim != 3 or motion.shape[1] < 2:
+        raise ValueError(
+            f"multimodality needs at least 2 samples a caption, [captions, samples, D]; got {motion.shape}"
+        )
     captions, samples, _ = motion.shape
     first = generator.integers(0, samples, (captions, count))
     second = (first + generator.integers(1, samples, (captions, count))) % samples
@@ -138,6 +146,8 @@ def foot_skating_ratio(skeleton: Skeleton, positions, fps: float = 20.0) -> floa
     Source: ACMDM's released evaluation, on the clip's true length.
     """
     toes = np.asarray(positions, np.float64)[:, list(skeleton.toes)]
+    if len(toes) < 2:
+        raise ValueError("foot skating needs at least 2 frames")
     low = toes[..., 1] < 0.05
     speed = np.linalg.norm(np.diff(toes[..., ::2], axis=0), axis=-1) * fps
     window = min(5, len(speed))
@@ -158,7 +168,15 @@ def control_errors(positions, wanted, given, threshold: float = 0.5) -> dict[str
       control_trajectory_error: share of clips with any point missed;
       control_location_error: share of points missed;
       control_average_error: mean distance at the points, metres.
+
+    Raises:
+      ValueError: for unlike shapes, or a clip without a point.
     """
+    positions, wanted, given = np.asarray(positions), np.asarray(wanted), np.asarray(given, bool)
+    if positions.shape != wanted.shape or positions.shape[:-1] != given.shape or positions.ndim != 4:
+        raise ValueError(f"positions {positions.shape}, wanted {wanted.shape} and given {given.shape} do not agree")
+    if not given.any(axis=(1, 2)).all():
+        raise ValueError(f"clip {int(np.argmin(given.any(axis=(1, 2))))} has no controlled point")
     distance = np.linalg.norm(positions - wanted, axis=-1)
     missed = (distance > threshold) & given
     return {

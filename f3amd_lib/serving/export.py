@@ -273,8 +273,10 @@ def save_artefact(
     with whole_folder(folder) as temporary:
         for file, content in files.items():
             (temporary / file).write_bytes(content)
-        if folder.exists():  # an artefact, see `_check_free`
-            shutil.rmtree(folder)
+        earlier = temporary.with_suffix(".earlier.part")
+        if folder.exists():  # an artefact, see `_check_free`; kept until the new one has its place
+            folder.rename(earlier)
+    shutil.rmtree(earlier, ignore_errors=True)
     return folder
 
 
