@@ -83,7 +83,7 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     for name in ("ACMDM-S-PS22-raw-n3", "MotionPCM-M1-small", "MotionPCM-VAE-small"):  # the newest comes last
         (tmp_path / "text" / f"{name}.safetensors").touch()
     assert text_models.find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
-    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
+    monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
     for asked in ("motionpcm", "MotionPCM-M1-small"):
         assert latent_models.find_latent_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
     with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
@@ -108,7 +108,7 @@ SHIPPED = PRETRAINED_DIR / "bandai" / "text"
 @pytest.mark.slow
 def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_guidance(tmp_path, monkeypatch):
     """`f3amd text ... --model motionpcm --steps 1`: the caption alone to one jump from level 999 to 0."""
-    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
+    monkeypatch.setattr(text_models, "text_model_folders", lambda _: [SHIPPED])
     made, asked = [], []
 
     def written(targets, scene, trained, *, overwrite):
@@ -154,7 +154,7 @@ def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, ca
     ("2", "MotionPCM-M1-small", "MotionPCM-M1-small takes 1 step, got 2"),
 ])  # fmt: skip
 def test_steps_that_no_student_takes_are_refused(steps, model, told, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(latent_models, "text_model_folders", lambda _: [SHIPPED])
+    monkeypatch.setattr(text_models, "text_model_folders", lambda _: [SHIPPED])
     words = ["text", "a person walks forward", "--model", model, "--steps", steps, "--out", str(tmp_path / "out")]
     assert command_line.main(words) == 2
     assert told in capsys.readouterr().err and not (tmp_path / "out").exists()

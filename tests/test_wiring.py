@@ -28,12 +28,13 @@ from builders import (
 from builders import wandering_motion as wandering
 
 from f3amd_lib.data import windows as windows_module
-from f3amd_lib.data.features import Normaliser
+from f3amd_lib.data.features import Normaliser, world_frames
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.experiments import learning_curves, real_clips
 from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.motion.root_paths import named_path
+from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.training import denoising_task as task_module
 from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, advance, held_out_terms, initial_state
@@ -316,7 +317,7 @@ def test_a_facing_that_flips_and_comes_back_is_smoothed_the_short_way():
     matrix[:, 2, 0], matrix[:, 2, 2] = -sine, cosine
     rotations = np.broadcast_to(np.eye(3), (60, SKELETON.num_joints, 3, 3)).copy()
     rotations[:, 0] = matrix
-    world = windows_module.world_frames(motion.replace(rotations=rotations))
+    world = world_frames(motion.replace(rotations=rotations))
     raw, *smoothed = windows_module._path_variants(SKELETON, world)
     np.testing.assert_allclose(raw[:, 2:], np.stack([sine, cosine], axis=1), atol=1e-9)
     for variant in smoothed:
@@ -329,8 +330,6 @@ def test_a_steady_turn_is_not_changed_by_smoothing():
     motion = wandering(60, 0)
     angle = 0.07 * np.arange(60)
     rotations = np.broadcast_to(np.eye(3), (60, SKELETON.num_joints, 3, 3)).copy()
-    rotations[:, 0] = windows_module.turn_frames.__globals__["matrix_from_yaw"](angle)
-    for variant in windows_module._path_variants(
-        SKELETON, windows_module.world_frames(motion.replace(rotations=rotations))
-    ):
+    rotations[:, 0] = matrix_from_yaw(angle)
+    for variant in windows_module._path_variants(SKELETON, world_frames(motion.replace(rotations=rotations))):
         np.testing.assert_allclose(np.unwrap(np.arctan2(variant[:, 2], variant[:, 3])), angle, atol=1e-6)
