@@ -251,7 +251,11 @@ def test_what_notebook_15_says_of_length_follows_from_the_record():
     both = of(second).loc[200 * thousand]
     assert (round(both["held_out_loss"], 3), round(both["x0_error_ratio"], 2), round(both["FID"])) == (0.181, 0.17, 32)
     other = of("residual-prior+history-input-seed0").loc[200 * thousand]
-    assert (round(other["held_out_loss"], 3), round(other["x0_error_ratio"], 2), round(other["FID"])) == (0.232, 0.37, 72)
+    assert (round(other["held_out_loss"], 3), round(other["x0_error_ratio"], 2), round(other["FID"])) == (
+        0.232,
+        0.37,
+        72,
+    )
     assert {*eyes("residual-prior+history-input-seed0")} == {*eyes("seed0")}
     assert eyes(second).iloc[0] == eyes("higher-learning-rate-seed1").iloc[0]
     # CAMDM after a sixteenth of the windows, so in a third of the time: ahead, but for postures and the seam.
