@@ -446,7 +446,7 @@ def test_motion_of_another_body_is_refused(trained):
 
 def test_windows_of_the_wrong_kind_are_refused(trained):
     windows = np.zeros((3, WINDOW, NUM_CHANNELS))
-    for wrong in (windows[:, :-1], windows[..., :-1], np.zeros(3)):
+    for wrong in (windows[:, :-1], windows[..., :-1], windows[:0], np.zeros(3)):
         refused(r"must be finite \[\.\.\., 20, 45\]", trained.features, wrong)
     windows[2, 0, 0] = np.nan
     refused("must be finite", trained.predict, windows)

@@ -155,11 +155,17 @@ def classify_windows(
       styles: what each was asked to look like.
 
     Raises:
-      ValueError: for an unknown style.
+      ValueError: if no motion is long enough, or for an unknown style.
     """
-    windows = [classifier.windows_of(motion.positions, motion.skeleton) for motion in motions]
-    features, predicted = classifier.features_and_classes(np.concatenate(windows))
-    source = np.repeat(np.arange(len(windows)), [len(cut) for cut in windows])
+    windows = {
+        number: classifier.windows_of(motion.positions, motion.skeleton)
+        for number, motion in enumerate(motions)
+        if motion.num_frames >= classifier.config.window
+    }
+    if not windows:
+        raise ValueError(f"no motion has the {classifier.config.window} frames that the style classifier looks at")
+    features, predicted = classifier.features_and_classes(np.concatenate(list(windows.values())))
+    source = np.repeat(list(windows), [len(cut) for cut in windows.values()])
     asked = np.array([classifier.style_index(style) for style in styles])
     return ClassifiedWindows(features, predicted, asked[source], source)
 

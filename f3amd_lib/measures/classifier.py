@@ -239,7 +239,7 @@ class StyleClassifier:
         """Return what `features` and `predict` return, with one run of the network for both."""
         windows = np.asarray(windows, np.float32)
         several, one = windows.shape[:-2], (self.config.window, NUM_CHANNELS)
-        if windows.shape[-2:] != one or not np.isfinite(windows).all():
+        if windows.shape[-2:] != one or windows.size == 0 or not np.isfinite(windows).all():
             raise ValueError(f"windows must be finite [..., {one[0]}, {one[1]}], got {windows.shape}: see `windows_of`")
         features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *one))
         return features.reshape(*several, -1), np.argmax(scores, axis=-1).reshape(several)
