@@ -236,6 +236,15 @@ def test_seeds_become_means_with_intervals():
     assert np.isnan(single["low"][0]) and single["value"][0] == 1.0
 
 
+def test_a_clip_shorter_than_the_classifiers_window_is_left_out(classifier):
+    long, short = synthesize(STYLES[0], 2.0, 0), synthesize(STYLES[1], 2.0, 0).slice(0, classifier.config.window - 1)
+    seen = module.classify_windows(classifier, [short, long, short], [STYLES[1], STYLES[0], STYLES[1]])
+    alone = module.classify_windows(classifier, [long], STYLES[:1])
+    assert set(seen.source) == {1} and len(seen.source) == long.num_frames // classifier.config.window
+    np.testing.assert_array_equal(seen.features, alone.features)
+    refused("no motion has the 20 frames", module.classify_windows, classifier, [short], STYLES[1:2])
+
+
 def test_a_classifier_that_cannot_tell_styles_gives_no_fid(generator, packed, prepared, classifier):
     blind = dataclasses.replace(classifier, held_out_accuracy={style: 0.5 for style in STYLES})
     refused("bar", measure_model, generator, packed, blind, SMALL, prepared.windows("validation"))
