@@ -263,6 +263,8 @@ def test_wrong_shapes_are_refused_by_name():
     module, condition = torch_camdm.torch_camdm(network), make_condition()
     given = torch_camdm.torch_condition(condition)
     run = torch_camdm.torch_round(module, SIGMAS)
+    for name in ("noise", "step_noise"):
+        refused(f"^{name} must have shape", run, given, **{name: torch.zeros((2, WINDOW, CHANNELS + 1))})
     refused("condition path must have shape", run, given._replace(path=given.path[..., :7]))
 
 

@@ -294,7 +294,7 @@ def torch_round(
       `run(condition, generator=None, *, noise=None, step_noise=None) -> [B, T, C]`. The condition
       is one of `torch_condition`; the generator is PyTorch's. In place of drawn numbers `noise`
       [B, T, C] starts the walk and `step_noise` [N, B, T, C] is added by DDPM's steps. It raises
-      ValueError for a condition that does not fit, and RuntimeError where `torch.compile` does not work.
+      ValueError for shapes that do not fit, and RuntimeError where `torch.compile` does not work.
 
     Raises:
       ImportError: if ONNX Runtime is asked for and not installed.
@@ -309,6 +309,9 @@ def torch_round(
     @torch.inference_mode()
     def run(condition, generator=None, *, noise=None, step_noise=None):
         shape = (len(condition.history), config.window, config.channels)
+        for name, given, wanted in (("noise", noise, shape), ("step_noise", step_noise, (len(scales), *shape))):
+            if given is not None and given.shape != wanted:
+                raise ValueError(f"{name} must have shape {wanted}, got {tuple(given.shape)}")
         draw = lambda: torch.randn(shape, generator=generator, device=device)
         context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features).to(device))
         x_noisy = sigmas[0] * (draw() if noise is None else noise)
