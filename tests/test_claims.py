@@ -803,8 +803,8 @@ def test_the_gate_asks_what_a_claim_needs(tmp_path):
     assert judge(keep(tmp_path / "time", CASES["E2"][0]), "E2").verdict == HOLDS
 
 
-def snapshots(root, rows):
-    """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each.
+def snapshots(root, rows, claim_id="Q10"):
+    """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each; judge.
 
     A worth may be a pair, of what is seen through the classifier and of the others.
     """
@@ -812,6 +812,7 @@ def snapshots(root, rows):
     table = [
         {
             "run": f"{model}-{recipe}-{seed}", "model": model, "windows": windows, "recipe": recipe, "seed": seed,
+            "epochs": windows / 100_000,
             "classifier": classifier, "window_frames": 32, "steps": 8, "metric": metric, "unit": unit,
             "value": np.broadcast_to(worth, 2)[int(metric not in through)],
         }
@@ -821,7 +822,7 @@ def snapshots(root, rows):
     record = {"dataset": "bandai", "profile": "laptop", "seed": 0, "device_platform": "cpu", "cores": 2}
     write_table(root / "bandai" / "laptop" / "records" / "campaign.csv", pd.DataFrame(table), record)
     evidence = [recorded_evidence(root, "bandai", "laptop"), *snapshot_evidence(root, "bandai", "laptop")]
-    return claims.judge_claim(claims.load_claims("f3amd")["Q10"], {"bandai": evidence})
+    return claims.judge_claim(claims.load_claims("f3amd")[claim_id], {"bandai": evidence})
 
 
 def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_path):
@@ -853,6 +854,36 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert whole.ours[0].figure == "alike in 9 of 9" and "classifier one" in str(whole.ours[0].sources[0])
     halves = [*alike[:2], *((model, 200_000, "paper", 0, "other", 1.0) for model in models[2:])]
     assert snapshots(tmp_path / "halves", halves).verdict == UNMEASURED
+
+
+def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
+    """E13 asks in which epoch a network comes close to its best."""
+    lengths = (100_000, 200_000, 400_000, 800_000)
+
+    def curve(model, worths, recipe="paper", seed=0, classifier="one"):
+        """What the classifier sees stays; the other metrics are better when they are lower."""
+        return [
+            (model, length, recipe, seed, classifier, (1.0, worth))
+            for length, worth in zip(lengths, worths, strict=True)
+        ]
+
+    soon, late, falling = (9.0, 1.0, 1.0, 1.0), (9.0, 5.0, 1.0, 1.0), (9.0, 5.0, 3.0, 1.0)
+    judged = lambda name, *curves: snapshots(tmp_path / name, sum(curves, []), "E13")
+    fast, slow = curve(FNO, soon), curve(CAMDM, late)
+    holds = judged("holds", fast, slow)
+    assert holds.verdict == HOLDS and "foot_sliding 2 against 4" in holds.ours[0].figure
+    assert judged("fails", curve(FNO, late), curve(CAMDM, soon)).verdict == FAILS
+    unfinished = judged("falling", fast, curve(CAMDM, falling))
+    assert unfinished.verdict == UNMEASURED and "still getting better at the last epoch, 8" in unfinished.ours[0].figure
+    # Another recipe, a single length, or a curve that another classifier saw is no curve beside this one.
+    for name, other in {
+        "recipe": curve(CAMDM, late, recipe="wide-decoder"),
+        "single": slow[:1],
+        "classifier": curve(CAMDM, late, classifier="another"),
+    }.items():
+        assert "quality_by_epoch.csv has no " in judged(name, fast, other).ours[0].figure, name
+    # Of two seeds the one with more snapshots tells.
+    assert judged("seeds", fast, slow, curve(FNO, late, seed=1)[:2]).verdict == HOLDS
 
 
 @pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])

@@ -474,12 +474,14 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     Returns:
       Evidence of `quality` for each number of windows and each style classifier, one that saw more networks first:
       networks by the paper's text alone, means over their seeds; of what needs no classifier, over all their seeds.
+      Then, for each classifier, evidence of `quality_by_epoch`: of each network the run with most snapshots.
     """
     path = Path(root) / dataset / profile / "records" / "campaign.csv"
     if not path.exists():
         return []
     table, record = read_table(path)
-    table = table[(table["recipe"] == "paper") & (table["steps"] > 0)].fillna({"unit": ""})
+    table = table[table["recipe"] == "paper"].fillna({"unit": ""})
+    every, table = table, table[table["steps"] > 0]
 
     def evidence(windows: int, classifier: str, rows: pd.DataFrame) -> Evidence:
         networks = rows[["model", "window_frames"]].drop_duplicates()
@@ -502,7 +504,26 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         rows = table[(table["windows"] == windows) & table["model"].isin(seen["model"])]
         rows = rows[~by_eyes[rows.index] | (rows["classifier"] == classifier)]
         found.append((windows, seen["model"].nunique(), evidence(windows, classifier, rows)))
-    return [one for *_, one in sorted(found, key=lambda each: each[:2], reverse=True)]
+    where = path.relative_to(root).as_posix()
+    curves = [_snapshot_curves(rows, record, where) for _, rows in every.groupby("classifier")]
+    return [one for *_, one in sorted(found, key=lambda each: each[:2], reverse=True)] + curves
+
+
+def _snapshot_curves(rows: pd.DataFrame, record: dict, where: str) -> Evidence:
+    """Return the learning curves among rows of the long queue that one classifier saw."""
+    rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
+    rows = rows[rows["steps"].isin([0, 8])]  # the loss has no steps
+    lengths = rows.groupby(["model", "run"])["windows"].nunique()
+    longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
+    curves = rows[rows["run"].isin(longest)].rename(columns={"epochs": "epoch"})
+    curves = curves[[*SCHEMAS["quality_by_epoch"], "value"]]
+
+    def load(name: str):
+        if name != "quality_by_epoch" or curves.empty:
+            raise NoTable(f"no {name}.csv of them")
+        return _checked(name, curves, where), record, where
+
+    return Evidence("jax", load)
 
 
 @functools.cache
