@@ -251,6 +251,18 @@ def test_a_classifier_that_cannot_tell_styles_gives_no_fid(generator, packed, pr
     refused("bar", measure_real, packed, blind, SMALL, window=32)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"styles": ()}, "at least one style"),
+        ({"num_seeds": 0}, "num_seeds must be at least 1"),
+        ({"styles": STYLES[:1], "windows_per_style": 1}, "windows_per_style must be at least 2"),
+    ],
+)
+def test_impossible_protocols_are_refused(changes, message):
+    refused(message, dataclasses.replace, SMALL, **changes)
+
+
 def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
     many = dataclasses.replace(SMALL, windows_per_style=1000)
     refused("1000 windows of style", measure_real, packed, classifier, many, window=32)

@@ -119,6 +119,7 @@ def test_the_source_of_every_shown_style_walks(style):
     free = synthesize(style, seconds=12.0, seed=5)
     table = walking.check_walks({style: along}, {style: along}, WINDOW)
     assert table["holds"].all()
+    refused("no source motion of style", walking.check_walks, {style: along}, {"another": along}, WINDOW)
     rates = [walking.stepping_rate(m.positions, m.skeleton) for m in (along, free)]
     assert rates[0] == pytest.approx(rates[1], rel=0.35)  # free clips stop and turn
 

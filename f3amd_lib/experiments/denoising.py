@@ -29,9 +29,18 @@ WINDOWS = 512
 """Held-out windows that are looked at, spread evenly."""
 
 
+def held_out_batch(windows: WindowSet, trained: TrainedModel, num_samples: int = WINDOWS) -> Batch:
+    """Return windows spread evenly over a held-out set; ValueError for windows of other sizes than the model's."""
+    config = trained.config
+    if (windows.window, windows.num_history) != (config.window, config.num_history):
+        sizes = f"windows are of {windows.num_history} + {windows.window} frames"
+        raise ValueError(f"{sizes}, but {trained.name} takes {config.num_history} + {config.window}")
+    return spread_windows(windows, num_samples)
+
+
 def held_out_condition(windows: WindowSet, trained: TrainedModel, num_conditions: int = 32):
     """Return the conditions of windows spread evenly over a held-out set, in network units."""
-    return network_inputs(spread_windows(windows, num_conditions), trained.normaliser)[1]
+    return network_inputs(held_out_batch(windows, trained, num_conditions), trained.normaliser)[1]
 
 
 def root_mean_square(squares, scale: float = CM) -> dict:
@@ -62,7 +71,7 @@ def x0_error_by_sigma(trained: TrainedModel, windows: WindowSet, sigmas, *, seed
       the error of the noisy input itself, which is sigma. Where x0_error does not fall below its
       value at high sigma although sigma does, the network does not use its input.
     """
-    batch = spread_windows(windows, WINDOWS)
+    batch = held_out_batch(windows, trained)
     x0, condition = network_inputs(batch, trained.normaliser)
     denoise = trained.denoiser(condition)
     noise, rows = jax.random.normal(jax.random.key(seed), x0.shape), []
@@ -112,7 +121,7 @@ def window_quality(generator: MotionGenerator, windows: WindowSet, *, seed: int 
       mean joint step from the last history frame to the first of the window, and its real value.
     """
     trained = generator.trained
-    batch = spread_windows(windows, WINDOWS)
+    batch = held_out_batch(windows, trained)
     _, condition = network_inputs(batch, trained.normaliser)
     x0_hat = generator.sample(jax.random.key(seed), condition)
     predicted = trained.joint_positions(x0_hat)

@@ -73,6 +73,16 @@ class Protocol:
     windows_per_style: int = 12
     path_seed: int = 0
 
+    def __post_init__(self):
+        # What is scored is spread over styles and seeds; fewer would leave intervals and distances without meaning.
+        limits = {"num_seeds": 1, "num_diversity_seeds": 2}
+        limits["windows_per_style"] = 1 if len(self.styles) > 1 else 2
+        if not self.styles:
+            raise ValueError("a protocol needs at least one style")
+        for name, least in limits.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
 
 def evaluation_paths(packed: PackedMotion, styles: Sequence[str], num_frames: int, *, seed: int = 0) -> list[RootPath]:
     """Make the path that each style walks: one complex path, at the usual pace of the style.

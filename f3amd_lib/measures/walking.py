@@ -290,6 +290,8 @@ def check_walks(
     """
     rows = []
     for style, motion in walks.items():
+        if style not in sources:
+            raise ValueError(f"no source motion of style {style!r} to hold the walk against")
         floor = float(floors.get(style, 0.0))
         figures, source = walking_figures(motion, window, floor), walking_figures(sources[style], window, floor)
         for name, (wanted, holds) in CHECKS.items():
