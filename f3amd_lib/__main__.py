@@ -4,6 +4,7 @@ A function a command: its parameters are the options, its docstring is their hel
 imported inside, so that `f3amd --help` is quick.
 """
 
+import contextlib
 import functools
 import importlib.util
 import logging
@@ -19,8 +20,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction
 
-from f3amd_lib.ground.files import locked
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.files import locked, whole_folder
+from f3amd_lib.ground.names import check_known, checked_seed
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 
 log = logging.getLogger("f3amd")
@@ -201,10 +202,13 @@ def train(
 
     if teacher is not None and not (preset and all(name.startswith(("MotionPCM", "MotionLCM")) for name in preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
-    if any(name == "judge" or "ACMDM" in name or name.startswith(("MotionPCM", "MotionLCM")) for name in preset):
-        return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
     together = (coordinator, processes, process)
     named = any(value is not None for value in together)
+    if any(name == "judge" or "ACMDM" in name or name.startswith(("MotionPCM", "MotionLCM")) for name in preset):
+        if all_devices or cluster or named:
+            what = "--all-devices, --processes, --process, --coordinator and --cluster"
+            raise ValueError(f"models of captioned motion train on one device: leave {what} out")
+        return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
     if cluster and named:
         raise ValueError("--cluster finds the processes itself: leave the three others out")
     if cluster or named:
@@ -359,6 +363,7 @@ def text(
 
     captions = [caption, *then]
     text_encoders.check_captions(captions)
+    seed = checked_seed(seed)
     captioned_motion.check_solver(steps, guidance)
     if weights is None:
         latent = model is not None and (model.lower() == "motionpcm" or latent_models.is_latent_preset(model))
@@ -481,7 +486,7 @@ def crowd(
     made = generate_crowd(
         generator, characters, num_frames, out, styles=list(style) or None,
         min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
-        overwrite=model.overwrite, progress=True,
+        overwrite=model.overwrite, finished_too=bool(drawn or formats), progress=True,
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     log.info("took         %.0f s", time.perf_counter() - started)
@@ -489,13 +494,13 @@ def crowd(
     lock = bool(drawn or formats) and not raw and _has_legs(made.skeleton)
     shown = lambda character: _finished(made.motion(character), window, lock)
     credit = generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
+    if formats:  # the longer part first: where it is stopped, nothing stands in the way of the same command
+        _crowd_motions(made, shown, credit, motions, formats)
+        log.info("wrote        %s: everybody as %s", motions, ", ".join(formats))
     if pictures:
         _crowd_pictures(made, shown, credit, *drawn)
     for file in drawn:
         log.info("wrote        %s", file)
-    if formats:
-        _crowd_motions(made, shown, credit, motions, formats)
-        log.info("wrote        %s: everybody as %s", motions, ", ".join(formats))
 
 
 def _finished(motion, window: int | None, lock: bool):
@@ -514,17 +519,17 @@ def _finished(motion, window: int | None, lock: bool):
 def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
     """Write a file a character and format, one after the other, so that no crowd is too large: NUMBER_STYLE.bvh.
 
-    Files of an earlier crowd are removed first; what else lies there stays.
+    Files of an earlier crowd are removed first; what else lies there stays. A new folder is there whole or not at all.
     """
     digits = len(str(len(crowd) - 1))
-    folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("*"):
         if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
             file.unlink()
-    for character in range(len(crowd)):
-        motion, name = shown(character), f"{character:0{digits}d}_{crowd.style(character)}"
-        for ending in formats:
-            _write_motion(folder / f"{name}{ending}", motion, credit, False)
+    with contextlib.nullcontext(folder) if folder.exists() else whole_folder(folder) as place:
+        for character in range(len(crowd)):
+            motion, name = shown(character), f"{character:0{digits}d}_{crowd.style(character)}"
+            for ending in formats:
+                _write_motion(place / f"{name}{ending}", motion, credit, False)
 
 
 def _crowd_pictures(crowd, shown, credit: str, still: Path, page: Path) -> None:
@@ -570,8 +575,8 @@ def export(
         elif not target:
             log.info("not compiled for this processor, since IREE is missing: make bench-tools")
         folder = export_model(
-            model.load(), out, num_steps=model.steps, batch=characters or 1, sampler=model.sampler, targets=target,
-            overwrite=model.overwrite,
+            model.load(), out, num_steps=model.steps, batch=1 if characters is None else characters,
+            sampler=model.sampler, targets=target, overwrite=model.overwrite,
         )  # fmt: skip
     for file in sorted(folder.iterdir()):
         log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)

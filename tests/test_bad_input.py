@@ -60,6 +60,12 @@ def test_absurd_numbers_in_a_row_are_refused_with_their_place():
         refused(r"walk.bvh, line \d+: .*number 1 of frame 0", parse_bvh, text, "walk.bvh")
 
 
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_a_scale_that_makes_no_body_is_refused(scale):
+    refused("scale must be positive", parse_bvh, TEXT, "walk.bvh", scale)
+    refused("scale must be positive", format_bvh, wandering_motion(3), scale=scale)
+
+
 def test_a_row_of_two_million_numbers_is_refused_in_a_moment():
     head, _, _ = TEXT.partition("Frame Time: 0.0333333333\n")
     started = time.perf_counter()

@@ -882,7 +882,10 @@ def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
         "classifier": curve(CAMDM, late, classifier="another"),
     }.items():
         assert "quality_by_epoch.csv has no " in judged(name, fast, other).ours[0].figure, name
-    # Of two seeds the one with more snapshots tells.
+    # Curves of more snapshots decide, whatever their classifier is called; of two seeds as well.
+    for name in ("a", "z"):
+        short = [*curve(FNO, late, classifier=name)[:2], *curve(CAMDM, soon, classifier=name)[:2]]
+        assert judged(f"named {name}", fast, slow, short).verdict == HOLDS
     assert judged("seeds", fast, slow, curve(FNO, late, seed=1)[:2]).verdict == HOLDS
 
 
@@ -1108,6 +1111,8 @@ def test_a_statement_names_its_kind_models_and_range():
         (STATEMENT | {"model": "FNO-96"}, "unknown model 'FNO-96'"),
         (STATEMENT | {"model": {"model": FNO, "step": 1}}, "unknown key 'step'; did you mean 'steps'"),
         (STATEMENT | {"within": [0, 1], "alike": 0.1}, "has the ranges within and alike; keep one"),
+        (STATEMENT | {"stated": [2]}, "stated: .2. is another number of numbers"),
+        (STATEMENT | {"about": [5, 2, 1]}, "about: .5, 2, 1. is another number of numbers"),
         (STATEMENT | {"within": [0, "miner"]}, "unknown threshold 'miner'; did you mean 'minor'"),
         (STATEMENT | {"metric": "FD"}, "unknown metric 'FD'; did you mean 'FID'"),
         (STATEMENT | {"kind": "ranked", "table": "qualty"}, "unknown table 'qualty'; did you mean 'quality'"),

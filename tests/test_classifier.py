@@ -199,6 +199,7 @@ def test_motion_that_is_shorter_than_a_window_or_not_finite_gives_none():
     assert side_by_side(classifier_frames(positions, SYNTHETIC_SKELETON), 60).shape == (0, 60, NUM_CHANNELS)
     positions[40, 3, 1] = np.nan
     refused("not finite at frame 40, joint 3$", classifier_frames, positions, SYNTHETIC_SKELETON)
+    refused(r"positions must be \[\.\.\., 23, 3\]", classifier_frames, np.zeros((60, 24, 3)), SYNTHETIC_SKELETON)
 
 
 # ------------------------------------------------------------------------------------- network
@@ -422,6 +423,9 @@ def test_a_style_without_clips_long_enough_is_named():
 def test_what_cannot_be_trained_is_refused(packed):
     one = dataclasses.replace(packed, primary_styles=("Runner",))
     refused("'tiny': a style classifier needs at least two styles, got 1", train_classifier, one, **TRAINING)
+    refused("unknown size of a style classifier 'windw'; did you mean 'window'", train_classifier, packed, windw=60)
+    for wrong in ({"batch_size": 1}, {"num_steps": 0}, {"widths": ()}):
+        refused("needs num_steps of 1, batch_size of 2 and widths", train_classifier, packed, **TRAINING | wrong)
 
 
 # ------------------------------------------------------------------------------------ refusals

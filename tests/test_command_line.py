@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from builders import WINDOW, tiny_trained
 
+from f3amd_lib import __main__ as command_line
 from f3amd_lib.__main__ import COMMANDS, main
 from f3amd_lib.benchmarking import machine, measurements
 from f3amd_lib.generation.crowd import read_crowd
@@ -105,6 +106,30 @@ def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsy
     assert "player-data" in (tmp_path / "crowd.html").read_text(encoding="utf-8")
 
 
+def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tmp_path, monkeypatch, capsys):
+    out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
+    write, written = command_line._write_motion, []
+
+    def stop_after_one(path, *arguments):
+        if len(written) == 1:
+            written.append(path)
+            raise KeyboardInterrupt
+        written.append(path)
+        return write(path, *arguments)
+
+    monkeypatch.setattr(command_line, "_write_motion", stop_after_one)
+    assert main([*words, "--format", "csv", "--pictures"]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+    before = {file: file.stat().st_mtime_ns for file in out.iterdir() if file.suffix == ".npy"}
+    assert before and not folder.exists() and not (tmp_path / "crowd.png").exists()
+    assert main([*words, "--format", "csv", "--pictures"]) == 0
+    assert len(list(folder.iterdir())) == 3 and (tmp_path / "crowd.html").exists()
+    assert before == {file: file.stat().st_mtime_ns for file in before}  # nobody was animated anew
+    # Without anything more to make, a finished crowd is still refused.
+    assert main(words) == 2 and "holds this crowd already" in capsys.readouterr().err
+
+
 def test_a_crowd_is_written_in_the_formats_that_are_asked_for(weights, tmp_path, capsys):
     out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
@@ -172,6 +197,8 @@ def test_export_without_iree_is_what_jax_alone_can_run(weights, tmp_path, monkey
     # Asked for by name, a target that cannot be had is one line and no traceback.
     assert main([*words[:-4], "--out", str(tmp_path / "other"), "--target", "llvm-cpu"]) == 2
     assert "make bench-tools" in capsys.readouterr().err
+    assert main([*words[:-4], "--out", str(tmp_path / "nobody"), "--characters", "0"]) == 2
+    assert "batch must be a whole number of characters, at least 1, got 0" in capsys.readouterr().err
 
 
 @pytest.mark.needs("iree.compiler", "iree.runtime")

@@ -88,6 +88,22 @@ def test_a_question_ends_where_its_phase_does_and_the_sampler_asks_there(task, n
     np.testing.assert_allclose(visited, levels.grid(8)[[0, *sorted(set(after))]])
 
 
+def test_a_student_is_asked_in_the_units_of_its_teacher(tmp_path, monkeypatch):
+    """Weights that ship bring a normaliser of their own, which is not that of the data as packed here."""
+    prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
+    teacher = tiny_trained()
+    own = jax.tree.map(lambda leaf: leaf + 0.25, teacher.normaliser)
+    teacher = dataclasses.replace(teacher, normaliser=own)
+    asked = []
+    monkeypatch.setattr(PreparedData, "model_config", lambda *given, **fields: teacher.config)
+    monkeypatch.setattr(consistency_task, "train_and_keep", lambda *given, **leg: asked.append(given[3]))
+    profile = load_profile("smoke", "synthetic")
+    teacher = dataclasses.replace(teacher, name="F3AMD-FNO-96")
+    consistency_task.distil(prepared, profile, teacher, tmp_path, num_steps=2, num_phases=1, batch_size=2)
+    for mine, theirs in zip(asked[0].denoising.normaliser, own, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
 def test_phases_that_no_sampler_visits_are_refused(task):
     with pytest.raises(ValueError, match="must divide the 4 steps"):
         dataclasses.replace(task, num_phases=3)

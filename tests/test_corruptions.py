@@ -11,6 +11,7 @@ from f3amd_lib.experiments.real_clips import own_path
 from f3amd_lib.measures import distributions, metrics
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt, frozen_pose, noisy_motion, shuffled_frames
 from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import synthesize
 
 WINDOW = 32
@@ -227,3 +228,11 @@ def test_a_strength_out_of_range_is_refused(name):
 
 def test_unknown_names_are_refused():
     refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", wandering_motion())
+
+
+def test_motion_that_a_recipe_cannot_break_is_refused():
+    whole = wandering_motion()
+    alone = Motion.from_positions(whole.skeleton, whole.positions)
+    for name in CORRUPTIONS:
+        refused(f"the corruption '{name}' needs rotations", corrupt, name, alone)
+    refused("a single frame cannot be shuffled", corrupt, "shuffled frames", whole.slice(0, 1))

@@ -385,7 +385,7 @@ def test_a_finished_crowd_is_replaced_only_if_asked(still, tmp_path):
     before = content(tmp_path / "here")
     refused("here: holds this crowd already, finished.*overwrite", call, 9)
     refused("made with num_characters 9, not 6", call, 6)
-    assert content(tmp_path / "here") == before
+    assert len(call(9, finished_too=True)) == 9 and content(tmp_path / "here") == before
     call(6, overwrite=True)
     generate_crowd(still, 6, 5, tmp_path / "fresh", chunk=4)
     assert content(tmp_path / "here") == content(tmp_path / "fresh")
@@ -585,6 +585,7 @@ def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, 
         ({"chunk": 0}, "chunk .* got 0"),
         ({"seed": -1}, "seed .* got -1"),
         ({"styles": ["prowd"]}, "unknown style 'prowd'.*calm, proud"),
+        ({"styles": "prowd"}, "unknown style 'prowd'; did you mean 'proud'"),
         ({"styles": []}, "at least one style"),
     ],
 )

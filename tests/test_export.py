@@ -335,6 +335,28 @@ def test_a_failure_leaves_the_old_artefact_and_nothing_else(exported, tmp_path, 
     assert [item.name for item in tmp_path.iterdir()] == ["round"]
 
 
+def test_the_old_artefact_comes_back_if_the_new_one_cannot_take_its_place(exported, tmp_path, monkeypatch):
+    folder = save_artefact(tmp_path / "round", exported, name="old", targets=())
+
+    def fails(*given):
+        raise OSError("cannot be moved")
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OSError, match="cannot be moved"):
+        save_artefact(folder, exported, name="new", targets=(), overwrite=True)
+    monkeypatch.undo()
+    assert load_artefact(folder, runtime="jax").manifest["model"] == "old"
+    assert [item.name for item in tmp_path.iterdir()] == ["round"]
+
+
+def test_a_link_to_an_artefact_stays_one(exported, tmp_path):
+    folder = save_artefact(tmp_path / "store" / "round", exported, name="old", targets=())
+    (tmp_path / "link").symlink_to(folder, target_is_directory=True)
+    save_artefact(tmp_path / "link", exported, name="new", targets=(), overwrite=True)
+    assert (tmp_path / "link").is_symlink() and load_artefact(folder, runtime="jax").manifest["model"] == "new"
+    assert [item.name for item in folder.parent.iterdir()] == ["round"]
+
+
 def test_weights_of_another_model_are_not_passed_off_as_a_trained_one(exported, tmp_path):
     other = builders.tiny_trained(latent_width=8)
     with pytest.raises(ValueError, match="does not hold the weights of the trained model"):

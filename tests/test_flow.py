@@ -119,6 +119,7 @@ def test_solvers_that_do_not_fit_are_refused():
         ("v", straight(), "heun", "'ddim' alone"),
         ("eps", straight(), None, "predict 'x0' or 'v' there, not 'eps'"),
         ("x0", BETAS, None, "give it a key"),
+        ("x", straight(), "ddim", "unknown objective 'x'"),
     ):
         with pytest.raises(ValueError, match=message):
             solve(nothing, objective, schedule, noise, sampler=sampler, num_steps=4)

@@ -1,6 +1,7 @@
 """HumanML3D's layout: a tree that the test writes by hand, broken in many ways, and BVH files on their way there."""
 
 import csv
+import dataclasses
 import shutil
 
 import numpy as np
@@ -198,6 +199,7 @@ def test_bvh_files_with_a_table_become_a_data_set(bvh_folder, tmp_path, caplog):
         ("file,caption\ntake0,\n", "line 2: needs a file and a caption"),
         ("name,text\ntake0,walks\n", "line 2: needs a file and a caption"),
         ("file,caption\ntake0,walks #1\n", "line 2: # parts the fields"),
+        ('file,caption\n\n\ntake0,"walks\nand runs #1"\n', "line 5: # parts the fields"),
         ("file,caption\n", "holds no caption"),
         ("file,caption\ntaek0,walks\n", "no motion, such as those of 'taek0'; did you mean 'take0'"),
     ],
@@ -209,6 +211,16 @@ def test_a_bad_table_is_refused(bvh_folder, tmp_path, table, words):
         humanml3d.captioned_motions(
             open_dataset("folder", path=bvh_folder), humanml3d.read_caption_table(path), progress=False
         )
+
+
+def test_another_skeleton_is_refused_by_the_first_ones_name_even_if_that_clip_was_too_short(tmp_path):
+    short, other = synthetic.synthesize("Neutral", seconds=0.4, seed=0), synthetic.synthesize("Neutral", 4.0, 1)
+    longer = dataclasses.replace(other.skeleton, offsets=1.1 * np.asarray(other.skeleton.offsets))
+    write_bvh(tmp_path / "a_short.bvh", short)
+    write_bvh(tmp_path / "b_long.bvh", other.replace(skeleton=longer))
+    captions = {"a_short": ["stands"], "b_long": ["walks"]}
+    with pytest.raises(ValueError, match="b_long: its skeleton differs from that of a_short"):
+        humanml3d.captioned_motions(open_dataset("folder", path=tmp_path), captions, progress=False)
 
 
 def test_nothing_is_written_over(bvh_folder, tmp_path):

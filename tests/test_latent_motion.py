@@ -465,6 +465,14 @@ def test_players_may_learn_by_turns(start):
                 for a, b in zip(*map(jax.tree.leaves, (before[branch], state.params[branch])), strict=True)
             )
             assert same == (branch != learner)
+    # The rate of each falls to 0 over its own turns.
+    for alternate, turns in ((True, 50), (False, 100)):
+        config = LatentMotionTraining(100, warmup_steps=1, alternate=alternate)
+        optimiser, weights = config.optimiser(), jnp.ones(1)
+        moments, last = optimiser.init(weights), None
+        for _ in range(turns):
+            last, moments = optimiser.update(jnp.ones(1), moments, weights)
+        assert abs(float(last[0])) < 0.01 * config.learning_rate
 
 
 @pytest.mark.slow

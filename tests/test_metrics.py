@@ -8,6 +8,7 @@ from f3amd_lib.measures import metrics, registry
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 
 WINDOW = 32
 SKELETON = Skeleton(
@@ -400,6 +401,14 @@ def test_nan_and_wrong_shape_are_refused(metric):
 def test_one_window_has_no_boundary(metric):
     refused("32 frames hold no boundary .* take more", metric, glide(WINDOW), WINDOW)
     metric(glide(WINDOW + 1), WINDOW)
+
+
+def test_toes_and_floors_that_are_not_there_are_refused():
+    refused("toes .3, 99. are not among the 5 joints", metrics.foot_sliding, glide(), (3, 99))
+    refused("floor_shift is not finite", metrics.foot_sliding, glide(), (3, 4), np.nan)
+    path = named_path("straight", 128)
+    for measure in (lambda *given: metrics.first_metrics(*given[:2], WINDOW, given[2]), metrics.camdm_metrics):
+        refused(r"positions must be \[\.\.\., 23, 3\]", measure, glide(), path, SYNTHETIC_SKELETON)
 
 
 def test_paths_that_do_not_fit_are_refused():

@@ -130,6 +130,14 @@ def test_a_mesh_of_one_device_changes_no_number(alone):
         np.testing.assert_allclose(theirs, ours, atol=1e-6)
 
 
+def test_what_lies_on_all_devices_is_a_copy_and_may_hold_what_is_no_number():
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), (parallel.AXIS,))
+    mine = jax.numpy.array([1.0, np.nan])
+    spread = parallel.replicate({"a": mine}, mesh)
+    jax.jit(lambda tree: jax.tree.map(lambda leaf: leaf + 1, tree), donate_argnums=0)(spread)
+    np.testing.assert_array_equal(mine, [1.0, np.nan])  # the caller's own is alive
+
+
 def test_a_batch_that_devices_cannot_share_is_refused():
     class Two:
         size = 2

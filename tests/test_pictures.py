@@ -1,17 +1,19 @@
 """Where the camera puts things, what covers what, and that colours tell rows apart."""
 
+import dataclasses
 import hashlib
 
 import numpy as np
-from builders import straight_motion, wandering_motion
+from builders import refused, straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 from matplotlib.colors import same_color
 
 from f3amd_lib.drawing.diagrams import arrow, boxes, influence_maps
-from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, poses_beside
+from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, poses_beside, write_gif
 from f3amd_lib.drawing.stick_figures import Camera, body_lines, drawn_points
 from f3amd_lib.drawing.style import keep_figure, model_style, new_figure
 from f3amd_lib.measures.corruptions import CORRUPTIONS
+from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import synthesize
 
 # --- the camera --------------------------------------------------------------------------------
@@ -155,6 +157,25 @@ def test_influence_maps_share_a_scale():
         assert figure.axes[0].get_ylabel() == "there"
         # An arrow on the colour bar where something lies beyond it.
         assert figure.axes[-1]._colorbar.extend == ("max" if end < 3 else "neither")
+
+
+def test_motion_of_positions_alone_is_drawn_without_its_tips():
+    whole = wandering_motion(4)
+    tipped = whole.replace(skeleton=dataclasses.replace(whole.skeleton, end_sites=((3, (0.0, 0.0, 0.1)),)))
+    alone = Motion.from_positions(tipped.skeleton, whole.positions)
+    frames = np.arange(2)
+    assert drawn_points(tipped, frames).shape[1] == whole.skeleton.num_joints + 1
+    np.testing.assert_allclose(drawn_points(alone, frames), whole.positions[:2])
+    poses_beside({"alone": alone}, frames)
+
+
+def test_frames_and_crowds_that_are_not_there_are_refused(tmp_path):
+    motion = wandering_motion(4)
+    refused("has frames 0 to 3; asked for 9 to 9", poses_beside, {"walk": motion}, [9])
+    refused("has frames 0 to 3; asked for -1 to -1", crowd_figure, {"": ([motion], ["#542788"])}, -1)
+    refused("at least one crowd", crowd_figure, {}, 1)
+    refused("at least one crowd, and somebody in each", crowd_figure, {"nobody": ([], [])}, 1)
+    refused("every must be a whole number of frames", write_gif, tmp_path / "walk.gif", motion, every=0)
 
 
 def test_a_kept_figure_names_its_data_set_and_its_light_copy_the_file_in_full_size(tmp_path):

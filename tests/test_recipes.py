@@ -170,6 +170,10 @@ def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkey
     found = table.set_index(["model", "metric"])["value"]
     assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(0.25)
     assert np.isnan(found["F3AMD-FNO-48", "held_out_fall"]) and set(record["weights_digests"]) == set(histories)
+    # Of a training that was gone on with, all legs count, as on its card.
+    tiny = dataclasses.replace(tiny, record=tiny.record | {"windows_seen": 5000})
+    table, _ = read_table(measure.measure_trained(prepared, PROFILE, ["F3AMD-FNO-32"]))
+    assert table.set_index(["model", "metric"])["value"]["F3AMD-FNO-32", "windows"] == 5000
 
 
 def test_what_notebook_15_says_of_single_changes_follows_from_the_record():

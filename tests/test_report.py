@@ -95,6 +95,7 @@ def test_record_tells_no_folder_of_the_machine(tmp_path):
 def test_record_refuses_taken_names_and_odd_values():
     refused("already has 'versions'", record, versions=1)
     refused("cannot hold", record, thing=object())
+    refused("cannot hold", record, thing=np.longdouble(1.5))
     refused("profile must be a name", record, profile=None)
 
 

@@ -140,6 +140,7 @@ def test_claim_q18_rank_agreement_in_closed_form():
     # The interval of two seeds is wide, but no correlation lies beyond 1.
     assert table.loc["FID", ["low", "high"]].tolist() == [-1.0, 1.0]
     assert table.loc["EMD minus FID", ["low", "high"]].tolist() == [-2.0, 2.0]
+    refused("one strength has no order", rank_agreement, rows[rows["strength"] == 0])
 
 
 def test_bad_input_to_graded_corruptions_is_refused(packed, classifier):

@@ -97,7 +97,8 @@ def test_a_group_is_timed_and_counted():
 
 def test_groups_are_not_mixed():
     mixed = [Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW) for count in (1, 2)]
-    refused("too many values", time_group, mixed, tiny)
+    refused("candidates of 2 groups cannot be timed by turns", time_group, mixed, tiny)
+    refused("candidates of 0 groups", time_group, [], tiny)
 
 
 def test_plans_name_presets_and_implementations_that_exist_each_once():

@@ -208,6 +208,8 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
     monkeypatch.setattr(captioned_models, "train_in_legs", loop)
     monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
     assert train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, window=32, **QUIET) is None
+    with pytest.raises(ValueError, match="no train clip has 64 frames, the longest has 32; tiny-AE needs longer ones"):
+        train_text_model(data, ENCODER, PROFILE, "tiny-AE", folder=tmp_path, window=32, **QUIET)
     cut, task = data.cut(32), given["task"]
     assert task.model_config.window == 32 and np.asarray(task.clips.length).tolist() == [32] * 8
     first = cut.normaliser().normalise(data.clip(data.members("train")[0])[:32])
@@ -439,6 +441,9 @@ def test_text_writes_four_files_that_say_the_same_and_overwrites_none(f3amd, tmp
     before = [file.read_bytes() for file in files]
     status, error = f3amd("a person walks ArmsCrossed", "--seconds", "1.2")
     assert status == 2 and "exists already; pass --overwrite" in error
+    for seed in ("-1", str(2**32)):  # the noise of another seed
+        status, error = f3amd("a person walks ArmsCrossed", "--seconds", "1.2", "--seed", seed)
+        assert status == 2 and "seed must be a whole number from 0" in error
     assert [file.read_bytes() for file in files] == before
 
 

@@ -112,6 +112,7 @@ def test_matmul_probe_has_the_type_of_its_precision():
 
 def test_unknown_precision_is_refused():
     refused("tf32", matmul_precision, "fp8")
+    refused("size must be at least 1, got 0", matmul_probe, size=0)
 
 
 def test_fast_flags_start_jax_with_as_many_devices():

@@ -253,6 +253,7 @@ def test_bad_input_is_refused():
         lambda: make(stranger): "only CAMDM",
         lambda: make(network, products="onedn"): "did you mean 'onednn'",
         lambda: prepare(module, SIGMAS, "ddmp"): "unknown PyTorch sampler 'ddmp'.*'ddpm'",
+        lambda: prepare(module, SIGMAS[:1]): "sigmas must be .N . 1. with at least one step, got shape .1,.",
         lambda: prepare(module, SIGMAS, runtime="onx"): "unknown PyTorch runtime 'onx'.*'onnx'",
     }.items():
         refused(message, call)

@@ -93,6 +93,7 @@ def test_config_survives_json(preset):
         ({"num_steps": 0}, "num_steps must be positive"),
         ({"batch_size": -1}, "batch_size must be positive"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive"),
+        ({"learning_rate": "1e-3"}, "learning_rate must be positive"),
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"own_history_share": 1.5}, "own_history_share"),
         ({"captured_path_share": -0.1}, "captured_path_share"),
@@ -107,6 +108,9 @@ def test_impossible_configs_are_refused(settings, message):
 def test_config_names_unknown_keys():
     with pytest.raises(ValueError, match="'learning_rat'; did you mean 'learning_rate'"):
         TrainingConfig.from_dict({"num_steps": 10, "learning_rat": 1e-3})
+    refused("needs num_steps", TrainingConfig.from_dict, {})
+    for name, value in (("loss", "literal"), ("diffusion", None)):
+        refused(f"'{name}' must be a table", TrainingConfig.from_dict, {"num_steps": 10, name: value})
 
 
 def test_network_inputs_by_hand(task):

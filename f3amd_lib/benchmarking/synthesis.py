@@ -92,7 +92,10 @@ def time_group(
     Raises:
       ValueError: for candidates of several groups.
     """
-    ((window, characters, precision),) = {candidate.group for candidate in candidates}
+    groups = {candidate.group for candidate in candidates}
+    if len(groups) != 1:
+        raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
+    ((window, characters, precision),) = groups
     ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:

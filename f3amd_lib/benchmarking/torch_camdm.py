@@ -303,6 +303,8 @@ def torch_round(
     for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
         check_known(given, known, f"PyTorch {what}")
     config, device, sigmas = module.config, module.code.device, np.array(sigmas, np.float32)
+    if sigmas.ndim != 1 or len(sigmas) < 2:
+        raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")
     scales, features = tell_levels(config, sigmas[:-1])
     denoise = RUNTIMES[runtime](module)
 

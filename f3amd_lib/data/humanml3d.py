@@ -273,11 +273,12 @@ def read_caption_table(path) -> dict[str, tuple[str, ...]]:
     """
     path = Path(path)
     try:
-        rows = list(csv.DictReader(_lines(path, "choose a CSV file in UTF-8")))
+        reader = csv.DictReader(_lines(path, "choose a CSV file in UTF-8"))
+        rows = [(reader.line_num, row) for row in reader]
     except csv.Error as error:
         raise ValueError(f"{path}: is not a CSV file ({error}); write it anew") from error
     captions: dict[str, list[str]] = {}
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
         file, caption = ((row.get(column) or "").strip() for column in ("file", "caption"))
         if not file or not caption:
             raise ValueError(f"{path}, line {line}: needs a file and a caption, under headings of these names")
@@ -333,9 +334,9 @@ def captioned_motions(
             continue
         motion = resample(clip.loader(), fps)
         if skeleton is None:
-            skeleton = motion.skeleton
+            skeleton, first = motion.skeleton, clip.name
         if motion.skeleton != skeleton:
-            raise ValueError(f"{clip.name}: its skeleton differs from that of {clips[0][0]}; a data set needs one")
+            raise ValueError(f"{clip.name}: its skeleton differs from that of {first}; a data set needs one")
         if motion.num_frames < FEWEST_FRAMES:
             skipped.append((clip.name, f"{motion.num_frames} frames, fewer than {FEWEST_FRAMES}"))
             continue

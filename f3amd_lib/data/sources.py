@@ -512,8 +512,8 @@ def _open_100style(path) -> Dataset:
     return _dataset("100style", clips, sorted(content), mirror=symmetric.get, notes=notes)
 
 
-def _read_table(archive: _Archive, table: str) -> tuple[str, list[dict[str, str]]]:
-    """Return where a table of 100STYLE lies, for messages, and its rows."""
+def _read_table(archive: _Archive, table: str) -> tuple[str, list[tuple[int, dict[str, str]]]]:
+    """Return where a table of 100STYLE lies, for messages, and its rows with their lines."""
     places = [name for name in archive.names() if PurePosixPath(name).name == table]
     if len(places) != 1:
         how = f"is there {len(places)} times ({', '.join(places)})" if places else "is missing"
@@ -524,13 +524,14 @@ def _read_table(archive: _Archive, table: str) -> tuple[str, list[dict[str, str]
         text = archive.read(places[0]).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{label}: is not UTF-8 text; fetch it again") from error
-    return label, list(csv.DictReader(io.StringIO(text, newline="")))
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    return label, [(reader.line_num, row) for row in reader]
 
 
 def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[tuple[str, str], tuple[int, int]]:
     """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges are left out."""
     (label, rows), cuts = _read_table(archive, table), {}
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         style = (row.get("STYLE_NAME") or "").strip()
         if not style:
             raise ValueError(f"{label}, line {line}: no STYLE_NAME; fetch the table again")
@@ -552,7 +553,7 @@ def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[t
 def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> dict[str, bool]:
     """Return, per style, whether its mirror image is the same style."""
     (label, rows), symmetric = _read_table(archive, table), {}
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         style, answer = ((row.get(column) or "").strip() for column in ("Style Name", "Symmetric"))
         if not style or answer not in ("Yes", "No"):
             what = "needs a Style Name, and Yes or No under Symmetric"

@@ -155,8 +155,8 @@ def load_wordllama() -> TextEncoder:
 
 def _load_transformers(kind: str, folder) -> TextEncoder:
     """Read CLIP's or Sentence-T5's text side from a folder of the user; ValueError names what is missing."""
-    folder = Path(folder or "").expanduser()
-    if folder == Path() or not (folder / "config.json").is_file():
+    given, folder = folder, Path(folder or "").expanduser()
+    if not given or not (folder / "config.json").is_file():
         raise ValueError(f"{kind}: {folder}/config.json is missing; give the folder of its weights (save_pretrained)")
     if importlib.util.find_spec("transformers") is None or importlib.util.find_spec("torch") is None:
         raise ImportError(f"the text encoder {kind} needs transformers and torch: make bench-tools")

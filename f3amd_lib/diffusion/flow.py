@@ -11,7 +11,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.diffusion.predictions import on_grid
+from f3amd_lib.diffusion.predictions import OBJECTIVES, on_grid
 from f3amd_lib.diffusion.samplers import SAMPLERS, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.names import check_known
@@ -46,9 +46,10 @@ def solve(
       key: JAX random key, for samplers that draw noise.
 
     Raises:
-      ValueError: for an unknown sampler or one that does not fit objective and schedule, or for noise predicted where
-        nothing is left of the signal, which says nothing of the signal.
+      ValueError: for an unknown objective or sampler, or one that does not fit objective and schedule, or for noise
+        predicted where nothing is left of the signal, which says nothing of the signal.
     """
+    check_known(objective, OBJECTIVES, "objective")
     sampler = sampler or default_sampler(objective, schedule)
     if sampler == DORMAND_PRINCE:
         if default_sampler(objective, schedule) != sampler:

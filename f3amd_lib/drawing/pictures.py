@@ -140,8 +140,7 @@ def film_strip(
     for (poses, plan), (motion, path, title) in zip(axes, rows, strict=True):
         last = motion.num_frames - 1
         chosen = np.linspace(0, last, count).round().astype(int) if frames is None else np.asarray(frames)
-        if chosen.min() < 0 or chosen.max() > last:
-            raise ValueError(f"{motion.name!r} has frames 0 to {last}; asked for {chosen.min()} to {chosen.max()}")
+        _check_frames(motion, chosen)
         _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
@@ -263,6 +262,7 @@ def poses_beside(
         axis.axis("off")
     for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
         if motion is not None:
+            _check_frames(motion, frames)
             _draw_poses(axis, motion, np.asarray(frames), np.pi / 3, scale=72 * inches, numbered=False)
             axis.set_ylim(-below, 1.85)
             axis.set_title(title, color=model_style(title).color)
@@ -270,6 +270,13 @@ def poses_beside(
 
 
 # ------------------------------------------------------------------------------------------ crowds
+
+
+def _check_frames(motion: Motion, frames) -> None:
+    """Raise ValueError for frames that a motion does not have."""
+    first, last = int(np.min(frames)), int(np.max(frames))
+    if first < 0 or last >= motion.num_frames:
+        raise ValueError(f"{motion.name!r} has frames 0 to {motion.num_frames - 1}; asked for {first} to {last}")
 
 
 def crowd_colors(labels: Sequence[str]) -> list[str]:
@@ -303,7 +310,14 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
 
     Returns:
       A matplotlib Figure.
+
+    Raises:
+      ValueError: for no crowd, an empty one, or a frame that a motion does not have.
     """
+    if not crowds or not all(motions for motions, _ in crowds.values()):
+        raise ValueError("a picture of crowds needs at least one crowd, and somebody in each")
+    for motion in (motion for motions, _ in crowds.values() for motion in motions):
+        _check_frames(motion, frame)
     columns = min(columns, len(crowds))
     rows, panel = -(-len(crowds) // columns), width / columns
     roots = np.array([motion.root_position[frame, [0, 2]] for motion in next(iter(crowds.values()))[0]], float)
@@ -403,6 +417,8 @@ def write_gif(
         second.
     """
     path = named_file(path, ".gif", "moving pictures")
+    if every < 1 or every != int(every):
+        raise ValueError(f"every must be a whole number of frames, 1 or more, got {every}")
     rows = _beside_each_other(motions, target_paths, titles)
     motions = [motion for motion, *_ in rows]
     rates = {motion.fps for motion in motions}

@@ -351,7 +351,9 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
         loss = history.get("held_out_loss", history["step"] * np.nan).dropna()
         early = loss[history["step"] <= 0.75 * last]
         fall = 1.0 - loss.iloc[-1] / early.iloc[-1] if len(early) else np.nan
-        figures = {"windows": last * trained.record["training"]["batch_size"], "held_out_fall": fall}
+        # Where training was gone on with, the file knows how many windows all of it saw.
+        windows = trained.record.get("windows_seen", last * trained.record["training"]["batch_size"])
+        figures = {"windows": windows, "held_out_fall": fall}
         return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
 
     records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
@@ -521,7 +523,7 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     if len(asked) > 1:
         raise ValueError(f"gradient_norm is a table of one model, got {', '.join(asked)}: name one with --model")
     (trained,) = by_name.values()
-    task = prepared.task(trained.name, profile_recipe(profile, trained.name))
+    task = prepared.task(trained.name, profile_recipe(profile, trained.name), normaliser=trained.normaliser)
     held_out = prepared.windows(prepared.held_out_split)
     table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
     return _write_anew(prepared, profile, "gradient_norm", table.assign(model=trained.name), by_name)

@@ -116,8 +116,13 @@ def rank_agreement(rows: pd.DataFrame) -> pd.DataFrame:
       [-2, 2]), repeats. Metrics are "FID", "EMD" and "EMD minus FID", the paired difference, which
       lies above 0 where EMD knows the order better.
 
+    Raises:
+      ValueError: for a single strength.
+
     Source: ours.
     """
+    if rows["strength"].nunique() < 2:
+        raise ValueError("one strength has no order; give `graded_corruptions` at least two")
     rows_of_seeds = []
     for (name, _), group in rows.groupby(["corruption", "seed"], sort=False):
         ranks = {}

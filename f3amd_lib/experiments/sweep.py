@@ -46,7 +46,7 @@ CAMPAIGN, TRAIN = "campaign", "train"
 NOT_BY_PRESET = ("recipes", "sensitivity", "gradient_norm")
 """Measurements whose table is not one of presets side by side."""
 
-THROUGH_CLASSIFIER = (CAMPAIGN, "quality", "quality_by_epoch", "literal_update")
+THROUGH_CLASSIFIER = (CAMPAIGN, "quality", "quality_by_epoch", "literal_update", "one_step")
 """Legs that need the style classifier, which is trained once, before them."""
 
 CONNECT_S = 10

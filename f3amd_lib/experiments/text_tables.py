@@ -25,6 +25,7 @@ from f3amd_lib.generation.captioned_motion import draw_motions, motion_drawer
 from f3amd_lib.generation.latent_motion import latent_motions, latent_sampler, reconstruction
 from f3amd_lib.generation.noise_optimisation import control_distance, optimise_noise
 from f3amd_lib.generation.text_to_motion import continue_prefix, sample_control, sample_text
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record
@@ -491,6 +492,8 @@ def measure_text_table(
     cut, most_frames = data.cut(settings["most_frames"]), settings["most_frames"]
     brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
     rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
+    for model in asked:
+        check_known(model, [row["model"] for row in rows], f"model of {name}")
     keys = [column for column in rows[0] if column not in ("trained", "first")]
     tables = dict.fromkeys((name, *about.get("beside", ())), keys)
     records = Records(results_dir(profile.dataset, profile.name) / "records", record, tables, again=asked)

@@ -213,8 +213,8 @@ class Crowd:
 
 def generate_crowd(
     generator: MotionGenerator, num_characters: int, num_frames: int, out, *,
-    styles: Sequence[str] | None = None, min_distance: float | None = None, seed: int = 0, chunk: int | None = None,
-    overwrite: bool = False, progress: bool = False,
+    styles: str | Sequence[str] | None = None, min_distance: float | None = None, seed: int = 0,
+    chunk: int | None = None, overwrite: bool = False, finished_too: bool = False, progress: bool = False,
 ) -> Crowd:  # fmt: skip
     """Animate any number of characters, and write them to a folder chunk by chunk.
 
@@ -226,12 +226,13 @@ def generate_crowd(
       num_characters: B.
       num_frames: F, at 30 fps.
       out: folder to write to (see the module's table); new, empty, or of this call when stopped.
-      styles: names, taken in turn; by default all that the model knows and has starting poses for.
+      styles: a name, or several taken in turn; by default all that the model knows and has starting poses for.
       min_distance: metres that paths keep from each other at every frame, all planned before the
         first chunk is made (see `crowd_planning`); None lets characters walk through one another.
       seed: of paths, starting poses and noise, 0 or more.
       chunk: characters generated at once; by default `default_chunk`.
       overwrite: write over a crowd that lies there, finished or not.
+      finished_too: take this very crowd, where it lies there finished, in place of refusing it.
       progress: show a progress bar.
 
     Returns:
@@ -250,6 +251,7 @@ def generate_crowd(
     chunk = min(_whole("chunk", chunk, 1), num_characters)
     if styles is None:
         styles = [style for style in trained.styles if style in trained.start_poses]
+    styles = [styles] if isinstance(styles, str) else styles
     in_turn = np.array([trained.style_index(style) for style in styles], np.int32)
     if not len(in_turn):
         raise ValueError("a crowd needs at least one style")
@@ -280,14 +282,14 @@ def generate_crowd(
     settings = json.loads(json.dumps(settings))
     out = Path(out)
     with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):
-        return _generate(generator, settings, in_turn, out, overwrite, progress)
+        return _generate(generator, settings, in_turn, out, overwrite, finished_too, progress)
 
 
-def _generate(generator, settings, in_turn, out: Path, overwrite, progress) -> Crowd:
+def _generate(generator, settings, in_turn, out: Path, overwrite, finished_too, progress) -> Crowd:
     """Make what is still missing of a crowd; the folder is ours alone."""
     trained = generator.trained
     num_characters, num_frames, seed, chunk = (settings[of] for of in ("num_characters", "num_frames", "seed", "chunk"))
-    finished, first_path = _look_into(out, settings, overwrite)
+    finished, first_path = _look_into(out, settings, overwrite, finished_too)
     _check_room(out, settings)
     planned = None
 
@@ -428,7 +430,7 @@ def _write_settings(folder: Path, settings: dict, finished: int) -> None:
     write_whole(folder / _SETTINGS, text + "\n")
 
 
-def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | None]:
+def _look_into(out: Path, settings: dict, overwrite: bool, finished_too: bool) -> tuple[int, str | None]:
     """Return how far this very crowd has come; ValueError for anything else.
 
     Returns:
@@ -448,7 +450,7 @@ def _look_into(out: Path, settings: dict, overwrite: bool) -> tuple[int, str | N
         if there.get(name) != value:
             old, new = (json.dumps(value)[:60] for value in (there.get(name), value))
             raise ValueError(f"{out}: holds a crowd made with {name} {old}, not {new}; {_WAY_OUT}")
-    if there["num_finished"] == settings["num_characters"]:
+    if there["num_finished"] == settings["num_characters"] and not finished_too:
         raise ValueError(f"{out}: holds this crowd already, finished; read it with read_crowd, {_WAY_OUT}")
     return there["num_finished"], there.get(_FIRST_PATH)
 

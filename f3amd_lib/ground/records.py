@@ -211,8 +211,8 @@ def _plain(value):
         return f".../{value.name}" if text.startswith("/") or value.drive else text
     if isinstance(value, str):
         return _shorten(value)
-    if isinstance(value, (np.generic, np.ndarray)):
-        return _plain(value.tolist())
+    if isinstance(value, (np.generic, np.ndarray)) and type(plain := value.tolist()) is not type(value):
+        return _plain(plain)
     if value is None or isinstance(value, (bool, int, float)):
         # JSON has no NaN; a figure that is undefined is null.
         return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -33,7 +33,7 @@ from flax import nnx
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, mirror_channels, side_by_side
@@ -450,6 +450,10 @@ def _asked_for(
         raise ValueError(
             f"data set {packed.dataset!r}: a style classifier needs at least two styles, got {len(styles)}"
         )
+    refuse_unknown(sizes, ClassifierConfig, "size of a style classifier")
+    if num_steps < 1 or batch_size < 2 or not sizes.get("widths", (1,)):
+        got = f"{num_steps}, {batch_size} and {sizes.get('widths', 'its own')}"
+        raise ValueError(f"a style classifier needs num_steps of 1, batch_size of 2 and widths at least, got {got}")
     return styles, ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
 
 

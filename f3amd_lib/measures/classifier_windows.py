@@ -12,7 +12,7 @@ import numpy as np
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.measures.metrics import checked_positions
 from f3amd_lib.motion.rotations import matrix_from_yaw
-from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
+from f3amd_lib.motion.skeleton import Skeleton, check_joints, facing_yaw
 
 _JOINTS = read_toml(Path(__file__).with_name("classifier_joints.toml"))
 _CONVENTIONS = _JOINTS["conventions"]
@@ -73,6 +73,7 @@ def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
     Source: CAMDM's evaluation code (its feature extraction).
     """
     positions = checked_positions(positions)
+    check_joints(skeleton, positions)
     seen = list(classifier_joints(skeleton))
     body = positions - positions[..., seen[:1], :]
     turned = body[..., seen, :] @ np.swapaxes(matrix_from_yaw(-facing_yaw(skeleton, body, shoulders=True)), -1, -2)

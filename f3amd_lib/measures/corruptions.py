@@ -115,9 +115,12 @@ def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) 
       The broken motion, as many frames on the same skeleton.
 
     Raises:
-      ValueError: for an unknown name, or a strength out of range.
+      ValueError: for an unknown name, a strength out of range, motion of positions alone, or a single frame to shuffle.
     """
     check_known(name, CORRUPTIONS, "corruption")
+    motion.needed_rotations(f"the corruption {name!r}")
+    if name == "shuffled frames" and motion.num_frames < 2:
+        raise ValueError("a single frame cannot be shuffled")
     if not 0.0 <= strength <= 1.0:
         raise ValueError(f"strength must lie between 0 (as it was) and 1, got {strength}")
     return CORRUPTIONS[name](motion, seed, float(strength))

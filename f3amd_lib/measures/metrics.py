@@ -100,7 +100,10 @@ def _joint_and_root_change(positions, order: int) -> tuple[np.ndarray, np.ndarra
 def _toes_and_root_step(positions, toes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return toe positions [..., T, 2, 3], their steps on the ground [..., T - 1, 2] and the root's mean one."""
     positions = checked_positions(positions, least=2)
-    toe = positions[..., list(toes.toes if isinstance(toes, Skeleton) else toes), :]
+    toes, num_joints = list(toes.toes if isinstance(toes, Skeleton) else toes), positions.shape[-2]
+    if not all(0 <= joint < num_joints for joint in toes):
+        raise ValueError(f"toes {toes} are not among the {num_joints} joints of positions")
+    toe = positions[..., toes, :]
     step = np.linalg.norm(np.diff(toe, axis=-3)[..., [0, 2]], axis=-1)
     root = np.linalg.norm(np.diff(positions[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
     return toe, step, root
@@ -256,6 +259,8 @@ def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONT
         floor = toe[..., 1].min(axis=(-2, -1))
     else:
         floor = np.broadcast_to(np.asarray(floor_shift, dtype=np.float64), toe.shape[:-3])
+        if not np.all(np.isfinite(floor)):  # nothing touches a floor that is nowhere, so that nothing would slide
+            raise ValueError("floor_shift is not finite")
     contact = (toe[..., :-1, :, 1] - floor[..., None, None]) < contact_height
     slide = (step * contact).sum(axis=(-2, -1)) / np.maximum(contact.sum(axis=(-2, -1)), 1)
     return _ratio(slide, root), contact.mean(axis=(-2, -1))

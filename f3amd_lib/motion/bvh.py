@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from f3amd_lib.ground.arrays import check_positive
 from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -85,6 +86,7 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
     Raises:
       ValueError: "name, line n: what is wrong; what to do" for anything that is not a sound BVH.
     """
+    check_positive("scale", scale)
     try:
         data = _clean(text, name)
         motion = _MOTION_LINE.search(data)
@@ -131,8 +133,9 @@ def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> s
       The text, LF line ends, six decimals; read again, joint positions agree to 1e-6 m.
 
     Raises:
-      ValueError: if the order is not a permutation of XYZ.
+      ValueError: if the order is not a permutation of XYZ, or the scale is not above 0.
     """
+    check_positive("scale", scale)
     if sorted(order) != ["X", "Y", "Z"]:
         raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
     rotations = motion.needed_rotations("a BVH file")

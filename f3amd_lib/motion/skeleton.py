@@ -198,8 +198,8 @@ class Motion:
 
     @classmethod
     def from_positions(cls, skeleton: Skeleton, positions, fps: float = 30.0, name: str = "") -> Motion:
-        """Return motion of positions alone, [T, J, 3] in metres, the root's first."""
-        positions = np.asarray(positions)
+        """Return motion of positions alone, [T, J, 3] in metres, the root's first; end sites need rotations, and go."""
+        positions, skeleton = np.asarray(positions), dataclasses.replace(skeleton, end_sites=())
         return cls(skeleton, positions[..., 0, :], None, fps, name, positions)
 
     def _arrays(self) -> dict[str, np.ndarray]:
@@ -302,6 +302,12 @@ def local_rotations(skeleton: Skeleton, turned: np.ndarray) -> np.ndarray:
     return np.concatenate([turned[:, :1], np.swapaxes(above, -1, -2) @ turned[:, 1:]], axis=1)
 
 
+def check_joints(skeleton: Skeleton, positions) -> None:
+    """Raise ValueError unless positions are [..., J, 3] of a skeleton's J joints."""
+    if positions.shape[-2:] != (skeleton.num_joints, 3):
+        raise ValueError(f"positions must be [..., {skeleton.num_joints}, 3] for this skeleton, got {positions.shape}")
+
+
 def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     """Return the yaw of cross(a, +Y), a = left hip - right hip.
 
@@ -313,7 +319,11 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
 
     Returns:
       Radians, [...]; 0 faces +Z, positive turns left.
+
+    Raises:
+      ValueError: for another number of joints, or a skeleton without hips.
     """
+    check_joints(skeleton, positions)
     xp = array_module(positions)
 
     def between(part):

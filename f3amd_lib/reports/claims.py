@@ -167,7 +167,12 @@ def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     number = lambda bound: find_entry(thresholds, bound, "threshold", where) if isinstance(bound, str) else bound
     for key in ranges:
         value = parameters.pop(key)
-        parameters["bounds"] = judging.RANGES[key](*map(number, value if isinstance(value, list) else [value]))
+        numbers = map(number, value if isinstance(value, list) else [value])
+        try:
+            bound = inspect.signature(judging.RANGES[key]).bind(*numbers)
+        except TypeError:
+            raise ValueError(f"{where}: {key}: {value!r} is another number of numbers than it takes") from None
+        parameters["bounds"] = judging.RANGES[key](*bound.args)
     try:
         inspect.signature(kind).bind(None, **parameters)
     except TypeError as error:

@@ -505,7 +505,10 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         rows = rows[~by_eyes[rows.index] | (rows["classifier"] == classifier)]
         found.append((windows, seen["model"].nunique(), evidence(windows, classifier, rows)))
     where = path.relative_to(root).as_posix()
-    curves = [_snapshot_curves(rows, record, where) for _, rows in every.groupby("classifier")]
+    # As `quality` above: the classifier that saw the longest curves comes first.
+    seen = [rows for _, rows in every.groupby("classifier")]
+    seen.sort(key=lambda rows: rows.groupby("run")["windows"].nunique().nlargest(2).sum(), reverse=True)
+    curves = [_snapshot_curves(rows, record, where) for rows in seen]
     return [one for *_, one in sorted(found, key=lambda each: each[:2], reverse=True)] + curves
 
 

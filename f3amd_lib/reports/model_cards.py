@@ -24,6 +24,7 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.measures.text_judge import load_judge
 from f3amd_lib.networks.presets import find_preset
@@ -256,17 +257,11 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
 
 def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     """Sum `records/walking.csv` up in the form of the protocol's table."""
-    rows = []
     figures = [metric.name for metric in SHOWN["card"] if metric.name in walking]
     figures.remove("joint_acceleration")  # the protocol has its own
     columns = ["model", "window_frames", "steps", "weights"]
-    for key, part in walking.fillna({"weights": ""}).groupby(columns, sort=False):
-        means = part.groupby("seed")[figures].mean()
-        half = 1.96 * means.std(ddof=1) / len(means) ** 0.5  # NaN for one seed
-        for name, value in means.mean().items():
-            interval = {"low": value - half[name], "high": value + half[name]}
-            rows.append({"metric": name, "value": value, **interval, **dict(zip(columns, key, strict=True))})
-    return pd.DataFrame(rows)
+    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
+    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
 
 
 def card_of(path: Path) -> str:

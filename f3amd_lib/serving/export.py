@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -270,12 +271,17 @@ def save_artefact(
         files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
     manifest = _manifest(exported, name, files, compiled, trained)
     files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
-    with whole_folder(folder) as temporary:
-        for file, content in files.items():
-            (temporary / file).write_bytes(content)
-        earlier = temporary.with_suffix(".earlier.part")
-        if folder.exists():  # an artefact, see `_check_free`; kept until the new one has its place
-            folder.rename(earlier)
+    place = folder.resolve()  # of a link, what it points to
+    earlier = place.with_name(f".{place.name}.{uuid.uuid4().hex}.earlier")
+    try:
+        with whole_folder(place) as temporary:
+            for file, content in files.items():
+                (temporary / file).write_bytes(content)
+            if place.exists():  # an artefact, see `_check_free`; kept until the new one has its place
+                place.rename(earlier)
+    finally:
+        if earlier.exists() and not place.exists():
+            earlier.rename(place)
     shutil.rmtree(earlier, ignore_errors=True)
     return folder
 

@@ -16,7 +16,7 @@ from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import make_body
 from f3amd_lib.motion.skeleton import Motion
 
-_COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
+_COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u2": gltf.UNSIGNED_SHORT, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
 _KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 _GREY = [0.42, 0.47, 0.55, 1.0]
 
@@ -92,7 +92,9 @@ def write_glb(path, motion: Motion, *, credit: str = "", overwrite: bool = False
     attributes = gltf.Attributes(
         POSITION=file.put(body.vertices, "f4", gltf.ARRAY_BUFFER),
         NORMAL=file.put(normals / np.linalg.norm(normals, axis=1, keepdims=True), "f4", gltf.ARRAY_BUFFER),
-        JOINTS_0=file.put(np.pad(body.joints, padding), "u1", gltf.ARRAY_BUFFER),
+        JOINTS_0=file.put(
+            np.pad(body.joints, padding), "u1" if skeleton.num_joints <= 256 else "u2", gltf.ARRAY_BUFFER
+        ),
         WEIGHTS_0=file.put(np.pad(body.weights, padding), "f4", gltf.ARRAY_BUFFER),
     )
     indices = file.put(body.faces.ravel(), "u4", gltf.ELEMENT_ARRAY_BUFFER)

@@ -142,7 +142,8 @@ def distil(
     """
     settings = {"batch_size": batch_size, "learning_rate": learning_rate, "ema_decay": ema_decay, "seed": profile.seed}
     config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
-    task = ConsistencyTask(prepared.task(teacher.name, config), teacher.params, num_phases=num_phases)
+    denoising = prepared.task(teacher.name, config, normaliser=teacher.normaliser)
+    task = ConsistencyTask(denoising, teacher.params, num_phases=num_phases)
     files = model_files(profile, teacher.name, folder=Path(folder))
     about = {"distilled_from": weights_digest(teacher.params), "num_phases": num_phases}
     return train_and_keep(prepared, profile, teacher.name, task, files, about, **leg)

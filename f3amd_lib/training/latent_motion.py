@@ -16,6 +16,7 @@ from flax import nnx
 from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
@@ -85,12 +86,14 @@ class LatentMotionTraining:
             )
         if not self.least_guidance <= self.most_guidance:
             raise ValueError("least_guidance must be no more than most_guidance")
+        checked_seed(self.seed)
 
     def optimiser(self, learning_rate: float | None = None, first_moment=0.9) -> optax.GradientTransformation:
         """Return AdamW without decay after clipping, with a warm-up and a cosine, at `learning_rate` or another."""
         learning_rate = learning_rate or self.learning_rate
-        warm = min(self.warmup_steps, self.num_steps - 1)
-        rate = optax.warmup_cosine_decay_schedule(learning_rate / (warm + 1), learning_rate, warm, self.num_steps)
+        num_steps = -(-self.num_steps // 2) if self.alternate else self.num_steps  # of each part by turns
+        warm = min(self.warmup_steps, num_steps - 1)
+        rate = optax.warmup_cosine_decay_schedule(learning_rate / (warm + 1), learning_rate, warm, num_steps)
         adam = optax.adamw(rate, b1=first_moment, b2=0.999, weight_decay=0.0)
         return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam)
 

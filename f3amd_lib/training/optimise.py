@@ -292,6 +292,8 @@ def optimise(
       TrainingDiverged: at the first loss or weight that is not finite; the checkpoint on disk
         is from before.
     """
+    if chunk < 1 or checkpoint_every < 1:
+        raise ValueError(f"chunk and checkpoint_every must be at least 1, got {chunk} and {checkpoint_every}")
     task = parallel.replicate(task, mesh)
     if state is not None:
         # The chunk donates its input; what the caller holds must stay alive.

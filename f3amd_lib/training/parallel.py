@@ -72,7 +72,18 @@ def replicate(tree, mesh: Mesh | None):
       tree: of arrays that every process has with the same values.
       mesh: from `all_devices`, or None.
     """
-    return tree if mesh is None else jax.device_put(tree, NamedSharding(mesh, EVERYWHERE))
+    if mesh is None:
+        return tree
+    whole = NamedSharding(mesh, EVERYWHERE)
+
+    def place(leaf):
+        if getattr(leaf, "sharding", None) == whole:
+            return leaf
+        # `device_put` would send every value between processes to compare them, and might share the caller's memory.
+        values = np.asarray(leaf)
+        return jax.make_array_from_callback(values.shape, whole, lambda part: values[part])
+
+    return jax.tree.map(place, tree)
 
 
 def laid(tree, mesh: Mesh | None, places: PartitionSpec):

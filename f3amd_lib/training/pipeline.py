@@ -88,15 +88,19 @@ class PreparedData:
             window=window or self.window, num_history=self.num_history, **settings,
         )  # fmt: skip
 
-    def task(self, preset: str, config: TrainingConfig, *, network: Mapping | None = None) -> DenoisingTask:
+    def task(
+        self, preset: str, config: TrainingConfig, *, network: Mapping | None = None,
+        normaliser: Normaliser | None = None,
+    ) -> DenoisingTask:  # fmt: skip
         """Return what trains a preset on this data set's training windows.
 
         Args:
           preset, config: the model and its training.
           network: fields of the preset's network to change.
+          normaliser: of weights that bring one of their own; by default that of the training windows.
         """
         return denoising_task(
-            self.model_config(preset, **(network or {})), config, self.packed.skeleton, self.normaliser,
+            self.model_config(preset, **(network or {})), config, self.packed.skeleton, normaliser or self.normaliser,
             self.windows("train"), dataset_fingerprint=self.packed.fingerprint,
         )  # fmt: skip
 

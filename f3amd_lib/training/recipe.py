@@ -106,6 +106,11 @@ class TrainingConfig:
     def from_dict(cls, values: dict) -> TrainingConfig:
         """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
         refuse_unknown(values, cls, "training setting")
+        if "num_steps" not in values:
+            raise ValueError("a training needs num_steps")
+        for name, kind in (("loss", LossWeights), ("diffusion", NoiseSchedule)):
+            if not isinstance(values.get(name, {}), (dict, kind)):
+                raise ValueError(f"training setting {name!r} must be a table, got {values[name]!r}")
         values = dict(values)
         if isinstance(values.get("loss"), dict):
             refuse_unknown(values["loss"], LossWeights, "loss setting")

@@ -24,6 +24,13 @@ _RANGES = {
 }
 
 
+def _in_range(value, wanted: str) -> bool:
+    try:
+        return _RANGES[wanted](value)
+    except TypeError:  # no number at all
+        return False
+
+
 def check_settings(settings, kind: str = "") -> None:
     """Raise ValueError for a field that is not what `settings.toml` says of its class: a variant, or in a range.
 
@@ -35,7 +42,7 @@ def check_settings(settings, kind: str = "") -> None:
         value = getattr(settings, name)
         if isinstance(wanted, list):
             check_known(value, wanted, name)
-        elif not _RANGES[wanted](value):
+        elif not _in_range(value, wanted):
             raise ValueError(f"{kind}{name} must be {wanted}, got {value!r}")
 
 

@@ -254,6 +254,9 @@ def autoencoder_task(
     axes, part = data.normaliser(), data.select(data.members(split))
     table, _ = clip_table(part, axes.normalise(part.positions))
     if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
+        if len(part.lengths) and part.lengths.max() < config.window:
+            lengths = f"no {split} clip has {config.window} frames, the longest has {part.lengths.max()}"
+            raise ValueError(f"data set {data.name!r}: {lengths}; {preset} needs longer ones, or a larger --window")
         model = presets.build_config(preset)
         return text_motion.AutoencoderTask(model, config, table, dataset_fingerprint=data.fingerprint)
     # The body stands as people do when clips begin: those of training, whatever the split.

@@ -18,6 +18,7 @@ from f3amd_lib.data.text_motions import ClipTable, draw_clips
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
 from f3amd_lib.networks.config import LayerKeys
@@ -77,8 +78,11 @@ class TextMotionTraining:
     seed: int = 3407
 
     def __post_init__(self):
+        if not isinstance(self.drops, (tuple, list)):
+            raise ValueError(f"drops must be steps, got {self.drops!r}")
         object.__setattr__(self, "drops", tuple(self.drops))
         check_settings(self)
+        checked_seed(self.seed)
 
     def rate(self, step):
         """Return the learning rate of a step."""
