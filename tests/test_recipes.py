@@ -267,8 +267,8 @@ def test_what_notebook_15_says_of_length_follows_from_the_record():
     )
     assert {*eyes("residual-prior+history-input-seed0")} == {*eyes("seed0")}
     assert eyes(second).iloc[0] == eyes("higher-learning-rate-seed1").iloc[0]
-    # CAMDM after a thirty-second of the windows, so in a sixth of the time: level on the path and in trembling, ahead in
-    # feet and the use of noise, behind in postures and at the seam.
+    # CAMDM after a thirty-second of the windows, so in a sixth of the time: level on the path and in trembling, ahead
+    # in feet and the use of noise, behind in postures.
     short = table.query("windows == 200_000 and steps in [0, 8]").set_index("run")
     camdm, rate = (short.loc[run] for run in ("CAMDM-seed0", "F3AMD-FNO-96-higher-learning-rate-seed1"))
     assert set(rate["classifier"]) == set(camdm["classifier"])
