@@ -158,10 +158,8 @@ def test_states_are_as_long_as_the_clips_but_for_prefixes_and_blocks(preset, win
     rows = [{"model": "ACMDM-S-PS22-raw", "trained": preset}]
     assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
     assert asked == [(preset, window)]
-    refused(
-        "unknown model of text_table1 'acmdm'", measure_text_table, "text_table1", data, ENCODER, PROFILE, ["acmdm"],
-        rows=rows, folder=tmp_path, **QUIET,
-    )  # fmt: skip
+    measure = lambda **how: measure_text_table("text_table1", data, ENCODER, PROFILE, folder=tmp_path, **how, **QUIET)
+    refused("unknown model of text_table1 'acmdm'", measure, rows=rows, models=["acmdm"])
 
 
 def test_steps_and_motions_a_step_of_a_table_arrive_where_networks_are_trained(data, tmp_path, monkeypatch):
