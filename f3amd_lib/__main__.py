@@ -744,14 +744,12 @@ def sweep(
       batch_size: windows a step of the queue's trainings; the paper's is 512.
       out: folder for legs, states and weights of the queue, instead of runs/DATA/PROFILE.
     """
-    import contextlib
-
     import pandas as pd
 
     from f3amd_lib.experiments import campaign as long_queue
     from f3amd_lib.experiments import measure, runner
     from f3amd_lib.experiments import sweep as engine
-    from f3amd_lib.ground.records import run_record
+    from f3amd_lib.ground.records import THROUGH_CLASSIFIER, run_record
 
     profile = motion.numbers()
     if motion.window not in (None, profile.window):
@@ -766,7 +764,7 @@ def sweep(
             place = folder / "campaign" if name == engine.CAMPAIGN else results / "records"
             held.enter_context(locked(place / f".{name}.lock", f"doing {name}"))
         prepared, _ = motion.open()  # so that workers find the cache, and the classifier below
-        if not set(names).isdisjoint(engine.THROUGH_CLASSIFIER):
+        if engine.CAMPAIGN in names or not THROUGH_CLASSIFIER.isdisjoint(names):  # trained once, before the legs
             measure.protocol_of(prepared, profile, "sweep")
         record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
         costs, ended = runner.Records(results / "records", record, {"sweep": ["leg"]}), {}

@@ -352,5 +352,5 @@ def test_what_notebook_15_says_of_ablations_follows_from_the_record():
     assert round(ratio.pop("AdaLN-zero"), 2) == 0.70 and (ratio.round(2) >= 0.95).all()
     zero = rows.query("model == 'F3AMD-FNO-96-AdaLN-zero' and metric == 'x0_error_ratio'")
     assert zero.sort_values("seed")["value"].round(2).tolist() == [0.71, 0.70]
-    # Thirteen rows of Tables 8 to 11, Transformer-64, and no IRD loss.
+    # Thirteen rows of Tables 8 to 11, two Transformers, and no IRD loss.
     assert len(variants) == 16

@@ -104,6 +104,13 @@ def _beside_each_other(motions, paths, titles) -> list[tuple]:
     return list(zip(motions, columns[0], named, strict=True))
 
 
+def _check_frames(motion: Motion, frames) -> None:
+    """Raise ValueError for frames that a motion does not have."""
+    first, last = int(np.min(frames)), int(np.max(frames))
+    if first < 0 or last >= motion.num_frames:
+        raise ValueError(f"{motion.name!r} has frames 0 to {motion.num_frames - 1}; asked for {first} to {last}")
+
+
 # --------------------------------------------------------------------------- film strips and poses
 
 
@@ -270,13 +277,6 @@ def poses_beside(
 
 
 # ------------------------------------------------------------------------------------------ crowds
-
-
-def _check_frames(motion: Motion, frames) -> None:
-    """Raise ValueError for frames that a motion does not have."""
-    first, last = int(np.min(frames)), int(np.max(frames))
-    if first < 0 or last >= motion.num_frames:
-        raise ValueError(f"{motion.name!r} has frames 0 to {motion.num_frames - 1}; asked for {first} to {last}")
 
 
 def crowd_colors(labels: Sequence[str]) -> list[str]:

@@ -46,9 +46,6 @@ CAMPAIGN, TRAIN = "campaign", "train"
 NOT_BY_PRESET = ("recipes", "sensitivity", "gradient_norm")
 """Measurements whose table is not one of presets side by side."""
 
-THROUGH_CLASSIFIER = (CAMPAIGN, "quality", "quality_by_epoch", "literal_update", "one_step")
-"""Legs that need the style classifier, which is trained once, before them."""
-
 CONNECT_S = 10
 """Seconds after which a scheduler counts as not reached."""
 

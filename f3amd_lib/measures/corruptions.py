@@ -64,8 +64,13 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
     Returns:
       The motion, T frames.
 
+    Raises:
+      ValueError: for a single frame.
+
     Source: ours.
     """
+    if motion.num_frames < 2:
+        raise ValueError("a single frame cannot be shuffled")
     ring = np.random.default_rng(seed).permutation(motion.num_frames)
     ring = ring[: round(strength * motion.num_frames)]
     order = np.arange(motion.num_frames)
@@ -119,8 +124,6 @@ def corrupt(name: str, motion: Motion, *, strength: float = 1.0, seed: int = 0) 
     """
     check_known(name, CORRUPTIONS, "corruption")
     motion.needed_rotations(f"the corruption {name!r}")
-    if name == "shuffled frames" and motion.num_frames < 2:
-        raise ValueError("a single frame cannot be shuffled")
     if not 0.0 <= strength <= 1.0:
         raise ValueError(f"strength must lie between 0 (as it was) and 1, got {strength}")
     return CORRUPTIONS[name](motion, seed, float(strength))

@@ -18,6 +18,8 @@ import pandas as pd
 from scipy.spatial.distance import cdist
 from scipy.special import stdtrit
 
+from f3amd_lib.ground.arrays import finite_array
+
 _MOST_PIVOTS = 10_000_000  # of the network simplex; POT's own 100,000 stops short of 2,000 windows
 
 
@@ -28,9 +30,7 @@ def _cloud(features, what: str) -> np.ndarray:
         raise ValueError(f"{what} must be [N, D], one row of features a window, got {features.shape}")
     if len(features) < 2:
         raise ValueError(f"{what} holds {len(features)} of at least 2 windows: generate more, or pool styles")
-    if not np.all(np.isfinite(features)):
-        raise ValueError(f"{what} is not finite at [window, feature] {np.argwhere(~np.isfinite(features))[0]}")
-    return features
+    return finite_array(what, features, ("window", "feature"))
 
 
 def _two_clouds(features, reference) -> tuple[np.ndarray, np.ndarray]:
@@ -296,10 +296,8 @@ def mean_and_interval(values) -> dict:
         raise ValueError(f"values must be [n], finite or NaN, got an array of {values.shape}")
     values = values[~np.isnan(values)]
     count = len(values)
-    mean = float(values.mean()) if count else float("nan")
-    half = float("nan")
-    if count > 1:
-        half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(count)
+    mean = float(values.mean()) if count else np.nan
+    half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(count) if count > 1 else np.nan
     return {"value": mean, "low": mean - half, "high": mean + half, "repeats": count}
 
 

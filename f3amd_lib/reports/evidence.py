@@ -482,6 +482,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     table, record = read_table(path)
     table = table[table["recipe"] == "paper"].fillna({"unit": ""})
     every, table = table, table[table["steps"] > 0]
+    place = path.relative_to(root).as_posix()
 
     def evidence(windows: int, classifier: str, rows: pd.DataFrame) -> Evidence:
         networks = rows[["model", "window_frames"]].drop_duplicates()
@@ -489,7 +490,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
             "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
             "trained": lambda: networks.assign(metric="windows", value=windows),
         }
-        where = f"{path.relative_to(root).as_posix()} at {windows:,} windows, seen by classifier {classifier}"
+        where = f"{place} at {windows:,} windows, seen by classifier {classifier}"
 
         def load(name: str):
             if name not in tables:
@@ -504,11 +505,10 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         rows = table[(table["windows"] == windows) & table["model"].isin(seen["model"])]
         rows = rows[~by_eyes[rows.index] | (rows["classifier"] == classifier)]
         found.append((windows, seen["model"].nunique(), evidence(windows, classifier, rows)))
-    where = path.relative_to(root).as_posix()
     # As `quality` above: the classifier that saw the longest curves comes first.
     seen = [rows for _, rows in every.groupby("classifier")]
     seen.sort(key=lambda rows: rows.groupby("run")["windows"].nunique().nlargest(2).sum(), reverse=True)
-    curves = [_snapshot_curves(rows, record, where) for rows in seen]
+    curves = [_snapshot_curves(rows, record, place) for rows in seen]
     return [one for *_, one in sorted(found, key=lambda each: each[:2], reverse=True)] + curves
 
 

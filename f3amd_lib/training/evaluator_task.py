@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -14,9 +13,9 @@ import optax
 
 from f3amd_lib.data.text_encoders import TextEmbeddings
 from f3amd_lib.data.text_motions import MOST_FRAMES, UNIT, draw_clips
-from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -41,9 +40,9 @@ class EvaluatorTraining:
     def __post_init__(self):
         if self.num_steps < 1 or self.batch_size < 2:
             raise ValueError(f"a judge needs at least 1 step and batches of 2, got {self}")
-        if not 0 < self.learning_rate < math.inf or self.num_frames < UNIT:
-            raise ValueError(f"a judge needs a learning rate above 0 and {UNIT} frames, got {self}")
-        checked_seed(self.seed)
+        if self.num_frames < UNIT:
+            raise ValueError(f"a judge needs at least {UNIT} frames, got {self}")
+        check_settings(self)
 
     def optimiser(self) -> optax.GradientTransformation:
         """Return Adam with a warm-up, gradients clipped."""

@@ -16,7 +16,6 @@ from flax import nnx
 from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.diffusion import phases
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.motion.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.networks import motionpcm
 from f3amd_lib.networks.presets import build_from_config
@@ -86,7 +85,6 @@ class LatentMotionTraining:
             )
         if not self.least_guidance <= self.most_guidance:
             raise ValueError("least_guidance must be no more than most_guidance")
-        checked_seed(self.seed)
 
     def optimiser(self, learning_rate: float | None = None, first_moment=0.9) -> optax.GradientTransformation:
         """Return AdamW without decay after clipping, with a warm-up and a cosine, at `learning_rate` or another."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import optax
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
-from f3amd_lib.ground.names import checked_seed, refuse_unknown
+from f3amd_lib.ground.names import refuse_unknown
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.losses import LossWeights
@@ -85,7 +85,6 @@ class TrainingConfig:
 
     def __post_init__(self):
         check_settings(self)
-        checked_seed(self.seed)
         # The other draws reach below 1 by a logarithm, which such a schedule alone has room for.
         exploding = self.diffusion.kind == "variance_exploding"
         if self.noise != "schedule" and not (exploding and self.diffusion.sigma_min < 1.0):

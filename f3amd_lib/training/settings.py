@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known, refuse_unknown
+from f3amd_lib.ground.names import check_known, checked_seed, refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
@@ -32,7 +32,7 @@ def _in_range(value, wanted: str) -> bool:
 
 
 def check_settings(settings, kind: str = "") -> None:
-    """Raise ValueError for a field that is not what `settings.toml` says of its class: a variant, or in a range.
+    """Raise ValueError for a field that is not what `settings.toml` says of its class, or a seed that is none.
 
     Args:
       settings: of a class that the file has.
@@ -44,6 +44,8 @@ def check_settings(settings, kind: str = "") -> None:
             check_known(value, wanted, name)
         elif not _in_range(value, wanted):
             raise ValueError(f"{kind}{name} must be {wanted}, got {value!r}")
+    if hasattr(settings, "seed"):
+        checked_seed(settings.seed)
 
 
 def part_recipe(training: type, part: str, num_steps: int, preset: str | None = None, **settings):

@@ -18,7 +18,6 @@ from f3amd_lib.data.text_motions import ClipTable, draw_clips
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
 from f3amd_lib.networks.config import LayerKeys
@@ -82,7 +81,6 @@ class TextMotionTraining:
             raise ValueError(f"drops must be steps, got {self.drops!r}")
         object.__setattr__(self, "drops", tuple(self.drops))
         check_settings(self)
-        checked_seed(self.seed)
 
     def rate(self, step):
         """Return the learning rate of a step."""
