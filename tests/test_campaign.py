@@ -136,6 +136,17 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     assert [state for *_, state in rest] == ["measured before", "measured", "measured"]
     pd.testing.assert_frame_equal(table, again)
     assert measured == 2 * once
+    # The losses on the way lie beside the weights, whole over both legs; the last held-out one is the table's.
+    for folder in (tmp_path / "whole", legs):
+        history, _ = read_table(folder / "runs" / "F3AMD-FNO-32-seed0" / "F3AMD-FNO-32.history.csv")
+        losses = table.query("run == 'F3AMD-FNO-32-seed0' and metric == 'held_out_loss'").set_index("windows")["value"]
+        assert (4 * history["step"]).tolist() == losses.index.tolist()
+        assert history["held_out_loss"].to_numpy() == pytest.approx(losses.to_numpy(), rel=1e-5)
+    # A snapshot that was passed is trained from the beginning, and the state that was further is kept.
+    folder, shorter = legs / "runs" / "F3AMD-FNO-32-seed0", [(Run("F3AMD-FNO-32"), 12)]
+    further = (folder / "F3AMD-FNO-32.state.safetensors").read_bytes()
+    run(packed, judges, legs, shorter, monkeypatch)
+    assert (folder / "F3AMD-FNO-32.old1.state.safetensors").read_bytes() == further
     # A nonsense must show: another seed gives other weights.
     _, (other, _) = run(packed, judges, tmp_path / "other", [(Run("F3AMD-FNO-32", seed=5), 8)], monkeypatch)
     assert other["weights"][0] not in set(table["weights"])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 
 import pandas as pd
 from jax.sharding import Mesh
@@ -16,7 +15,16 @@ from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise, restore_state
-from f3amd_lib.training.pipeline import PreparedData, as_trained, finished_model, model_files, train
+from f3amd_lib.training.pipeline import (
+    ModelFiles,
+    PreparedData,
+    as_trained,
+    finished_model,
+    model_files,
+    set_aside_run,
+    train,
+    train_in_legs,
+)
 from f3amd_lib.training.recipe import TrainingConfig, short_recipe
 
 SHORT_RUN = {"num_steps": 200, "batch_size": 32, "learning_rate": 1e-3}
@@ -76,7 +84,8 @@ def snapshot(
       prepared, preset, recipe: the data, the model, and how a whole run is trained.
       steps: at most those of the recipe.
       record: from `run_record`; what the model is told of its training.
-      folder: where the training state is kept.
+      folder: where the training state and the history of the losses are kept; a state that is further than `steps` is
+        kept under another name.
       network: fields of the preset's network to change.
       stop_at: see `optimise`.
       progress: show a progress bar.
@@ -87,18 +96,16 @@ def snapshot(
     Raises:
       ValueError: if the state that lies there is of other settings.
     """
-    task, file = prepared.task(preset, recipe, network=network), Path(folder) / f"{preset}.state.safetensors"
-    state = restore_state(file, task) if file.exists() else None
-    if state is None or int(state.step) > steps:
-        state = initial_state(task)
-    state, _ = optimise(
-        task, state, checkpoint=file, checkpoint_every=min(steps, 400), chunk=min(50, steps), stop_after=steps,
-        stop_at=stop_at, progress=progress,
-    )  # fmt: skip
+    task, files = prepared.task(preset, recipe, network=network), ModelFiles.of(folder, preset)
+    held_out = prepared.windows(prepared.held_out_split)
+    record = {**record, "training": recipe.to_dict(), "windows_seen": steps * recipe.batch_size}
+    if files.state.exists() and int(restore_state(files.state, task).step) > steps:
+        set_aside_run(files)
+    leg = {"every": min(steps, 400), "stop_after": steps, "stop_at": stop_at, "progress": progress}
+    state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
     if int(state.step) < steps:
         return None, math.nan
-    loss = held_out_terms(task, state, prepared.windows(prepared.held_out_split))["loss"]
-    record = {**record, "training": recipe.to_dict(), "windows_seen": steps * recipe.batch_size}
+    loss = held_out_terms(task, state, held_out)["loss"]
     return as_trained(prepared, task, preset, state.averaged, record), loss
 
 

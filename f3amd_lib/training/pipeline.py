@@ -232,7 +232,7 @@ def alone_with(files: ModelFiles) -> contextlib.AbstractContextManager:
 
 
 def train_in_legs(
-    task: Task, files: ModelFiles, record: dict, *, held_out, mesh: Mesh | None = None, **leg
+    task: Task, files: ModelFiles, record: dict, *, held_out, every: int | None = None, mesh: Mesh | None = None, **leg
 ) -> tuple[TrainingState, pd.DataFrame]:
     """Train a task from where its files are, keeping its state and its history there.
 
@@ -241,15 +241,16 @@ def train_in_legs(
       files: of the run; what lies there without a state is kept under another name.
       record: goes beside the history.
       held_out: data to watch the losses on.
+      every: steps between checkpoints and looks at the held-out losses; by default a twentieth of the run.
       mesh: devices that share each batch.
-      **leg: stop_at and progress, as for `optimise`.
+      **leg: stop_after, stop_at and progress, as for `optimise`.
 
     Returns:
       (state, history); the state is short of the task's steps where `stop_at` came first.
     """
     state, rows = _begun(files, task, mesh)
-    # At least two chunks, so that the shortest run can be stopped on its way, too.
-    every = max(1, min(max(5, task.config.num_steps // 20), task.config.num_steps // 2))
+    if every is None:  # at least two chunks, so that the shortest run can be stopped on its way, too
+        every = max(1, min(max(5, task.config.num_steps // 20), task.config.num_steps // 2))
 
     def keep(row: dict) -> None:
         rows.append(row)
@@ -281,7 +282,7 @@ def _begun(files: ModelFiles, task: Task, mesh: Mesh | None) -> tuple[TrainingSt
         raise ValueError(f"{files.state}: one process sees it and another does not; {advice}")
     if not begun:
         if parallel.is_first_process():
-            _set_aside(files)  # a finished model without its state cannot be gone on with
+            set_aside_run(files)  # a finished model without its state cannot be gone on with
         return None, []
     state = restore_state(files.state, task, mesh)
     if not parallel.same_everywhere(int(state.step)):
@@ -330,7 +331,7 @@ def obtain_model(
             return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
     if files.model.exists() or not files.history.exists():
-        _set_aside(files)
+        set_aside_run(files)
     set_aside_other_state(prepared, files, wanted, recipe)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
@@ -415,7 +416,7 @@ def set_aside_other_state(
     """
     wanted = weights_identity(model, config, prepared.packed.fingerprint)
     if files.state.exists() and differences(wanted, describe(files.state)):
-        _set_aside(files)
+        set_aside_run(files)
 
 
 def available_models(profile: Profile) -> list[str]:
@@ -456,7 +457,7 @@ def find_model(dataset: str) -> Path:
     )
 
 
-def _set_aside(files: ModelFiles) -> None:
+def set_aside_run(files: ModelFiles) -> None:
     """Rename what lies there to the first free number, so that nothing a user made is lost."""
     name = files.model.name.removesuffix(".safetensors")
     if kept := set_aside((*files, files.history.with_suffix(".json")), name):
