@@ -212,8 +212,13 @@ def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeyp
     levels = posterior.POSTERIOR["smoke"]["num_levels"]
     assert len(mine) == 3 * levels and mine["sigma"].max() == pytest.approx(128.0)
     assert mine["weights"].str.fullmatch("[0-9a-f]{12}").all()
+    assert record["weights_digests"] == {"F3AMD-FNO-32": [mine["weights"].iloc[0]]}
     again, _ = read_table(measure.measure_posterior(prepared, profile))
-    assert again.equals(table)
+    assert again.equals(table) and not list(path.parent.glob("*.old1.*"))
+    # Of another model alone: what was measured of the first is kept.
+    other, _ = read_table(measure.measure_posterior(prepared, profile, ["F3AMD-FNO-48"]))
+    assert set(other["model"]) == {"real", "F3AMD-FNO-48"}
+    assert read_table(path.with_name("posterior.old1.csv"))[0].equals(table)
 
 
 def test_the_measurement_has_a_name_on_the_command_line():

@@ -52,7 +52,7 @@ from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
-from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.ground.records import run_record, set_aside_table, whole_table, write_table
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.walking import walking_figures
@@ -155,10 +155,16 @@ def _write_anew(
     prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, trained: Mapping[str, TrainedModel],
     **settings,
 ) -> Path:  # fmt: skip
-    """Write a table that is measured as a whole; its record names the weights of its models."""
+    """Write a table that is measured as a whole; its record names the weights of its models.
+
+    A table with models that this one lacks is kept under another name.
+    """
+    path = _records_dir(profile) / f"{name}.csv"
+    if (there := whole_table(path)) and not set(there[0].get("model", ())) <= set(table["model"]):
+        log.warning("%s has other models as well: kept as %s", path, set_aside_table(path).name)
     digests = {model: [digest] for model, digest in _digests(trained).items()}
     record = _record(prepared, profile, name, **settings, weights_digests=digests)
-    return write_table(_records_dir(profile) / f"{name}.csv", table, record)
+    return write_table(path, table, record)
 
 
 def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> list[tuple[str, Motion]]:
@@ -414,11 +420,10 @@ def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable
     settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
     _, trained = _asked(prepared, profile, models)
     table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
-    record = _record(
-        prepared, profile, "posterior", held_out_split=prepared.held_out_split, settings=settings,
+    return _write_anew(
+        prepared, profile, "posterior", table, trained, held_out_split=prepared.held_out_split, settings=settings,
         numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
     )  # fmt: skip
-    return write_table(_records_dir(profile) / "posterior.csv", table, record)
 
 
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
