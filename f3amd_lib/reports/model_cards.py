@@ -28,6 +28,7 @@ from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.measures.text_judge import load_judge
 from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.reports.gate import LEAST_SHARE
 from f3amd_lib.reports.quality_tables import figure_column, measured_table
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.latent_models import is_latent_preset, load_latent_model
@@ -126,8 +127,9 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
             figures = _CARDS["measured"]["model"].format(table=markdown_table(_figures(measured, real)))
             limits = _limits(measured, real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
-    if training["passes"] < 20:
-        limits.append("It was trained far shorter than the paper's models.")
+    whole = load_paper_file("paper")["training"]["windows"].get(str(trained.config.window))
+    if whole and training["seen"] < LEAST_SHARE * whole:
+        limits.append(f"It saw {100 * training['seen'] / whole:.2g} % of the windows that the paper's models saw.")
     return _filled(
         "model_card", path, trained, trained.params, **training,
         styles=", ".join(trained.styles), measured=figures, limits="\n".join(f"- {limit}" for limit in limits),
