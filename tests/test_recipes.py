@@ -291,6 +291,19 @@ def test_what_notebook_15_says_of_length_follows_from_the_record():
     for metric, (longer, shorter) in beside.items():
         assert most[metric] == pytest.approx(longer, rel=0.03), metric
         assert camdm[metric] == pytest.approx(shorter, rel=0.03), metric
+    # Twice the windows put it ahead, or level.
+    twice = family.loc[("CAMDM", 400 * thousand)]
+    assert set(table.query("run == 'CAMDM-seed0'")["classifier"]) == set(eyes("seed0"))
+    said = {
+        "trajectory_error": (0.0437, 0.051), "joint_acceleration": (1.7, 2.0), "FID": (20, 19), "IRD": (6.9, 2.2),
+        "foot_sliding": (0.55, 0.67), "foot_alternation": (0.62, 0.13), "x0_error_ratio": (0.57, 0.91),
+        "use_of_x": (1.83, 0.33),
+    }  # fmt: skip
+    for metric, (theirs, ours) in said.items():
+        assert (twice[metric], most[metric]) == pytest.approx((theirs, ours), rel=0.025), metric
+    ships = read_table(records / "quality.csv")[0].query("model == 'CAMDM' and steps == 8").set_index("metric")["value"]
+    assert (round(ships["trajectory_error"], 3), round(ships["joint_acceleration"], 1)) == (0.047, 1.4)
+    assert round(ships["FID"]) == 53
     # At as many windows, through the same classifier, the higher rate alone: a second seed of it.
     assert (round(rate["held_out_loss"], 3), round(rate["x0_error_ratio"], 2)) == (0.210, 0.95)
     assert (round(rate["FID"]), round(camdm["FID"]), round(least["FID"])) == (23, 27, 137)

@@ -449,7 +449,7 @@ def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
     reached = float(curve["epoch"].iloc[int(np.argmax(close))])
     last = float(curve["epoch"].iloc[-1])
     if reached > STILL_BETTER * last:
-        raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:g}")
+        raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:.3g}")
     return reached
 
 
