@@ -142,7 +142,8 @@ def test_limits_follow_from_the_figures():
     good = {"x0_error_ratio": 0.2, "stepping_rate": 1.9, "slide_speed": 6.0}
     for word in ("noisy input", "skates", "rarely", "sink"):
         assert word not in limits(**good)
-    assert "hardly uses its noisy input" in limits(**good | {"x0_error_ratio": 0.95})
+    assert "hardly uses its noisy input" in limits(**good | {"x0_error_ratio": 0.85})
+    assert "noisy input" not in limits(**good | {"x0_error_ratio": 0.75})
     assert "steps too rarely: 0.9" in limits(**good | {"stepping_rate": 0.9})
     assert "skates: its lower toe moves over the ground at 84 cm/s" in limits(**good | {"slide_speed": 84.0})
     assert "Toes sink" in limits(**good, floor_penetration=2.0)

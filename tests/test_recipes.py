@@ -161,14 +161,16 @@ def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkey
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     tiny = tiny_trained()
     tiny = dataclasses.replace(tiny, record=tiny.record | {"training": {"batch_size": 16}})
-    losses = [4.0, np.nan, 2.0, 1.9, 1.5]  # watched at 20, 60, 80 and 100 of 100 steps
+    losses = [4.0, np.nan, 2.0, 1.8, 1.5]  # watched at 20, 60, 80 and 100 of 100 steps
     history = pd.DataFrame({"step": [20, 40, 60, 80, 100], "held_out_loss": losses})
     histories = {"F3AMD-FNO-32": history, "F3AMD-FNO-48": history[["step"]]}
     monkeypatch.setattr(measure, "obtain_model", lambda prepared, profile, *, preset: (tiny, histories[preset], ""))
     monkeypatch.setattr(measure, "available_models", lambda profile: list(histories))
     table, record = read_table(measure.measure_trained(prepared, PROFILE))
     found = table.set_index(["model", "metric"])["value"]
-    assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(0.25)
+    assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(
+        1.0 - 1.5 / (2.0 - 0.2 * np.log(75 / 60) / np.log(80 / 60))
+    )
     assert np.isnan(found["F3AMD-FNO-48", "held_out_fall"]) and set(record["weights_digests"]) == set(histories)
     # Of a training that was gone on with, all legs count, as on its card.
     tiny = dataclasses.replace(tiny, record=tiny.record | {"windows_seen": 5000})
@@ -311,7 +313,7 @@ def test_what_notebook_15_says_of_length_follows_from_the_record():
     steps = read_table(repository_root() / "paper_figures/synthetic/laptop/records/training_time.csv")[0]
     steps = steps.query("window_frames == 32").set_index("model")["value"]
     cost = steps / steps["F3AMD-FNO-96"]
-    assert 4.5 < cost["CAMDM"] < 5.5 and cost["F3AMD-Transformer-64"] > 0.9 and 0.45 < cost["F3AMD-FNO-32"] < 0.55
+    assert 4.5 < cost["CAMDM"] < 5.5 and 0.9 < cost["F3AMD-Transformer-64"] < 1.1 and 0.45 < cost["F3AMD-FNO-32"] < 0.55
 
 
 def test_what_notebook_15_says_of_ablations_follows_from_the_record():

@@ -98,7 +98,7 @@ def snapshot(
     """
     task, files = prepared.task(preset, recipe, network=network), ModelFiles.of(folder, preset)
     held_out = prepared.windows(prepared.held_out_split)
-    record = {**record, "training": recipe.to_dict(), "windows_seen": steps * recipe.batch_size}
+    record = {**record, "training": recipe.to_dict()}
     if files.state.exists() and int(restore_state(files.state, task).step) > steps:
         set_aside_run(files)
     leg = {"every": min(steps, 400), "stop_after": steps, "stop_at": stop_at, "progress": progress}
@@ -106,7 +106,8 @@ def snapshot(
     if int(state.step) < steps:
         return None, math.nan
     loss = held_out_terms(task, state, held_out)["loss"]
-    return as_trained(prepared, task, preset, state.averaged, record), loss
+    seen = {"windows_seen": steps * recipe.batch_size}
+    return as_trained(prepared, task, preset, state.averaged, record | seen), loss
 
 
 def learning_curve(

@@ -353,10 +353,11 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
 
     def sum_up(row: Mapping) -> dict:
         trained, history, _ = found[row["model"]]
-        last = history["step"].max()
-        loss = history.get("held_out_loss", history["step"] * np.nan).dropna()
-        early = loss[history["step"] <= 0.75 * last]
-        fall = 1.0 - loss.iloc[-1] / early.iloc[-1] if len(early) else np.nan
+        last, fall = history["step"].max(), np.nan
+        if len(looks := history.get(["step", "held_out_loss"], history.iloc[:0]).dropna()):
+            # Between two looks the loss is taken to fall evenly with the logarithm of the steps.
+            step, loss = np.log(looks["step"].to_numpy()), looks["held_out_loss"].to_numpy()
+            fall = 1.0 - loss[-1] / np.interp(np.log(0.75 * last), step, loss, left=np.nan)
         # Where training was gone on with, the file knows how many windows all of it saw.
         windows = trained.record.get("windows_seen", last * trained.record["training"]["batch_size"])
         figures = {"windows": windows, "held_out_fall": fall}
