@@ -160,7 +160,7 @@ def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkey
     """Windows are steps times batch; the fall is that of the held-out loss over the last quarter."""
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     tiny = tiny_trained()
-    tiny = dataclasses.replace(tiny, record=tiny.record | {"training": {"batch_size": 16}})
+    tiny = dataclasses.replace(tiny, record=tiny.record | {"training": {"num_steps": 100, "batch_size": 16}})
     losses = [4.0, np.nan, 2.0, 1.8, 1.5]  # watched at 20, 60, 80 and 100 of 100 steps
     history = pd.DataFrame({"step": [20, 40, 60, 80, 100], "held_out_loss": losses})
     histories = {"F3AMD-FNO-32": history, "F3AMD-FNO-48": history[["step"]]}

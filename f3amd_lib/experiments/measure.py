@@ -354,13 +354,11 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
     def sum_up(row: Mapping) -> dict:
         trained, history, _ = found[row["model"]]
         last, fall = history["step"].max(), np.nan
-        if len(looks := history.get(["step", "held_out_loss"], history.iloc[:0]).dropna()):
+        if len(looks := history.reindex(columns=["step", "held_out_loss"]).dropna()):
             # Between two looks the loss is taken to fall evenly with the logarithm of the steps.
             step, loss = np.log(looks["step"].to_numpy()), looks["held_out_loss"].to_numpy()
             fall = 1.0 - loss[-1] / np.interp(np.log(0.75 * last), step, loss, left=np.nan)
-        # Where training was gone on with, the file knows how many windows all of it saw.
-        windows = trained.record.get("windows_seen", last * trained.record["training"]["batch_size"])
-        figures = {"windows": windows, "held_out_fall": fall}
+        figures = {"windows": trained.windows_seen, "held_out_fall": fall}
         return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
 
     records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)

@@ -204,6 +204,12 @@ class TrainedModel:
     start_poses: dict
     record: dict
 
+    @property
+    def windows_seen(self) -> int:
+        """Windows that the weights were trained on, over all legs of a training and up to its snapshot."""
+        recipe = self.record["training"]
+        return self.record.get("windows_seen", recipe["num_steps"] * recipe["batch_size"])
+
     def network(self):
         """Return the network with its weights."""
         return network_with(self.config, self.params)
