@@ -78,6 +78,21 @@ def weights_identity(model: NetworkConfig, config: TrainingConfig, dataset_finge
     return {"model": model.to_dict(), "training": config.to_dict(), "dataset_fingerprint": dataset_fingerprint}
 
 
+OWN_HISTORY_STEPS = 4_000
+"""Of a longer run this many count when its share of own histories rises: the network walks by then, and a snapshot of
+the long queue is what a run of its own length would be."""
+
+
+def own_history_share(config: TrainingConfig, step):
+    """Return the share of samples that start from the network's own history at a step.
+
+    It rises from 0 to the config's between 10 and 40 % of the run, or of the first `OWN_HISTORY_STEPS` of a longer one:
+    before that there is nothing to learn from.
+    """
+    progress = step / min(config.num_steps, OWN_HISTORY_STEPS)
+    return config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Constants:
     """What is known of the training windows as a whole, compiled into the step.
@@ -173,9 +188,7 @@ class DenoisingTask(Task):
         made = jnp.concatenate([before.history, made], axis=1)[:, -batch.history.shape[1] :]
         # From the coordinates of the window before to those of this one.
         made = center_window(made, before.future[:, -1, jnp.array([0, 2])])
-        # The share rises between 10 and 40 % of the run: before that there is nothing to learn from.
-        progress = state.step / config.num_steps
-        share = config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
+        share = own_history_share(config, state.step)
         chosen = room & jax.random.bernoulli(key_choice, share, room.shape)
         return jnp.where(chosen[:, None, None], made, batch.history)
 

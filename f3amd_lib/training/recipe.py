@@ -51,7 +51,8 @@ class TrainingConfig:
       own_history_share: share of samples that start from the network's own last frames of the
         window before, made in one step without gradient, instead of captured ones (ours; 0 in
         paper presets). Without it small losses of swing add up over rounds until nobody walks.
-        It rises from 0 between 10 and 40 % of the run, when there is something to learn from.
+        It rises from 0 between 10 and 40 % of the run, or of the first 4,000 steps of a longer one, when there is
+        something to learn from.
       history_damping: share of samples whose history is pulled towards the mean pose of its style,
         by a random amount, while the target soon returns to what was captured (ours; 0 in paper
         presets): the same remedy, for histories that have lost the swing of more than one round.
