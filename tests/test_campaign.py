@@ -11,7 +11,7 @@ from builders import packed_from, refused
 
 from f3amd_lib.experiments import campaign
 from f3amd_lib.experiments.campaign import Run, queue, run_campaign
-from f3amd_lib.experiments.denoising import held_out_condition, input_use
+from f3amd_lib.experiments.denoising import held_out_condition, held_out_error, input_use
 from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -123,6 +123,8 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
         uses = input_use(kept, held_out_condition(held_out, kept)).set_index("metric")["value"]
         found = table.query("run == @each.name and windows == @windows and steps == 8").set_index("metric")["value"]
         assert found[uses.index].to_numpy() == pytest.approx(uses.to_numpy(), rel=0.02) and uses.min() > 0.0
+        (error,) = table.query("run == @each.name and windows == @windows and metric == 'held_out_error'")["value"]
+        assert error == pytest.approx(held_out_error(kept, held_out), rel=0.01) and error > 0.0
     uses = table[table["metric"] == "use_of_x"].groupby("run")["value"].first()
     assert uses.max() > 1.1 * uses.min(), "two networks of equal use would hide a row of the wrong one"
     once = measured.copy()

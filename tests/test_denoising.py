@@ -64,6 +64,33 @@ def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
     assert lowest == pytest.approx(four.levels[0]) and highest == pytest.approx(four.sigma_max)
 
 
+def test_networks_are_compared_at_camdms_levels_or_at_those_that_they_were_told(model_that, monkeypatch):
+    windows, asked = tiny_windows(), []
+
+    def spy(trained, windows, sigmas, **settings):
+        asked.append(tuple(sigmas))
+        return pd.DataFrame({"joint_error_cm": [1.0, 2.0, 6.0]})
+
+    monkeypatch.setattr(denoising, "x0_error_by_sigma", spy)
+    four, camdms = variance_preserving_cosine(4), variance_preserving_cosine()
+    told = tiny_trained(config=tiny_camdm(noise_levels=tuple(four.levels.tolist())), diffusion=four)
+    assert denoising.held_out_error(told, windows) == pytest.approx(3.0)
+    any_level = model_that(lambda x_noisy, sigma: x_noisy)
+    denoising.held_out_error(any_level, windows)
+    assert asked[0] == pytest.approx(four.levels.tolist())
+    assert asked[1][:-1] == pytest.approx(camdms.levels[:-1].tolist())
+    assert asked[1][-1] == any_level.diffusion.sigma_max < camdms.sigma_max
+
+
+def test_the_truth_has_no_held_out_error_and_the_noise_itself_a_large_one(model_that):
+    windows = tiny_windows()
+    batch = spread_windows(windows, denoising.WINDOWS)
+    x0 = network_inputs(batch, model_that(lambda x, s: x).normaliser)[0]
+    answers = lambda x, s: x0, lambda x, s: 0.0 * x, lambda x, s: x  # the truth, the mean, the noise itself
+    errors = [denoising.held_out_error(model_that(answer), windows) for answer in answers]
+    assert errors[0] == pytest.approx(0.0, abs=1e-3) and 1.0 < errors[1] < errors[2]
+
+
 @pytest.mark.slow
 def test_seed_spread_is_the_spread_that_the_samples_have(model_that, monkeypatch):
     trained = model_that(lambda x_noisy, sigma: x_noisy)

@@ -3,9 +3,10 @@
 The queue stands in `papers/f3amd/campaign.toml`. Every run follows the paper's text, whose learning
 rate hardly falls, so that each snapshot of a long run is a fair row at its length. Snapshots are
 kept as weights and measured by the protocol of `experiments.protocol` with one seed; how far their
-answers move with the noisy input, and with the noise level, is measured as well. All of it is one
-table, `records/campaign.csv`. A queue may take months and machines: each row names the style
-classifier that it was seen through, and FID and EMD are compared between rows of one classifier.
+answers move with the noisy input, and with the noise level, and how far they are off, is measured
+as well. All of it is one table, `records/campaign.csv`. A queue may take months and machines: each
+row names the style classifier that it was seen through, and FID and EMD are compared between rows
+of one classifier.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 
-from f3amd_lib.experiments.denoising import held_out_condition, input_use
+from f3amd_lib.experiments.denoising import held_out_condition, held_out_error, input_use
 from f3amd_lib.experiments.learning_curves import snapshot
 from f3amd_lib.experiments.protocol import Protocol, measure_model
 from f3amd_lib.experiments.recipes import find_recipe
@@ -191,7 +192,8 @@ def _measured(
         trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=protocol.path_seed
     )
     tables.append(use.assign(steps=STEPS_MEASURED[0]))
-    tables.append(pd.DataFrame([{"steps": 0, "metric": "held_out_loss", "value": loss}]))
+    error = held_out_error(trained, held_out, seed=protocol.path_seed)
+    tables.append(pd.DataFrame({"steps": 0, "metric": ["held_out_loss", "held_out_error"], "value": [loss, error]}))
     columns = {
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
