@@ -5,6 +5,7 @@ import itertools
 import math
 
 import jax
+import numpy as np
 import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, wandering_motion
@@ -68,6 +69,42 @@ def test_the_table_says_what_fell():
 
 
 @pytest.mark.slow
+def test_a_power_law_is_found_and_followed():
+    windows = np.array([2e5, 4e5, 8e5, 1.6e6])
+    found = learning_curves.power_law(windows, 3.0 * windows**-0.25, [1e6, 2e8])
+    assert found["exponent"].tolist() == pytest.approx([-0.25, -0.25])
+    assert found["value"].tolist() == pytest.approx([3.0 * 1e6**-0.25, 3.0 * 2e8**-0.25])
+    assert found["low"].tolist() == pytest.approx(found["high"].tolist())  # no scatter, no doubt
+
+
+def test_the_interval_of_a_power_law_holds_the_truth_as_often_as_it_says():
+    windows, reach = 2e5 * 2.0 ** np.arange(6), 2e8
+    noise = np.random.default_rng(3).normal(scale=0.1, size=(400, 6))
+    found = [learning_curves.power_law(windows, 3.0 * windows**-0.25 * np.exp(one), [reach]).iloc[0] for one in noise]
+    held = np.mean([row["low"] < 3.0 * reach**-0.25 < row["high"] for row in found])
+    assert 0.92 < held < 0.98
+    widths = {
+        last: learning_curves.power_law(windows, np.exp(noise[0]), [last]).eval("high / low")[0]
+        for last in (1e6, reach)
+    }
+    assert widths[reach] > 1.5 * widths[1e6]  # doubt grows with the way
+
+
+@pytest.mark.parametrize(
+    "windows, values, reach, message",
+    [
+        ([1, 2], [1, 2], [3], "needs 3 points"),
+        ([1, 2, 3], [1, 2], [3], "needs 3 points"),
+        ([1, 2, 3], [1, 0, 2], [3], "positive, finite"),
+        ([1, 2, 3], [1, np.nan, 2], [3], "positive, finite"),
+        ([1, 2, 3], [1, 2, 3], [-1], "positive, finite"),
+    ],
+)
+def test_what_has_no_power_law_is_refused(windows, values, reach, message):
+    with pytest.raises(ValueError, match=message):
+        learning_curves.power_law(windows, values, reach)
+
+
 def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeypatch):
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     profile = load_profile("smoke", "synthetic")

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import same_color
 
 from f3amd_lib.drawing.diagrams import arrow, boxes, influence_maps
-from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, poses_beside, write_gif
+from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside, write_gif
 from f3amd_lib.drawing.stick_figures import Camera, body_lines, drawn_points
 from f3amd_lib.drawing.style import keep_figure, model_style, new_figure
 from f3amd_lib.measures.corruptions import CORRUPTIONS
@@ -54,6 +54,24 @@ def test_poses_stand_in_a_row_and_a_panel_may_stay_empty():
     middles = [np.concatenate(body.get_segments())[:, 0].mean() for body in bodies(figure.axes[2])]
     np.testing.assert_allclose(np.diff(middles), SLOT, atol=1e-6)
     assert [text.get_text() for text in figure.axes[0].texts] == ["0.0 s", "0.2 s", "0.3 s"]
+
+
+def test_toes_stand_below_their_poses_and_are_thick_where_they_rest():
+    motions = {"walks": wandering_motion(30), "": None, "frozen pose": straight_motion(30)}
+    frames = range(0, 30, 10)
+    figure = poses_beside(motions, frames, below=1.5)
+    draw_toes(figure, motions, frames)
+    assert not figure.axes[1].lines and [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "left toe", "right toe", "a toe rests",
+    ]  # fmt: skip
+    motion, lines = motions["walks"], figure.axes[0].lines[-5:-1]  # the last is in the legend alone
+    toes = motion.positions[:21][:, list(motion.skeleton.toes), 1]
+    for foot, (thin, thick) in enumerate((lines[:2], lines[2:])):
+        along, height = map(np.asarray, thin.get_data())
+        assert along[[0, 10, 20]] == pytest.approx([0.0, SLOT, 2 * SLOT])  # under the poses of frames 0, 10 and 20
+        assert np.diff(height) == pytest.approx(4.0 * np.diff(toes[:, foot]), abs=1e-6) and height.max() < 0.0
+        np.testing.assert_array_equal(np.isfinite(thick.get_ydata()), motion.contacts[:21, foot])
+        assert thick.get_linewidth() > 2 * thin.get_linewidth()
 
 
 def test_broken_motion_has_colours_that_no_network_has():

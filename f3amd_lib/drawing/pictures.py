@@ -276,6 +276,28 @@ def poses_beside(
     return figure
 
 
+def draw_toes(figure, motions: Mapping[str, Motion | None], frames: range) -> None:
+    """Draw below each panel of `poses_beside` how high the toes are, thick where a toe rests.
+
+    Args:
+      figure: of `poses_beside(motions, frames, below=1.5)`.
+      motions, frames: the same; frames a range, and every one between its ends is drawn.
+    """
+    every = np.arange(frames[0], frames[-1] + 1)
+    along = SLOT * (every - frames[0]) / frames.step  # a time stands below its pose
+    for axis, motion in zip(figure.axes, motions.values(), strict=False):
+        if motion is None:
+            continue
+        height = motion.positions[every][:, list(motion.skeleton.toes), 1]
+        height = 4.0 * (height - height.min()) - 1.4  # four times as high, below the poses
+        for foot, side in enumerate(("left", "right")):
+            color = LIMB_COLORS[side]
+            axis.plot(along, height[:, foot], color=color, linewidth=0.9, label=f"{side} toe")
+            axis.plot(along, np.where(motion.contacts[every, foot], height[:, foot], np.nan), color=color, linewidth=3)
+    figure.axes[0].plot([], [], color=PALETTE["black"], linewidth=3, label="a toe rests")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
+
+
 # ------------------------------------------------------------------------------------------ crowds
 
 

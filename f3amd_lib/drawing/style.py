@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from PIL import Image
 
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
@@ -107,6 +109,13 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         return figure, figure.subplots(nrows, ncols, **grid)
+
+
+def label_log_axis(axis, places: Sequence[float] = (1, 3), form: str = "{x:g}") -> None:
+    """Label a logarithmic axis (`axes.xaxis` or `axes.yaxis`) at these places of each decade, and nowhere else."""
+    axis.set_major_locator(LogLocator(subs=places))
+    axis.set_major_formatter(form)
+    axis.set_minor_formatter("")
 
 
 def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:

@@ -8,8 +8,11 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping
 
+import numpy as np
 import pandas as pd
 from jax.sharding import Mesh
+from scipy.stats import linregress
+from scipy.stats import t as student_t
 
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training import parallel
@@ -140,6 +143,37 @@ def learning_curve(
     _, history = optimise(task, state, held_out=held_out, chunk=chunk, checkpoint_every=chunk, progress=False)
     rows += [{"model": preset, **{name: row[name] for name in ("step", "loss", "held_out_loss")}} for row in history]
     return pd.DataFrame(rows)
+
+
+def power_law(windows, values, reach) -> pd.DataFrame:
+    """Fit c windows^exponent through a learning curve, and follow it.
+
+    Args:
+      windows, values: positive, at least 3 points [N].
+      reach: numbers of windows to follow it to, [M].
+
+    Returns:
+      A row for each of `reach`: windows, value, low and high: the 95 % interval of the fitted line, which knows of
+      scatter about a power law and not of a curve that is none; and exponent, the same in all rows.
+
+    Raises:
+      ValueError: for fewer points, or what has no logarithm.
+    """
+    windows, values, reach = (np.asarray(each, float) for each in (windows, values, reach))
+    if len(windows) < 3 or windows.shape != values.shape:
+        raise ValueError(f"a power law needs 3 points of windows and values, got {windows.shape} and {values.shape}")
+    if not all((np.isfinite(each) & (each > 0)).all() for each in (windows, values, reach)):
+        raise ValueError("a power law needs positive, finite windows and values")
+    x, y, ahead = np.log(windows), np.log(values), np.log(reach)
+    fit = linregress(x, y)
+    line, spare = fit.slope * ahead + fit.intercept, len(x) - 2
+    scatter = np.sqrt(np.sum((y - fit.slope * x - fit.intercept) ** 2) / spare)
+    leverage = 1 / len(x) + (ahead - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2)
+    half = student_t.ppf(0.975, spare) * scatter * np.sqrt(leverage)
+    rows = {"windows": reach, "value": line, "low": line - half, "high": line + half}
+    return pd.DataFrame(rows).assign(
+        **{each: lambda table, each=each: np.exp(table[each]) for each in ("value", "low", "high")}, exponent=fit.slope
+    )
 
 
 def learning_table(curves: pd.DataFrame) -> pd.DataFrame:
