@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 
 import numpy as np
+import pytest
 from builders import refused, straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 from matplotlib.colors import same_color

@@ -15,6 +15,7 @@ from f3amd_lib.reports.quality_tables import (
     QUALITY_TABLES,
     beside_paper,
     figure_text,
+    of_queue,
     paper_rows,
     quality_markdown,
     side_by_side,
@@ -178,3 +179,25 @@ def test_the_papers_numbers_stand_in_columns_of_their_own():
     assert table["metric"].tolist() == ["IRD (cm)", "drift ↓"]
     assert table.loc[0, paper].tolist() == [1.795, 3.834]
     assert table.loc[1, ["real", *paper]].isna().all()
+
+
+def test_rows_of_the_queue_are_means_over_trainings_through_one_classifier():
+    def trained(seed, value, classifier, model="F3AMD-FNO-96", recipe="paper", windows=1000):
+        rows = figures(model, value=value).drop(columns=["low", "high", "repeats", "better"])
+        return rows.assign(seed=seed, classifier=classifier, recipe=recipe, windows=windows)
+
+    campaign = table_of(
+        trained(0, 10.0, "old"), trained(0, 50.0, "new", "F3AMD-FNO-96-m4"), trained(1, 14.0, "new"),
+        trained(0, 900.0, "new", recipe="mixed-noise"), trained(0, 900.0, "new", windows=2000),
+    )  # fmt: skip
+    rows = of_queue(campaign, 1000).set_index(["model", "metric"])
+    assert set(rows.index.get_level_values(0)) == {"F3AMD-FNO-96", "F3AMD-FNO-96-m4"}
+    # Two trainings: their mean, and Student's interval of two (12.7 s / sqrt 2); FID through the new classifier alone.
+    traj = rows.loc[("F3AMD-FNO-96", "trajectory_error")]
+    first = list(FIGURES).index("trajectory_error")
+    assert traj["value"] == 12.0 + first and traj["repeats"] == 2 and traj["unit"] == "m"
+    assert traj["high"] - traj["value"] == pytest.approx(12.706 * np.std([10, 14], ddof=1) / np.sqrt(2), rel=1e-3)
+    fid = rows.loc[("F3AMD-FNO-96", "FID")]
+    assert fid["value"] == 14.0 and fid["repeats"] == 1 and np.isnan(fid["high"])
+    wide = wide_rows(beside_paper(10, of_queue(campaign, 1000), LABEL))
+    assert wide[wide["source"] == LABEL]["model"].tolist() == ["F3AMD-FNO-96", "F3AMD-FNO-96-m4"]

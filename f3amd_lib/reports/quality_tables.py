@@ -17,6 +17,7 @@ import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
+from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import SHOWN, Metric
 from f3amd_lib.networks import presets
 
@@ -129,6 +130,22 @@ def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.Da
     gaps = pd.Series("" if system in systems else NOT_MEASURED for system in asked)
     undefined = rows["value"].isna() & (rows["source"] == dataset_label)
     return rows.assign(printed=rows["printed"].mask(undefined, gaps))
+
+
+def of_queue(campaign: pd.DataFrame, windows: int) -> pd.DataFrame:
+    """Return rows of the long queue as `beside_paper` takes them: each network after equally many windows.
+
+    Args:
+      campaign: `records/campaign.csv`.
+      windows: seen by each network.
+
+    Returns:
+      As from `protocol.summarise`, repeats being trainings: a mean over seeds, with an interval where there are two or
+      more. Figures that compare through one style classifier alone (FID, EMD) are those of the newest.
+    """
+    kept = (campaign["recipe"] == "paper") & (campaign["windows"] == windows) & campaign["metric"].isin(FIGURES)
+    by_eye = campaign["metric"].isin(["FID", "EMD"]) & (campaign["classifier"] != campaign["classifier"].iloc[-1])
+    return intervals_over_repeats(campaign[kept & ~by_eye].fillna({"unit": ""}), [*_KEYS, "unit"])
 
 
 def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
