@@ -5,8 +5,8 @@ rate hardly falls, so that each snapshot of a long run is a fair row at its leng
 kept as weights and measured by the protocol of `experiments.protocol` with one seed; how far their
 answers move with the noisy input, and with the noise level, and how far they are off, is measured
 as well. All of it is one table, `records/campaign.csv`. A queue may take months and machines: each
-row names the style classifier that it was seen through, and FID and EMD are compared between rows
-of one classifier.
+row names its commit and the style classifier that it was seen through, and FID and EMD are compared
+between rows of one classifier.
 """
 
 from __future__ import annotations
@@ -198,6 +198,6 @@ def _measured(
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
-        "device": jax.devices()[0].device_kind,
+        "device": jax.devices()[0].device_kind, "commit": (record["git_commit"] or "")[:10],
     }  # fmt: skip
     return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**columns)
