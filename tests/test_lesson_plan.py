@@ -96,7 +96,7 @@ def stated_minutes(notebook) -> tuple[int, int]:
 
 
 NOTEBOOKS = PLAN.parents[1] / "notebooks"
-BESIDE_THE_PAPER = [path.name for path in sorted([*NOTEBOOKS.glob("0*.ipynb"), *NOTEBOOKS.glob("1[0-5]*.ipynb")])]
+BESIDE_THE_PAPER = [path.name for path in sorted(NOTEBOOKS.glob("[0-9]*.ipynb"))]
 STANDALONE = ["standalone/sampler_theory_standalone.ipynb"]
 COURSE = [f"course/{path.name}" for path in sorted((NOTEBOOKS / "course").glob("*.ipynb"))]
 

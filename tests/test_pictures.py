@@ -60,7 +60,7 @@ def test_poses_stand_in_a_row_and_a_panel_may_stay_empty():
 def test_toes_stand_below_their_poses_and_are_thick_where_they_rest():
     motions = {"walks": wandering_motion(30), "": None, "frozen pose": straight_motion(30)}
     frames = range(0, 30, 10)
-    figure = poses_beside(motions, frames, below=1.5)
+    figure = poses_beside(motions, frames, below=1.1)
     draw_toes(figure, motions, frames)
     assert not figure.axes[1].lines and [text.get_text() for text in figure.legends[0].get_texts()] == [
         "left toe", "right toe", "a toe rests",

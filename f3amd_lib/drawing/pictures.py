@@ -280,7 +280,7 @@ def draw_toes(figure, motions: Mapping[str, Motion | None], frames: range) -> No
     """Draw below each panel of `poses_beside` how high the toes are, thick where a toe rests.
 
     Args:
-      figure: of `poses_beside(motions, frames, below=1.5)`.
+      figure: of `poses_beside(motions, frames, below=1.1)`.
       motions, frames: the same; frames a range, and every one between its ends is drawn.
     """
     every = np.arange(frames[0], frames[-1] + 1)
@@ -289,7 +289,7 @@ def draw_toes(figure, motions: Mapping[str, Motion | None], frames: range) -> No
         if motion is None:
             continue
         height = motion.positions[every][:, list(motion.skeleton.toes), 1]
-        height = 4.0 * (height - height.min()) - 1.4  # four times as high, below the poses
+        height = 4.0 * (height - height.min()) - 1.0  # four times as high, below the poses
         for foot, side in enumerate(("left", "right")):
             color = LIMB_COLORS[side]
             axis.plot(along, height[:, foot], color=color, linewidth=0.9, label=f"{side} toe")

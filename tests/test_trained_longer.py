@@ -1,0 +1,304 @@
+"""What notebook 23 says of the long queue, against its record."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from f3amd_lib.experiments.campaign import Run
+from f3amd_lib.experiments.learning_curves import power_law
+from f3amd_lib.ground.papers import load_paper_file, load_paper_table
+from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.networks import presets
+from f3amd_lib.training.recipe import learning_rate_schedule
+
+RECORDS = repository_root() / "paper_figures/bandai/laptop/records"
+MAIN, THOUSAND = "F3AMD-FNO-96", 1_000
+BOTH = "residual-prior+higher-learning-rate"
+FIVE = "history-anchor+residual-prior+higher-learning-rate+wide-decoder+history-input"
+PAPERS_LENGTH = load_paper_file("paper")["training"]["windows"]["32"]
+
+
+@pytest.fixture(scope="module")
+def queue() -> pd.DataFrame:
+    return read_table(RECORDS / "campaign.csv")[0]
+
+
+@pytest.fixture(scope="module")
+def eyes(queue) -> str:
+    """The newest style classifier, through which FIDs of the notebook compare."""
+    return queue["classifier"].iloc[-1]
+
+
+@pytest.fixture(scope="module")
+def real() -> pd.Series:
+    return read_table(RECORDS / "quality.csv")[0].query("model == 'real'").set_index("metric")["value"]
+
+
+@pytest.fixture(scope="module")
+def row(queue):
+    """Figures of a training at so many thousand windows, 8 steps: `row("CAMDM", 200, recipe=..., seed=...)`."""
+
+    def figures(model: str, thousands: int, recipe: str = "paper", seed: int = 0, steps: int = 8) -> pd.Series:
+        asked = "model == @model and recipe == @recipe and seed == @seed and windows == 1000 * @thousands"
+        rows = queue.query(asked + " and window_frames == 32 and steps in [0, @steps]")
+        assert len(rows), (model, thousands, recipe, seed)
+        return rows.set_index("metric")["value"]
+
+    return figures
+
+
+@pytest.fixture(scope="module")
+def long(row) -> pd.DataFrame:
+    lengths = (200, 400, 800, 1600, 3200, 6400)
+    return pd.DataFrame({thousands * THOUSAND: row(MAIN, thousands) for thousands in lengths}).T
+
+
+def said(figures: pd.Series, **expected: float) -> None:
+    """Each figure as the text prints it, to the digits that stand there."""
+    for metric, value in expected.items():
+        digits = len(str(value).partition(".")[2]) if isinstance(value, float) else 0
+        assert round(figures[metric], digits) == value, (metric, figures[metric], value)
+
+
+def test_what_length_brings(long, row, real, queue, eyes):
+    least, middle, late, most = (long.loc[thousands * THOUSAND] for thousands in (200, 800, 3200, 6400))
+    leaves = long["held_out_error"] / long["held_out_error"].shift()
+    assert leaves[1:].between(0.83, 0.88).all() and leaves[1:].mean() == pytest.approx(0.85, abs=0.01)
+    assert (long[["held_out_error", "trajectory_error", "joint_acceleration"]].diff()[1:] < 0).all(axis=None)
+    assert most["joint_acceleration"] / real["joint_acceleration"] == pytest.approx(2.9, abs=0.05)
+    # FID falls to a fifth, and then by no more than five draws of one network scatter (notebook 07's protocol).
+    assert middle["FID"] / least["FID"] == pytest.approx(1 / 5, rel=0.1)
+    draws = read_table(RECORDS / "quality_by_seed.csv")[0].query("model == @MAIN and steps == 8 and metric == 'FID'")
+    assert (round(draws["value"].min()), round(draws["value"].max())) == (18, 27)
+    assert middle["FID"] - most["FID"] < draws["value"].max() - draws["value"].min()
+    assert set(queue[queue["run"] == f"{MAIN}-seed0"]["classifier"]) == {eyes}
+    # Feet come last, and the seam sticks.
+    said(least, foot_sliding=1.07)
+    said(most, foot_sliding=0.67, foot_alternation=0.13, IRD=2.2)
+    said(real, foot_sliding=0.08, foot_alternation=1.9, IRD=4.0)
+
+
+def test_the_family_comes_down_later(row):
+    error = {(name, at): row(name, at)["held_out_error"] for name, at in (
+        (MAIN, 200), (MAIN, 400), (MAIN, 800), ("F3AMD-Transformer-64", 1600), ("F3AMD-FNO-32", 1600))}  # fmt: skip
+    printed = [9.1, 7.7, 6.6, 7.1, 8.6]
+    assert [round(value, 1) for value in error.values()] == printed
+    table = load_paper_table(3).query("window_frames == 32 and steps == 8").set_index(["model", "metric"])["value"]
+    assert abs(table["F3AMD-Transformer-64", "EMD"] - table[MAIN, "EMD"]) < 0.3
+
+
+def test_camdm_is_ahead_with_an_eighth_of_the_windows(long, row, queue, eyes):
+    error = long["held_out_error"]
+    reached = np.exp(
+        np.interp(np.log(row("CAMDM", 200)["held_out_error"]), np.log(error[::-1]), np.log(error.index[::-1]))
+    )
+    assert reached == pytest.approx(8 * 200 * THOUSAND, rel=0.05)
+    longest, most = row("CAMDM", 800), long.loc[6400 * THOUSAND]
+    printed = {
+        "held_out_error": (3.6, 4.2), "joint_acceleration": (1.3, 2.0), "foot_sliding": (0.44, 0.67),
+        "foot_alternation": (0.94, 0.13),
+    }  # fmt: skip
+    for metric, (theirs, ours) in printed.items():
+        said(longest, **{metric: theirs})
+        said(most, **{metric: ours})
+    assert [round(100 * one["trajectory_error"], 1) for one in (longest, most)] == [3.7, 5.1]
+    assert [round(one["FID"]) for one in (longest, most)] == [24, 19] and round(longest["IRD"], 1) == 5.7
+    assert set(queue[queue["run"] == "CAMDM-seed0"]["classifier"]) == {eyes}
+    # The one that ships is another training.
+    ships = read_table(RECORDS / "quality.csv")[1]["weights_digests"]["CAMDM"]
+    assert ships and set(ships).isdisjoint(queue["weights"])
+
+
+def test_the_training_loss_keeps_its_line_and_the_held_out_loss_does_not(long):
+    history = read_table(repository_root() / f"f3amd_lib/pretrained/bandai/{MAIN}.history.csv")[0]
+    held_out = history.dropna(subset="held_out_loss").set_index("step")["held_out_loss"]
+    training = pd.Series({
+        step: history.loc[history["step"].between(0.9 * step, step), "loss"].mean() for step in held_out.index
+    })  # fmt: skip
+    leaves = lambda values: (100 * values / values.shift())[1:]
+    assert leaves(held_out).round().tolist() == [81, 84, 86, 92, 96]
+    assert leaves(training).to_numpy() == pytest.approx(80, abs=1.2)
+    assert round(held_out.iloc[-1] / training.iloc[-1], 2) == 1.66
+    # The joints of held-out motion keep theirs: a line through the first three lengths holds the last within 2 %.
+    error = long["held_out_error"]
+    ahead = power_law(error.index[:3], error[:3], error.index)["value"]
+    assert error.to_numpy() == pytest.approx(ahead.to_numpy(), rel=0.02)
+    bent = power_law(128 * held_out.index[:3], held_out[:3], 128 * held_out.index)["value"]
+    assert held_out.iloc[-1] > 1.25 * bent.iloc[-1]
+    # Most of the sum is the error of all features.
+    last = history.dropna(subset="held_out_loss").iloc[-1]
+    assert last["held_out_sample"] > 0.75 * last["held_out_loss"]
+
+
+def test_where_the_lines_end(long, real):
+    hundred = 100 * 193_962
+    ends = {}
+    for metric in ("trajectory_error", "joint_acceleration"):
+        for points in (6, 5):
+            line = long[metric].iloc[-points:]
+            ends[metric, points] = power_law(line.index, line, [hundred, PAPERS_LENGTH])
+    path = [100 * ends["trajectory_error", points]["value"][0] for points in (6, 5)]
+    assert [round(one, 1) for one in path] == [3.6, 4.3] and round(100 * real["trajectory_error"], 1) == 2.9
+    printed = load_paper_table(3).query("model == @MAIN and window_frames == 32 and steps == 8").set_index("metric")
+    assert printed["value"]["trajectory_error"] == 0.033
+    joints = [ends["joint_acceleration", points]["value"][0] for points in (6, 5)]
+    assert [round(one, 1) for one in joints] == [1.4, 1.6]
+    assert min(joints) / real["joint_acceleration"] == pytest.approx(2.0, abs=0.1)
+    late = ends["joint_acceleration", 5].iloc[1]
+    assert (round(late["value"], 1), round(late["low"], 2), round(late["high"], 1)) == (1.0, 0.87, 1.2)
+    assert late["low"] > real["joint_acceleration"]
+    assert round(PAPERS_LENGTH / 193_962, -2) == 1000
+    # The rate.
+    config = Run(MAIN).config(193_962, 128)
+    left = [
+        float(learning_rate_schedule(config)(step)) / config.learning_rate for step in (50_000, hundred / 128, 389_607)
+    ]
+    assert [round(100 * one) for one in left] == [44, 16, 4]
+
+
+def test_the_use_of_noise_along_the_run(long, row):
+    said(long.loc[200 * THOUSAND], use_of_x=0.60, use_of_sigma=0.83, seed_spread=0.36, x0_error_ratio=0.96)
+    said(long.loc[1600 * THOUSAND], seed_spread=0.57)
+    said(long.loc[6400 * THOUSAND], use_of_x=0.33, use_of_sigma=0.38, seed_spread=0.41, x0_error_ratio=0.91)
+    assert long["use_of_sigma"].iloc[3:].to_numpy() == pytest.approx(0.38, abs=0.02)
+    assert (long["x0_error_ratio"].diff()[1:] < 0).all() and (long["use_of_x"].diff()[1:] < 0.001).all()
+    assert sorted(round(row("CAMDM", at)["use_of_x"], 1) for at in (200, 400, 800)) == [1.6, 1.7, 1.8]
+    shaking = [row(MAIN, thousands, steps=steps)["joint_acceleration"] for thousands in (200, 6400) for steps in (1, 8)]
+    assert [round(value, 1) for value in shaking] == [3.5, 5.2, 1.9, 2.0]
+
+
+SINGLE = [
+    "history-input", "block-residual", "higher-learning-rate", "history-anchor", "residual-prior",
+    "skip-and-output-scaling", "log-normal-noise", "mixed-noise", "low-noise-weighting", "fitted-sigma-max",
+    "wide-decoder",
+]  # fmt: skip
+
+
+def test_what_single_changes_bring(row, queue, eyes):
+    short = pd.DataFrame({name: row(MAIN, 200, name) for name in SINGLE}).T
+    users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise"}
+    assert set(short.index[short["x0_error_ratio"] < 0.8]) == users
+    assert short["x0_error_ratio"].drop(users).min() > 0.9
+    longer = pd.DataFrame({name: row(MAIN, 400, name) for name in SINGLE}).T
+    assert set(longer.index[longer["x0_error_ratio"] < 0.8]) == users
+    # Noise that stays in the motion.
+    assert short["seed_spread"][["skip-and-output-scaling", "log-normal-noise"]].round().tolist() == [10, 6]
+    blocks = [round(one["FID"]["block-residual"]) for one in (short, longer)]
+    assert blocks == [141, 812]
+    # The rate is worth twice the length; FID of its second seed is the least of all that the newest classifier saw.
+    rates = [row(MAIN, 200, "higher-learning-rate", seed=seed) for seed in (0, 1)]
+    assert [round(one["held_out_loss"], 3) for one in rates] == [0.216, 0.210]
+    assert round(row(MAIN, 400)["held_out_loss"], 3) == 0.225
+    seen = queue.query("classifier == @eyes and metric == 'FID' and steps == 8 and windows == 200_000")
+    seen = seen[seen["recipe"].isin(SINGLE)].set_index(["recipe", "seed"])["value"]
+    assert seen.idxmin() == ("higher-learning-rate", 1) and round(seen.min()) == 23
+    assert round(row("CAMDM", 200)["FID"]) == 27
+    printed = {"paper": (9.1, 7.7), "wide-decoder": (7.9, 6.9), "history-input": (8.2, 6.8)}
+    for name, errors in printed.items():
+        assert tuple(round(row(MAIN, at, name)["held_out_error"], 1) for at in (200, 400)) == errors
+    prior, plain = row(MAIN, 400, "residual-prior"), row(MAIN, 400)
+    assert round(prior["held_out_loss"], 3) == 0.193
+    assert [round(100 * one["trajectory_error"], 1) for one in (prior, plain)] == [9.1, 8.4]
+    anchor = [row(MAIN, at, "history-anchor") for at in (200, 400)]
+    assert all(
+        one["held_out_loss"] < row(MAIN, at)["held_out_loss"] for one, at in zip(anchor, (200, 400), strict=True)
+    )
+    assert anchor[0]["joint_acceleration"] > 5 * anchor[1]["joint_acceleration"]
+
+
+FOUR = f"{BOTH}+wide-decoder+history-input"
+
+
+def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
+    error = lambda recipe, at=200, seed=0: row(MAIN, at, recipe, seed)["held_out_error"]
+    camdm = row("CAMDM", 200)
+    assert round(camdm["held_out_error"], 1) == 5.7
+    assert [round(error(FOUR, seed=seed), 1) for seed in (0, 1)] == [5.5, 5.3]
+    assert max(error(FOUR), error(FOUR, seed=1), error(FIVE)) < camdm["held_out_error"] and round(error(FIVE), 1) == 5.3
+    # Three of them are not enough, nor is the anchor in place of the decoder.
+    fewer = {f"{BOTH}+history-input": 6.1, f"{BOTH}+wide-decoder": 6.0, f"history-anchor+{BOTH}+history-input": 5.9}
+    for recipe, printed in fewer.items():
+        assert round(error(recipe), 1) == printed and error(recipe) > camdm["held_out_error"]
+    assert round(error(BOTH, seed=1), 1) == 6.4
+    # In what a walk needs they are near CAMDM at that length, but for the path.
+    four = row(MAIN, 200, FOUR)
+    said(four, joint_acceleration=2.0, foot_sliding=0.66, foot_alternation=0.29, x0_error_ratio=0.17)
+    said(camdm, joint_acceleration=2.1, foot_sliding=0.61, foot_alternation=0.34)
+    assert [round(100 * one["trajectory_error"], 1) for one in (four, camdm)] == [9.2, 5.1]
+    assert [round(one["FID"]) for one in (four, row(MAIN, 200, FOUR, seed=1), camdm)] == [35, 65, 27]
+    # Twice as long.
+    five, theirs = row(MAIN, 400, FIVE), row("CAMDM", 400)
+    said(five, held_out_error=4.6, foot_alternation=0.13, foot_sliding=0.81, joint_acceleration=2.0)
+    said(theirs, held_out_error=4.5, foot_alternation=0.62, foot_sliding=0.55, joint_acceleration=1.7)
+    assert (round(five["FID"]), round(theirs["FID"])) == (31, 20)
+    assert round(five["held_out_loss"], 3) == 0.128 and round(long["held_out_loss"].iloc[-1], 3) == 0.144
+
+
+def test_ablations(queue):
+    rows = queue
+    asked = "recipe == 'paper' and windows == 200_000 and window_frames == 32 and steps in [0, 8]"
+    rows = rows.query(asked + " and model.str.startswith('F3AMD-') and model != 'F3AMD-FNO-32'")
+    table = rows.pivot_table(index="model", columns="metric", values="value")
+    variants = table.drop("F3AMD-FNO-96").rename(index=lambda name: name.removeprefix("F3AMD-").removeprefix("FNO-96-"))
+    seeds = rows[rows["model"] == "F3AMD-FNO-96"].pivot(index="run", columns="metric", values="value")
+    # Equal losses, other walks.
+    assert sorted(seeds["held_out_loss"].round(3)) == [0.274, 0.280, 0.287]
+    spread = seeds.max() - seeds.min()
+    assert (round(spread["held_out_loss"], 3), round(spread["x0_error_ratio"], 3)) == (0.013, 0.004)
+    assert seeds["joint_acceleration"].max() > 2 * seeds["joint_acceleration"].min()
+    ranges = {"trajectory_error": (0.10, 0.23), "joint_acceleration": (4.1, 8.9), "IRD": (4.7, 14.0)}
+    for metric, (least, most) in ranges.items():
+        assert seeds[metric].agg(["min", "max"]).tolist() == pytest.approx([least, most], rel=0.02), metric
+    inside = (variants >= seeds.min()) & (variants <= seeds.max())
+    assert inside[["trajectory_error", "joint_acceleration", "IRD"]].to_numpy().mean() > 0.75
+    layers = ["m8", "m12", "m14", "DCT-96", "weighted-FNO-96", "reduced-rank-FNO-96"]
+    assert inside.loc[layers, ["trajectory_error", "joint_acceleration", "IRD"]].all(axis=None)
+    # What leaves the band.
+    walks, ratio = variants["trajectory_error"], variants["x0_error_ratio"]
+    assert walks.idxmax() == ratio.idxmax() == "m1" and (round(walks["m1"], 2), round(ratio["m1"], 2)) == (0.26, 0.99)
+    loss = variants["held_out_loss"]
+    assert loss.nlargest(4).round(2).to_dict() == {
+        "Transformer-64-linear": 0.41, "Transformer-64": 0.35, "linear": 0.33, "concatenation": 0.33,
+    }  # fmt: skip
+    assert walks.idxmin() == "concatenation" and round(walks.min(), 2) == 0.09
+    shaking = variants["joint_acceleration"]
+    assert shaking.idxmax() == "Transformer-64" and round(shaking.max(), 1) == 10.5
+    calm = shaking[shaking < seeds["joint_acceleration"].min()]
+    assert calm.round(1).to_dict() == {"AdaLN-zero": 2.8, "m4": 3.2, "cross-attention": 3.2, "no-IRD": 3.5}
+    by_eyes = rows[rows["metric"] == "FID"].set_index(["classifier", "run"])["value"]
+    assert by_eyes.idxmax()[1] == "F3AMD-Transformer-64-seed0" and round(by_eyes.max()) == 1090
+    first, second, third = (by_eyes[name] for name in ("3e50a95e2c44", "67e5a68238c9", "4e6bb8c28b27"))
+    wide = variants.loc["Transformer-96"]
+    assert (round(wide["held_out_loss"], 3), round(wide["joint_acceleration"], 1)) == (0.295, 6.2)
+    assert third.round().sort_values().to_dict() == {
+        "F3AMD-FNO-96-seed0": 137, "F3AMD-Transformer-96-seed0": 247, "F3AMD-Transformer-64-seed0": 1090,
+    }  # fmt: skip
+    assert first.nsmallest(1).round().to_dict() == {"F3AMD-FNO-96-cross-attention-seed0": 70}
+    two = {"F3AMD-FNO-96-no-IRD-seed0": 71, "F3AMD-FNO-96-cross-attention-seed1": 105}
+    assert second.nsmallest(2).round().to_dict() == two
+    assert [round(first["F3AMD-FNO-96-seed1"]), round(second["F3AMD-FNO-96-seed2"])] == [133, 451]
+    losses = rows.query("model == 'F3AMD-FNO-96-cross-attention' and metric == 'held_out_loss'")["value"]
+    assert sorted(losses.round(3)) == [0.256, 0.260] and losses.max() < seeds["held_out_loss"].min()
+    assert sorted(seeds["FID"].round()) == [133, 137, 451]
+    assert round(variants["IRD"]["no-IRD"]) == 10 and sorted(seeds["IRD"].round(1)) == [4.7, 6.4, 14.0]
+    # CAMDM, 96 wide.
+    seen = queue
+    seen = seen.query("windows == 200_000 and steps == 8 and classifier == '4e6bb8c28b27'")
+    seen = seen[seen["model"].isin(["CAMDM-96", "CAMDM", "F3AMD-FNO-96"]) & (seen["recipe"] == "paper")]
+    seen = seen.pivot(index="metric", columns="model", values="value")[["CAMDM-96", "CAMDM", "F3AMD-FNO-96"]]
+    assert seen.loc["style_coverage"].round().tolist() == [82, 99, 60]
+    assert seen.loc["EMD"].tolist() == pytest.approx([9.8, 6.3, 13], rel=0.03)
+    table_12 = load_paper_table(12).query("metric == 'style_coverage'")
+    assert table_12["value"].min() == 2 and presets.find_preset("CAMDM-96").network["latent_width"] == 96
+    # What the paper has of them.
+    table_10 = load_paper_table(10).query("metric == 'FID'").set_index("model")["value"]
+    assert table_10.idxmax() == "F3AMD-FNO-96, m=1"
+    table_9 = load_paper_table(9).query("metric == 'style_coverage'").set_index("model")["value"]
+    assert "linear" in table_9.filter(like="FNO-96").idxmin()
+    # The one with a way around its blocks looks at its noise.
+    assert round(ratio.pop("AdaLN-zero"), 2) == 0.70 and (ratio.round(2) >= 0.95).all()
+    zero = rows.query("model == 'F3AMD-FNO-96-AdaLN-zero' and metric == 'x0_error_ratio'")
+    assert zero.sort_values("seed")["value"].round(2).tolist() == [0.71, 0.70]
+    # Thirteen rows of Tables 8 to 11, two Transformers, and no IRD loss.
+    assert len(variants) == 16
