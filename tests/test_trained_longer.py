@@ -149,6 +149,11 @@ def test_where_the_lines_end(long, real):
     assert (round(late["value"], 1), round(late["low"], 2), round(late["high"], 1)) == (1.0, 0.87, 1.2)
     assert late["low"] > real["joint_acceleration"]
     assert round(PAPERS_LENGTH / 193_962, -2) == 1000
+    # What the paper prints: direction stands, foot sliding is below, the seam falls towards it.
+    assert (
+        long["direction_error"].iloc[1:].between(8, 9.5).all() and round(printed["value"]["direction_error"], 1) == 3.3
+    )
+    assert long["foot_sliding"].max() < printed["value"]["foot_sliding"] and (long["IRD"].diff()[1:] < 0).all()
     # The rate.
     config = Run(MAIN).config(193_962, 128)
     left = [
@@ -216,6 +221,9 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     assert round(camdm["held_out_error"], 1) == 5.7
     assert [round(error(FOUR, seed=seed), 1) for seed in (0, 1)] == [5.5, 5.3]
     assert max(error(FOUR), error(FOUR, seed=1), error(FIVE)) < camdm["held_out_error"] and round(error(FIVE), 1) == 5.3
+    # The CAMDM that ships learned at the four's rate, and is ahead of both.
+    ships = read_table(RECORDS / "x0_by_sigma.csv")[0].query("model == 'CAMDM'")["joint_error_cm"]
+    assert len(ships) == 8 and round(ships.mean(), 1) == 4.1
     # Three of them are not enough, nor is the anchor in place of the decoder.
     fewer = {f"{BOTH}+history-input": 6.1, f"{BOTH}+wide-decoder": 6.0, f"history-anchor+{BOTH}+history-input": 5.9}
     for recipe, printed in fewer.items():
@@ -232,6 +240,8 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     said(five, held_out_error=4.6, foot_alternation=0.13, foot_sliding=0.81, joint_acceleration=2.0)
     said(theirs, held_out_error=4.5, foot_alternation=0.62, foot_sliding=0.55, joint_acceleration=1.7)
     assert (round(five["FID"]), round(theirs["FID"])) == (31, 20)
+    said(row(MAIN, 200, FIVE), foot_alternation=0.21, foot_sliding=0.75)
+    assert long["held_out_error"].iloc[-1] < five["held_out_error"] < long["held_out_error"].iloc[-2]
     assert round(five["held_out_loss"], 3) == 0.128 and round(long["held_out_loss"].iloc[-1], 3) == 0.144
 
 
