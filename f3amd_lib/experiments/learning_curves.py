@@ -11,8 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 import pandas as pd
 from jax.sharding import Mesh
-from scipy.stats import linregress
-from scipy.stats import t as student_t
+from scipy import stats
 
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.training import parallel
@@ -165,11 +164,11 @@ def power_law(windows, values, reach) -> pd.DataFrame:
     if not all((np.isfinite(each) & (each > 0)).all() for each in (windows, values, reach)):
         raise ValueError("a power law needs positive, finite windows and values")
     x, y, ahead = np.log(windows), np.log(values), np.log(reach)
-    fit = linregress(x, y)
+    fit = stats.linregress(x, y)
     line, spare = fit.slope * ahead + fit.intercept, len(x) - 2
     scatter = np.sqrt(np.sum((y - fit.slope * x - fit.intercept) ** 2) / spare)
     leverage = 1 / len(x) + (ahead - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2)
-    half = student_t.ppf(0.975, spare) * scatter * np.sqrt(leverage)
+    half = stats.t.ppf(0.975, spare) * scatter * np.sqrt(leverage)
     rows = {"windows": reach, "value": line, "low": line - half, "high": line + half}
     return pd.DataFrame(rows).assign(
         **{each: lambda table, each=each: np.exp(table[each]) for each in ("value", "low", "high")}, exponent=fit.slope
