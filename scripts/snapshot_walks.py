@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 
 from f3amd_lib.experiments.real_clips import follow_longest
 from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.ground.files import write_whole
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.motion.bvh import write_bvh
@@ -41,7 +42,7 @@ def snapshot_walks(weights: tyro.conf.Positional[list[Path]]) -> None:
         write_bvh(media / f"{name}.bvh", motion, overwrite=True)
         known[name] = weights_digest(trained.params)
     record = run_record(profile=profile, dataset=packed, seed=0, weights_digests=dict(sorted(known.items())))
-    about.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_whole(about, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -169,10 +169,8 @@ def power_law(windows, values, reach) -> pd.DataFrame:
     scatter = np.sqrt(np.sum((y - fit.slope * x - fit.intercept) ** 2) / spare)
     leverage = 1 / len(x) + (ahead - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2)
     half = stats.t.ppf(0.975, spare) * scatter * np.sqrt(leverage)
-    rows = {"windows": reach, "value": line, "low": line - half, "high": line + half}
-    return pd.DataFrame(rows).assign(
-        **{each: lambda table, each=each: np.exp(table[each]) for each in ("value", "low", "high")}, exponent=fit.slope
-    )
+    rows = {"windows": reach, "value": np.exp(line), "low": np.exp(line - half), "high": np.exp(line + half)}
+    return pd.DataFrame(rows | {"exponent": fit.slope})
 
 
 def learning_table(curves: pd.DataFrame) -> pd.DataFrame:
