@@ -1,5 +1,6 @@
 """The long queue: what it holds, that each run is trained as its row says, and that a stopped leg loses nothing."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -84,6 +85,16 @@ def test_snapshots_of_one_run_are_trained_alike_whatever_comes_after_them():
     assert short == long and short.num_steps == 100 * 1000 // 8 and short.schedule == "inverse_square"
     assert Run("F3AMD-FNO-96", recipe="mixed-noise").config(1000, 8).noise == "mixed" != short.noise
     assert Run("F3AMD-FNO-96", seed=2).config(1000, 8).seed == 2
+
+
+def test_a_change_may_start_from_another_network_which_keeps_its_own_losses_and_noise(tmp_path):
+    file = tmp_path / "campaign.toml"
+    file.write_text('[[run]]\npresets = ["CAMDM"]\nrecipes = ["higher-learning-rate"]\nwindows = [1]\n')
+    ((run, windows),) = queue(file)
+    plain, changed = Run("CAMDM").config(1000, 8), run.config(1000, 8)
+    assert (run.name, windows) == ("CAMDM-higher-learning-rate-seed0", 1000)
+    assert changed == dataclasses.replace(plain, learning_rate=2e-3) != plain
+    assert changed.loss.ird == 0.0 < Run("F3AMD-FNO-96", "higher-learning-rate").config(1000, 8).loss.ird
 
 
 def test_a_queue_with_a_misspelt_row_is_refused(tmp_path):

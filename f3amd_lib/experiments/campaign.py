@@ -12,6 +12,7 @@ between rows of one classifier.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import time
 from collections.abc import Iterable, Iterator
@@ -82,7 +83,9 @@ class Run:
         """Return the training config of `EPOCHS` epochs over so many windows."""
         steps = EPOCHS * num_windows // batch_size
         if self.recipe != "paper":
-            return find_recipe(self.recipe).config(steps, batch_size, self.seed)
+            return dataclasses.replace(find_recipe(self.recipe), preset=self.preset).config(
+                steps, batch_size, self.seed
+            )
         return paper_recipe(self.preset, steps, batch_size=batch_size, seed=self.seed)
 
 
@@ -105,10 +108,9 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
             for key, values, least in numbers:
                 if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
                     raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
-            runs = [("paper", presets.find_preset(name).name) for name in row.get("presets", ())]
-            runs += [(name, find_recipe(name).preset) for name in row.get("recipes", ())]
-            for recipe, preset in runs:
-                for seed in row["seeds"]:
+            named = [presets.find_preset(name).name for name in row.get("presets", ())]
+            for recipe in row.get("recipes", ["paper"]):
+                for preset, seed in itertools.product(named or [find_recipe(recipe).preset], row["seeds"]):
                     run = Run(preset, recipe, row["window"], seed)
                     snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
     return snapshots
