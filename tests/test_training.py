@@ -60,6 +60,10 @@ def test_other_schedules_by_hand():
     assert float(cosine(10)) == pytest.approx(1e-2)
     assert float(cosine(60)) == pytest.approx((1e-2 + 1e-4) / 2)
     assert float(cosine(110)) == pytest.approx(1e-4)
+    warm = learning_rate_schedule(TrainingConfig(10, schedule="warmup_inverse_square", warmup_steps=100))
+    printed = learning_rate_schedule(TrainingConfig(10))
+    assert float(warm(0)) == 0.0 and float(warm(50)) == pytest.approx(printed(50) / 2)
+    assert [float(warm(step)) for step in (100, 1e5)] == pytest.approx([printed(100), printed(1e5)])
 
 
 def test_section_4_5_defaults_are_the_papers():

@@ -28,9 +28,10 @@ class TrainingConfig:
       batch_size: windows a step (paper: 512).
       learning_rate: peak value (paper: 5e-4).
       schedule: "inverse_square" is the paper's text, lr (1 + step / decay_steps)^-2;
-        "inverse_sqrt" the usual reading of such schedules; "warmup_cosine" ours, for short runs.
+        "inverse_sqrt" the usual reading of such schedules; "warmup_cosine" ours, for short runs;
+        "warmup_inverse_square" the paper's after a linear rise.
       decay_steps: the paper's decay constant, 1e5.
-      warmup_steps: of "warmup_cosine".
+      warmup_steps: of the schedules that rise first.
       ema_decay: moving average of the weights (paper: 0.993); what is evaluated and shipped.
       gradient_clip: largest global gradient norm; 0 clips nothing (the paper names none).
       noise: "schedule" draws levels as the schedule says (Eq. 9: t uniform); "mixed" (ours) draws
@@ -167,5 +168,9 @@ def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     if config.schedule == "warmup_cosine":
         warm, peak = min(config.warmup_steps, config.num_steps - 1), config.learning_rate
         return optax.warmup_cosine_decay_schedule(0.0, peak, warm, config.num_steps, 0.01 * peak)
-    power = {"inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
-    return lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
+    power = {"inverse_square": -2.0, "warmup_inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
+    falling = lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
+    if config.schedule != "warmup_inverse_square":
+        return falling
+    rising = optax.linear_schedule(0.0, 1.0, config.warmup_steps)
+    return lambda step: rising(step) * falling(step)
