@@ -94,6 +94,10 @@ def test_a_change_may_start_from_another_network_which_keeps_its_own_losses_and_
     plain, changed = Run("CAMDM").config(1000, 8), run.config(1000, 8)
     assert (run.name, windows) == ("CAMDM-higher-learning-rate-seed0", 1000)
     assert changed == dataclasses.replace(plain, learning_rate=2e-3) != plain
+    slow = Run("CAMDM", "warm-up+higher-learning-rate").config(100_000, 128)
+    assert slow == dataclasses.replace(
+        Run("CAMDM").config(100_000, 128), learning_rate=2e-3, schedule="warmup_inverse_square", warmup_steps=200
+    )
     assert changed.loss.ird == 0.0 < Run("F3AMD-FNO-96", "higher-learning-rate").config(1000, 8).loss.ird
 
 
@@ -102,6 +106,17 @@ def test_a_queue_with_a_misspelt_row_is_refused(tmp_path):
     for line, told in (('presets = ["F3AMD-FNO-69"]', "F3AMD-FNO-69"), ('recipes = ["mixed-nose"]', "mixed-noise")):
         file.write_text(f"[[run]]\n{line}\nwindows = [1]\n")
         refused(told, queue, file)
+    for line in ("", "presets = []", "presets = []\nrecipes = []"):
+        file.write_text(f"[[run]]\n{line}\nwindows = [1]\n")
+        refused("neither presets nor recipes", queue, file)
+    for recipe, told in (
+        ("plus", "a recipe of its own of F3AMD-FNO-96-plus"), ("wide-decoder", "decoder_hidden_width"),
+        ("IRD-excess", "its loss"), ("fitted-sigma-max", "its diffusion"), ("mixed-noise", "variance-exploding"),
+    ):  # fmt: skip
+        file.write_text(f'[[run]]\npresets = ["CAMDM"]\nrecipes = ["{recipe}"]\nwindows = [1]\n')
+        refused(told, queue, file)
+    file.write_text('[[run]]\npresets = ["CAMDM"]\nrecipes = []\nwindows = [1]\n')
+    assert queue(file) == [(Run("CAMDM"), 1000)]
 
 
 # --------------------------------------------------------------------------------------- legs

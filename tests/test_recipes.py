@@ -39,7 +39,7 @@ def test_every_recipe_changes_one_thing(prepared):
         network = prepared.model_config(recipe.preset, num_kept_modes=5, **recipe.network)
         training = recipe.config(100, 8, 0).to_dict()
         ours = changed(base, network.to_dict()) | changed(paper.to_dict(), training)
-        assert len(ours) == 1 or name == "warm-up-and-cosine", (name, ours)
+        assert len(ours - {"warmup_steps"}) == 1 or name == "warm-up-and-cosine", (name, ours)
     warm = recipes.RECIPES["warm-up-and-cosine"].config(100, 8, 0)
     assert (warm.schedule, warm.warmup_steps, warm.learning_rate) == ("warmup_cosine", 10, 2e-3)
     plus = recipes.RECIPES["plus"].config(100, 8, 0)

@@ -247,6 +247,9 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     said(row(MAIN, 400, FOUR), held_out_error=4.7)
     said(five, held_out_error=4.6, foot_alternation=0.13)
     said(row("CAMDM", 400), held_out_error=4.5)
+    assert (
+        round(error(FOUR) - error(FOUR, seed=1), 2) == 0.15 and four["held_out_error"] - theirs["held_out_error"] > 0.3
+    )
     said(row(MAIN, 200, FIVE), foot_alternation=0.21)
     said(four, held_out_error=4.1, foot_alternation=0.39, foot_sliding=0.62, joint_acceleration=2.0)
     said(theirs, held_out_error=3.6, foot_alternation=0.94, foot_sliding=0.44, joint_acceleration=1.3)

@@ -1,7 +1,8 @@
 """The long queue: all that is trained on real motion, in order, in legs that go on where the last one stopped.
 
-The queue stands in `papers/f3amd/campaign.toml`. Every run follows the paper's text, whose learning
-rate hardly falls, so that each snapshot of a long run is a fair row at its length. Snapshots are
+The queue stands in `papers/f3amd/campaign.toml`. Runs without a recipe follow the paper's text, but
+for `-steady`. The learning rate depends on the step and not on the length of a run, so that each
+snapshot of a long run is a fair row at its length. Snapshots are
 kept as weights and measured by the protocol of `experiments.protocol` with one seed; how far their
 answers move with the noisy input, and with the noise level, and how far they are off, is measured
 as well. All of it is one table, `records/campaign.csv`. A queue may take months and machines: each
@@ -83,9 +84,7 @@ class Run:
         """Return the training config of `EPOCHS` epochs over so many windows."""
         steps = EPOCHS * num_windows // batch_size
         if self.recipe != "paper":
-            return dataclasses.replace(find_recipe(self.recipe), preset=self.preset).config(
-                steps, batch_size, self.seed
-            )
+            return find_recipe(self.recipe).on(self.preset).config(steps, batch_size, self.seed)
         return paper_recipe(self.preset, steps, batch_size=batch_size, seed=self.seed)
 
 
@@ -103,15 +102,18 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
         for number, row in enumerate(table["run"], 1):
             where = f"{path}: run {number}"
             check_entry(row, where, ["windows"], ["presets", "recipes", "seeds", "window"])
+            if not (row.get("presets") or row.get("recipes")):
+                raise ValueError(f"{where}: names neither presets nor recipes")
             row = {"seeds": [0], "window": 32, **row}
             numbers = ("windows", row["windows"], 1), ("seeds", row["seeds"], 0), ("window", [row["window"]], 2)
             for key, values, least in numbers:
                 if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
                     raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
             named = [presets.find_preset(name).name for name in row.get("presets", ())]
-            for recipe in row.get("recipes", ["paper"]):
+            for recipe in row.get("recipes") or ["paper"]:
                 for preset, seed in itertools.product(named or [find_recipe(recipe).preset], row["seeds"]):
                     run = Run(preset, recipe, row["window"], seed)
+                    run.config(1000, 8)  # refuses a change that is none of this model's
                     snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
     return snapshots
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from f3amd_lib.ground.names import check_known
@@ -25,13 +25,13 @@ RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
 
 @dataclass(frozen=True)
 class Recipe:
-    """One way to train `F3AMD-FNO-96`.
+    """One way to train `F3AMD-FNO-96`, or another model.
 
     Attributes:
       name: of the row; fit for a folder.
       change: what differs from the paper, in words.
       source: where the idea comes from.
-      preset: what it starts from.
+      preset: what it starts from, unless a row of the queue names another.
       network: fields of the network's config that differ.
       training: fields of the training config that differ.
     """
@@ -50,9 +50,26 @@ class Recipe:
           num_steps, batch_size, seed: the same for all rows that are compared.
         """
         settings = {"batch_size": batch_size, "seed": seed, **self.training}
+        tenth = max(1, num_steps // 10)
         if settings.get("schedule") == "warmup_cosine":
-            settings["warmup_steps"] = max(1, num_steps // 10)
+            settings["warmup_steps"] = tenth
+        if settings.get("schedule") == "warmup_inverse_square":
+            settings["warmup_steps"] = min(200, tenth)
         return paper_recipe(self.preset, num_steps, **settings)
+
+    def on(self, preset: str) -> Recipe:
+        """Return the same change of another model, which keeps its own network, losses and noise.
+
+        Raises:
+          ValueError: if the row changes one of these.
+        """
+        if preset == self.preset:
+            return self
+        own = [*self.network, *(name for name in ("loss", "diffusion") if name in self.training)]
+        if own or self.preset != Recipe.preset:
+            what = f"its {', '.join(own)}" if own else "a recipe of its own"
+            raise ValueError(f"{self.name} changes {what} of {self.preset}, so that it is no change of {preset}")
+        return replace(self, preset=preset)
 
 
 RECIPES: dict[str, Recipe] = {name: Recipe(name, **row) for name, row in load_paper_file("recipes").items()}
