@@ -102,13 +102,13 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
         for number, row in enumerate(table["run"], 1):
             where = f"{path}: run {number}"
             check_entry(row, where, ["windows"], ["presets", "recipes", "seeds", "window"])
-            if not (row.get("presets") or row.get("recipes")):
-                raise ValueError(f"{where}: names neither presets nor recipes")
             row = {"seeds": [0], "window": 32, **row}
             numbers = ("windows", row["windows"], 1), ("seeds", row["seeds"], 0), ("window", [row["window"]], 2)
             for key, values, least in numbers:
                 if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
                     raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
+            if not (row.get("presets") or row.get("recipes")):
+                raise ValueError(f"{where}: names neither presets nor recipes")
             named = [presets.find_preset(name).name for name in row.get("presets", ())]
             for recipe in row.get("recipes") or ["paper"]:
                 for preset, seed in itertools.product(named or [find_recipe(recipe).preset], row["seeds"]):
