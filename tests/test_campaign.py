@@ -87,6 +87,17 @@ def test_snapshots_of_one_run_are_trained_alike_whatever_comes_after_them():
     assert Run("F3AMD-FNO-96", seed=2).config(1000, 8).seed == 2
 
 
+def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(packed, monkeypatch, tmp_path):
+    run, seen = Run("F3AMD-FNO-96", "batch-512"), []
+    assert (run.config(100_000, 128).batch_size, run.config(100_000, 128).num_steps) == (512, 100 * 100_000 // 512)
+    assert Run("F3AMD-FNO-96").config(100_000, 128).batch_size == 128
+    monkeypatch.setattr(campaign, "snapshot", lambda *given, **_: (seen.append(given[2:4]), (None, 0.0))[1])
+    prepared = PreparedData(packed, 32, 10)
+    for each in (run, Run("F3AMD-FNO-96")):
+        assert campaign._measured(prepared, None, None, each, 10_240, 128, {}, tmp_path, None, False) is None
+    assert [(config.batch_size, steps) for config, steps in seen] == [(512, 20), (128, 80)]
+
+
 def test_a_change_may_start_from_another_network_which_keeps_its_own_losses_and_noise(tmp_path):
     file = tmp_path / "campaign.toml"
     file.write_text('[[run]]\npresets = ["CAMDM"]\nrecipes = ["higher-learning-rate"]\nwindows = [1]\n')

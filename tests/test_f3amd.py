@@ -73,6 +73,9 @@ def test_config_names_unknown_keys():
         ({"dropout": 1.0}, "dropout must be below 1"),
         ({"dropout": -0.1}, "dropout must be positive"),
         ({"block_residual": True, "conditioning": "adaln_zero"}, "residual already"),
+        ({"pre_norm": True, "conditioning": "adaln_zero"}, "normalises what a block reads already: leave pre_norm"),
+        ({"film_from_identity": True, "conditioning": "concatenation"}, "c enters by concatenation"),
+        ({"encoder_hidden_width": -1}, "encoder_hidden_width must be"),
     ],
 )
 def test_impossible_configs_are_refused(changes, message):
@@ -313,21 +316,68 @@ def test_output_scaling_passes_a_nearly_clean_input_through():
     np.testing.assert_allclose(answer, x_noisy, atol=1e-2)
 
 
+@pytest.mark.parametrize("side", ["encoder", "decoder"])
 @pytest.mark.parametrize("coder", ["fno", "linear"])
-def test_a_wider_decoder_has_a_second_layer(coder):
-    wide = make_network(decoder_hidden_width=24, encoder_decoder=coder)
+def test_a_wider_coder_has_a_second_layer(coder, side):
+    hidden = f"{side}_hidden"
+    wide = make_network(**{f"{hidden}_width": 24}, encoder_decoder=coder)
     x_noisy = draw(2, WINDOW, CHANNELS)
-    assert run(wide, x_noisy).shape == x_noisy.shape
-    state = nnx.state(wide).flat_state()
-    names = {str(path) for path, _ in state}
-    assert any("decoder_hidden" in name for name in names)
-    plain = nnx.state(make_network(encoder_decoder=coder)).flat_state()
-    assert not any("decoder_hidden" in str(path) for path, _ in plain)
+    stations = dict(wide.stages(x_noisy, SIGMA, wide.encode(make_condition())))
+    into = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None] if side == "encoder" else stations["block 1"]
+    expected = getattr(wide, side)(nnx.gelu(getattr(wide, hidden)(into)))
+    np.testing.assert_allclose(stations[side], expected, atol=1e-5)
     # The hidden layer makes 24 channels, the last one takes them.
-    shapes = {str(path): np.shape(leaf[...]) for path, leaf in state}
-    for layer in ("'decoder_hidden'", "'decoder'"):
+    shapes = {str(path): np.shape(leaf[...]) for path, leaf in nnx.state(wide).flat_state()}
+    for layer in (f"'{hidden}'", f"'{side}'"):
         assert any(24 in shape for name, shape in shapes.items() if layer in name), layer
-    assert not any(24 in np.shape(leaf[...]) for _, leaf in plain)
+    plain = nnx.state(make_network(encoder_decoder=coder)).flat_state()
+    assert not any(hidden in str(path) or 24 in np.shape(leaf[...]) for path, leaf in plain)
+
+
+@pytest.mark.parametrize("changes", [{}, {"conditioning": "concatenation"}, {"history_input": True}])
+@pytest.mark.parametrize("skip", [True, False])
+def test_a_skip_brings_the_encoders_frames_to_the_decoder(changes, skip):
+    network, x_noisy = make_network(encoder_skip=skip, **changes), draw(2, WINDOW, CHANNELS)
+    stations = dict(network.stages(x_noisy, SIGMA, network.encode(make_condition())))
+    encoded = stations["encoder"]
+    read = stations["block 1"][:, -encoded.shape[1] :]
+    with_skip, without = (np.asarray(network.decoder(each))[:, -WINDOW:] for each in (read + encoded, read))
+    np.testing.assert_allclose(stations["decoder"], with_skip if skip else without, atol=1e-5)
+    assert np.abs(with_skip - without).max() > 1e-2
+
+
+def test_film_from_identity_begins_with_nothing_to_modulate_and_learns():
+    """z_tilde = z_base in Eq. 6, so that c is not seen at first."""
+    x_noisy, condition, blocks = draw(2, WINDOW, CHANNELS), make_condition(), {}
+    for identity in (True, False):
+        network = make_network(film_from_identity=identity)
+        stations = dict(network.stages(x_noisy, SIGMA, network.encode(condition)))
+        block, film = network.blocks[0], network.conditionings[0]
+        blocks[identity] = stations["block 1"], nnx.silu(film.output(block(stations["encoder"])))
+        other = condition._replace(style=condition.style[::-1])
+        moved = np.abs(run(network, x_noisy, condition=other) - run(network, x_noisy, condition=condition)).max()
+        assert moved == 0.0 if identity else moved > 1e-4
+    np.testing.assert_allclose(*blocks[True], atol=1e-5)
+    assert float(jnp.abs(blocks[False][0] - blocks[False][1]).max()) > 1e-2
+    network = make_network(film_from_identity=True)
+    answer = lambda network: jnp.sum(network(x_noisy, SIGMA, network.encode(condition)) ** 2)
+    gradient = nnx.jit(nnx.grad(answer))(network)
+    assert float(jnp.abs(gradient["conditionings"][0]["modulation"]["kernel"][...]).max()) > 1e-3
+
+
+@pytest.mark.parametrize("base_block", ["fno", "transformer"])
+def test_pre_norm_is_what_a_block_reads(base_block):
+    x_noisy, condition = draw(2, WINDOW, CHANNELS), make_condition()
+    for pre_norm in (True, False):
+        network = make_network(pre_norm=pre_norm, base_block=base_block, depth=2)
+        stations = dict(network.stages(x_noisy, SIGMA, network.encode(condition)))
+        read = stations["block 1"]
+        mean, deviation = (np.asarray(each(read, axis=-1, keepdims=True)) for each in (jnp.mean, jnp.std))
+        normalised = (read - mean) / np.sqrt(deviation**2 + 1e-6)
+        block, layer = network.blocks[1], network.conditionings[1]
+        answers = [np.asarray(layer(block, each, stations["c"])) for each in (normalised, read)]
+        np.testing.assert_allclose(stations["block 2"], answers[0 if pre_norm else 1], atol=1e-4)
+        assert np.abs(answers[0] - answers[1]).max() > 1e-2
 
 
 def lively_network(**changes):

@@ -39,7 +39,7 @@ from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import errors_name, save_model, weights_digest
 from f3amd_lib.training.pipeline import PreparedData
-from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
+from f3amd_lib.training.recipe import TrainingConfig
 
 log = logging.getLogger("f3amd")
 
@@ -81,11 +81,10 @@ class Run:
         return {self.preset, self.recipe, self.name}
 
     def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
-        """Return the training config of `EPOCHS` epochs over so many windows."""
-        steps = EPOCHS * num_windows // batch_size
-        if self.recipe != "paper":
-            return find_recipe(self.recipe).on(self.preset).config(steps, batch_size, self.seed)
-        return paper_recipe(self.preset, steps, batch_size=batch_size, seed=self.seed)
+        """Return the training config of `EPOCHS` epochs over so many windows; a recipe may have a batch of its own."""
+        recipe = find_recipe(self.recipe).on(self.preset)
+        batch_size = recipe.training.get("batch_size", batch_size)
+        return recipe.config(EPOCHS * num_windows // batch_size, batch_size, self.seed)
 
 
 def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
@@ -129,7 +128,7 @@ def run_campaign(
       prepared, profile: the data, and where records go.
       classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
       folder: where training states and weights lie, a folder a run.
-      batch_size: windows a step (the paper's is 512, for a GPU).
+      batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
       only: names of presets, of recipes or of single runs; all by default.
       budget_s: seconds; the run under way stops with a checkpoint when they are over.
       snapshots: see `queue`, which is the default.
@@ -177,11 +176,11 @@ def _measured(
     """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
     data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
     num_windows = data.windows("train").num_windows
-    network = find_recipe(run.recipe).network if run.recipe != "paper" else None
-    steps, folder = max(1, windows // batch_size), Path(folder) / run.name
+    config, folder = run.config(num_windows, batch_size), Path(folder) / run.name
+    steps = max(1, windows // config.batch_size)
     trained, loss = snapshot(
-        data, run.preset, run.config(num_windows, batch_size), steps, record,
-        folder=folder, network=network, stop_at=stop_at, progress=progress,
+        data, run.preset, config, steps, record,
+        folder=folder, network=find_recipe(run.recipe).network, stop_at=stop_at, progress=progress,
     )  # fmt: skip
     if trained is None:
         return None
@@ -200,7 +199,7 @@ def _measured(
     tables.append(pd.DataFrame({"steps": 0, "metric": ["held_out_loss", "held_out_error"], "value": [loss, error]}))
     columns = {
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
-        "epochs": steps * batch_size / num_windows, "weights": weights_digest(trained.params),
+        "epochs": steps * config.batch_size / num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
         "device": jax.devices()[0].device_kind, "commit": (record["git_commit"] or "")[:10],
     }  # fmt: skip

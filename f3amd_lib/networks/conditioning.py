@@ -158,8 +158,11 @@ def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
 class FiLM(nnx.Module):
     """Feature-wise linear modulation with a bounded gate (Eqs 5-7)."""
 
-    def __init__(self, width: int, condition_width: int, *, zero_output: bool = False, rngs: nnx.Rngs):
-        self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs)
+    def __init__(
+        self, width: int, condition_width: int, *, identity: bool = False, zero_output: bool = False, rngs: nnx.Rngs
+    ):
+        initial = {"kernel_init": nnx.initializers.zeros_init()} if identity else {}
+        self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs, **initial)
         self.output = _output_layer(width, zero_output, rngs)
 
     def modulate(self, z_base, c):
@@ -236,8 +239,9 @@ CONDITIONINGS = {
 
 
 def conditioning_layer(
-    name: str, width: int, condition_width: int, *, num_heads: int = 1, zero_output: bool = False, rngs: nnx.Rngs
-):
+    name: str, width: int, condition_width: int, *, num_heads: int = 1, identity: bool = False,
+    zero_output: bool = False, rngs: nnx.Rngs,
+):  # fmt: skip
     """Return a layer that brings c into a backbone block, called as layer(base, z, c).
 
     There `base` is the base block (a callable z -> z_base), z is [B, T, D] and c [B, T, C_cond].
@@ -248,6 +252,7 @@ def conditioning_layer(
       width: D.
       condition_width: C_cond; for "concatenation", D as well.
       num_heads: of "cross_attention".
+      identity: let "film" begin with nothing to modulate, z_tilde = z_base in Eq. 6.
       zero_output: start as zero, for a block whose input is added to its output ("adaln_zero" adds
         its input itself, and starts with nothing to add anyway).
 
@@ -255,5 +260,5 @@ def conditioning_layer(
       ValueError: for an unknown name, with the nearest.
     """
     check_known(name, CONDITIONINGS, "conditioning")
-    heads = {"num_heads": num_heads} if name == "cross_attention" else {}
-    return CONDITIONINGS[name](width, condition_width, **heads, zero_output=zero_output, rngs=rngs)
+    own = {"cross_attention": {"num_heads": num_heads}, "film": {"identity": identity}}.get(name, {})
+    return CONDITIONINGS[name](width, condition_width, **own, zero_output=zero_output, rngs=rngs)

@@ -56,8 +56,15 @@ class F3AMDConfig(ConditionedConfig):
       output_scaling: let the network estimate what is left of the clean features after a skip,
         x0_hat = c_skip x + c_out F(c_in x), as Karras et al. 2022 do (Table 1, with sigma_data);
         at low noise the noisy input passes through (ours).
-      decoder_hidden_width: channels between two layers of the decoder; 0: one layer, as in the
+      encoder_hidden_width: channels between two layers of the encoder; 0: one layer, as in the
         paper (ours).
+      decoder_hidden_width: the same of the decoder.
+      encoder_skip: add the encoder's output to what the decoder reads (ours; the idea of Ronneberger
+        et al. 2015).
+      film_from_identity: let FiLM begin with gamma = beta = 0, so that z_tilde = z_base in Eq. 6, as
+        Zhang et al. 2023 begin what they add (ours).
+      pre_norm: normalise the channels that each base block reads to mean 0 and variance 1, as Xiong
+        et al. 2020 (ours).
       residual_prior: combine the network's estimate with the noisy input as the posterior mean of a
         Gaussian residual whose variance per channel and cosine mode is learned (ours).
       facing_frame: turn history, path and noisy input so that the path's first frame faces +Z, and
@@ -79,7 +86,9 @@ class F3AMDConfig(ConditionedConfig):
         "encoder_decoder": ("fno", "linear"),
         "conditioning": CONDITIONINGS,
     }
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "num_kept_modes", "decoder_hidden_width")
+    may_be_zero: ClassVar[tuple[str, ...]] = (
+        "dropout", "num_kept_modes", "encoder_hidden_width", "decoder_hidden_width",
+    )  # fmt: skip
 
     base_block: str = "fno"
     num_kept_modes: int = 0
@@ -95,7 +104,11 @@ class F3AMDConfig(ConditionedConfig):
     block_residual: bool = False
     history_anchor: bool = False
     output_scaling: bool = False
+    encoder_hidden_width: int = 0
     decoder_hidden_width: int = 0
+    encoder_skip: bool = False
+    film_from_identity: bool = False
+    pre_norm: bool = False
     residual_prior: bool = False
     facing_frame: bool = False
     history_input: bool = False
@@ -111,8 +124,11 @@ class F3AMDConfig(ConditionedConfig):
             found = f"{self.block_frames} frames, got {self.num_kept_modes}"
             raise ValueError(f"num_kept_modes must be at most {modes} for blocks of {found}")
         check_num_heads(self.latent_width, self.num_heads)
-        if self.block_residual and self.conditioning == "adaln_zero":
-            raise ValueError("adaln_zero is residual already: leave block_residual off")
+        for has, option in (("is residual", "block_residual"), ("normalises what a block reads", "pre_norm")):
+            if self.conditioning == "adaln_zero" and getattr(self, option):
+                raise ValueError(f"adaln_zero {has} already: leave {option} off")
+        if self.film_from_identity and self.conditioning != "film":
+            raise ValueError(f"film_from_identity is of FiLM, and c enters by {self.conditioning}")
 
     @property
     def block_frames(self) -> int:
@@ -181,6 +197,11 @@ def _applied(layer, turned: bool):
     return layer.frames_first if turned and isinstance(layer, FrameLayer) else layer
 
 
+def _after_norm(base):
+    """Return a base block that reads its channels normalised."""
+    return lambda z: base(jax.nn.standardize(z, axis=-1, epsilon=1e-6))
+
+
 class F3AMD(DenoisingNetwork):
     """Denoiser G of Eq. 1: noisy features, noise level and context in, clean features out."""
 
@@ -191,9 +212,12 @@ class F3AMD(DenoisingNetwork):
         self.condition = ConditionEncoder(config, heads, config.frames_before, rngs=rngs)
         # Beside the features: the path, and whether a frame is given or noisy.
         beside = PATH_CHANNELS + 1 if config.history_input else 0
-        self.encoder = self._coder(config.channels + beside, width, rngs)
+        if hidden := config.encoder_hidden_width:
+            self.encoder_hidden = self._coder(config.channels + beside, hidden, rngs)
+        self.encoder = self._coder(hidden or config.channels + beside, width, rngs)
         self.blocks = nnx.List([self._base_block(rngs) for _ in range(config.depth)])
         options = {"num_heads": heads, "zero_output": config.block_residual, "rngs": rngs}
+        options["identity"] = config.film_from_identity
         way_in = lambda: conditioning_layer(config.conditioning, width, width, **options)
         self.conditionings = nnx.List([way_in() for _ in range(config.depth)])
         if hidden := config.decoder_hidden_width:
@@ -279,7 +303,9 @@ class F3AMD(DenoisingNetwork):
         turned = not attends and all(isinstance(block, FrameLayer) for block in self.blocks)
         turn = frames_first if turned else lambda array: array
         z, c, frames = turn(z), turn(c), 0 if turned else 1
-        z = _applied(self.encoder, turned)(z)
+        if config.encoder_hidden_width:
+            z = nnx.gelu(_applied(self.encoder_hidden, turned)(z))
+        z = encoded = _applied(self.encoder, turned)(z)
         yield "encoder", turn(z)
         if config.conditioning == "concatenation":
             z = jnp.concatenate([c, z], axis=frames)
@@ -290,12 +316,16 @@ class F3AMD(DenoisingNetwork):
             base = _applied(block, turned)
             if key is not None and not turned:
                 base = partial(base, key=jax.random.fold_in(key, number))
+            if config.pre_norm:
+                base = _after_norm(base)
             update = conditioning(base, z, c)
             z = z + update if config.block_residual else update
             yield f"block {number + 1}", turn(z)
         # Frames of c go before the decoder; those of the history hold its period together.
         decoded = config.window + config.frames_before
         last = jax.lax.slice_in_dim(z, z.shape[frames] - decoded, z.shape[frames], axis=frames)
+        if config.encoder_skip:
+            last = last + encoded
         if config.decoder_hidden_width:
             last = nnx.gelu(_applied(self.decoder_hidden, turned)(last))
         x0_hat = turn(_applied(self.decoder, turned)(last))[:, config.frames_before :]
