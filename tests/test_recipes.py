@@ -39,10 +39,12 @@ def test_every_recipe_changes_one_thing(prepared):
         network = prepared.model_config(recipe.preset, num_kept_modes=5, **recipe.network)
         training = recipe.config(100, 8, 0).to_dict()
         ours = changed(base, network.to_dict()) | changed(paper.to_dict(), training)
-        of_rise = {"warmup_steps"} if name == "warm-up" else set()
-        assert len(ours - of_rise) == 1 or name == "warm-up-and-cosine", (name, ours)
+        follows = {"warm-up": {"warmup_steps"}, "batch-512": {"num_steps"}}.get(name, set())  # of the change itself
+        assert len(ours - follows) == 1 or name == "warm-up-and-cosine", (name, ours)
     warm = recipes.RECIPES["warm-up-and-cosine"].config(100, 8, 0)
     assert (warm.schedule, warm.warmup_steps, warm.learning_rate) == ("warmup_cosine", 10, 2e-3)
+    large = recipes.RECIPES["batch-512"].config(1000, 8, 0)
+    assert large.batch_size == 512 and large.num_steps == 1000 * 8 // 512, "as many windows"
     plus = recipes.RECIPES["plus"].config(100, 8, 0)
     assert plus.own_history_share == presets.find_preset("F3AMD-FNO-96-plus").training[
         "own_history_share"

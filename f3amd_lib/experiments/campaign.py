@@ -81,10 +81,9 @@ class Run:
         return {self.preset, self.recipe, self.name}
 
     def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
-        """Return the training config of `EPOCHS` epochs over so many windows; a recipe may have a batch of its own."""
-        recipe = find_recipe(self.recipe).on(self.preset)
-        batch_size = recipe.training.get("batch_size", batch_size)
-        return recipe.config(EPOCHS * num_windows // batch_size, batch_size, self.seed)
+        """Return the training config of `EPOCHS` epochs over so many windows."""
+        steps = EPOCHS * num_windows // batch_size
+        return find_recipe(self.recipe).on(self.preset).config(steps, batch_size, self.seed)
 
 
 def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:

@@ -47,9 +47,11 @@ class Recipe:
         """Return the training config: the paper's, but for the row's change.
 
         Args:
-          num_steps, batch_size, seed: the same for all rows that are compared.
+          num_steps, batch_size, seed: the same for all rows that are compared; a row with a batch of its own sees as
+            many windows, in other steps.
         """
         settings = {"batch_size": batch_size, "seed": seed, **self.training}
+        num_steps = max(1, num_steps * batch_size // settings["batch_size"])
         tenth = max(1, num_steps // 10)
         if settings.get("schedule") == "warmup_cosine":
             settings["warmup_steps"] = tenth
