@@ -33,7 +33,7 @@ from f3amd_lib.training.checkpoints import load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, prepare
 
 CLIP, STYLE, SEED = "dataset-2_walk-turn-left_normal_007", "2-normal", 0
-SYSTEMS = (("F3AMD-FNO-96-plus", 8), ("F3AMD-FNO-96-plus", 1), ("CAMDM", 8))
+SYSTEMS = (("F3AMD-FNO-96-steady", 8), ("F3AMD-FNO-96-steady", 1), ("CAMDM", 8))
 FPS = 25
 WIDTH = 960  # pixels
 LANE = 1.8  # metres between neighbours

@@ -90,7 +90,7 @@ PRECISION_SEEDS = 5
 SNAPSHOTS = 10
 """Measurements on the way of a training in `measure_quality_by_epoch`."""
 
-ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-plus": (1,)}
+ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-steady": (1,)}
 """Models that `measure_one_step` distils -> the numbers of phases, each a student of its own. A continuous schedule's
 grid of 2 steps does not visit the middle of its grid of 8, so that its student has one phase."""
 
