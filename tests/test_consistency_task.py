@@ -114,7 +114,7 @@ def test_phases_that_no_sampler_visits_are_refused(task):
 def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learned(tmp_path, monkeypatch):
     levels = variance_preserving_cosine(8)
     config = tiny_camdm(noise_levels=tuple(levels.levels.tolist()))
-    models = {"CAMDM": tiny_trained(config=config, diffusion=levels), "F3AMD-FNO-96-plus": tiny_trained()}
+    models = {"CAMDM": tiny_trained(config=config, diffusion=levels), "F3AMD-FNO-96-steady": tiny_trained()}
     profile = load_profile("smoke", "synthetic", batch_size=2, window=WINDOW)
     distilled, walked = [], []
 
@@ -147,7 +147,7 @@ def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learn
     assert {sampler for _, sampler, _, _ in walked} == {"ddim"}
     grid, digest = levels.grid(8), {name: weights_digest(model.params) for name, model in models.items()}
     wanted = [("CAMDM, by DDIM", 1), *[("CAMDM, distilled", 8 // phases) for phases in (1, 2, 4)]]
-    assert [name for name, *_ in walked] == [*[name for name, _ in wanted], "F3AMD-FNO-96-plus, distilled"]
+    assert [name for name, *_ in walked] == [*[name for name, _ in wanted], "F3AMD-FNO-96-steady, distilled"]
     for (_, stride), (_, _, sigmas, _) in zip(wanted, walked, strict=False):
         np.testing.assert_allclose(sigmas, grid[::stride])
     assert walked[-1][2].tolist() == pytest.approx([128.0, 0.0])

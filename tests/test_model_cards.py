@@ -126,13 +126,13 @@ def test_shipped_weights_stay_within_their_megabytes():
 def quality(weights: str, **figures) -> pd.DataFrame:
     real = {"stepping_rate": 2.0, "slide_speed": 4.0, "joint_acceleration": 0.6, "FID": 10.0}
     rows = [("real", 0, "real", name, value) for name, value in real.items()]
-    rows += [("F3AMD-FNO-96-plus", 8, weights, name, value) for name, value in figures.items()]
+    rows += [("F3AMD-FNO-96-steady", 8, weights, name, value) for name, value in figures.items()]
     columns = ["model", "steps", "weights", "metric", "value"]
     return pd.DataFrame(rows, columns=columns).assign(low=float("nan"), high=float("nan"))
 
 
 def test_limits_follow_from_the_figures():
-    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-plus.safetensors"
+    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-steady.safetensors"
     weights = weights_digest(load_model(path).params)
 
     def limits(**figures):
@@ -151,7 +151,7 @@ def test_limits_follow_from_the_figures():
 
 
 def test_figures_of_other_weights_are_not_shown():
-    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-plus.safetensors"
+    path = PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-steady.safetensors"
     assert "Not measured by the protocol" in model_cards.model_card(path, quality("other", FID=5.0))
     assert "Not measured by the protocol" in model_cards.model_card(path, None)
     weights = weights_digest(load_model(path).params)

@@ -109,7 +109,7 @@ def test_models_that_lie_there_are_listed(trained_once, same_runs, monkeypatch, 
     assert pipeline.available_models(profile) == [profile.preset]
     laptop = dataclasses.replace(profile, name="laptop", dataset="bandai")
     # Shipped ones count on a laptop, whatever lies in runs/.
-    assert {"F3AMD-FNO-96", "F3AMD-FNO-96-plus"} <= set(pipeline.available_models(laptop))
+    assert {"F3AMD-FNO-96", "F3AMD-FNO-96-steady"} <= set(pipeline.available_models(laptop))
     longer = dataclasses.replace(laptop, window=64)
     assert pipeline.available_models(longer) == []
 

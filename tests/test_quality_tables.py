@@ -53,7 +53,7 @@ LABEL = "tiny, smoke"
 REAL = figures("real", 0, metrics=[metric for metric in FIGURES if metric != "diversity"])
 QUALITY = table_of(
     REAL, figures("frozen pose", 0, value=3.0), figures(), figures(steps=1, value=20.0),
-    figures("CAMDM-code", value=30.0), figures("F3AMD-FNO-96-plus", value=77.0),
+    figures("CAMDM-code", value=30.0), figures("F3AMD-FNO-96-steady", value=77.0),
 )  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def test_the_papers_names_are_ours_by_find_preset_and_ours_alone_are_in_no_row_o
     many = beside_paper(10, QUALITY, LABEL)
     assert line_of(many, LABEL, model="F3AMD-FNO-96").loc["FID", "value"] == 10.0
     for number in QUALITY_TABLES:
-        assert "F3AMD-FNO-96-plus" not in set(beside_paper(number, QUALITY, LABEL)["model"])
+        assert "F3AMD-FNO-96-steady" not in set(beside_paper(number, QUALITY, LABEL)["model"])
 
 
 def test_wide_rows_say_what_is_missing_in_the_papers_own_line():

@@ -91,7 +91,7 @@ def test_what_is_said_of_frameworks(milliseconds):
     ("sentence", "model"),
     [
         (r"real people moves at (\d+) cm/s", "real"),
-        (r"`-plus`(?: moves)? at about (\d+),", "F3AMD-FNO-96-plus"),
+        (r"`-steady`(?: moves)? at about (\d+),", "F3AMD-FNO-96-steady"),
         (r"that of `CAMDM` at about (\d+)[,.]", "CAMDM"),
         (r"after 33 passes, (?:skates )?at about (\d+)[:,]", FNO),
     ],
@@ -111,7 +111,7 @@ def test_what_is_said_of_the_level_of_one_step():
 
 
 def test_what_is_said_of_students_of_locomotion():
-    rows, plus = rows_of_one_step(), "F3AMD-FNO-96-plus"
+    rows, steady = rows_of_one_step(), "F3AMD-FNO-96-steady"
     value, camdm = rows["value"], "CAMDM, distilled"
 
     def same(said, *asked):
@@ -131,7 +131,7 @@ def test_what_is_said_of_students_of_locomotion():
         r"from ([\d.]+) cm to ([\d.]+) by distilling, and Foot from (0\.\d+) to (0\.\d+)\. Its FID\D+(\d+) to (\d+)",
         RESULTS,
     )
-    ways = ((plus, 1), (plus + ", distilled", 1))
+    ways = ((steady, 1), (steady + ", distilled", 1))
     assert same(small, *[(*key, metric) for metric in ("diversity", "foot_sliding") for key in ways])
     assert [before, after] == [round(value[(*key, "FID")]) for key in ways]
     assert rows.loc[(*ways[0], "FID"), "low"] < rows.loc[(*ways[1], "FID"), "high"]
@@ -183,17 +183,17 @@ def test_number_of_claims():
 def test_how_much_of_the_papers_training_models_of_its_recipe_saw():
     trained = pd.read_csv(ROOT / "paper_figures/bandai/laptop/records/trained.csv").query("metric == 'windows'")
     seen = trained.set_index("model")["value"]
-    of_paper = seen[~seen.index.str.endswith("-plus")]
+    of_paper = seen[~seen.index.str.endswith("-steady")]
     whole = load_paper_file("paper")["training"]["windows"]["32"]
     (share,) = stated(r"models of the paper's recipe saw at most ([\d.]+) % of its training")
     assert len(of_paper) >= 3 and share == round(100 * of_paper.max() / whole, 1)
     # What the table of results shows, and in passes over the clips.
-    camdm, plus, millions, passes, share = stated(
-        r"`CAMDM` saw ([\d,]+) windows, our own recipe `F3AMD-FNO-96-plus` ([\d,]+), and `F3AMD-FNO-96`, "
+    camdm, steady, millions, passes, share = stated(
+        r"`CAMDM` saw ([\d,]+) windows, our own recipe `F3AMD-FNO-96-steady` ([\d,]+), and `F3AMD-FNO-96`, "
         r"by the paper's text, ([\d.]+) million: (\d+) passes over Bandai, ([\d.]+) % of the paper's windows",
         RESULTS,
     )
-    assert [camdm, plus, 1e6 * millions] == [seen[name] for name in ("CAMDM", f"{FNO}-plus", FNO)]
+    assert [camdm, steady, 1e6 * millions] == [seen[name] for name in ("CAMDM", f"{FNO}-steady", FNO)]
     record = load_model(PRETRAINED_DIR / "bandai" / f"{FNO}.safetensors").record
     assert passes == round(seen[FNO] / record["num_train_windows"]) == 33
     assert share == round(100 * seen[FNO] / whole, 1)
