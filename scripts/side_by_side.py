@@ -64,8 +64,8 @@ def draw(walkers: dict, line, credit: str) -> list[Image.Image]:
         motion.replace(root_position=motion.root_position + place * across)
         for motion, place in zip(walkers.values(), places, strict=True)
     ]
-    plus = np.array(to_rgb(model_style(SYSTEMS[0][0]).color))
-    colors = ["#555555", to_hex(plus), to_hex(0.6 * plus), model_style("CAMDM").color]
+    ours = np.array(to_rgb(model_style(SYSTEMS[0][0]).color))
+    colors = ["#555555", to_hex(ours), to_hex(0.6 * ours), model_style("CAMDM").color]
     # Room around everybody at all times, from the credit below the feet to the label above the head.
     roots = np.concatenate([motion.root_position for motion in moved]) * [1.0, 0.0, 1.0]
     around = np.array([0.75, 0.0, 0.0]) * across[0] + np.array([0.0, 0.0, 0.75]) * across[2]
