@@ -214,11 +214,20 @@ def test_what_single_changes_bring(row, queue, eyes):
     film = [round(row(MAIN, at, "film-from-identity")["held_out_loss"], 3) for at in (200, 400)]
     assert film == [0.255, 0.207]
     seeds = [row(MAIN, 200, seed=seed)["held_out_loss"] for seed in range(3)]
+    assert film[0] < min(seeds)
+    by_loss = short.drop("higher-learning-rate")["held_out_loss"].sort_values()  # which is the lowest of all
+    assert rates[0]["held_out_loss"] < by_loss.iloc[0]
+    joined = {"wide-decoder", "residual-prior", "history-anchor", "history-input"}
+    assert set(by_loss.index[:5]) == joined | {"film-from-identity"} and by_loss.index[5] == "fitted-sigma-max"
+    assert abs(by_loss["film-from-identity"] - by_loss["history-input"]) < 0.002
+    said(short.loc["fitted-sigma-max"], seed_spread=1.4)
+    said(row("CAMDM", 200), seed_spread=1.6)
     for name in ("pre-norm", "wide-encoder"):
         assert min(seeds) < short["held_out_loss"][name] < max(seeds), name
     around = short.loc[["block-residual", "encoder-skip"]]
     assert around["held_out_error"].round(1).tolist() == [8.2, 8.2] and around["held_out_loss"].min() > max(seeds)
     assert around["held_out_loss"].round(2).tolist() == [0.31, 0.31]
+    assert around["held_out_error"].max() < row(MAIN, 200)["held_out_error"]
     # Fewer, larger steps.
     said(longer.loc["batch-512"], held_out_error=10.2)
     assert round(longer["held_out_loss"]["batch-512"], 3) == 0.347 > row(MAIN, 200)["held_out_loss"]
