@@ -85,7 +85,7 @@ def draw(walkers: dict, line, credit: str) -> list[Image.Image]:
             ground = np.stack([line[:, 0], np.zeros(len(line)), line[:, 1]], axis=-1) + place * across
             axis.plot(*camera.project(ground)[:, :2].T, color=TARGET_COLOR, linewidth=0.8, alpha=0.5, zorder=1.5)
             x, y = camera.project(motion.root_position[frame] * [1.0, 0.0, 1.0] + [0.0, 1.8, 0.0])[:2]
-            axis.text(x, y, label, color=color, fontsize=9.5, fontweight="bold", ha="center", va="bottom", zorder=20)
+            axis.text(x, y, label, color=color, fontsize=8.5, fontweight="bold", ha="center", va="bottom", zorder=20)
         axis.text(0.5, 0.012, credit, transform=axis.transAxes, fontsize=7, color="#555555", ha="center", va="bottom")
         canvas.draw()
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))

@@ -197,6 +197,11 @@ def test_states_of_other_settings_or_data_are_refused(finished, tmp_path):
     assert differences(mine, {**mine, "dataset_fingerprint": "other"}) == ["dataset fingerprint"]
     assert differences(mine, {}) == ["training", "dataset fingerprint", "sizes"]
     assert differences(mine, {**mine, "training": {**mine["training"], "more": 1}}) == ["training settings (more)"]
+    # An option that is younger than the file changes nothing while it is off.
+    younger = lambda value: {**mine, "training": {**mine["training"], "option": value}}
+    assert [differences(younger(off), mine) for off in (False, 0, 0.0, [], None)] == [[]] * 5
+    assert differences(younger(True), mine) == ["training settings (option)"]
+    assert differences(younger(False), younger(True)) == ["training settings (option)"]
 
 
 def test_broken_data_stop_training_and_keep_the_checkpoint(tmp_path):

@@ -180,13 +180,14 @@ def test_the_use_of_noise_along_the_run(long, row):
 SINGLE = [
     "history-input", "block-residual", "higher-learning-rate", "history-anchor", "residual-prior",
     "skip-and-output-scaling", "log-normal-noise", "mixed-noise", "low-noise-weighting", "fitted-sigma-max",
-    "wide-decoder",
+    "wide-decoder", "encoder-skip", "film-from-identity", "wide-encoder", "pre-norm", "batch-512",
 ]  # fmt: skip
 
 
 def test_what_single_changes_bring(row, queue, eyes):
     short = pd.DataFrame({name: row(MAIN, 200, name) for name in SINGLE}).T
-    users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise"}
+    users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise", "encoder-skip"}
+    assert len(SINGLE) == 16
     assert set(short.index[short["x0_error_ratio"] < 0.8]) == users
     assert short["x0_error_ratio"].drop(users).min() > 0.9
     longer = pd.DataFrame({name: row(MAIN, 400, name) for name in SINGLE}).T
@@ -194,7 +195,7 @@ def test_what_single_changes_bring(row, queue, eyes):
     # Noise that stays in the motion.
     assert short["seed_spread"][["skip-and-output-scaling", "log-normal-noise"]].round().tolist() == [10, 6]
     blocks = [round(one["FID"]["block-residual"]) for one in (short, longer)]
-    assert blocks == [141, 812]
+    assert blocks == [123, 136] and [round(row(MAIN, at)["FID"]) for at in (200, 400)] == [137, 61]
     # The rate is worth twice the length; FID of its second seed is the least of all that the newest classifier saw.
     rates = [row(MAIN, 200, "higher-learning-rate", seed=seed) for seed in (0, 1)]
     assert [round(one["held_out_loss"], 3) for one in rates] == [0.216, 0.210]
@@ -209,6 +210,28 @@ def test_what_single_changes_bring(row, queue, eyes):
     prior, plain = row(MAIN, 400, "residual-prior"), row(MAIN, 400)
     assert round(prior["held_out_loss"], 3) == 0.193
     assert [round(100 * one["trajectory_error"], 1) for one in (prior, plain)] == [9.1, 8.4]
+    # What begins as the identity learns faster, what three seeds would not tell apart brings nothing.
+    film = [round(row(MAIN, at, "film-from-identity")["held_out_loss"], 3) for at in (200, 400)]
+    assert film == [0.255, 0.207]
+    seeds = [row(MAIN, 200, seed=seed)["held_out_loss"] for seed in range(3)]
+    assert film[0] < min(seeds)
+    by_loss = short.drop("higher-learning-rate")["held_out_loss"].sort_values()  # which is the lowest of all
+    assert rates[0]["held_out_loss"] < by_loss.iloc[0]
+    joined = {"wide-decoder", "residual-prior", "history-anchor", "history-input"}
+    assert set(by_loss.index[:5]) == joined | {"film-from-identity"} and by_loss.index[5] == "fitted-sigma-max"
+    assert abs(by_loss["film-from-identity"] - by_loss["history-input"]) < 0.002
+    said(short.loc["fitted-sigma-max"], seed_spread=1.4)
+    said(row("CAMDM", 200), seed_spread=1.6)
+    for name in ("pre-norm", "wide-encoder"):
+        assert min(seeds) < short["held_out_loss"][name] < max(seeds), name
+    around = short.loc[["block-residual", "encoder-skip"]]
+    assert around["held_out_error"].round(1).tolist() == [8.2, 8.2] and around["held_out_loss"].min() > max(seeds)
+    assert around["held_out_loss"].round(2).tolist() == [0.31, 0.31]
+    assert around["held_out_error"].max() < row(MAIN, 200)["held_out_error"]
+    # Fewer, larger steps.
+    said(longer.loc["batch-512"], held_out_error=10.2)
+    assert round(longer["held_out_loss"]["batch-512"], 3) == 0.347 > row(MAIN, 200)["held_out_loss"]
+    assert longer["held_out_error"]["batch-512"] > row(MAIN, 200)["held_out_error"]
     anchor = [row(MAIN, at, "history-anchor") for at in (200, 400)]
     assert all(
         one["held_out_loss"] < row(MAIN, at)["held_out_loss"] for one, at in zip(anchor, (200, 400), strict=True)

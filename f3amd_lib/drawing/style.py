@@ -112,7 +112,10 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
 
 
 def label_log_axis(axis, places: Sequence[float] = (1, 3), form: str = "{x:g}") -> None:
-    """Label a logarithmic axis (`axes.xaxis` or `axes.yaxis`) at these places of each decade, and nowhere else."""
+    """Label a logarithmic axis (`axes.xaxis` or `axes.yaxis`) at these places of each decade, and nowhere else.
+
+    An axis that shows fewer than two of them is labelled at even steps by matplotlib.
+    """
     axis.set_major_locator(LogLocator(subs=places))
     axis.set_major_formatter(form)
     axis.set_minor_formatter("")

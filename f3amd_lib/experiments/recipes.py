@@ -2,7 +2,7 @@
 
 A network that predicts clean motion can lower its loss by answering with the mean of what history,
 path and style allow, and never look at its noisy input; one step then does as well as eight. The
-rows stand in `papers/f3amd/recipes.toml`; all take the same number of steps from the same seed.
+rows stand in `papers/f3amd/recipes.toml`; all see as many windows from the same seed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_oth
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
 RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
-"""Optimiser steps of every row, by profile."""
+"""Optimiser steps of every row, by profile; of one with a batch of its own, as many windows."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Recipe:
 
         Args:
           num_steps, batch_size, seed: the same for all rows that are compared; a row with a batch of its own sees as
-            many windows, in other steps.
+            many windows, in other steps, of which it takes one at least.
         """
         settings = {"batch_size": batch_size, "seed": seed, **self.training}
         num_steps = max(1, num_steps * batch_size // settings["batch_size"])

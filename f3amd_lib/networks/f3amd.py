@@ -63,8 +63,8 @@ class F3AMDConfig(ConditionedConfig):
         et al. 2015).
       film_from_identity: let FiLM begin with gamma = beta = 0, so that z_tilde = z_base in Eq. 6, as
         Zhang et al. 2023 begin what they add (ours).
-      pre_norm: normalise the channels that each base block reads to mean 0 and variance 1, as Xiong
-        et al. 2020 (ours).
+      pre_norm: normalise the channels that each base block reads to mean 0 and variance 1 (ours; after
+        Xiong et al. 2020, without their learned scale).
       residual_prior: combine the network's estimate with the noisy input as the posterior mean of a
         Gaussian residual whose variance per channel and cosine mode is learned (ours).
       facing_frame: turn history, path and noisy input so that the path's first frame faces +Z, and

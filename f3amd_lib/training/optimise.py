@@ -246,7 +246,8 @@ def differences(identity: dict, description: dict) -> list[str]:
 
     Args:
       identity: of the task.
-      description: of the file; what it tells beside the task's identity does not matter.
+      description: of the file; what it tells beside the task's identity does not matter, nor does a setting that it
+        does not know, as one younger than the file, if that is off (false, 0 or empty).
     """
     # Files have lists where settings have tuples.
     wanted, stored = (
@@ -256,8 +257,11 @@ def differences(identity: dict, description: dict) -> list[str]:
     for part in (part for part in wanted if wanted[part] != stored[part]):
         if isinstance(wanted[part], dict) and isinstance(stored[part], dict):
             names = sorted(wanted[part].keys() | stored[part].keys())
-            changed = [name for name in names if wanted[part].get(name) != stored[part].get(name)]
-            unlike.append(f"{part} settings ({', '.join(changed)})")
+            younger = {name for name in wanted[part].keys() - stored[part].keys() if not wanted[part][name]}
+            changed = [
+                name for name in names if wanted[part].get(name) != stored[part].get(name) and name not in younger
+            ]
+            unlike += [f"{part} settings ({', '.join(changed)})"] if changed else []
         else:
             unlike.append(part.replace("_", " "))
     return unlike
