@@ -85,7 +85,7 @@ def draw(walkers: dict, line, credit: str) -> list[Image.Image]:
             ground = np.stack([line[:, 0], np.zeros(len(line)), line[:, 1]], axis=-1) + place * across
             axis.plot(*camera.project(ground)[:, :2].T, color=TARGET_COLOR, linewidth=0.8, alpha=0.5, zorder=1.5)
             x, y = camera.project(motion.root_position[frame] * [1.0, 0.0, 1.0] + [0.0, 1.8, 0.0])[:2]
-            axis.text(x, y, label, color=color, fontsize=9.5, fontweight="bold", ha="center", va="bottom", zorder=20)
+            axis.text(x, y, label, color=color, fontsize=8.5, fontweight="bold", ha="center", va="bottom", zorder=20)
         axis.text(0.5, 0.012, credit, transform=axis.transAxes, fontsize=7, color="#555555", ha="center", va="bottom")
         canvas.draw()
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
@@ -109,7 +109,7 @@ def main() -> None:
     with whole_file(path, overwrite=True) as temporary:
         pictures[0].save(
             temporary, "webp", save_all=True, append_images=pictures[1:], duration=durations, loop=0,
-            quality=48, method=4,
+            quality=45, method=4,
         )  # fmt: skip
     path.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     print(f"{path.relative_to(repository_root())}: {len(pictures)} frames, {path.stat().st_size / 1e6:.2f} MB")
