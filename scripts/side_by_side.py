@@ -109,7 +109,7 @@ def main() -> None:
     with whole_file(path, overwrite=True) as temporary:
         pictures[0].save(
             temporary, "webp", save_all=True, append_images=pictures[1:], duration=durations, loop=0,
-            quality=48, method=4,
+            quality=45, method=4,
         )  # fmt: skip
     path.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     print(f"{path.relative_to(repository_root())}: {len(pictures)} frames, {path.stat().st_size / 1e6:.2f} MB")
