@@ -148,11 +148,16 @@ class ConditionEncoder(nnx.Module):
         return asked + self.output(attend(query, context.keys, context.values, self.num_heads))
 
 
+def _linear(width_in: int, width_out: int, zero: bool, rngs: nnx.Rngs) -> nnx.Linear:
+    """Return a linear layer, whose answers are zero at the start if `zero`."""
+    initial = {"kernel_init": nnx.initializers.zeros_init()} if zero else {}
+    return nnx.Linear(width_in, width_out, rngs=rngs, **initial)
+
+
 def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
     """Return the linear layer of Eq. 7 (a convolution of kernel 1 is a linear layer per frame)."""
     # Zero at the start makes a residual block the identity, so that depth costs nothing.
-    initial = {"kernel_init": nnx.initializers.zeros_init()} if zero_output else {}
-    return nnx.Linear(width, width, rngs=rngs, **initial)
+    return _linear(width, width, zero_output, rngs)
 
 
 class FiLM(nnx.Module):
@@ -161,8 +166,7 @@ class FiLM(nnx.Module):
     def __init__(
         self, width: int, condition_width: int, *, identity: bool = False, zero_output: bool = False, rngs: nnx.Rngs
     ):
-        initial = {"kernel_init": nnx.initializers.zeros_init()} if identity else {}
-        self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs, **initial)
+        self.modulation = _linear(condition_width, 2 * width, identity, rngs)
         self.output = _output_layer(width, zero_output, rngs)
 
     def modulate(self, z_base, c):
@@ -201,8 +205,7 @@ class AdaLNZero(nnx.Module):
     """
 
     def __init__(self, width: int, condition_width: int, *, zero_output: bool = True, rngs: nnx.Rngs):
-        zeros = nnx.initializers.zeros_init()
-        self.modulation = nnx.Linear(condition_width, 3 * width, kernel_init=zeros, rngs=rngs)
+        self.modulation = _linear(condition_width, 3 * width, True, rngs)
 
     def __call__(self, base, z, c):
         """Add to z [B, T, D] what the base block makes of it under c [B, T, C_cond]."""

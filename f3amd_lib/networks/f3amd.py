@@ -216,9 +216,8 @@ class F3AMD(DenoisingNetwork):
             self.encoder_hidden = self._coder(config.channels + beside, hidden, rngs)
         self.encoder = self._coder(hidden or config.channels + beside, width, rngs)
         self.blocks = nnx.List([self._base_block(rngs) for _ in range(config.depth)])
-        options = {"num_heads": heads, "zero_output": config.block_residual, "rngs": rngs}
-        options["identity"] = config.film_from_identity
-        way_in = lambda: conditioning_layer(config.conditioning, width, width, **options)
+        options = {"num_heads": heads, "identity": config.film_from_identity, "zero_output": config.block_residual}
+        way_in = lambda: conditioning_layer(config.conditioning, width, width, **options, rngs=rngs)
         self.conditionings = nnx.List([way_in() for _ in range(config.depth)])
         if hidden := config.decoder_hidden_width:
             self.decoder_hidden = self._coder(width, hidden, rngs)

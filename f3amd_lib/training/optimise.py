@@ -256,11 +256,10 @@ def differences(identity: dict, description: dict) -> list[str]:
     unlike = []
     for part in (part for part in wanted if wanted[part] != stored[part]):
         if isinstance(wanted[part], dict) and isinstance(stored[part], dict):
-            names = sorted(wanted[part].keys() | stored[part].keys())
-            younger = {name for name in wanted[part].keys() - stored[part].keys() if not wanted[part][name]}
-            changed = [
-                name for name in names if wanted[part].get(name) != stored[part].get(name) and name not in younger
-            ]
+            off = {name: value for name, value in wanted[part].items() if not value}
+            known = off | stored[part]
+            names = sorted(wanted[part].keys() | known.keys())
+            changed = [name for name in names if wanted[part].get(name) != known.get(name)]
             unlike += [f"{part} settings ({', '.join(changed)})"] if changed else []
         else:
             unlike.append(part.replace("_", " "))
