@@ -4,6 +4,8 @@ import pandas as pd
 import pytest
 from builders import refused
 
+from f3amd_lib.experiments.measure import ONE_STEP_MODELS
+from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.reports.quality_bars import BAR_MODELS, quality_bars
 
 REAL = {
@@ -89,3 +91,9 @@ def test_what_was_not_measured_is_said():
     assert alone.pop("Classifier, held-out accuracy") == "both"
     assert set(alone.values()) == {"not measured"}
     refused("no rows of real motion", quality_bars, frame[frame["model"] != "real"], 0.9)
+
+
+def test_what_is_asked_and_distilled_is_the_walker_that_ships():
+    """Both name it, where a run would take it from the profile."""
+    ours = load_profile("laptop", "bandai").preset
+    assert BAR_MODELS[1] == ours and ours in ONE_STEP_MODELS

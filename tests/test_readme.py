@@ -13,6 +13,7 @@ from PIL import Image
 
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.reports.claims import load_claims
 from f3amd_lib.reports.model_cards import committed_quality
 from f3amd_lib.training.checkpoints import load_model, weights_digest
@@ -86,12 +87,19 @@ def test_what_is_said_of_frameworks(milliseconds):
     assert slower == round(camdm["iree", count] / camdm["torch", count], 1)
 
 
+def test_what_steady_pays_for_its_feet():
+    assert README.count("(its FID is higher)") == 1
+    fid = committed_quality("bandai").query("metric == 'FID' and window_frames == 32").set_index(["model", "steps"])
+    fid = fid["value"]
+    assert all(fid[f"{FNO}-steady", steps] > fid[name, steps] for name in ("CAMDM", FNO) for steps in (1, 2, 4, 8))
+
+
 @pytest.mark.parametrize("page", [README, RESULTS], ids=["README", "results"])
 @pytest.mark.parametrize(
     ("sentence", "model"),
     [
         (r"real people moves at (\d+) cm/s", "real"),
-        (r"`-steady`(?: moves)? at about (\d+),", "F3AMD-FNO-96-steady"),
+        (r"`-steady`(?: moves)? at about (\d+)(?: \(its FID is higher\))?,", "F3AMD-FNO-96-steady"),
         (r"that of `CAMDM` at about (\d+)[,.]", "CAMDM"),
         (r"after 33 passes, (?:skates )?at about (\d+)[:,]", FNO),
     ],
@@ -122,18 +130,28 @@ def test_what_is_said_of_students_of_locomotion():
         RESULTS,
     )
     assert same(variety, *[(*key, "diversity") for key in ((camdm, 1), ("CAMDM", 1), ("CAMDM, by DDIM", 8))])
+    assert README.count("Distilled, `CAMDM` triples its variety in one step, and slides more") == 1
+    for metric, low, high in (("diversity", 2.7, 3.3), ("foot_sliding", 1.1, 2.0)):
+        assert low < value[camdm, 1, metric] / value["CAMDM", 1, metric] < high
     feet = stated(
         r"Foot is ([\d.]+) after distilling, ([\d.]+) before\. Students of 2 and 4 steps have (0\.\d+) and (0\.\d+)",
         RESULTS,
     )
     assert same(feet, *[(*key, "foot_sliding") for key in ((camdm, 1), ("CAMDM", 1), (camdm, 2), (camdm, 4))])
-    *small, before, after = stated(
-        r"from ([\d.]+) cm to ([\d.]+) by distilling, and Foot from (0\.\d+) to (0\.\d+)\. Its FID\D+(\d+) to (\d+)",
+    *variety, before, after = stated(
+        r"from ([\d.]+) cm to ([\d.]+) by distilling\. Its FID goes from (\d+) to (\d+)", RESULTS
+    )
+    *touching, first, second = stated(
+        r"off: (\d+) % of them are lower than 1 cm, before (\d+) %, in real motion (\d+) %\. "
+        r"Foot, .*, goes from (0\.\d+) to (0\.\d+)\.",
         RESULTS,
     )
     ways = ((steady, 1), (steady + ", distilled", 1))
-    assert same(small, *[(*key, metric) for metric in ("diversity", "foot_sliding") for key in ways])
+    assert same([*variety, first, second], *[(*key, name) for name in ("diversity", "foot_sliding") for key in ways])
     assert [before, after] == [round(value[(*key, "FID")]) for key in ways]
+    shares = [rows.loc[(*key, "contact_share"), "value"] for key in (ways[1], ways[0])]
+    real = committed_quality("bandai").query("model == 'real' and metric == 'contact_share'")["value"]
+    assert touching == [round(100 * share) for share in (*shares, real.iloc[0])]
     assert rows.loc[(*ways[0], "FID"), "low"] < rows.loc[(*ways[1], "FID"), "high"]
 
 
@@ -183,7 +201,7 @@ def test_number_of_claims():
 def test_how_much_of_the_papers_training_models_of_its_recipe_saw():
     trained = pd.read_csv(ROOT / "paper_figures/bandai/laptop/records/trained.csv").query("metric == 'windows'")
     seen = trained.set_index("model")["value"]
-    of_paper = seen[~seen.index.str.endswith("-steady")]
+    of_paper = seen[[find_preset(name).source != "ours" for name in seen.index]]
     whole = load_paper_file("paper")["training"]["windows"]["32"]
     (share,) = stated(r"models of the paper's recipe saw at most ([\d.]+) % of its training")
     assert len(of_paper) >= 3 and share == round(100 * of_paper.max() / whole, 1)

@@ -3,7 +3,7 @@
 Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
 paper, what decides it, and the statements it stands for, each with its kind of judgement. A verdict
 follows from recorded figures alone, and from none of ours to none of the paper's: models of our own
-(`-plus`, `-raw`, ...) decide nothing. The same statements are judged from the paper's own tables,
+(`-plus`, `-steady`, `-raw`, ...) decide nothing. The same statements are judged from the paper's own tables,
 which do not always say what its text says.
 
 The verdicts are committed. When a new measurement changes one, a test fails until somebody has
