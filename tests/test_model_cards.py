@@ -148,6 +148,8 @@ def test_limits_follow_from_the_figures():
     assert "skates: its lower toe moves over the ground at 84 cm/s" in limits(**good | {"slide_speed": 84.0})
     assert "Toes sink" in limits(**good, floor_penetration=2.0)
     assert "trembles" in limits(**good, joint_acceleration=1.0)
+    assert "its walks cover 92 % of them" in limits(**good, style_coverage=92.2)
+    assert "all styles" not in limits(**good, style_coverage=97.6)
 
 
 def test_figures_of_other_weights_are_not_shown():
