@@ -296,10 +296,15 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     assert round(five["held_out_loss"], 3) == 0.128 and round(long["held_out_loss"].iloc[-1], 3) == 0.144
 
 
-def bands(queue, windows):
-    """Figures of F3AMD's rows of the paper's text at one length, 8 steps, by model; and of the seeds of `MAIN`."""
+def ablated(queue, windows):
+    """Rows of 23.8: F3AMD by the paper's text at one length, 8 steps."""
     asked = "recipe == 'paper' and windows == @windows and window_frames == 32 and steps in [0, 8]"
-    rows = queue.query(asked + " and model.str.startswith('F3AMD-') and model != 'F3AMD-FNO-32'")
+    return queue.query(asked + " and model.str.startswith('F3AMD-') and model != 'F3AMD-FNO-32'")
+
+
+def bands(queue, windows):
+    """Figures of the seeds of `MAIN` at one length, and of the variants by model."""
+    rows = ablated(queue, windows)
     seeds = rows[rows["model"] == MAIN].pivot(index="seed", columns="metric", values="value")
     variants = rows[rows["model"] != MAIN].pivot_table(index="model", columns="metric", values="value")
     short = lambda name: name.removeprefix("F3AMD-").removeprefix("FNO-96-")
@@ -331,8 +336,7 @@ DRAWN = ["held_out_loss", "FID", "trajectory_error", "joint_acceleration", "IRD"
 
 def far_from(queue, eyes, windows):
     """What 23.8 names, (variant, figure) more than a width of the seeds' range away, and how many are drawn."""
-    asked = "recipe == 'paper' and windows == @windows and window_frames == 32 and steps in [0, 8] and metric in @DRAWN"
-    rows = queue.query(asked + " and model.str.startswith('F3AMD-') and model != 'F3AMD-FNO-32'")
+    rows = ablated(queue, windows).query("metric in @DRAWN")
     rows = rows[(rows["metric"] != "FID") | (rows["classifier"] == eyes)]
     rows = rows[~(rows["model"].str.endswith("no-IRD") & (rows["metric"] == "held_out_loss"))]
     ends = rows[rows["model"] == MAIN].groupby("metric")["value"].agg(["min", "max"])
@@ -346,14 +350,27 @@ def test_ablations(queue, eyes):
     seeds, variants = bands(queue, 200_000)
     # Thirteen rows of Tables 8 to 11, two Transformers, and no IRD loss, whose own sum of terms is not drawn.
     assert len(variants) == 16
-    first = queue[(queue["model"] != "F3AMD-FNO-32") & queue["model"].str.startswith("F3AMD-")]
-    first = first.query("recipe == 'paper' and windows == 200_000 and seed == 0")
-    assert set(first["classifier"]) == {eyes}
+    assert set(ablated(queue, 200_000).query("seed == 0")["classifier"]) == {eyes}
     far, drawn = far_from(queue, eyes, 200_000)
     assert (len(far), drawn) == (16, 95)
     assert {one for one in far if one[1] not in ("held_out_loss", "x0_error_ratio")} == {
         ("F3AMD-Transformer-64", "FID")
     }
+    # In how they walk nearly all lie among the seeds.
+    inside = (variants >= seeds.min()) & (variants <= seeds.max())
+    assert inside[["trajectory_error", "joint_acceleration", "IRD"]].to_numpy().mean() > 0.75
+    layers = ["m8", "m12", "m14", "DCT-96", "weighted-FNO-96", "reduced-rank-FNO-96"]
+    assert inside.loc[layers, ["trajectory_error", "joint_acceleration", "IRD"]].all(axis=None)
+    path, shaking = variants["trajectory_error"], variants["joint_acceleration"]
+    assert path.idxmax() == "m1" and round(path["m1"], 2) == 0.26
+    assert shaking.idxmax() == "Transformer-64" and round(shaking.max(), 1) == 10.5
+    calm = shaking[shaking < seeds["joint_acceleration"].min()]
+    assert calm.round(1).to_dict() == {"AdaLN-zero": 2.8, "m4": 3.2, "cross-attention": 3.2, "no-IRD": 3.5}
+    # What the paper has of them.
+    table_10 = load_paper_table(10).query("metric == 'FID'").set_index("model")["value"]
+    assert table_10.idxmax() == "F3AMD-FNO-96, m=1"
+    table_9 = load_paper_table(9).query("metric == 'style_coverage'").set_index("model")["value"]
+    assert "linear" in table_9.filter(like="FNO-96").idxmin()
     loss, ratio = variants["held_out_loss"].drop("no-IRD"), variants["x0_error_ratio"]
     assert loss.nlargest(3).round(2).to_dict() == {
         "Transformer-64-linear": 0.41,
@@ -441,6 +458,8 @@ def test_camdm_narrow_and_with_other_noise(queue, row, eyes):
     seen = seen[(seen["classifier"] == eyes) & seen["model"].isin(["CAMDM-96", "CAMDM", MAIN])]
     covered = seen.groupby("model")["value"].agg(["min", "max"]).round()
     assert covered.T.to_dict("list") == {"CAMDM": [99, 99], "CAMDM-96": [82, 82], MAIN: [33, 65]}
+    emd = [row(name, 200)["EMD"] for name in ("CAMDM-96", "CAMDM", MAIN)]
+    assert emd == pytest.approx([9.8, 6.3, 13], rel=0.03)
     table_12 = load_paper_table(12).query("metric == 'style_coverage'")
     assert table_12["value"].min() == 2 and presets.find_preset("CAMDM-96").network["latent_width"] == 96
     exploding, own = row("CAMDM-VE", 200), row("CAMDM", 200)
