@@ -28,6 +28,7 @@ from f3amd_lib.reports.equation_map import (
     running_times,
 )
 from f3amd_lib.reports.readings import fill_reading, readings_table
+from f3amd_lib.training.recipe import short_recipe
 
 
 @pytest.mark.parametrize(
@@ -291,6 +292,16 @@ def test_open_points_show_what_a_preset_sets():
     share = table["history masked in training, `CAMDM-code`"]
     assert share == f"a share of {code.training['history_dropout']}"
     assert table["IRD in its loss"].startswith(f"weight {code.training['loss']['ird']};")
+
+
+@pytest.mark.parametrize("form", ["-plus", "-steady"])
+def test_open_points_name_all_of_our_recipes_that_set_them(form):
+    table, preset = readings_table().set_index("open point")["here"], find_preset("F3AMD-FNO-96" + form)
+    share, heads = short_recipe(preset.name, 1_000).captured_path_share, preset.network["num_condition_heads"]
+    assert table["smoothness of the path condition"].endswith(f"; `-plus` and `-steady` {share}")
+    assert table["heads of that cross-attention"] == f"1; `-plus` and `-steady` {heads}"
+    assert table["residual connections"].endswith("; `-plus` and `-steady` have them")
+    assert preset.network["block_residual"]
 
 
 READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}", "why": "so"}

@@ -192,12 +192,13 @@ def test_rows_of_the_queue_are_means_over_trainings_through_one_classifier():
     )  # fmt: skip
     rows = of_queue(campaign, 1000).set_index(["model", "metric"])
     assert set(rows.index.get_level_values(0)) == {"F3AMD-FNO-96", "F3AMD-FNO-96-m4"}
-    # Two trainings: their mean, and Student's interval of two (12.7 s / sqrt 2); FID through the new classifier alone.
+    # Two trainings: their mean, and Student's interval of two (12.7 s / sqrt 2); of classifiers the new alone.
     traj = rows.loc[("F3AMD-FNO-96", "trajectory_error")]
     first = list(FIGURES).index("trajectory_error")
     assert traj["value"] == 12.0 + first and traj["repeats"] == 2 and traj["unit"] == "m"
     assert traj["high"] - traj["value"] == pytest.approx(12.706 * np.std([10, 14], ddof=1) / np.sqrt(2), rel=1e-3)
-    fid = rows.loc[("F3AMD-FNO-96", "FID")]
-    assert fid["value"] == 14.0 and fid["repeats"] == 1 and np.isnan(fid["high"])
+    for metric in ("FID", "EMD", "style_coverage"):
+        seen = rows.loc[("F3AMD-FNO-96", metric)]
+        assert seen["value"] == 14.0 + list(FIGURES).index(metric) and seen["repeats"] == 1 and np.isnan(seen["high"])
     wide = wide_rows(beside_paper(10, of_queue(campaign, 1000), LABEL))
     assert wide[wide["source"] == LABEL]["model"].tolist() == ["F3AMD-FNO-96", "F3AMD-FNO-96-m4"]

@@ -1,10 +1,11 @@
-"""What notebook 23 says of the long queue, against its record."""
+"""What notebooks 23 and 24 say of the long queue, against its record."""
 
 import re
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from f3amd_lib.experiments.campaign import Run
 from f3amd_lib.experiments.learning_curves import power_law
@@ -183,14 +184,14 @@ def test_the_use_of_noise_along_the_run(long, row):
 SINGLE = [
     "history-input", "block-residual", "higher-learning-rate", "history-anchor", "residual-prior",
     "skip-and-output-scaling", "log-normal-noise", "mixed-noise", "low-noise-weighting", "fitted-sigma-max",
-    "wide-decoder", "encoder-skip", "film-from-identity", "wide-encoder", "pre-norm", "batch-512",
+    "wide-decoder", "encoder-skip", "film-from-identity", "wide-encoder", "pre-norm", "batch-512", "IRD-excess",
 ]  # fmt: skip
 
 
 def test_what_single_changes_bring(row, queue, eyes):
     short = pd.DataFrame({name: row(MAIN, 200, name) for name in SINGLE}).T
     users = {"block-residual", "residual-prior", "skip-and-output-scaling", "log-normal-noise", "encoder-skip"}
-    assert len(SINGLE) == 16
+    assert len(SINGLE) == 17
     assert set(short.index[short["x0_error_ratio"] < 0.8]) == users
     assert short["x0_error_ratio"].drop(users).min() > 0.9
     longer = pd.DataFrame({name: row(MAIN, 400, name) for name in SINGLE}).T
@@ -241,6 +242,10 @@ def test_what_single_changes_bring(row, queue, eyes):
     said(longer.loc["batch-512"], held_out_error=10.2)
     assert round(longer["held_out_loss"]["batch-512"], 3) == 0.347 > row(MAIN, 200)["held_out_loss"]
     assert longer["held_out_error"]["batch-512"] > row(MAIN, 200)["held_out_error"]
+    # The data's step at the seam in place of none.
+    seam = [[row(MAIN, at, name) for at in (200, 400)] for name in ("IRD-excess", "paper")]
+    assert [[round(one["held_out_error"], 1) for one in two] for two in seam] == [[9.0, 7.6], [9.1, 7.7]]
+    assert [round(two[1]["IRD"], 1) for two in seam] == [5.7, 3.9]
     anchor = [row(MAIN, at, "history-anchor") for at in (200, 400)]
     assert all(
         one["held_out_loss"] < row(MAIN, at)["held_out_loss"] for one, at in zip(anchor, (200, 400), strict=True)
@@ -297,7 +302,7 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
 
 
 def ablated(queue, windows):
-    """Rows of 23.8: F3AMD by the paper's text at one length, 8 steps."""
+    """Rows of 24.1: F3AMD by the paper's text at one length, 8 steps."""
     asked = "recipe == 'paper' and windows == @windows and window_frames == 32 and steps in [0, 8]"
     return queue.query(asked + " and model.str.startswith('F3AMD-') and model != 'F3AMD-FNO-32'")
 
@@ -335,7 +340,7 @@ DRAWN = ["held_out_loss", "FID", "trajectory_error", "joint_acceleration", "IRD"
 
 
 def far_from(queue, eyes, windows):
-    """What 23.8 names, (variant, figure) more than a width of the seeds' range away, and how many are drawn."""
+    """What 24.1 names, (variant, figure) more than a width of the seeds' range away, and how many are drawn."""
     rows = ablated(queue, windows).query("metric in @DRAWN")
     rows = rows[(rows["metric"] != "FID") | (rows["classifier"] == eyes)]
     rows = rows[~(rows["model"].str.endswith("no-IRD") & (rows["metric"] == "held_out_loss"))]
@@ -365,7 +370,7 @@ def test_ablations(queue, eyes):
     assert path.idxmax() == "m1" and round(path["m1"], 2) == 0.26
     assert shaking.idxmax() == "Transformer-64" and round(shaking.max(), 1) == 10.5
     calm = shaking[shaking < seeds["joint_acceleration"].min()]
-    assert calm.round(1).to_dict() == {"AdaLN-zero": 2.8, "m4": 3.2, "cross-attention": 3.2, "no-IRD": 3.5}
+    assert calm.round(1).to_dict() == {"AdaLN-zero": 2.8, "m4": 3.2, "cross-attention": 3.2, "no-IRD": 3.3}
     # What the paper has of them.
     table_10 = load_paper_table(10).query("metric == 'FID'").set_index("model")["value"]
     assert table_10.idxmax() == "F3AMD-FNO-96, m=1"
@@ -397,7 +402,7 @@ def test_ablations_after_four_times_the_length(queue, eyes):
     seeds, variants = bands(queue, 800_000)
     few_seeds, few = bands(queue, 200_000)
     far, drawn = far_from(queue, eyes, 800_000)
-    assert (len(far), drawn, len(variants)) == (19, 36, 6)
+    assert (len(far), drawn, len(variants)) == (44, 89, 15)
     assert len([one for one in far if one[1] in ("joint_acceleration", "trajectory_error", "IRD", "FID")]) > 4
     layers = ["DCT-96", "weighted-FNO-96", "reduced-rank-FNO-96"]
     shaking = variants["joint_acceleration"]
@@ -451,6 +456,163 @@ def test_ablations_after_four_times_the_length(queue, eyes):
     assert seeds["x0_error_ratio"].round(3).agg(["min", "max"]).tolist() == [0.943, 0.945]
     assert variants["x0_error_ratio"][["DCT-96", "weighted-FNO-96"]].round(3).tolist() == [0.935, 0.931]
     assert [round(one["held_out_loss"]["Transformer-64"], 2) for one in (few, variants)] == [0.35, 0.23]
+
+
+def test_kept_modes(queue):
+    (few_seeds, few), (seeds, variants) = (bands(queue, windows) for windows in (200_000, 800_000))
+    modes = ["m1", "m4", "m8", "m12", "m14"]
+    # After 0.2 million windows the mean alone is behind, after 0.8 hardly.
+    others = [*few["trajectory_error"][modes[1:]], *few_seeds["trajectory_error"]]
+    four = ablated(queue, 200_000).query("model == 'F3AMD-FNO-96-m4' and metric == 'trajectory_error'")["value"].min()
+    assert [round(100 * one) for one in (few["trajectory_error"]["m1"], four, max(others))] == [26, 9, 23]
+    ends = lambda metric: pd.concat([variants[metric][modes], seeds[metric]]).agg(["min", "max"])
+    assert (100 * ends("trajectory_error")).round(1).tolist() == [7.1, 8.0]
+    assert ends("held_out_error").round(1).tolist() == [6.5, 6.9]
+    behind = {"FID": (33, 23, 31), "EMD": (6.8, 5.9, 6.6), "diversity": (0.33, 0.39, 0.53)}
+    for metric, printed in behind.items():
+        rest = pd.concat([variants[metric][modes[1:]], seeds[metric]])
+        digits = len(str(printed[0]).partition(".")[2])
+        figures = (variants[metric]["m1"], rest.min(), rest.max())
+        assert tuple(round(one, digits) for one in figures) == printed, metric
+    assert few["foot_sliding"]["m1"] < min(few["foot_sliding"][modes[1:]].min(), few_seeds["foot_sliding"].min())
+    # Calmer with fewer, after the longer training alone.
+    assert round(few["joint_acceleration"]["m1"], 1) == 6.4
+    shaking = variants["joint_acceleration"]
+    assert shaking[modes].round(1).tolist() == [2.3, 2.2, 2.6, 3.1, 2.9]
+    assert round(seeds["joint_acceleration"].max() - seeds["joint_acceleration"].min(), 2) == 0.07
+    feet = variants["foot_alternation"].round(2)
+    assert feet[modes].tolist() == [0.13, 0.18, 0.05, 0.05, 0.04]
+    assert seeds["foot_alternation"].round(2).agg(["min", "max"]).tolist() == [0.02, 0.04]
+
+
+def test_ways_of_the_condition(queue):
+    (few_seeds, few), (seeds, variants) = (bands(queue, windows) for windows in (200_000, 800_000))
+    said(variants.loc["cross-attention"], held_out_loss=0.178, held_out_error=6.1, FID=31, direction_error=11.3)
+    said(
+        variants.loc["concatenation"], held_out_loss=0.19, joint_acceleration=2.2, foot_alternation=0.3,
+        style_coverage=54, FID=100,
+    )  # fmt: skip
+    said(
+        variants.loc["AdaLN-zero"], held_out_error=5.6, held_out_loss=0.174, joint_acceleration=2.0, FID=59,
+        style_coverage=83, x0_error_ratio=0.62, use_of_x=1.07, diversity=0.93,
+    )  # fmt: skip
+    ways = variants.loc[["cross-attention", "concatenation", "AdaLN-zero"]]
+    assert ways["FID"].min() > seeds["FID"].max() and set(seeds["style_coverage"]) == {100}
+    assert ways["held_out_loss"].idxmin() == ways["joint_acceleration"].idxmin() == "AdaLN-zero"
+    assert ways["held_out_loss"].min() < seeds["held_out_loss"].min()
+    printed = {
+        "direction_error": (8.0, 9.2), "joint_acceleration": (2.9, 3.0), "use_of_x": (0.50, 0.51),
+        "diversity": (0.39, 0.53),
+    }  # fmt: skip
+    for metric, ends in printed.items():
+        digits = 1 if ends[0] > 1 else 2
+        assert tuple(seeds[metric].agg(["min", "max"]).round(digits)) == ends, metric
+    # The two that lose style are ahead in trembling, feet and path.
+    lost = variants.loc[["concatenation", "AdaLN-zero"]]
+    assert (100 * lost["trajectory_error"]).round(1).tolist() == [6.8, 6.4]
+    for metric in ("trajectory_error", "joint_acceleration"):
+        assert lost[metric].max() < seeds[metric].min()
+    assert lost["foot_alternation"].min() > seeds["foot_alternation"].max()
+    said(lost.loc["AdaLN-zero"], foot_sliding=0.92)
+    assert seeds["foot_sliding"].agg(["min", "max"]).round(2).tolist() == [0.78, 0.84]
+    assert round(variants["style_coverage"]["cross-attention"], 1) == 99.7
+    assert round(few["use_of_x"]["AdaLN-zero"], 2) == 1.84
+    assert few_seeds["use_of_x"].agg(["min", "max"]).round(2).tolist() == [0.54, 0.66]
+    rest = variants["style_coverage"].drop([*lost.index, "Transformer-64-linear"])
+    assert lost["style_coverage"].max() < 85 < 98 < rest.min()
+    # Who uses the noise.
+    for table in (few, variants):
+        assert table["x0_error_ratio"].drop("AdaLN-zero").min() > 0.9
+    once = queue.query("metric == 'joint_acceleration' and steps == 1 and windows == 800_000 and recipe == 'paper'")
+    once = once[once["window_frames"] == 32].set_index("model")["value"]
+    assert round(once["F3AMD-FNO-96-AdaLN-zero"], 1) == 3.1
+    assert (round(once[MAIN].min(), 1), round(once[MAIN].max(), 1)) == (2.6, 2.8)
+
+
+def test_without_the_ird_loss(queue, row, real, eyes):
+    """Eq. 10's term shortens the step at a seam, and costs half of the training or more."""
+    seeds = bands(queue, 800_000)[0]
+    without = queue.query("model == 'F3AMD-FNO-96-no-IRD' and windows == 800_000 and steps in [0, 8]")
+    without = without.pivot(index="seed", columns="metric", values="value")
+    assert len(without) == 2
+    printed = {
+        "IRD": (1, [7.0, 7.5], (3.2, 3.7)), "IRD_excess": (1, [5.9, 6.5], (6.2, 6.9)),
+        "held_out_error": (1, [5.2, 5.4], (6.5, 6.8)), "FID": (0, [16, 19], (23, 27)),
+        "trajectory_error": (3, [0.059, 0.067], (0.071, 0.077)), "joint_acceleration": (1, [1.9, 2.1], (2.9, 3.0)),
+        "foot_sliding": (2, [0.63, 0.63], (0.78, 0.84)), "foot_alternation": (2, [0.27, 0.28], (0.02, 0.04)),
+        "x0_error_ratio": (3, [0.906, 0.91], (0.943, 0.945)),
+    }  # fmt: skip
+    better = {"foot_alternation": -1}
+    for metric, (digits, two, ends) in printed.items():
+        assert sorted(without[metric].round(digits)) == two, metric
+        assert tuple(seeds[metric].agg(["min", "max"]).round(digits)) == ends, metric
+        if metric not in ("IRD", "IRD_excess"):
+            side = better.get(metric, 1)
+            assert (side * without[metric]).max() < (side * seeds[metric]).min(), metric
+    said(real, IRD=4.0, IRD_excess=0.7, FID=15)
+    assert set(without["style_coverage"]) == {100}
+    assert seeds["direction_error"].min() < without["direction_error"].min()
+    assert without["direction_error"].max() < seeds["direction_error"].max()
+    assert without["trajectory_error"].max() > row(MAIN, 1600)["trajectory_error"] == pytest.approx(0.065, abs=5e-4)
+    assert seeds["IRD"].max() < real["IRD"] < without["IRD"].min()
+    # The data's step in place of none: the least rough seam, nothing learnt faster.
+    other = row(MAIN, 800, "IRD-excess")
+    said(other, held_out_error=6.5, FID=27, foot_sliding=0.82, foot_alternation=0.04, IRD_excess=5.2, IRD=5.1)
+    assert (
+        round(100 * other["trajectory_error"], 1) == 5.6 and other["held_out_error"] > without["held_out_error"].max()
+    )
+    assert other["IRD_excess"] < min(without["IRD_excess"].min(), seeds["IRD_excess"].min())
+    later = [row(MAIN, at)["held_out_error"] for at in (1600, 3200)]
+    assert [round(one, 1) for one in later] == [5.7, 4.8]
+    assert later[0] > without["held_out_error"].max() and without["held_out_error"].min() > later[1]
+
+
+def test_the_papers_way_in_half_of_what_is_far_from_the_seeds(queue):
+    rows = of_queue(queue, 800_000).query("steps == 8 and window_frames == 32")
+    ours = rows.pivot(index="model", columns="metric", values="value")
+    printed = pd.concat([load_paper_table(number) for number in (8, 9, 10, 11)]).query("steps == 8")
+    printed = printed.assign(model=[presets.find_preset(label).name for label in printed["model"]])
+    theirs = printed.pivot_table(index="model", columns="metric", values="value")
+    variants = theirs.index.drop(MAIN)
+    assert len(variants) == 13 and set(variants) <= set(ours.index)
+    seeds = bands(queue, 800_000)[0]
+    found, chances = [], []
+    for metric in FIGURES:
+        low, high = seeds[metric].min(), seeds[metric].max()
+        mine = ours.loc[variants, metric]
+        away = np.maximum(low - mine, mine - high)
+        for name in variants[away > np.maximum(high - low, 0.01 * ours[metric][MAIN])]:
+            pair = [table[metric][name] / table[metric][MAIN] for table in (ours, theirs)]
+            found.append((name, metric, (pair[0] > 1) == (pair[1] > 1)))
+        pairs = [np.log(table.loc[variants, metric] / table[metric][MAIN]) for table in (ours, theirs)]
+        chances.append(stats.spearmanr(*pairs).pvalue)
+    assert (len(found), sum(same for *_, same in found)) == (35, 17)
+    assert round(min(chances), 2) == 0.06
+    linear = {
+        name: {same: {metric for one, metric, way in found if (one, way) == (f"F3AMD-{name}-linear", same)}
+               for same in (True, False)}
+        for name in ("FNO-96", "Transformer-64")
+    }  # fmt: skip
+    both, path = {"direction_error", "style_coverage"}, {"trajectory_error"}
+    assert linear["FNO-96"] == {True: both | {"smoothness", "IRD"}, False: path}
+    assert linear["Transformer-64"] == {True: both | {"FID", "diversity"}, False: path | {"EMD", "smoothness", "IRD"}}
+    path = theirs["trajectory_error"] / theirs["trajectory_error"][MAIN]
+    assert [round(100 * one - 100) for one in (path.min(), path.max())] == [-52, 191]
+    mine = ours.loc[variants, "trajectory_error"] / ours["trajectory_error"][MAIN]
+    assert mine.filter(regex="^(?!.*linear)").sub(1).abs().max() < 0.135
+    paths = [bands(queue, windows)[0]["trajectory_error"] for windows in (800_000, 200_000)]
+    spans = [path.max() / path.min() for path in paths]
+    assert 1.07 < spans[0] < 1.09 and spans[1] > 2
+
+
+def test_camdm_with_the_ird_loss(row):
+    printed = {
+        "IRD": [3.2, 8.1], "IRD_excess": [4.8, 6.7], "held_out_error": [6.0, 5.7], "FID": [45, 27],
+        "style_coverage": [91, 99], "trajectory_error": [0.064, 0.051],
+    }  # fmt: skip
+    for metric, figures in printed.items():
+        for name, figure in zip(("CAMDM-IRD", "CAMDM"), figures, strict=True):
+            said(row(name, 200), **{metric: figure})
 
 
 def test_camdm_narrow_and_with_other_noise(queue, row, eyes):

@@ -17,7 +17,7 @@ import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
-from f3amd_lib.measures.distributions import DISTANCES, intervals_over_repeats
+from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import SHOWN, Metric
 from f3amd_lib.networks import presets
 
@@ -141,11 +141,12 @@ def of_queue(campaign: pd.DataFrame, windows: int) -> pd.DataFrame:
 
     Returns:
       As from `protocol.summarise`, repeats being trainings: a mean over seeds, with an interval where there are two or
-      more. Figures that compare through one style classifier alone (FID, EMD) are those of the newest.
+      more. Figures of a style classifier (FID, EMD, style coverage) are those of the newest, which compare.
     """
     kept = (campaign["recipe"] == "paper") & (campaign["windows"] == windows) & campaign["metric"].isin(FIGURES)
-    by_eye = campaign["metric"].isin(DISTANCES) & (campaign["classifier"] != campaign["classifier"].iloc[-1])
-    return intervals_over_repeats(campaign[kept & ~by_eye].fillna({"unit": ""}), [*_KEYS, "unit"])
+    older = campaign["classifier"] != campaign["classifier"].iloc[-1]
+    by_eye = campaign["metric"].isin([metric.name for metric in SHOWN["classifier"]])
+    return intervals_over_repeats(campaign[kept & ~(by_eye & older)].fillna({"unit": ""}), [*_KEYS, "unit"])
 
 
 def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
