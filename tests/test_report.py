@@ -164,6 +164,15 @@ def test_table_survives_other_line_ends(tmp_path):
     pd.testing.assert_frame_equal(records.read_table(path)[0], FRAME)
 
 
+def test_digests_stay_text_where_they_look_like_numbers(tmp_path):
+    digests = {"weights": ["912345678901"] * 2, "classifier": ["1e10", None], "commit": ["9548690e74", "00042"]}
+    table = pd.DataFrame({"value": [0.1, 2.0], **digests})
+    records.write_table(tmp_path / "rows.csv", table, record())
+    back = records.read_table(tmp_path / "rows.csv")[0]
+    assert back["weights"].tolist() == digests["weights"] and back["commit"].tolist() == digests["commit"]
+    assert back["classifier"][0] == "1e10" and pd.isna(back["classifier"][1]) and back["value"].tolist() == [0.1, 2.0]
+
+
 def test_table_without_its_record_is_refused(tmp_path):
     path = records.write_table(tmp_path / "quality.csv", FRAME, record())
     path.with_suffix(".json").unlink()

@@ -33,6 +33,8 @@ _REPOSITORY = _LIBRARY.parent
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
 _EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
+# Digests and commits are text, also one that looks like a number: 9548690e74.
+_DIGESTS = dict.fromkeys(("weights", "classifier", "commit"), str)
 _TABLES = read_toml(Path(__file__).with_name("records.toml"))
 
 ON_WEIGHTS = frozenset(_TABLES["on_weights"])
@@ -137,7 +139,7 @@ def read_table(path) -> tuple[pd.DataFrame, dict]:
       path: the CSV file.
 
     Returns:
-      (table, record).
+      (table, record). Columns of digests (weights, classifier, commit) are text, whatever they look like.
 
     Raises:
       FileNotFoundError: if there is no such table.
@@ -154,7 +156,7 @@ def read_table(path) -> tuple[pd.DataFrame, dict]:
             f"{path}: not the table that {path.stem}.json describes (it was changed, or a run died while writing); "
             "measure it again"
         )
-    return pd.read_csv(io.StringIO(text), **_EXACT_FLOATS), record
+    return pd.read_csv(io.StringIO(text), dtype=_DIGESTS, **_EXACT_FLOATS), record
 
 
 def _read_record(path: Path) -> dict:
