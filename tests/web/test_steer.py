@@ -285,18 +285,26 @@ def test_mouse_and_gamepad_are_heard(browser, page):
     opened(browser, page)
     choose(browser, "steps", 1)
 
-    def wish():
+    def wish(row="at(-1)"):
         rounds = browser.script("return steer.state().rounds")
         browser.wait(f"return steer.state().rounds > {rounds + 1}", 60)
-        return browser.script("return steer.record().at(-1).wish")
+        return browser.script(f"return steer.record().{row}.wish")
 
-    for x, side in ((1240, -1), (420, 1)):
-        where = {"x": x, "y": 200, "button": "left", "clickCount": 1}
-        browser.command("Input.dispatchMouseEvent", type="mousePressed", **where)
-        wanted = wish()
-        browser.command("Input.dispatchMouseEvent", type="mouseReleased", **where)
-        assert wanted["speed"] > 0.3 and side * wanted["direction"] > 0.2
+    def mouse(kind, x):
+        browser.command("Input.dispatchMouseEvent", type=kind, x=x, y=200, button="left", clickCount=1)
+
+    mouse("mousePressed", 1240)
+    wish()  # heard: from now on nobody walks by itself
+    mouse("mouseReleased", 1240)
     assert wish()["speed"] == 0
+    for x, side in ((1240, -1), (420, 1)):
+        browser.script("steer.forget()")
+        mouse("mousePressed", x)
+        # The first that is heard: the camera turns with the walker, and so does what a held mouse points at.
+        wanted = wish("find((row) => row.wish.speed > 0.3)")
+        mouse("mouseReleased", x)
+        assert side * wanted["direction"] > 0.2
+        assert wish()["speed"] == 0
     browser.script("navigator.getGamepads = () => [{connected: true, axes: [1, 0, 0, 0], buttons: []}]")
     wanted = wish()
     assert wanted["speed"] > 0.3 and abs(wanted["direction"] + np.pi / 2) < 1e-3
