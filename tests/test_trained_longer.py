@@ -507,7 +507,7 @@ def test_ways_of_the_condition(queue):
     for metric, ends in printed.items():
         digits = 1 if ends[0] > 1 else 2
         assert tuple(seeds[metric].agg(["min", "max"]).round(digits)) == ends, metric
-    # The two that lose style are ahead in trembling, feet and path.
+    # The two that lose style are ahead in trembling, changes of the resting foot and path.
     lost = variants.loc[["concatenation", "AdaLN-zero"]]
     assert (100 * lost["trajectory_error"]).round(1).tolist() == [6.8, 6.4]
     for metric in ("trajectory_error", "joint_acceleration"):
@@ -529,10 +529,9 @@ def test_ways_of_the_condition(queue):
     assert (round(once[MAIN].min(), 1), round(once[MAIN].max(), 1)) == (2.6, 2.8)
 
 
-def test_without_the_ird_loss(queue, row, real, eyes):
-    """Eq. 10's term shortens the step at a seam, and costs half of the training or more."""
+def test_without_the_ird_loss(queue, row, real):
     seeds = bands(queue, 800_000)[0]
-    without = queue.query("model == 'F3AMD-FNO-96-no-IRD' and windows == 800_000 and steps in [0, 8]")
+    without = ablated(queue, 800_000).query("model == 'F3AMD-FNO-96-no-IRD'")
     without = without.pivot(index="seed", columns="metric", values="value")
     assert len(without) == 2
     printed = {
@@ -558,9 +557,8 @@ def test_without_the_ird_loss(queue, row, real, eyes):
     # The data's step in place of none: the least rough seam, nothing learnt faster.
     other = row(MAIN, 800, "IRD-excess")
     said(other, held_out_error=6.5, FID=27, foot_sliding=0.82, foot_alternation=0.04, IRD_excess=5.2, IRD=5.1)
-    assert (
-        round(100 * other["trajectory_error"], 1) == 5.6 and other["held_out_error"] > without["held_out_error"].max()
-    )
+    assert round(100 * other["trajectory_error"], 1) == 5.6
+    assert other["held_out_error"] > without["held_out_error"].max()
     assert other["IRD_excess"] < min(without["IRD_excess"].min(), seeds["IRD_excess"].min())
     later = [row(MAIN, at)["held_out_error"] for at in (1600, 3200)]
     assert [round(one, 1) for one in later] == [5.7, 4.8]
