@@ -181,24 +181,21 @@ def test_the_papers_numbers_stand_in_columns_of_their_own():
     assert table.loc[1, ["real", *paper]].isna().all()
 
 
-def test_rows_of_the_queue_are_means_over_trainings_through_one_classifier():
-    def trained(seed, value, classifier, model="F3AMD-FNO-96", recipe="paper", windows=1000):
+def test_rows_of_the_queue_are_means_over_trainings():
+    def trained(seed, value, model="F3AMD-FNO-96", recipe="paper", windows=1000):
         rows = figures(model, value=value).drop(columns=["low", "high", "repeats", "better"])
-        return rows.assign(seed=seed, classifier=classifier, recipe=recipe, windows=windows)
+        return rows.assign(seed=seed, recipe=recipe, windows=windows)
 
     campaign = table_of(
-        trained(0, 10.0, "old"), trained(0, 50.0, "new", "F3AMD-FNO-96-m4"), trained(1, 14.0, "new"),
-        trained(0, 900.0, "new", recipe="mixed-noise"), trained(0, 900.0, "new", windows=2000),
+        trained(0, 10.0), trained(0, 50.0, "F3AMD-FNO-96-m4"), trained(1, 14.0),
+        trained(0, 900.0, recipe="mixed-noise"), trained(0, 900.0, windows=2000),
     )  # fmt: skip
     rows = of_queue(campaign, 1000).set_index(["model", "metric"])
     assert set(rows.index.get_level_values(0)) == {"F3AMD-FNO-96", "F3AMD-FNO-96-m4"}
-    # Two trainings: their mean, and Student's interval of two (12.7 s / sqrt 2); of classifiers the new alone.
-    traj = rows.loc[("F3AMD-FNO-96", "trajectory_error")]
-    first = list(FIGURES).index("trajectory_error")
-    assert traj["value"] == 12.0 + first and traj["repeats"] == 2 and traj["unit"] == "m"
-    assert traj["high"] - traj["value"] == pytest.approx(12.706 * np.std([10, 14], ddof=1) / np.sqrt(2), rel=1e-3)
-    for metric in ("FID", "EMD", "style_coverage"):
+    # Two trainings: their mean, and Student's interval of two (12.7 s / sqrt 2).
+    for number, metric in enumerate(FIGURES):
         seen = rows.loc[("F3AMD-FNO-96", metric)]
-        assert seen["value"] == 14.0 + list(FIGURES).index(metric) and seen["repeats"] == 1 and np.isnan(seen["high"])
+        assert seen["value"] == 12.0 + number and seen["repeats"] == 2 and seen["unit"] == UNITS.get(metric, "")
+        assert seen["high"] - seen["value"] == pytest.approx(12.706 * np.std([10, 14], ddof=1) / np.sqrt(2), rel=1e-3)
     wide = wide_rows(beside_paper(10, of_queue(campaign, 1000), LABEL))
     assert wide[wide["source"] == LABEL]["model"].tolist() == ["F3AMD-FNO-96", "F3AMD-FNO-96-m4"]

@@ -6,8 +6,8 @@ snapshot of a long run is a fair row at its length. Snapshots are
 kept as weights and measured by the protocol of `experiments.protocol` with one seed; how far their
 answers move with the noisy input, and with the noise level, and how far they are off, is measured
 as well. All of it is one table, `records/campaign.csv`. A queue may take months and machines: each
-row names its commit and the style classifier that it was seen through, and FID and EMD are compared
-between rows of one classifier.
+row names its commit and the style classifier that it was seen through (`records/classifiers.csv` has
+how little two of one recipe differ).
 """
 
 from __future__ import annotations
