@@ -536,7 +536,7 @@ def obtain_classifier(
     It is not shipped: its 8.5 million weights would take as much room as all models together, and a
     laptop trains it in under a minute. The seed is always the same, since features of two trainings
     do not compare. Two machines, or two numbers of cores, add in another order and end at other weights,
-    so that records name them; FIDs through two such classifiers lie within 4 %
+    so that records name them; on Bandai FIDs through two such classifiers were within 4 %
     (`records/classifiers.csv`). It is kept in `runs/<data set>/<profile>/classifier/` under a name that depends
     on data, styles and recipe.
 

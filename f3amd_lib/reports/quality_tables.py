@@ -142,7 +142,7 @@ def of_queue(campaign: pd.DataFrame, windows: int) -> pd.DataFrame:
     Returns:
       As from `protocol.summarise`, repeats being trainings: a mean over seeds, with an interval where there are two or
       more. FID, EMD and style coverage of a queue that went on elsewhere are through several style classifiers;
-      how little that changes is in `records/classifiers.csv`.
+      how little that changes on Bandai is in `records/classifiers.csv`.
     """
     kept = (campaign["recipe"] == "paper") & (campaign["windows"] == windows) & campaign["metric"].isin(FIGURES)
     return intervals_over_repeats(campaign[kept].fillna({"unit": ""}), [*_KEYS, "unit"])
