@@ -709,5 +709,5 @@ def test_our_own_recipe_at_the_rate_of_the_queue(queue, row):
     said(steady[1], held_out_error=3.8, joint_acceleration=5.6, FID=2313)
     errors = queue.query("windows == 400_000 and metric == 'held_out_error'").set_index("model")["value"]
     assert errors.idxmin() == "F3AMD-FNO-96-steady"
-    ships = load_model(PRETRAINED_DIR / "bandai" / "F3AMD-FNO-96-steady.safetensors").record
-    assert ships["windows_seen"] == 1600 * THOUSAND
+    trained = read_table(RECORDS / "trained.csv")[0].query("model == 'F3AMD-FNO-96-steady' and metric == 'windows'")
+    assert trained["value"].tolist() == [1600 * THOUSAND]
