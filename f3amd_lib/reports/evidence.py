@@ -21,7 +21,6 @@ from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_tabl
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
 from f3amd_lib.measures.distributions import intervals_over_repeats
-from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 
@@ -472,9 +471,9 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
       root, dataset, profile: as for `recorded_evidence`.
 
     Returns:
-      Evidence of `quality` for each number of windows and each style classifier, one that saw more networks first:
-      networks by the paper's text alone, means over their seeds; of what needs no classifier, over all their seeds.
-      Then, for each classifier, evidence of `quality_by_epoch`: of each network the run with most snapshots.
+      Evidence of `quality` for each number of windows: networks by the paper's text alone, means over their seeds.
+      Then evidence of `quality_by_epoch`: of each network the run with most snapshots. A queue that went on elsewhere
+      has rows of several style classifiers; how little that changes is in `records/classifiers.csv`.
     """
     path = Path(root) / dataset / profile / "records" / "campaign.csv"
     if not path.exists():
@@ -484,13 +483,13 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     every, table = table, table[table["steps"] > 0]
     place = path.relative_to(root).as_posix()
 
-    def evidence(windows: int, classifier: str, rows: pd.DataFrame) -> Evidence:
+    def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
         networks = rows[["model", "window_frames"]].drop_duplicates()
         tables = {
             "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
             "trained": lambda: networks.assign(metric="windows", value=windows),
         }
-        where = f"{place} at {windows:,} windows, seen by classifier {classifier}"
+        where = f"{place} at {windows:,} windows"
 
         def load(name: str):
             if name not in tables:
@@ -499,21 +498,12 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
 
         return Evidence("jax", load)
 
-    by_eyes = table["metric"].isin([metric.name for metric in SHOWN["classifier"]])
-    found = []
-    for (windows, classifier), seen in table.groupby(["windows", "classifier"]):
-        rows = table[(table["windows"] == windows) & table["model"].isin(seen["model"])]
-        rows = rows[~by_eyes[rows.index] | (rows["classifier"] == classifier)]
-        found.append((windows, seen["model"].nunique(), evidence(windows, classifier, rows)))
-    # As `quality` above: the classifier that saw the longest curves comes first.
-    seen = [rows for _, rows in every.groupby("classifier")]
-    seen.sort(key=lambda rows: rows.groupby("run")["windows"].nunique().nlargest(2).sum(), reverse=True)
-    curves = [_snapshot_curves(rows, record, place) for rows in seen]
-    return [one for *_, one in sorted(found, key=lambda each: each[:2], reverse=True)] + curves
+    by_length = [evidence(windows, rows) for windows, rows in table.groupby("windows")]
+    return [*reversed(by_length), _snapshot_curves(every, record, place)]
 
 
 def _snapshot_curves(rows: pd.DataFrame, record: dict, where: str) -> Evidence:
-    """Return the learning curves among rows of the long queue that one classifier saw."""
+    """Return the learning curves among rows of the long queue."""
     rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
     rows = rows[rows["steps"].isin([0, 8])]  # the loss has no steps
     lengths = rows.groupby(["model", "run"])["windows"].nunique()
