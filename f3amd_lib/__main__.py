@@ -27,7 +27,7 @@ from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 log = logging.getLogger("f3amd")
 
 UNFINISHED = 3
-"""Exit status of `train` where the minutes were over first; a later call goes on."""
+"""Exit status of `train`, `measure` and `campaign` where the minutes were over first; a later call goes on."""
 
 Repeatable = UseAppendAction[tuple[str, ...]]
 Required = Annotated[str, tyro.conf.arg(metavar="NAME")]
@@ -36,6 +36,19 @@ Required = Annotated[str, tyro.conf.arg(metavar="NAME")]
 def _given(**options) -> dict:
     """Return those options that were given: not None."""
     return {name: value for name, value in options.items() if value is not None}
+
+
+def _stop_at(minutes: float | None) -> float | None:
+    """Return when so many minutes from now are over (`time.monotonic`)."""
+    return None if minutes is None else time.monotonic() + 60.0 * minutes
+
+
+def _use_fast_flags() -> None:
+    """Set XLA's flags, unless the user has; JAX reads them when it first looks for devices: call this before."""
+    from f3amd_lib.benchmarking.machine import fast_xla_flags
+
+    if "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = fast_xla_flags()
 
 
 @dataclass(frozen=True)
@@ -238,7 +251,7 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
             raise ValueError(f"{name} needs no captions: train it by a call of its own")
     profile = motion.numbers(train_steps=steps, batch_size=batch_size, seed=seed)
     data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
-    stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
+    stop_at = _stop_at(minutes)
     how = {"batch_size": batch_size, "folder": out, "stop_at": stop_at}
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
@@ -610,11 +623,7 @@ def bench(
       training: time training steps (Table 2).
       parts: time a round without each part.
     """
-    from f3amd_lib.benchmarking.machine import fast_xla_flags
-
-    # JAX reads them when it first looks for devices, which is later than this.
-    if "XLA_FLAGS" not in os.environ:
-        os.environ["XLA_FLAGS"] = fast_xla_flags()
+    _use_fast_flags()
     from f3amd_lib.benchmarking import measurements, speed_tables, synthesis
     from f3amd_lib.ground.records import read_table
     from f3amd_lib.ground.tables import markdown_table
@@ -632,7 +641,7 @@ def bench(
     if parts:
         log.info("parts        %s", measurements.measure_round_parts(prepared, profile))
     if training:
-        log.info("training     %s", measurements.measure_training_time(prepared, profile))
+        log.info("training     %s", measurements.measure_training_time(prepared, profile, again=again))
 
 
 def measure(
@@ -684,7 +693,7 @@ def _measure_text(names, motion: Data, models, minutes) -> int:
 
     profile, encoder = motion.numbers(), load_text_encoder()
     data = open_text_motions(motion.data, motion.source)
-    stop_at = None if minutes is None else time.monotonic() + 60.0 * minutes
+    stop_at = _stop_at(minutes)
     for name in names:
         with _measuring(name, profile):
             table = TEXT_MEASUREMENTS[name](data, encoder, profile, models=models, stop_at=stop_at)
@@ -697,33 +706,47 @@ def _measure_text(names, motion: Data, models, minutes) -> int:
 
 def campaign(
     motion: Data, minutes: float | None = None, batch_size: int = 128, only: Repeatable = (),
-    packed: Path | None = None, out: Path | None = None,
+    packed: Path | None = None, times: bool = False, out: Path | None = None,
 ) -> int:  # fmt: skip
     """Train and measure the long queue of real motion in legs; a killed leg goes on where it stopped.
 
     Args:
-      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
+      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3; a measurement that is
+        under way is finished.
       batch_size: windows a step; the paper's is 512.
       only: this preset, recipe or run of the queue; repeatable.
       packed: the data set as its packed cache file, instead of its source.
+      times: first the times of Tables 1, 2, 4, 7 and 11 that are not on record, and then the longest trainings of the
+        queue first; for a GPU.
       out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
     """
+    stop_at, timed = _stop_at(minutes), ()
+    if times:
+        _use_fast_flags()
+        from f3amd_lib.benchmarking.measurements import measure_synthesis_time, measure_training_time
+
+        timed = (measure_synthesis_time, measure_training_time)
     from f3amd_lib.data.packed import load_packed
-    from f3amd_lib.experiments.campaign import run_campaign
+    from f3amd_lib.experiments.campaign import chosen, longest_first, queue, run_campaign
     from f3amd_lib.experiments.measure import protocol_of
     from f3amd_lib.training.pipeline import PreparedData
 
+    snapshots = chosen(longest_first(queue()) if times else queue(), only)
     if packed is None:
         prepared, profile = motion.open()
     else:
         profile = motion.numbers()
         prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
-    classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
-    budget = None if minutes is None else 60.0 * minutes
-    how = {"folder": folder, "batch_size": batch_size, "only": only, "budget_s": budget}
-    legs = run_campaign(prepared, profile, classifier, protocol, **how)
+    how = {"folder": folder, "snapshots": snapshots, "batch_size": batch_size, "stop_at": stop_at}
     with locked(folder / ".campaign.lock", "running the campaign"):
+        for measure_time in timed:
+            if (table := measure_time(prepared, profile, stop_at=stop_at)) is None:
+                log.info("%-12s times", "unfinished")
+                return UNFINISHED
+            log.info("%-12s %s", "times", table)
+        classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
+        legs = run_campaign(prepared, profile, classifier, protocol, **how)
         for name, windows, state in legs:
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0

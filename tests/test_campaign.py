@@ -1,6 +1,7 @@
 """The long queue: what it holds, that each run is trained as its row says, and that a stopped leg loses nothing."""
 
 import dataclasses
+import time
 from types import SimpleNamespace
 
 import jax
@@ -10,8 +11,12 @@ import pandas as pd
 import pytest
 from builders import packed_from, refused
 
-from f3amd_lib.experiments import campaign
-from f3amd_lib.experiments.campaign import Run, queue, run_campaign
+from f3amd_lib.__main__ import UNFINISHED, main
+from f3amd_lib.benchmarking import measurements
+from f3amd_lib.benchmarking.synthesis import Candidate
+from f3amd_lib.data.packed import save_packed
+from f3amd_lib.experiments import campaign, measure
+from f3amd_lib.experiments.campaign import Run, chosen, longest_first, queue, run_campaign
 from f3amd_lib.experiments.denoising import held_out_condition, held_out_error, input_use
 from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground.profiles import load_profile
@@ -168,7 +173,7 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     assert len(once) == 2 * len(snapshots) and len(set(once)) == len(snapshots)
     # Stopped at once, then after the first snapshot, then to the end.
     legs = tmp_path / "legs"
-    stopped, nothing = run(packed, judges, legs, snapshots, monkeypatch, budget_s=0.0)
+    stopped, nothing = run(packed, judges, legs, snapshots, monkeypatch, stop_at=0.0)
     assert [state for *_, state in stopped] == ["unfinished"] and nothing is None
     run(packed, judges, legs, snapshots[:1], monkeypatch)
     rest, (again, _) = run(packed, judges, legs, snapshots, monkeypatch)
@@ -194,7 +199,7 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
 @pytest.mark.slow
 def test_windows_of_64_frames_and_only_one_preset(packed, judges, small, tmp_path, monkeypatch):
     snapshots = [(Run("F3AMD-FNO-32"), 4), (Run("F3AMD-FNO-48", window=64), 4)]
-    states, (table, _) = run(packed, judges, tmp_path, snapshots, monkeypatch, only=["F3AMD-FNO-48"])
+    states, (table, _) = run(packed, judges, tmp_path, chosen(snapshots, ["F3AMD-FNO-48"]), monkeypatch)
     assert [name for name, *_ in states] == ["F3AMD-FNO-48-64frames-seed0"]
     assert set(table["window_frames"]) == {64} and np.isfinite(table.query("metric == 'held_out_loss'")["value"]).all()
     assert table["device"].unique().tolist() == [jax.devices()[0].device_kind]
@@ -214,18 +219,87 @@ MIXED, SEEDED = Run("F3AMD-FNO-32", "mixed-noise"), Run("F3AMD-FNO-32", seed=1)
         ([], [MIXED, SEEDED, Run("CAMDM")]),
     ],
 )
-def test_what_is_named_is_trained_and_nothing_else(packed, tmp_path, monkeypatch, only, wanted):
-    asked, judges = [], (SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(STYLES))
-    monkeypatch.setattr(campaign, "_measured", lambda *given: asked.append(given[3]) or pd.DataFrame({"value": [1.0]}))
+def test_what_is_named_is_trained_and_nothing_else(only, wanted):
     snapshots = [(MIXED, 4), (SEEDED, 4), (Run("CAMDM"), 4)]
-    states, _ = run(packed, judges, tmp_path, snapshots, monkeypatch, only=only)
-    assert asked == wanted and [name for name, *_ in states] == [each.name for each in wanted]
+    assert chosen(snapshots, only) == [(run, 4) for run in wanted]
 
 
 @pytest.mark.parametrize(
     ("only", "nearest"),
     [("F3AMD-FNO-23", "F3AMD-FNO-32"), ("mixed-nose", "mixed-noise"), ("F3AMD-FNO-32-seed2", "F3AMD-FNO-32-seed1")],
 )
-def test_a_name_that_is_not_in_the_queue_is_refused(packed, tmp_path, monkeypatch, only, nearest):
-    call = lambda: run(packed, (None, None), tmp_path, [(MIXED, 4), (SEEDED, 4)], monkeypatch, only=["paper", only])
-    refused(f"unknown name in the queue '{only}'; did you mean '{nearest}'", call)
+def test_a_name_that_is_not_in_the_queue_is_refused(only, nearest):
+    told = f"unknown name in the queue '{only}'; did you mean '{nearest}'"
+    refused(told, chosen, [(MIXED, 4), (SEEDED, 4)], ["paper", only])
+
+
+# ----------------------------------------------------------------------------- a GPU for minutes at a time
+
+
+def test_the_longest_trainings_come_first_each_in_its_own_order():
+    short, long, last = Run("F3AMD-FNO-32"), Run("F3AMD-FNO-48"), Run("CAMDM")
+    snapshots = [(short, 1), (short, 2), (long, 4), (last, 2), (long, 8)]
+    assert longest_first(snapshots) == [(long, 4), (long, 8), (short, 1), (short, 2), (last, 2)]
+    usual = queue()
+    whole = longest_first(usual)
+    assert {run.name for run, _ in whole[:9]} == {"F3AMD-FNO-96-seed0"} and whole[8][1] == 19_400_000
+    for each, _ in usual:
+        assert chosen(whole, [each.name]) == chosen(usual, [each.name])
+
+
+@pytest.fixture
+def minutes(packed, monkeypatch, tmp_path):
+    """Return a function that calls the command for so many minutes: (status, what was done). Each work takes one."""
+    done, now = [], [0.0]
+
+    def work(name):
+        done.append(name)
+        now[0] += 60.0
+
+    def time_group(candidates, *_, **__):
+        (one,) = candidates
+        work(f"{one.characters} characters")
+        named = dict(zip(measurements.CANDIDATE_COLUMNS, dataclasses.astuple(one), strict=True))
+        return pd.DataFrame([named | {"framework": "jax", "device": "CPU", "value": 1.0}]), {}
+
+    def measured(prepared, classifier, protocol, run, windows, *_):
+        work(f"{run.name} {windows}")
+        return pd.DataFrame({"value": [1.0]})
+
+    groups = [Candidate("F3AMD-FNO-32", 1, count, "jit") for count in (1, 8)]
+    judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(STYLES), None
+    monkeypatch.setattr(measurements, "plan", lambda suite: {one.group: [one] for one in groups})
+    monkeypatch.setattr(measurements, "time_group", time_group)
+    monkeypatch.setattr(measurements, "plan_memory", lambda *_: 0)
+    monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32",))
+    monkeypatch.setattr(measurements, "_training_call", lambda *_: work("training") or (lambda: None))
+    monkeypatch.setattr(measure, "protocol_of", lambda *_: judges)
+    monkeypatch.setattr(campaign, "_measured", measured)
+    monkeypatch.setattr(campaign, "queue", lambda: [(SEEDED, 4), (Run("CAMDM"), 4), (Run("CAMDM"), 8)])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
+    save_packed(tmp_path / "packed.npz", packed)
+
+    def call(number: float, *words: str):
+        done.clear()
+        given = ["--packed", str(tmp_path / "packed.npz"), "--out", str(tmp_path / "out"), "--minutes", str(number)]
+        return main(["campaign", "--profile", "smoke", "--times", *given, *words]), done.copy()
+
+    return call
+
+
+def test_times_come_first_and_the_next_call_goes_on_where_the_minutes_ended(minutes):
+    """One budget for all of it; what is on record is neither timed nor trained again."""
+    assert minutes(0.0) == (UNFINISHED, [])
+    assert minutes(0.5) == (UNFINISHED, ["1 characters"])
+    assert minutes(0.5) == (UNFINISHED, ["8 characters"])  # over before the training times
+    assert minutes(1.5) == (UNFINISHED, ["training", "CAMDM-seed0 4"])
+    assert minutes(0.5) == (UNFINISHED, ["CAMDM-seed0 8"])
+    assert minutes(9.0) == (0, [f"{SEEDED.name} 4"])
+    assert minutes(9.0) == (0, [])
+
+
+def test_a_misspelt_name_is_refused_before_anything_is_timed(minutes, capsys):
+    assert minutes(9.0, "--only", "CAMDN") == (2, [])
+    assert "did you mean 'CAMDM'" in capsys.readouterr().err

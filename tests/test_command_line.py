@@ -270,13 +270,14 @@ def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags
     assert asked["flags"] == "--mine"
 
 
-def test_flags_of_bench_are_set_before_jax_looks_for_devices():
-    script = """
+@pytest.mark.parametrize("words", [["bench", "--suite", "bar"], ["campaign", "--times", "--packed", "none.npz"]])
+def test_fast_flags_are_set_before_jax_looks_for_devices(words):
+    script = f"""
 import os, sys
 from f3amd_lib.__main__ import main
 from f3amd_lib.benchmarking import machine
 machine.fast_xla_flags = lambda: "--xla_force_host_platform_device_count=3"
-assert main(["bench", "--profile", "smoke", "--suite", "bar"]) == 2
+assert main({words!r}) == 2
 import jax
 sys.exit(jax.device_count())
 """

@@ -147,7 +147,7 @@ def test_a_command_is_understood(run, monkeypatch):
             (name, profile.window, models, extra)
         )
         monkeypatch.setitem(measure.MEASUREMENTS, name, note)
-    monkeypatch.setattr(measurements, "measure_training_time", lambda prepared, profile: called.append(profile.window))
+    monkeypatch.setattr(measurements, "measure_training_time", lambda _, profile, **__: called.append(profile.window))
     monkeypatch.setattr(measurements, "measure_synthesis_time", lambda *a, **k: called.append(a[2]) or 1 / 0)
     monkeypatch.setattr(claims, "main", lambda *words: called.append(words) or 0)
     command, _, _, window, what, models = asked(run)

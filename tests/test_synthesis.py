@@ -140,6 +140,7 @@ class Prepared:
 @pytest.mark.slow
 def test_measurement_writes_both_tables_and_goes_on_where_it_was(quick_suite):
     profile = load_profile("smoke", "synthetic")
+    assert measurements.measure_synthesis_time(Prepared, profile, stop_at=0.0) is None and quick_suite == []
     path = measurements.measure_synthesis_time(Prepared, profile)
     assert quick_suite == [1, 2]
     table, record = read_table(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import time
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
@@ -61,8 +62,8 @@ def _circumstances() -> dict:
 
 def measure_synthesis_time(
     prepared: PreparedData, profile: Profile, suites: Iterable[str] | None = None, *,
-    characters: Collection[int] | None = None, again: bool = False,
-) -> Path:  # fmt: skip
+    characters: Collection[int] | None = None, again: bool = False, stop_at: float | None = None,
+) -> Path | None:  # fmt: skip
     """Time rounds of the family in every implementation there is (see `benchmarking.synthesis`).
 
     Args:
@@ -71,11 +72,12 @@ def measure_synthesis_time(
       suites: keys of `synthesis.SUITES`.
       characters: time groups of these numbers of characters only.
       again: time groups anew that an earlier run with the same settings has timed.
+      stop_at: begin no group after this time (`time.monotonic`).
 
     Returns:
       The table `records/synthesis_time.csv`, the fastest implementation of each framework. Beside it
       lies `synthesis_ways.csv` with every one; it is written after every group, so that a stopped run
-      goes on where it was.
+      goes on where it was. None where `stop_at` came first.
 
     Raises:
       ValueError: for an unknown suite.
@@ -102,6 +104,8 @@ def measure_synthesis_time(
     ]
     with tqdm(todo, unit="group") as bar:
         for suite, candidates in bar:
+            if stop_at is not None and time.monotonic() >= stop_at:
+                return None
             bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *candidates[0].group))
             circumstances = _circumstances()
             rows, not_possible = time_group(
@@ -138,20 +142,33 @@ def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterab
     return write_table(path, table, _record(prepared, profile, "round_parts", **_circumstances()))
 
 
-def measure_training_time(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+def measure_training_time(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, again: bool = False,
+    stop_at: float | None = None,
+) -> Path | None:  # fmt: skip
     """Time training steps by turns, all models in one run (Table 2).
 
     Args:
       prepared: the data; an epoch is once over its training windows.
       profile: names the results' folder; says how large a batch is and how many steps are timed.
       models: presets; by default the recommended ones, the baseline, and two other widths.
+      again: time them anew though an earlier run with the same settings has timed all of them.
+      stop_at: do not begin after this time (`time.monotonic`).
 
     Returns:
       The table `records/training_time.csv`: value, low and high in seconds a step, epoch_minutes,
-      and peak_memory_mib as the compiler plans it.
+      and peak_memory_mib as the compiler plans it. None where `stop_at` came first.
     """
     names = [presets.find_preset(name).name for name in models or _TRAINED]
     steps, chunk, batch_size = _TRAINING[profile.name]
+    path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
+    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
+    kept, keys = kept_rows(path, record), ["model", "window_frames", "device", "batch_size"]
+    done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
+    if done.issuperset((name, prepared.window, device_name(), batch_size) for name in names):
+        return path
+    if stop_at is not None and time.monotonic() >= stop_at:
+        return None
     calls, memory = {}, {}
     for name in tqdm(names, unit="compiled"):
         recipe = short_recipe(name, num_steps=steps, batch_size=batch_size, seed=profile.seed)
@@ -177,11 +194,8 @@ def measure_training_time(prepared: PreparedData, profile: Profile, models: Iter
         }
         for name, timing in timings.items()
     ]
-    path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
-    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
     # Rows of other windows and models stay.
-    table = pd.concat([kept_rows(path, record), pd.DataFrame(rows)])
-    table = table.drop_duplicates(["model", "window_frames", "device", "batch_size"], keep="last")
+    table = pd.concat([kept, pd.DataFrame(rows)]).drop_duplicates(keys, keep="last")
     return write_table(path, table, record)
 
 

@@ -16,7 +16,7 @@ import dataclasses
 import itertools
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,7 +77,7 @@ class Run:
 
     @property
     def names(self) -> set[str]:
-        """What `only` may call it: its preset, its recipe, or this run alone."""
+        """What `chosen` may call it: its preset, its recipe, or this run alone."""
         return {self.preset, self.recipe, self.name}
 
     def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
@@ -116,35 +116,48 @@ def queue(path: Path = _QUEUE) -> list[tuple[Run, int]]:
     return snapshots
 
 
+def chosen(snapshots: Iterable[tuple[Run, int]], only: Collection[str]) -> list[tuple[Run, int]]:
+    """Return the snapshots of a queue whose preset, recipe or run is named; all of them where none is.
+
+    Raises:
+      ValueError: for a name that is none of the queue's.
+    """
+    snapshots = list(snapshots)
+    for name in only:
+        check_known(name, {name for run, _ in snapshots for name in run.names}, "name in the queue")
+    return [(run, windows) for run, windows in snapshots if not only or not run.names.isdisjoint(only)]
+
+
+def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]:
+    """Return the snapshots of a queue, longest runs first; those of a run stay in their order."""
+    snapshots = list(snapshots)
+    longest: dict[Run, int] = {}
+    for run, windows in snapshots:
+        longest[run] = max(windows, longest.get(run, 0))
+    return sorted(snapshots, key=lambda snapshot: -longest[snapshot[0]])
+
+
 def run_campaign(
     prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
-    batch_size: int = 128, only: Iterable[str] = (), budget_s: float | None = None,
-    snapshots: list[tuple[Run, int]] | None = None, known: Path | None = None, progress: bool = True,
+    snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, stop_at: float | None = None,
+    known: Path | None = None, progress: bool = True,
 ) -> Iterator[tuple[str, int, str]]:  # fmt: skip
-    """Train and measure what the queue still lacks, until it is done or the time is over.
+    """Train and measure snapshots that are not on record, until all are or the time is over.
 
     Args:
       prepared, profile: the data, and where records go.
       classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
       folder: where training states and weights lie, a folder a run.
+      snapshots: of `queue`, in the order in which they are trained.
       batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
-      only: names of presets, of recipes or of single runs; all by default.
-      budget_s: seconds; the run under way stops with a checkpoint when they are over.
-      snapshots: see `queue`, which is the default.
+      stop_at: the run under way stops with a checkpoint after this time (`time.monotonic`).
       known: folder of another run's records, whose snapshots count as measured.
       progress: show progress bars.
 
     Yields:
       (run, windows, state) for each snapshot: "measured before", "measured", or "unfinished", which is the last.
-
-    Raises:
-      ValueError: if `only` names nothing of the queue.
     """
-    snapshots, only = queue() if snapshots is None else snapshots, list(only)
-    for name in only:
-        check_known(name, {name for run, _ in snapshots for name in run.names}, "name in the queue")
     protocol = dataclasses.replace(protocol, num_seeds=1)
-    stop_at = None if budget_s is None else time.monotonic() + budget_s
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement="campaign",
         batch_size=batch_size, protocol=dataclasses.asdict(protocol),
@@ -153,8 +166,6 @@ def run_campaign(
     records = Records(folder_of_records, record, keys, known=known)
     for run, windows in snapshots:
         key = {"run": run.name, "windows": windows}
-        if only and run.names.isdisjoint(only):
-            continue
         if records.has("campaign", key):
             yield run.name, windows, "measured before"
             continue
