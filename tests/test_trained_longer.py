@@ -111,6 +111,7 @@ def test_what_length_brings(long, row, real, queue, eyes, draws):
     said(least, foot_sliding=1.07)
     said(most, foot_sliding=0.67, foot_alternation=0.13, IRD=2.2)
     said(real, foot_sliding=0.08, foot_alternation=1.9, IRD=4.0)
+    said(row(MAIN, 6400, steps=1), foot_alternation=0.22)
 
 
 def test_the_family_comes_down_later(row):
@@ -168,12 +169,23 @@ def test_the_training_loss_keeps_its_line_and_the_held_out_loss_does_not(long):
 
 
 def test_where_the_lines_end(long, real):
-    hundred = 100 * 193_962
+    hundred, papers_steps = 100 * 193_962, PAPERS_LENGTH / 512
     ends = {}
-    for metric in ("trajectory_error", "joint_acceleration"):
+    for metric in ("held_out_error", "trajectory_error", "joint_acceleration"):
         for points in (6, 5):
             line = long[metric].iloc[-points:]
-            ends[metric, points] = power_law(line.index, line, [hundred, PAPERS_LENGTH])
+            law = power_law(line.index, line, [hundred, PAPERS_LENGTH, 128 * papers_steps])
+            ends[metric, points] = law.assign(steps=[hundred / 128, PAPERS_LENGTH / 128, papers_steps])
+    assert round(papers_steps) == 389_607 and round(128 * papers_steps / 1e6) == 50
+    for points, slope in ((6, -0.23), (5, -0.22)):
+        one_window = ends["held_out_error", points]
+        assert one_window["value"].round(1).tolist() == [3.2, 1.9, 2.6] and round(one_window["exponent"][0], 2) == slope
+    at_papers_steps = [ends[metric, points]["value"][2] for metric in ("trajectory_error", "joint_acceleration")
+                       for points in (6, 5)]  # fmt: skip
+    assert [round(one, 3) for one in at_papers_steps[:2]] == [0.029, 0.036]
+    assert [round(one, 1) for one in at_papers_steps[2:]] == [1.1, 1.3]
+    whole, late = (100 * ends["trajectory_error", points].iloc[0][["low", "high"]] for points in (6, 5))
+    assert whole.round(1).tolist() == [2.5, 5.3] and late.round(1).tolist() == [3.9, 4.6]  # print and real motion
     path = [100 * ends["trajectory_error", points]["value"][0] for points in (6, 5)]
     assert [round(one, 1) for one in path] == [3.6, 4.3] and round(100 * real["trajectory_error"], 1) == 2.9
     printed = load_paper_table(3).query("model == @MAIN and window_frames == 32 and steps == 8").set_index("metric")
@@ -190,10 +202,18 @@ def test_where_the_lines_end(long, real):
         long["direction_error"].iloc[1:].between(8, 9.5).all() and round(printed["value"]["direction_error"], 1) == 3.3
     )
     assert long["foot_sliding"].max() < printed["value"]["foot_sliding"] and (long["IRD"].diff()[1:] < 0).all()
+    # All nine of Table 3, and what held-out clips of real motion have.
+    first, last = (long.loc[at * THOUSAND] for at in (200, 6400))
+    said(real, FID=15, EMD=5.2, direction_error=4.2, smoothness=2.1, IRD=4.0)
+    said(last, FID=19, EMD=5.5, style_coverage=100, smoothness=1.25, diversity=0.38)
+    said(first, smoothness=1.06)
+    said(printed["value"], smoothness=2.1, diversity=30, IRD=1.8, foot_sliding=1.28)
+    assert 8 < last["foot_sliding"] / real["foot_sliding"] < 9 and long["diversity"].max() < 0.6
     # The rate.
     config = Run(MAIN).config(193_962, 128)
     left = [
-        float(learning_rate_schedule(config)(step)) / config.learning_rate for step in (50_000, hundred / 128, 389_607)
+        float(learning_rate_schedule(config)(step)) / config.learning_rate
+        for step in (50_000, hundred / 128, papers_steps)
     ]
     assert [round(100 * one) for one in left] == [44, 16, 4]
 
@@ -228,6 +248,8 @@ def test_what_single_changes_bring(row, queue):
     assert short["seed_spread"][["skip-and-output-scaling", "log-normal-noise"]].round().tolist() == [10, 6]
     blocks = [round(one["FID"]["block-residual"]) for one in (short, longer)]
     assert blocks == [123, 136] and [round(row(MAIN, at)["FID"]) for at in (200, 400)] == [137, 61]
+    once = [[round(row(MAIN, at, name, steps=1)["FID"]) for at in (200, 400)] for name in ("block-residual", "paper")]
+    assert once == [[226, 112], [92, 36]]
     # The rate is worth twice the length; its two seeds have the least FIDs of all single changes.
     rates = [row(MAIN, 200, "higher-learning-rate", seed=seed) for seed in (0, 1)]
     assert [round(one["held_out_loss"], 3) for one in rates] == [0.216, 0.210]
@@ -247,6 +269,8 @@ def test_what_single_changes_bring(row, queue):
         assert tuple(round(row(MAIN, at, name)["held_out_error"], 1) for at in (200, 400)) == errors
     prior, plain = row(MAIN, 400, "residual-prior"), row(MAIN, 400)
     assert round(prior["held_out_loss"], 3) == 0.193
+    said(prior, FID=40, style_coverage=99, joint_acceleration=3.7)
+    said(plain, FID=61, style_coverage=88, joint_acceleration=3.5)
     assert [round(100 * one["trajectory_error"], 1) for one in (prior, plain)] == [9.2, 8.4]
     # What begins as the identity learns faster, what three seeds would not tell apart brings nothing.
     film = [round(row(MAIN, at, "film-from-identity")["held_out_loss"], 3) for at in (200, 400)]
@@ -307,6 +331,27 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     said(camdm, joint_acceleration=2.1, foot_sliding=0.61, foot_alternation=0.34)
     assert [round(100 * one["trajectory_error"], 1) for one in (four, camdm)] == [9.2, 5.1]
     assert [round(one["FID"]) for one in (four, row(MAIN, 200, FOUR, seed=1), camdm)] == [35, 65, 27]
+    # In one step the four walk better than in eight, in both seeds.
+    once = [row(MAIN, 200, FOUR, seed, steps=1) for seed in (0, 1)]
+    for metric, (digits, printed) in {
+        "joint_acceleration": (1, [1.6, 1.7]), "foot_alternation": (2, [0.57, 0.49]), "FID": (0, [25, 25]),
+        "trajectory_error": (3, [0.085, 0.081]),
+    }.items():  # fmt: skip
+        assert [round(one[metric], digits) for one in once] == printed, metric
+    for seed, one in enumerate(once):
+        eight = row(MAIN, 200, FOUR, seed)
+        assert one["joint_acceleration"] < min(eight["joint_acceleration"], camdm["joint_acceleration"])
+        assert one["foot_alternation"] > max(eight["foot_alternation"], camdm["foot_alternation"])
+        assert one["FID"] < min(eight["FID"], camdm["FID"]) and one["trajectory_error"] > camdm["trajectory_error"]
+    said(row("CAMDM", 200, steps=1), joint_acceleration=3.6, foot_alternation=0.05, FID=30)
+    once = [row(MAIN, 800, FOUR, steps=1), row("CAMDM", 800, steps=1)]
+    for metric, (digits, printed) in {
+        "joint_acceleration": (1, [1.4, 1.9]), "foot_alternation": (2, [0.57, 0.54]), "FID": (0, [22, 22]),
+        "trajectory_error": (3, [0.077, 0.047]), "foot_sliding": (2, [0.59, 0.53]),
+    }.items():  # fmt: skip
+        assert [round(one[metric], digits) for one in once] == printed, metric
+    feet = [round(row(MAIN, at, FIVE, steps=1)["foot_alternation"], 2) for at in (200, 400)]
+    assert feet == [0.34, 0.43]
     # Longer.
     five, four, theirs = row(MAIN, 400, FIVE), row(MAIN, 800, FOUR), row("CAMDM", 800)
     said(row(MAIN, 400, FOUR), held_out_error=4.7)
@@ -597,35 +642,42 @@ def test_without_the_ird_loss(queue, row, real):
 def test_the_papers_way_in_half_of_what_is_far_from_the_seeds(queue):
     rows = of_queue(queue, 800_000).query("steps == 8 and window_frames == 32")
     ours = rows.pivot(index="model", columns="metric", values="value")
-    printed = pd.concat([load_paper_table(number) for number in (8, 9, 10, 11)]).query("steps == 8")
+    printed = pd.concat([load_paper_table(number) for number in (8, 9, 10, 11, 3)])
+    printed = printed.query("steps == 8 and window_frames == 32")
     printed = printed.assign(model=[presets.find_preset(label).name for label in printed["model"]])
     theirs = printed.pivot_table(index="model", columns="metric", values="value")
-    variants = theirs.index.drop(MAIN)
+    ablations = pd.concat([load_paper_table(number) for number in (8, 9, 10, 11)])["model"].unique()
+    variants = pd.Index({presets.find_preset(label).name for label in ablations} - {MAIN}).sort_values()
     assert len(variants) == 13 and set(variants) <= set(ours.index)
+    # The Transformer with linear coders stands beside the one with Fourier coders, all others beside `MAIN`.
+    baselines = variants.map({"F3AMD-Transformer-64-linear": "F3AMD-Transformer-64"}).fillna(MAIN)
+    assert list(baselines).count(MAIN) == 12
+    changes = [each.loc[variants] / each.loc[baselines].to_numpy() for each in (ours, theirs)]
     seeds = bands(queue, 800_000)[0]
-    found, chances = [], []
+    found, chances = [], {}
     for metric in FIGURES:
-        low, high = seeds[metric].min(), seeds[metric].max()
-        mine = ours.loc[variants, metric]
+        of_seeds = seeds[metric] / seeds[metric].mean()
+        low, high = of_seeds.min(), of_seeds.max()
+        mine = changes[0][metric]
         away = np.maximum(low - mine, mine - high)
-        for name in variants[away > np.maximum(high - low, 0.01 * ours[metric][MAIN])]:
-            pair = [table[metric][name] / table[metric][MAIN] for table in (ours, theirs)]
-            found.append((name, metric, (pair[0] > 1) == (pair[1] > 1)))
-        pairs = [np.log(table.loc[variants, metric] / table[metric][MAIN]) for table in (ours, theirs)]
-        chances.append(stats.spearmanr(*pairs).pvalue)
-    assert (len(found), sum(same for *_, same in found)) == (35, 17)
-    assert round(min(chances), 2) == 0.06
+        for name in variants[away > max(high - low, 0.01)]:
+            found.append((name, metric, (mine[name] > 1) == (changes[1][metric][name] > 1)))
+        chances[metric] = stats.spearmanr(*(np.log(each[metric]) for each in changes)).pvalue
+    assert (len(found), sum(same for *_, same in found)) == (35, 18)
+    likely = pd.Series(chances).sort_values()
+    assert likely.index[0] == "foot_sliding" and round(likely.iloc[0], 2) == 0.03 and likely.iloc[1] > 0.05
     linear = {
         name: {same: {metric for one, metric, way in found if (one, way) == (f"F3AMD-{name}-linear", same)}
                for same in (True, False)}
         for name in ("FNO-96", "Transformer-64")
     }  # fmt: skip
-    both, path = {"direction_error", "style_coverage"}, {"trajectory_error"}
-    assert linear["FNO-96"] == {True: both | {"smoothness", "IRD"}, False: path}
-    assert linear["Transformer-64"] == {True: both | {"FID", "diversity"}, False: path | {"EMD", "smoothness", "IRD"}}
-    path = theirs["trajectory_error"] / theirs["trajectory_error"][MAIN]
+    both, path = {"direction_error", "style_coverage", "IRD"}, {"trajectory_error"}
+    assert linear["FNO-96"] == {True: both | {"smoothness"}, False: path}
+    assert linear["Transformer-64"] == {True: both | {"FID", "foot_sliding"}, False: path | {"EMD", "smoothness"}}
+    assert round(changes[1]["IRD"]["F3AMD-Transformer-64-linear"], 3) == 0.997
+    path = changes[1]["trajectory_error"]
     assert [round(100 * one - 100) for one in (path.min(), path.max())] == [-52, 191]
-    mine = ours.loc[variants, "trajectory_error"] / ours["trajectory_error"][MAIN]
+    mine = changes[0]["trajectory_error"]
     assert mine.filter(regex="^(?!.*linear)").sub(1).abs().max() < 0.135
     paths = [bands(queue, windows)[0]["trajectory_error"] for windows in (800_000, 200_000)]
     spans = [path.max() / path.min() for path in paths]
@@ -679,7 +731,7 @@ def test_camdm_narrow_and_with_other_noise(queue, row):
 
 
 def test_width(queue, row):
-    """Table 3's latent dimensions after 0.8 million windows: 32 and 48 of one depth, 64 and 96 of another."""
+    """Table 3's latent dimensions after 0.8 million windows: 32 and 48 of one depth, 64 and 96 of another, then 128."""
     depth = {width: presets.find_preset(f"F3AMD-FNO-{width}").network["depth"] for width in (32, 48, 64, 96, 128)}
     assert depth == {32: 8, 48: 8, 64: 6, 96: 6, 128: 4}
     seeds = bands(queue, 800_000)[0]
@@ -697,6 +749,17 @@ def test_width(queue, row):
         falls = [*narrow.loc[metric], seeds[metric].max()]
         assert falls == sorted(falls, reverse=True), metric
     assert seeds["trajectory_error"].min() < narrow[64]["trajectory_error"] < seeds["trajectory_error"].max()
+    # The widest errs least, and walks as 96 does but for calmer joints.
+    wide = row("F3AMD-FNO-128", 800)
+    said(wide, held_out_error=6.1, held_out_loss=0.176, foot_sliding=0.78, FID=26, joint_acceleration=2.6)
+    said(wide, IRD_excess=6.1, trajectory_error=0.071, style_coverage=100)
+    assert (
+        wide["held_out_error"] < seeds["held_out_error"].min() and wide["held_out_loss"] < seeds["held_out_loss"].min()
+    )
+    assert wide["joint_acceleration"] < seeds["joint_acceleration"].min() and wide["foot_alternation"] < 0.05
+    for metric in ("FID", "foot_sliding", "trajectory_error", "IRD_excess"):
+        width = seeds[metric].max() - seeds[metric].min()  # of a fourth training of 96, as 24.1 has it
+        assert seeds[metric].min() - width < wide[metric] < seeds[metric].max() + width, metric
     assert max(narrow.loc["foot_alternation"].max(), seeds["foot_alternation"].max()) < 0.05
     assert narrow.loc["style_coverage"].round().tolist() == [95, 82, 99]
     said(narrow[64], IRD=3.2)
@@ -704,9 +767,13 @@ def test_width(queue, row):
     said(transformer, held_out_error=8.2, IRD=4.0, IRD_excess=8.5, joint_acceleration=3.7, FID=42, style_coverage=99)
     assert round(100 * transformer["trajectory_error"], 1) == 8.2
     table = load_paper_table(3).query("window_frames == 32 and steps == 8").set_index(["model", "metric"])["value"]
-    fid = [table[f"F3AMD-FNO-{width}", "FID"] for width in (32, 96)]
-    assert fid[1] / fid[0] == pytest.approx(0.75, abs=0.01)
-    assert [round(table[f"F3AMD-FNO-{width}", "style_coverage"]) for width in (32, 96)] == [88, 94]
+    printed = pd.DataFrame({width: table[f"F3AMD-FNO-{width}"] for width in depth})
+    assert printed.loc["FID"].idxmin() == printed.loc["style_coverage"].idxmax() == 96
+    assert printed.loc["FID", [32, 96]].round(2).tolist() == [0.25, 0.19]
+    assert printed.loc["style_coverage", [32, 96]].round().tolist() == [88, 94]
+    path = printed.loc["trajectory_error"]
+    assert (path.idxmax(), path.max(), path.idxmin(), path.min()) == (128, 0.074, 64, 0.01)
+    assert not (path.is_monotonic_increasing or path.is_monotonic_decreasing)
 
 
 def test_our_own_recipe_at_the_rate_of_the_queue(queue, row):
