@@ -716,8 +716,8 @@ def campaign(
       batch_size: windows a step; the paper's is 512.
       only: this preset, recipe or run of the queue; repeatable.
       packed: the data set as its packed cache file, instead of its source.
-      times: first the times of Tables 1, 2, 4, 7 and 11 that are not on record, and then the longest trainings of the
-        queue first; for a GPU.
+      times: first the times of Tables 1, 2 (32 frames), 4, 7 and 11 that are not on record, and then the longest
+        trainings of the queue first; for a GPU.
       out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
     """
     stop_at, timed = _stop_at(minutes), ()
@@ -745,6 +745,8 @@ def campaign(
                 log.info("%-12s times", "unfinished")
                 return UNFINISHED
             log.info("%-12s %s", "times", table)
+        if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
+            return UNFINISHED
         classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
         legs = run_campaign(prepared, profile, classifier, protocol, **how)
         for name, windows, state in legs:

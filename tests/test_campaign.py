@@ -1,6 +1,7 @@
 """The long queue: what it holds, that each run is trained as its row says, and that a stopped leg loses nothing."""
 
 import dataclasses
+import functools
 import time
 from types import SimpleNamespace
 
@@ -273,7 +274,8 @@ def minutes(packed, monkeypatch, tmp_path):
     monkeypatch.setattr(measurements, "plan_memory", lambda *_: 0)
     monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32",))
     monkeypatch.setattr(measurements, "_training_call", lambda *_: work("training") or (lambda: None))
-    monkeypatch.setattr(measure, "protocol_of", lambda *_: judges)
+    trained = functools.cache(lambda: work("classifier"))  # kept, as the real one is
+    monkeypatch.setattr(measure, "protocol_of", lambda *_: trained() or judges)
     monkeypatch.setattr(campaign, "_measured", measured)
     monkeypatch.setattr(campaign, "queue", lambda: [(SEEDED, 4), (Run("CAMDM"), 4), (Run("CAMDM"), 8)])
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -286,6 +288,7 @@ def minutes(packed, monkeypatch, tmp_path):
         given = ["--packed", str(tmp_path / "packed.npz"), "--out", str(tmp_path / "out"), "--minutes", str(number)]
         return main(["campaign", "--profile", "smoke", "--times", *given, *words]), done.copy()
 
+    call.done = done
     return call
 
 
@@ -294,10 +297,31 @@ def test_times_come_first_and_the_next_call_goes_on_where_the_minutes_ended(minu
     assert minutes(0.0) == (UNFINISHED, [])
     assert minutes(0.5) == (UNFINISHED, ["1 characters"])
     assert minutes(0.5) == (UNFINISHED, ["8 characters"])  # over before the training times
-    assert minutes(1.5) == (UNFINISHED, ["training", "CAMDM-seed0 4"])
+    assert minutes(0.5) == (UNFINISHED, ["training"])  # over before a style classifier is trained
+    assert minutes(1.5) == (UNFINISHED, ["classifier", "CAMDM-seed0 4"])
     assert minutes(0.5) == (UNFINISHED, ["CAMDM-seed0 8"])
     assert minutes(9.0) == (0, [f"{SEEDED.name} 4"])
     assert minutes(9.0) == (0, [])
+
+
+def test_training_times_on_record_are_taken_again_where_asked_or_where_one_is_missing(minutes, packed, monkeypatch):
+    assert minutes(2.5) == (UNFINISHED, ["1 characters", "8 characters", "training"])
+    prepared, profile = PreparedData(packed, 32, 10), PROFILE
+
+    def timed(**how):
+        minutes.done.clear()
+        measurements.measure_training_time(prepared, profile, **how)
+        return minutes.done.copy()
+
+    assert timed() == [] and timed(again=True) == ["training"]
+    monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32", "F3AMD-FNO-48"))
+    assert timed() == ["training", "training"] and timed() == []
+
+
+def test_only_what_is_named_is_trained_after_the_times(minutes):
+    times = ["1 characters", "8 characters", "training", "classifier"]
+    assert minutes(9.0, "--only", SEEDED.name) == (0, [*times, f"{SEEDED.name} 4"])
+    assert minutes(9.0) == (0, ["CAMDM-seed0 4", "CAMDM-seed0 8"])
 
 
 def test_a_misspelt_name_is_refused_before_anything_is_timed(minutes, capsys):

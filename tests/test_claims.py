@@ -833,12 +833,13 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     judgement = snapshots(tmp_path, [*alike, *others])
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure == "alike in 9 of 9"
     assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
-    assert "at 200,000 windows" in str(judgement.ours[0].sources[0])
+    assert "at 200,000 windows, one training a network" in str(judgement.ours[0].sources[0])
     # As the whole ledger has it.
     assert judgement == next(each for each in claims.judge_claims(tmp_path) if each.claim.id == "Q10")
     # Seeds are averaged, and two that differ have a wide interval.
     seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "one", 1.2)])
     assert f"FID 1.1x ({FNO} over" in seeds.ours[0].figure
+    assert "1 to 2 trainings a network" in str(seeds.ours[0].sources[0])
     # Nonsense: one of them is twice as bad, or one of them is missing at this length.
     apart = [*alike[:3], (models[3], 200_000, "paper", 0, "one", 2.0)]
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("alike in 0 of 9")

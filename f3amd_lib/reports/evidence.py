@@ -473,7 +473,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     Returns:
       Evidence of `quality` for each number of windows: networks by the paper's text alone, means over their seeds.
       Then evidence of `quality_by_epoch`: of each network the run with most snapshots. A queue that went on elsewhere
-      has rows of several style classifiers; how little that changes is in `records/classifiers.csv`.
+      has rows of several style classifiers; how little most of them differ is in `records/classifiers.csv`.
     """
     path = Path(root) / dataset / profile / "records" / "campaign.csv"
     if not path.exists():
@@ -489,7 +489,9 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
             "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
             "trained": lambda: networks.assign(metric="windows", value=windows),
         }
-        where = f"{place} at {windows:,} windows"
+        trainings = rows.groupby(["model", "window_frames"])["seed"].nunique()
+        most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
+        where = f"{place} at {windows:,} windows, {most} a network"
 
         def load(name: str):
             if name not in tables:
