@@ -776,6 +776,7 @@ def test_width(queue, row):
     printed = pd.DataFrame({width: table[f"F3AMD-FNO-{width}"] for width in depth})
     assert printed.loc["FID"].idxmin() == printed.loc["style_coverage"].idxmax() == 96
     assert printed.loc["FID", [32, 96]].round(2).tolist() == [0.25, 0.19]
+    assert printed.loc["FID", 96] / printed.loc["FID", 32] == pytest.approx(0.75, abs=0.01)
     assert printed.loc["style_coverage", [32, 96]].round().tolist() == [88, 94]
     path = printed.loc["trajectory_error"]
     assert (path.idxmax(), path.max(), path.idxmin(), path.min()) == (128, 0.074, 64, 0.01)
