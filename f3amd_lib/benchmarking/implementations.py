@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import jax
@@ -102,8 +102,14 @@ def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> C
 
 def _network(workload: Workload):
     """Return the network with random weights, in the workload's precision."""
-    network = presets.build_from_config(workload.config, jax.random.key(0))
-    return cast_network(network, PRECISIONS[workload.precision][1])
+    return _built_network(workload.config, PRECISIONS[workload.precision][1])
+
+
+@lru_cache(maxsize=64)
+def _built_network(config: NetworkConfig, dtype):
+    """Build a network once for all its numbers of steps and characters, on the CPU: a GPU compiles for each layer."""
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        return cast_network(presets.build_from_config(config, jax.random.key(0)), dtype)
 
 
 def jit_round(workload: Workload, network, sample: Callable = sample_round, sharding=None) -> Round:

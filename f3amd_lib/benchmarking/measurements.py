@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Collection, Iterable
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -13,7 +14,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.benchmarking.implementations import Workload
-from f3amd_lib.benchmarking.machine import describe_machine, device_name
+from f3amd_lib.benchmarking.machine import describe_machine, device_name, prepared_at_once
 from f3amd_lib.benchmarking.speed_tables import fastest_implementations
 from f3amd_lib.benchmarking.synthesis import CANDIDATE_COLUMNS, Candidate, check_suites, plan, time_group
 from f3amd_lib.benchmarking.time_breakdown import time_breakdown
@@ -22,7 +23,7 @@ from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.training.denoising_task import DenoisingTask
-from f3amd_lib.training.optimise import advance, initial_state, plan_memory
+from f3amd_lib.training.optimise import compile_steps, initial_state, planned_memory
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import short_recipe
 
@@ -169,12 +170,11 @@ def measure_training_time(
         return path
     if stop_at is not None and time.monotonic() >= stop_at:
         return None
-    calls, memory = {}, {}
-    for name in tqdm(names, unit="compiled"):
-        recipe = short_recipe(name, num_steps=steps, batch_size=batch_size, seed=profile.seed)
-        task = prepared.task(name, recipe)
-        memory[name] = plan_memory(task, chunk)
-        calls[name] = _training_call(task, chunk)
+    recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
+    tasks = {name: prepared.task(name, recipe(name)) for name in names}
+    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk), names)
+    compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
+    calls = {name: _training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows = prepared.windows("train").num_windows
     rows = [
@@ -186,10 +186,10 @@ def measure_training_time(
             **timing.columns("s/step", 1.0 / chunk),
             "rounds": timing.rounds,
             "steps_timed": timing.rounds * chunk,
-            "compile_seconds": round(timing.first, 1),
+            "compile_seconds": round(compiled[name][1], 1),
             "epoch_windows": windows,
             "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0,
-            "peak_memory_mib": memory[name] / 2**20,
+            "peak_memory_mib": planned_memory(compiled[name][0]) / 2**20,
             **_circumstances(),
         }
         for name, timing in timings.items()
@@ -199,13 +199,19 @@ def measure_training_time(
     return write_table(path, table, record)
 
 
-def _training_call(task: DenoisingTask, chunk: int):
-    """Return a function that trains on for `chunk` steps and waits."""
+def _compiled(task: DenoisingTask, chunk: int):
+    """Return (program of `chunk` steps, seconds that compiling took)."""
+    started = time.perf_counter()
+    return compile_steps(task, chunk), time.perf_counter() - started
+
+
+def _training_call(task: DenoisingTask, program):
+    """Return a function that trains on for the steps of a compiled program and waits."""
     state = initial_state(task)
 
     def call():
         nonlocal state
-        state, _ = advance(task, state, chunk)
+        state, _ = program(task, state)
         jax.block_until_ready(state)
 
     return call

@@ -16,7 +16,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.benchmarking import implementations
-from f3amd_lib.benchmarking.machine import device_name
+from f3amd_lib.benchmarking.machine import device_name, prepared_at_once
 from f3amd_lib.benchmarking.timing import take_turns
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, row_label
@@ -96,14 +96,20 @@ def time_group(
     if len(groups) != 1:
         raise ValueError(f"candidates of {len(groups)} groups cannot be timed by turns")
     ((window, characters, precision),) = groups
+
+    def prepare(candidate: Candidate) -> tuple[implementations.Workload, implementations.Round]:
+        config = build_config(candidate.model, window)
+        workload = implementations.Workload(candidate.model, config, candidate.steps, characters, precision)
+        return workload, implementations.prepare_round(candidate.implementation, workload)
+
+    # PyTorch's compiler is not made for threads.
+    prepared = prepared_at_once(prepare, [one for one in candidates if one.implementation.startswith("jit")])
     ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:
             bar.set_postfix_str(str(candidate))
-            config = build_config(candidate.model, window)
-            workload = implementations.Workload(candidate.model, config, candidate.steps, characters, precision)
             try:
-                ready[candidate] = workload, implementations.prepare_round(candidate.implementation, workload)
+                ready[candidate] = prepared[candidate]() if candidate in prepared else prepare(candidate)
             except implementations.NotPossible as reason:
                 failed[str(candidate)] = str(reason)
     if not ready:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.arrays import array_module, exact_products, finite_array
 from f3amd_lib.motion import rotations
 from f3amd_lib.motion.skeleton import Motion, Skeleton, forward_kinematics
 
@@ -71,7 +71,8 @@ def frame_yaw(skeleton: Skeleton, frames):
         raise ValueError("facing needs hip joints that are children of the root joint")
     across_local = (skeleton.offsets[left] - skeleton.offsets[right]).astype(frames.dtype)
     root = rotations.matrix_from_rotation_6d(frames[..., 3:9])
-    across = xp.einsum("...ab,b->...a", root, across_local)
+    with exact_products():
+        across = xp.einsum("...ab,b->...a", root, across_local)
     return xp.arctan2(-across[..., 2], across[..., 0])
 
 
@@ -100,7 +101,8 @@ def turn_frames(frames, yaw):
     matrix = rotations.matrix_from_yaw(yaw)
     # Root position and the two columns of the root's rotation are three vectors to turn.
     vectors = frames[..., :9].reshape(*frames.shape[:-1], 3, 3)
-    turned = xp.einsum("...ab,...tvb->...tva", matrix, vectors)
+    with exact_products():
+        turned = xp.einsum("...ab,...tvb->...tva", matrix, vectors)
     return xp.concatenate([turned.reshape(*frames.shape[:-1], 9), frames[..., 9:]], axis=-1)
 
 

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 
+from f3amd_lib.benchmarking.machine import device_name, matmul_precision
 from f3amd_lib.experiments.denoising import held_out_condition, held_out_error, input_use
 from f3amd_lib.experiments.learning_curves import snapshot
 from f3amd_lib.experiments.protocol import Protocol, measure_model
@@ -48,6 +49,9 @@ EPOCHS = 100
 
 STEPS_MEASURED = (8, 1)
 """Denoising steps with which a snapshot is measured."""
+
+_EVERY = {"CPU": 400}
+"""Steps between checkpoints by device: on a GPU 400 steps take seconds, and a checkpoint costs as much as many."""
 
 _QUEUE = Path(__file__).parents[1] / "papers" / "f3amd" / "campaign.toml"
 
@@ -139,8 +143,8 @@ def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]
 
 def run_campaign(
     prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
-    snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, stop_at: float | None = None,
-    known: Path | None = None, progress: bool = True,
+    snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, precision: str = "float32",
+    stop_at: float | None = None, known: Path | None = None, progress: bool = True,
 ) -> Iterator[tuple[str, int, str]]:  # fmt: skip
     """Train and measure snapshots that are not on record, until all are or the time is over.
 
@@ -150,6 +154,7 @@ def run_campaign(
       folder: where training states and weights lie, a folder a run.
       snapshots: of `queue`, in the order in which they are trained.
       batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
+      precision: of the matrix products of training, a key of `machine.PRECISIONS`: float32, or tf32 on a GPU.
       stop_at: the run under way stops with a checkpoint after this time (`time.monotonic`).
       known: folder of another run's records, whose snapshots count as measured.
       progress: show progress bars.
@@ -172,7 +177,8 @@ def run_campaign(
         if stop_at is not None and time.monotonic() >= stop_at:
             yield run.name, windows, "unfinished"
             return
-        rows = _measured(prepared, classifier, protocol, run, windows, batch_size, record, folder, stop_at, progress)
+        how = batch_size, precision, record, folder, stop_at, progress
+        rows = _measured(prepared, classifier, protocol, run, windows, *how)
         if rows is None:
             yield run.name, windows, "unfinished"
             return
@@ -181,17 +187,20 @@ def run_campaign(
 
 
 def _measured(
-    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, record, folder, stop_at, progress
-) -> pd.DataFrame | None:
+    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, precision: str, record, folder, stop_at,
+    progress,
+) -> pd.DataFrame | None:  # fmt: skip
     """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
     data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
     num_windows = data.windows("train").num_windows
     config, folder = run.config(num_windows, batch_size), Path(folder) / run.name
     steps = max(1, windows // config.batch_size)
-    trained, loss = snapshot(
-        data, run.preset, config, steps, record,
-        folder=folder, network=find_recipe(run.recipe).network, stop_at=stop_at, progress=progress,
-    )  # fmt: skip
+    with matmul_precision(precision):
+        trained, loss = snapshot(
+            data, run.preset, config, steps, record,
+            folder=folder, network=find_recipe(run.recipe).network, every=_EVERY.get(device_name(), 4000),
+            stop_at=stop_at, progress=progress,
+        )  # fmt: skip
     if trained is None:
         return None
     save_model(folder / f"{windows}.safetensors", trained, jnp.bfloat16)
@@ -211,6 +220,6 @@ def _measured(
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": steps * config.batch_size / num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
-        "device": jax.devices()[0].device_kind, "commit": (record["git_commit"] or "")[:10],
+        "device": jax.devices()[0].device_kind, "precision": precision, "commit": (record["git_commit"] or "")[:10],
     }  # fmt: skip
     return pd.concat(tables)[["steps", "metric", "unit", "value"]].assign(**columns)

@@ -78,7 +78,7 @@ def train_family(
 
 def snapshot(
     prepared: PreparedData, preset: str, recipe: TrainingConfig, steps: int, record: dict, *, folder,
-    network: Mapping | None = None, stop_at: float | None = None, progress: bool = True,
+    network: Mapping | None = None, every: int = 400, stop_at: float | None = None, progress: bool = True,
 ) -> tuple[TrainedModel | None, float]:  # fmt: skip
     """Train up to a step, going on from an earlier snapshot of the folder.
 
@@ -89,6 +89,7 @@ def snapshot(
       folder: where the training state and the history of the losses are kept; a state that is further than `steps` is
         kept under another name.
       network: fields of the preset's network to change.
+      every: steps between checkpoints and held-out losses.
       stop_at: see `optimise`.
       progress: show a progress bar.
 
@@ -103,7 +104,7 @@ def snapshot(
     record = {**record, "training": recipe.to_dict()}
     if files.state.exists() and int(restore_state(files.state, task).step) > steps:
         set_aside_run(files)
-    leg = {"every": min(steps, 400), "stop_after": steps, "stop_at": stop_at, "progress": progress}
+    leg = {"every": min(steps, every), "stop_after": steps, "stop_at": stop_at, "progress": progress}
     state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
     if int(state.step) < steps:
         return None, math.nan

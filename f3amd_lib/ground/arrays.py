@@ -12,6 +12,11 @@ def array_module(*arrays):
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
+def exact_products():
+    """Return a context for products of rotations and metres: float32 on a GPU too, where JAX rounds to 10 bits."""
+    return jax.default_matmul_precision("float32")
+
+
 def check_positive(name: str, value) -> None:
     """Raise ValueError unless a number is finite and above 0."""
     if not (np.isfinite(value) and value > 0):

@@ -26,7 +26,7 @@ import itertools
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.arrays import array_module, exact_products, finite_array
 from f3amd_lib.motion import rotations
 from f3amd_lib.motion.skeleton import Skeleton
 
@@ -217,10 +217,12 @@ def positions_from_redundant(vectors):
     turned = xp.swapaxes(rotations.matrix_from_yaw(-2.0 * summed(turn)[..., 0]), -1, -2)
     arriving = xp.concatenate([turned[..., 1:, :, :], turned[..., :1, :, :]], axis=-3)
     flat = xp.concatenate([velocity[..., :1], 0.0 * height, velocity[..., 1:]], axis=-1)
-    ground = summed((flat[..., None, :] @ arriving)[..., 0, :])
+    with exact_products():
+        ground = summed((flat[..., None, :] @ arriving)[..., 0, :])
     local = local.reshape(*local.shape[:-1], -1, 3)
     root = xp.concatenate([ground[..., :1], height, ground[..., 2:]], axis=-1)
-    return xp.concatenate([root[..., None, :], local @ turned + ground[..., None, :]], axis=-2)
+    with exact_products():
+        return xp.concatenate([root[..., None, :], local @ turned + ground[..., None, :]], axis=-2)
 
 
 def grouped_statistics(vectors) -> tuple[np.ndarray, np.ndarray]:
