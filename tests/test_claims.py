@@ -710,6 +710,8 @@ def test_an_order_needs_an_interval_that_leaves_out_1():
         ([LARGER, OPEN, UNMEASURED], LARGER),
         ([HOLDS, LARGER], IN_PART),
         ([LARGER, FAILS], FAILS),
+        ([LARGER, UNJUDGED], UNJUDGED),
+        ([HOLDS, LARGER, UNJUDGED], IN_PART),
         ([UNJUDGED, UNMEASURED, REMARK], UNJUDGED),
         ([HOLDS, UNJUDGED], IN_PART),
         ([FAILS, OPEN, UNMEASURED], FAILS),

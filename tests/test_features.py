@@ -199,3 +199,12 @@ def test_identity_normaliser_changes_nothing():
     np.testing.assert_array_equal(normaliser.normalise(x), x)
     np.testing.assert_array_equal(normaliser.denormalise(x), x)
     np.testing.assert_array_equal(normaliser.normalise_path(path), path)
+
+
+def test_turns_are_exact_where_a_gpu_would_round_products():
+    frames, yaw = jnp.asarray(random_frames((2, 4)), jnp.float32), jnp.zeros(2)
+    with jax.default_matmul_precision("tensorfloat32"):
+        for function in (turn_frames, lambda frames, _: frame_yaw(SKELETON, frames)):
+            text = str(jax.make_jaxpr(function)(frames, yaw))
+            assert "dot_general" in text and "HIGHEST" in text
+        assert "HIGHEST" not in str(jax.make_jaxpr(jnp.matmul)(frames, frames.swapaxes(-1, -2)))

@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 import time
 
 import jax
@@ -128,3 +129,24 @@ def test_fast_flags_start_jax_with_as_many_devices():
 def test_a_flag_that_xla_does_not_know_is_left_out(monkeypatch):
     monkeypatch.setattr("f3amd_lib.benchmarking.machine._FAST_FLAGS", ("--xla_no_such_flag=1",))
     assert "no_such_flag" not in fast_xla_flags(2)
+
+
+def test_all_is_prepared_at_once_for_a_gpu_and_one_after_the_other_for_a_cpu(monkeypatch):
+    together = threading.Barrier(2)
+
+    def prepare(item):
+        if item == "broken":
+            raise ValueError("no such product")
+        together.wait(timeout=20)  # breaks where one waits for the other to be done
+        return item.upper()
+
+    monkeypatch.setattr(machine, "device_name", lambda: "GPU")
+    monkeypatch.setattr(machine, "usable_cores", lambda: 3)
+    ready = machine.prepared_at_once(prepare, ["a", "b", "broken"])
+    assert (ready["b"](), ready["a"]()) == ("B", "A")
+    with pytest.raises(ValueError, match="no such product"):
+        ready["broken"]()
+    monkeypatch.setattr(machine, "device_name", lambda: "CPU")
+    asked = []
+    ready = machine.prepared_at_once(lambda item: asked.append(item) or item, ["a", "b"])
+    assert asked == [] and ready["b"]() == "b" and asked == ["b"]

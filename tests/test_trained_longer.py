@@ -490,7 +490,8 @@ def test_ablations_after_four_times_the_length(queue):
     alike = []
     for windows in (200_000, 800_000):
         rows = of_queue(queue, windows)
-        rows = rows[(rows["steps"] == 8) & rows["model"].isin([MAIN, *(f"F3AMD-{layer}" for layer in layers)])]
+        rows = rows.query("window_frames == 32 and steps == 8")
+        rows = rows[rows["model"].isin([MAIN, *(f"F3AMD-{layer}" for layer in layers)])]
         means = rows.pivot(index="metric", columns="model", values="value")
         assert means.shape == (9, 4) and means.notna().all(axis=None)
         alike.append(means.max(axis=1) / means.min(axis=1) <= 1.3)
@@ -702,6 +703,7 @@ def test_camdm_with_the_ird_loss(row):
 
 def test_camdm_narrow_and_with_other_noise(queue, row):
     seen = queue.query("windows == 200_000 and steps == 8 and metric == 'style_coverage' and recipe == 'paper'")
+    seen = seen.query("window_frames == 32")
     seen = seen[seen["model"].isin(["CAMDM-96", "CAMDM", MAIN])]
     covered = seen.groupby("model")["value"].agg(["min", "max"]).round()
     assert covered.T.to_dict("list") == {"CAMDM": [99, 99], "CAMDM-96": [82, 82], MAIN: [33, 65]}
@@ -794,3 +796,113 @@ def test_our_own_recipe_at_the_rate_of_the_queue(queue, row):
     assert errors.idxmin() == "F3AMD-FNO-96-steady"
     trained = read_table(RECORDS / "trained.csv")[0].query("model == 'F3AMD-FNO-96-steady' and metric == 'windows'")
     assert trained["value"].tolist() == [1600 * THOUSAND]
+
+
+FOUR = FIVE.removeprefix("history-anchor+")
+
+
+def test_a_step_with_512_windows_teaches_little_more_than_one_with_128(queue):
+    """23.8: at equal steps, and what long training in such batches brought."""
+    rows = queue.query("window_frames == 32 and seed == 0 and steps == 0 and metric == 'held_out_error'")
+    error = rows.set_index(["model", "recipe", "windows"])["value"]
+    gains = {}
+    for name, model, small, large in (
+        ("text", MAIN, "paper", "batch-512"),
+        ("CAMDM", "CAMDM", "paper", "batch-512"),
+        ("four", MAIN, FOUR, f"{FOUR}+batch-512"),
+    ):
+        pairs = [(4 * windows, windows) for windows in error[model, small].index if 4 * windows in error[model, large]]
+        gains[name] = [1 - error[model, large, four_times] / error[model, small, one] for four_times, one in pairs]
+    assert {name: len(gain) for name, gain in gains.items()} == {"text": 4, "CAMDM": 3, "four": 3}
+    ends = {name: [round(100 * end(gain)) for end in (min, max)] for name, gain in gains.items()}
+    assert ends == {"text": [1, 6], "CAMDM": [7, 9], "four": [2, 5]}
+    # Against windows they are behind, by far.
+    assert all(
+        error[MAIN, "batch-512", at] > 1.12 * error[MAIN, "paper", at] for at in error[MAIN, "batch-512"].index[:6]
+    )
+    # 23.4's middle length is the paper's number of steps in batches of 128.
+    assert round(PAPERS_LENGTH / 512 * 128 / 1e6) == 50 and round(PAPERS_LENGTH / 512) == 389_607
+
+
+def figures_of(queue, run: str, windows: int, steps: int = 8) -> pd.Series:
+    rows = queue.query("run == @run and windows == @windows and steps in [0, @steps]")
+    assert len(rows)
+    return rows.set_index("metric")["value"]
+
+
+def test_long_training_in_the_papers_batch(queue, row, real):
+    text = figures_of(queue, f"{MAIN}-batch-512-seed0", 9_267_200)
+    said(text, held_out_error=4.9, foot_alternation=0.13, FID=25)
+    assert row(MAIN, 1600)["held_out_error"] > text["held_out_error"] > row(MAIN, 3200)["held_out_error"]
+    assert (round(9_267_200 / 512), round(4_198_400 / 512)) == (18_100, 8_200)
+    lengths = (1_600_000, 3_200_000, 4_198_400)
+    camdm = [figures_of(queue, "CAMDM-batch-512-seed0", at) for at in lengths]
+    said(camdm[-1], held_out_error=3.1, foot_sliding=0.39, foot_alternation=1.26, joint_acceleration=1.1, IRD=4.5)
+    assert [round(100 * each["trajectory_error"], 1) for each in (camdm[-1], real)] == [3.3, 2.9]
+    assert [round(each["FID"]) for each in camdm] == [23, 24, 33]
+    assert [round(each["style_coverage"]) for each in camdm] == [100, 96, 93]
+    for metric in ("held_out_error", "foot_sliding", "joint_acceleration", "trajectory_error"):
+        assert np.all(np.diff([each[metric] for each in camdm]) < 0), metric
+    run = f"{MAIN}-{FOUR}+batch-512-seed0"
+    eight, once = (figures_of(queue, run, 3_302_400, steps) for steps in (8, 1))
+    said(eight, held_out_error=4.0, joint_acceleration=2.2, foot_alternation=0.25)
+    said(once, joint_acceleration=1.4, foot_alternation=0.57)
+    said(row(MAIN, 800, FOUR), joint_acceleration=2.0, foot_alternation=0.39)
+    said(row(MAIN, 800, FOUR, steps=1), joint_acceleration=1.4, foot_alternation=0.57)
+
+
+def test_all_five_and_our_own_recipe_after_four_times_the_length(queue, row):
+    five = [row(MAIN, at, FIVE) for at in (200, 400, 800)]
+    assert [round(each["foot_alternation"], 2) for each in five] == [0.21, 0.13, 0.27]
+    assert [round(row(MAIN, at, FIVE, steps=1)["foot_alternation"], 2) for at in (200, 400, 800)] == [0.34, 0.43, 0.48]
+    said(five[2], held_out_error=4.0, IRD=2.2, trajectory_error=0.065)
+    said(row(MAIN, 800, FOUR), IRD=4.5)
+    seeds = [row("F3AMD-FNO-96-steady", 800, seed=seed) for seed in (1, 2)]
+    assert [round(each["held_out_error"], 1) for each in seeds] == [3.2, 3.1]
+    assert max(each["held_out_error"] for each in seeds) < row("CAMDM", 800)["held_out_error"]
+    assert [round(each["joint_acceleration"], 1) for each in seeds] == [9.0, 5.2]
+    assert [round(100 * each["trajectory_error"]) for each in seeds] == [19, 23]
+    once = [row("F3AMD-FNO-96-steady", 800, seed=seed, steps=1) for seed in (1, 2)]
+    assert [round(each["joint_acceleration"], 1) for each in once] == [1.0, 1.1]
+    assert [round(each["foot_alternation"], 2) for each in once] == [1.03, 0.98]
+    assert [round(100 * each["trajectory_error"], 1) for each in once] == [2.1, 2.2]
+    assert round(100 * row("CAMDM", 800, steps=1)["trajectory_error"], 1) == 4.7
+    assert [round(each["style_coverage"]) for each in once] == [29, 45]
+
+
+def test_camdm_with_f3amds_noise_and_with_the_seam_loss_after_twice_the_length(row):
+    noise, own, seam = (row(name, 400) for name in ("CAMDM-VE", "CAMDM", "CAMDM-IRD"))
+    once = [row(name, 400, steps=1) for name in ("CAMDM-VE", "CAMDM")]
+    said(once[0], foot_alternation=0.29, joint_acceleration=2.3, FID=24)
+    said(once[1], foot_alternation=0.21, joint_acceleration=2.5, FID=24)
+    said(noise, foot_alternation=0.71, joint_acceleration=1.6, FID=19, use_of_x=0.54, diversity=0.36)
+    said(own, foot_alternation=0.62, joint_acceleration=1.7, FID=20, use_of_x=1.83, diversity=1.55)
+    said(seam, IRD=2.2, IRD_excess=4.4, held_out_error=4.8, FID=30, trajectory_error=0.054, style_coverage=97)
+    said(own, IRD=6.9, IRD_excess=5.5, held_out_error=4.5, trajectory_error=0.044, style_coverage=100)
+
+
+def test_windows_of_64_frames(queue):
+    def figures(model: str, windows: int, frames: int) -> pd.Series:
+        rows = queue.query("model == @model and windows == @windows and window_frames == @frames")
+        rows = rows.query("recipe == 'paper' and seed == 0 and steps in [0, 8]")
+        return rows.set_index("metric")["value"]
+
+    pairs = {
+        name: [figures(name, windows, frames) for frames in (64, 32)]
+        for name, windows in ((MAIN, 800_000), ("F3AMD-Transformer-64", 800_000), ("CAMDM", 200_000))
+    }
+    told = {
+        (MAIN, "held_out_error"): (8.3, 6.6), (MAIN, "FID"): (34, 26), (MAIN, "style_coverage"): (98, 100),
+        (MAIN, "trajectory_error"): (0.102, 0.072),
+        ("F3AMD-Transformer-64", "held_out_error"): (10.4, 8.2), ("F3AMD-Transformer-64", "FID"): (52, 42),
+        ("F3AMD-Transformer-64", "style_coverage"): (89, 99),
+        ("F3AMD-Transformer-64", "trajectory_error"): (0.105, 0.082),
+        ("CAMDM", "held_out_error"): (8.0, 5.7), ("CAMDM", "foot_sliding"): (1.25, 0.6), ("CAMDM", "FID"): (48, 27),
+        ("CAMDM", "joint_acceleration"): (4.7, 2.1), ("CAMDM", "style_coverage"): (88, 99),
+    }  # fmt: skip
+    for (name, metric), printed in told.items():
+        for seen, value in zip(pairs[name], printed, strict=True):
+            said(seen, **{metric: value})
+    grows = {name: wide["held_out_error"] / usual["held_out_error"] - 1 for name, (wide, usual) in pairs.items()}
+    assert grows == pytest.approx({MAIN: 0.25, "F3AMD-Transformer-64": 0.25, "CAMDM": 0.4}, abs=0.03)
+    assert pairs["CAMDM"][0]["foot_alternation"] < 0.02

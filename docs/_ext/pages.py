@@ -158,7 +158,7 @@ def moving_markdown(dataset: str = "", *, with_credit: bool = True) -> str:
     items = []
     for folder in result_folders(dataset or "*"):
         credit = credit_line(folder) if with_credit else label_of(folder)
-        for path in sorted(path for path in (folder / "media").iterdir() if path.suffix in (".gif", ".webp", ".html")):
+        for path in sorted(path for path in (folder / "media").glob("*") if path.suffix in (".gif", ".webp", ".html")):
             notebook = notebooks_by_number().get(path.name[:2])
             source = f" From [notebook {path.name[:2]}](/{relative(notebook)})." if notebook else ""
             title = f"{words(path.stem).capitalize()} ({folder.parent.name})"

@@ -124,13 +124,13 @@ def matmul_probe(precision: str = "float32", size: int | None = None) -> tuple[C
     return lambda: multiply(matrix, matrix).block_until_ready(), 2 * size**3
 
 
-_FAST_FLAGS = ("--xla_cpu_experimental_ynn_fusion_type=",)
-"""XLA's flags that made rounds faster on a CPU: without fusion into YNNPACK's products a step of
-F3AMD-FNO-96 took 0.8 of the time."""
+_FAST_FLAGS = ("--xla_cpu_experimental_ynn_fusion_type=", "--xla_gpu_experimental_enable_fusion_autotuner=false")
+"""XLA's flags that helped. On a CPU: without fusion into YNNPACK's products a step of F3AMD-FNO-96 took 0.8 of the
+time. For a GPU: XLA of jax 0.11 tries out each of a program's fusions, and compiled a training step for minutes."""
 
 
 def fast_xla_flags(num_devices: int | None = None) -> str:
-    """Return XLA_FLAGS for the fastest rounds on a CPU: one device a core, and what helped besides.
+    """Return XLA_FLAGS for the fastest rounds: on a CPU one device a core, and what helped besides.
 
     They must be in the environment before JAX starts. A flag that this release of XLA does not know
     would end the process, so each is tried in a process of its own.

@@ -162,6 +162,7 @@ def run_campaign(
     Yields:
       (run, windows, state) for each snapshot: "measured before", "measured", or "unfinished", which is the last.
     """
+    matmul_precision(precision)  # refuses an unknown one
     protocol = dataclasses.replace(protocol, num_seeds=1)
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement="campaign",

@@ -107,14 +107,16 @@ def combine(verdicts: Iterable[str]) -> str:
     """Return the verdict on a claim from those on its statements.
 
     All hold: it holds. Some do, and others do not or could not be judged: it holds in part. None
-    does: it does not hold where one was contradicted; else it is larger than stated where one is.
-    Otherwise nothing can be told apart, judged or measured.
+    does: it does not hold where one was contradicted; else it is larger than stated where one is, unless
+    another could not be judged. Otherwise nothing can be told apart, judged or measured.
     """
     found = set(verdicts) - {REMARK}
     if found == {HOLDS}:
         return HOLDS
     if found & {HOLDS, IN_PART}:
         return IN_PART
+    if UNJUDGED in found:
+        found.discard(LARGER)
     return next((verdict for verdict in (FAILS, LARGER, OPEN, UNJUDGED) if verdict in found), UNMEASURED)
 
 
