@@ -728,19 +728,20 @@ def campaign(
 
         timed = (measure_synthesis_time, measure_training_time)
     from f3amd_lib.data.packed import load_packed
-    from f3amd_lib.experiments.campaign import chosen, longest_first, queue, run_campaign
+    from f3amd_lib.experiments.campaign import check_precision, chosen, longest_first, queue, run_campaign
     from f3amd_lib.experiments.measure import protocol_of
     from f3amd_lib.training.pipeline import PreparedData
 
     snapshots = chosen(longest_first(queue()) if times else queue(), only)
+    check_precision(precision)
     if packed is None:
         prepared, profile = motion.open()
     else:
         profile = motion.numbers()
         prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
-    how = {"folder": folder, "snapshots": snapshots, "batch_size": batch_size, "stop_at": stop_at}
-    how["precision"] = precision
+    how = {"folder": folder, "snapshots": snapshots, "stop_at": stop_at}
+    how |= {"batch_size": batch_size, "precision": precision}
     with locked(folder / ".campaign.lock", "running the campaign"):
         for measure_time in timed:
             if (table := measure_time(prepared, profile, stop_at=stop_at)) is None:

@@ -116,9 +116,10 @@ def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp
 
 
 def test_an_unknown_precision_is_refused_before_anything_is_trained(packed, tmp_path):
-    how = {"folder": tmp_path, "snapshots": [(SEEDED, 8)], "precision": "tf23"}
-    with pytest.raises(ValueError, match="tf23"):
-        next(run_campaign(PreparedData(packed, 32, 10), PROFILE, None, Protocol(STYLES), **how))
+    for precision, why in (("tf23", "tf23"), ("bfloat16", "bfloat16"), ("tf32", "for a GPU")):
+        how = {"folder": tmp_path, "snapshots": [(SEEDED, 8)], "precision": precision}
+        with pytest.raises(ValueError, match=why):
+            next(run_campaign(PreparedData(packed, 32, 10), PROFILE, None, Protocol(STYLES), **how))
     assert not list(tmp_path.iterdir())
 
 
@@ -311,6 +312,16 @@ def minutes(packed, monkeypatch, tmp_path):
 
     call.done = done
     return call
+
+
+def test_the_command_hands_its_precision_on(minutes, monkeypatch):
+    seen = []
+    monkeypatch.setattr(campaign, "check_precision", seen.append)
+    original = campaign.run_campaign
+    handed = lambda *given, **how: seen.append(how["precision"]) or original(*given, **how)
+    monkeypatch.setattr(campaign, "run_campaign", handed)
+    minutes(9.0, "--precision", "tf32")
+    assert set(seen) == {"tf32"} and len(seen) == 3
 
 
 def test_times_come_first_and_the_next_call_goes_on_where_the_minutes_ended(minutes):

@@ -1,5 +1,7 @@
 """The claims ledger: every rule on made-up records, the paper's own tables, accepted verdicts."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -697,6 +699,34 @@ def test_an_order_needs_an_interval_that_leaves_out_1():
     assert ordered(Figure.of(1.2, 1.1, 1.3)) == HOLDS
     assert ordered(Figure.of(0.8, 0.7, 0.9)) == FAILS
     assert ordered(Figure.of(1.2, 0.9, 1.5)) == ordered(Figure.of(1.0)) == OPEN
+
+
+def test_times_of_another_device_fill_gaps_from_another_data_set(tmp_path):
+    """E7 is of both devices: one data set was timed on a GPU, the other on a CPU."""
+    settings = ("F3AMD-FNO-96", 13.0), ("F3AMD-FNO-96", 2.0, 1)
+    keep(tmp_path, {"synthesis_time": times("GPU", [1024], *settings)}, profile="gpu")
+    alone = judge(tmp_path, "E7")
+    assert [s.verdict for s in alone.ours].count(UNMEASURED) == 3 and alone.times_of == ()
+    keep(tmp_path, {"synthesis_time": times("CPU", [1, 32], *settings)}, dataset="synthetic")
+    both = judge(tmp_path, "E7")
+    assert [s.verdict for s in both.ours].count(UNMEASURED) == 1
+    assert (both.dataset, both.times_of) == ("bandai", ("synthetic",))
+    row = claims.ledger([both]).iloc[0]
+    assert row["dataset"] == "bandai; synthetic (procedural, no real motion)"
+    assert "bandai/gpu" in row["record"] and "synthetic/laptop" in row["record"]
+
+
+def test_only_times_fill_gaps(tmp_path):
+    """What another data set says of quality is not taken."""
+    settings = ("F3AMD-FNO-96", 13.0), ("F3AMD-FNO-96", 2.0, 1)
+    keep(tmp_path, {"synthesis_time": times("GPU", [1024], *settings)}, profile="gpu")
+    judged = claims.load_claims()["E7"].judge(recorded_evidence(tmp_path, "bandai", "gpu"))
+    measured = next(s for s in judged if s.verdict != UNMEASURED)
+    gap = next(s for s in judged if s.verdict == UNMEASURED)
+    of_quality = dataclasses.replace(measured, sources=(claims.Source("synthetic/laptop/records/quality.csv", "", ""),))
+    assert claims._filled([gap], {"synthetic": [measured]}) == ((measured,), ("synthetic",))
+    assert claims._filled([gap], {"synthetic": [of_quality]}) == ((gap,), ())
+    assert claims._filled([measured], {"synthetic": [gap]}) == ((measured,), ())
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,9 @@ def test_quotients_at_1024_characters(times):
     assert all(
         gain[f"F3AMD-Transformer-{width}", 8][1] > gain[f"F3AMD-Transformer-{width}", 8][0] for width in (32, 48, 64)
     )
+    for width in (96, 128):
+        paper, ours = gain[f"F3AMD-Transformer-{width}", 8]
+        assert abs(ours / paper - 1) < 0.02
     quicker = [paper / ours for paper, ours in rows.values() if ours > 0]
     assert (round(min(quicker)), round(max(quicker))) == (7, 11)
     ways = committed_table("bandai", "synthesis_ways", profile="gpu")[0]
@@ -56,4 +59,5 @@ def test_a_step_of_training():
     assert gain.loc["F3AMD-FNO-96"].round(1).tolist() == [2.5, 4.3]
     assert gain.loc["F3AMD-FNO-32"].round(1).tolist() == [2.5, 7.1]
     minutes = beside["paper_minutes"].drop("CAMDM")
-    assert minutes.max() / minutes.min() < 1.25 and (table["batch_size"] == 512).all()
+    assert minutes.max() / minutes.min() < 1.25
+    assert (table["batch_size"] == 512).all() and (table["precision"] == "float32").all()

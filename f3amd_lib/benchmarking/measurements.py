@@ -14,7 +14,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.benchmarking.implementations import Workload
-from f3amd_lib.benchmarking.machine import describe_machine, device_name, prepared_at_once
+from f3amd_lib.benchmarking.machine import describe_machine, device_name, matmul_precision, prepared_at_once
 from f3amd_lib.benchmarking.speed_tables import fastest_implementations
 from f3amd_lib.benchmarking.synthesis import CANDIDATE_COLUMNS, Candidate, check_suites, plan, time_group
 from f3amd_lib.benchmarking.time_breakdown import time_breakdown
@@ -144,8 +144,8 @@ def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterab
 
 
 def measure_training_time(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, again: bool = False,
-    stop_at: float | None = None,
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, precision: str = "float32",
+    again: bool = False, stop_at: float | None = None,
 ) -> Path | None:  # fmt: skip
     """Time training steps by turns, all models in one run (Table 2).
 
@@ -153,6 +153,7 @@ def measure_training_time(
       prepared: the data; an epoch is once over its training windows.
       profile: names the results' folder; says how large a batch is and how many steps are timed.
       models: presets; by default the recommended ones, the baseline, and two other widths.
+      precision: of matrix products, a key of `machine.PRECISIONS`.
       again: time them anew though an earlier run with the same settings has timed all of them.
       stop_at: do not begin after this time (`time.monotonic`).
 
@@ -172,7 +173,7 @@ def measure_training_time(
         return None
     recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
     tasks = {name: prepared.task(name, recipe(name)) for name in names}
-    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk), names)
+    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk, precision), names)
     compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
     calls = {name: _training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
@@ -183,6 +184,7 @@ def measure_training_time(
             "window_frames": prepared.window,
             "device": device_name(),
             "batch_size": batch_size,
+            "precision": precision,
             **timing.columns("s/step", 1.0 / chunk),
             "rounds": timing.rounds,
             "steps_timed": timing.rounds * chunk,
@@ -199,10 +201,11 @@ def measure_training_time(
     return write_table(path, table, record)
 
 
-def _compiled(task: DenoisingTask, chunk: int):
+def _compiled(task: DenoisingTask, chunk: int, precision: str):
     """Return (program of `chunk` steps, seconds that compiling took)."""
     started = time.perf_counter()
-    return compile_steps(task, chunk), time.perf_counter() - started
+    with matmul_precision(precision):  # here: what a caller sets does not reach other threads
+        return compile_steps(task, chunk), time.perf_counter() - started
 
 
 def _training_call(task: DenoisingTask, program):

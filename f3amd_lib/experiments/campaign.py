@@ -51,7 +51,9 @@ STEPS_MEASURED = (8, 1)
 """Denoising steps with which a snapshot is measured."""
 
 _EVERY = {"CPU": 400}
-"""Steps between checkpoints by device: on a GPU 400 steps take seconds, and a checkpoint costs as much as many."""
+"""Steps between checkpoints, and looks at the held-out loss, by device: on a GPU 1,000, which takes it seconds."""
+
+_PRECISIONS = ("float32", "tf32")
 
 _QUEUE = Path(__file__).parents[1] / "papers" / "f3amd" / "campaign.toml"
 
@@ -141,6 +143,13 @@ def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]
     return sorted(snapshots, key=lambda snapshot: -longest[snapshot[0]])
 
 
+def check_precision(precision: str) -> None:
+    """Raise ValueError for a precision of training that is unknown, or that this device does not have."""
+    check_known(precision, _PRECISIONS, "precision of training")
+    if precision == "tf32" and device_name() == "CPU":
+        raise ValueError("tf32 is for a GPU: on this CPU products are float32, leave --precision out")
+
+
 def run_campaign(
     prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
     snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, precision: str = "float32",
@@ -162,7 +171,7 @@ def run_campaign(
     Yields:
       (run, windows, state) for each snapshot: "measured before", "measured", or "unfinished", which is the last.
     """
-    matmul_precision(precision)  # refuses an unknown one
+    check_precision(precision)
     protocol = dataclasses.replace(protocol, num_seeds=1)
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement="campaign",
@@ -199,7 +208,7 @@ def _measured(
     with matmul_precision(precision):
         trained, loss = snapshot(
             data, run.preset, config, steps, record,
-            folder=folder, network=find_recipe(run.recipe).network, every=_EVERY.get(device_name(), 4000),
+            folder=folder, network=find_recipe(run.recipe).network, every=_EVERY.get(device_name(), 1000),
             stop_at=stop_at, progress=progress,
         )  # fmt: skip
     if trained is None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, exact_products
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
 from f3amd_lib.motion.curves import unit
@@ -167,5 +167,6 @@ def pose_body(body: Body, skeleton: Skeleton, root_position, rotations):
     xp = array_module(root_position, rotations)
     positions, turned = walk_tree(skeleton, root_position, rotations)
     local = body.vertices[:, None] - skeleton.rest_positions[body.joints]  # [V, K, 3]
-    moved = xp.einsum("...vkab,vkb->...vka", turned[..., body.joints, :, :], local) + positions[..., body.joints, :]
+    with exact_products():
+        moved = xp.einsum("...vkab,vkb->...vka", turned[..., body.joints, :, :], local) + positions[..., body.joints, :]
     return xp.sum(body.weights[..., None] * moved, axis=-2)

@@ -33,6 +33,7 @@ from f3amd_lib.reports import judgements as judging
 from f3amd_lib.reports import theory
 from f3amd_lib.reports.evidence import (
     SCHEMAS,
+    TIMES,
     Evidence,
     NotMeasured,
     Setting,
@@ -48,7 +49,7 @@ log = logging.getLogger("f3amd")
 
 DATASET_ORDER = ("bandai", "synthetic", "folder")
 """Whose records decide: Bandai's motion first; CAMDM's published weights walk on a folder alone. All
-statements of a claim come from one data set."""
+statements of a claim come from one data set, but for times, which another may have taken on another device."""
 
 PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
@@ -241,12 +242,14 @@ class Judgement:
       ours: statements from our records (or computed).
       paper: the same statements from the paper's tables; none for a computed claim.
       dataset: whose records decided; "" if none did.
+      times_of: other data sets whose times fill gaps.
     """
 
     claim: Claim
     ours: tuple[Statement, ...]
     paper: tuple[Statement, ...]
     dataset: str
+    times_of: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -267,7 +270,26 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
 def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
     """Take each statement from the evidence that knows most of it, of equals the first."""
     judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
-    return _seen(max(statements, key=lambda statement: statement.known) for statements in judged)
+    return tuple(max(statements, key=lambda statement: statement.known) for statements in judged)
+
+
+def _is_of_times(statement: Statement) -> bool:
+    """Say whether a judged statement rests on times alone, which hang on the device and hardly on the data."""
+    return bool(statement.sources) and all(source.name in TIMES for source in statement.sources)
+
+
+def _filled(
+    ours: Sequence[Statement], others: Mapping[str, Sequence[Statement]]
+) -> tuple[tuple[Statement, ...], tuple[str, ...]]:
+    """Put times of other data sets where there are none, the first that has some; return whose, too."""
+    filled, of = [], {}
+    for place, statement in enumerate(ours):
+        theirs = {data: some[place] for data, some in others.items() if _is_of_times(some[place])}
+        if statement.verdict == judging.UNMEASURED and theirs:
+            data, statement = next(iter(theirs.items()))
+            of[data] = None
+        filled.append(statement)
+    return tuple(filled), tuple(of)
 
 
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
@@ -286,9 +308,10 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
         return Judgement(claim, paper, (), "computed")
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
     dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
-    ours = tried[dataset]
+    ours, times_of = _filled(tried[dataset], {data: some for data, some in tried.items() if data != dataset})
+    ours = _seen(ours)
     nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
-    return Judgement(claim, ours, paper, "" if nothing else dataset)
+    return Judgement(claim, ours, paper, "" if nothing else dataset, times_of)
 
 
 def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
@@ -340,7 +363,8 @@ def _row(judgement: Judgement) -> dict:
     said["decided_by"] = claim.decided_by
     judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
     judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
-    dataset = judgement.dataset + (" (procedural, no real motion)" if judgement.dataset == "synthetic" else "")
+    names = [name for name in (judgement.dataset, *judgement.times_of) if name]
+    dataset = "; ".join(name + " (procedural, no real motion)" * (name == "synthetic") for name in names)
     hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
     record = "; ".join(dict.fromkeys(map(str, sources)))
     return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}

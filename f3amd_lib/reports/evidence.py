@@ -154,6 +154,9 @@ SCHEMAS: dict[str, list[str]] = read_toml(Path(__file__).with_name("schemas.toml
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (in the last two
 a column of another name) and, where it was repeated, `low` and `high`."""
 
+TIMES = ("synthesis_time", "training_time")
+"""Those of them that hang on the device."""
+
 _LEAST_STEPS = 10_000
 """Optimiser steps below which a comparison of recipes decides nothing."""
 
@@ -214,6 +217,11 @@ class Source:
 
     def __str__(self) -> str:
         return f"{self.table} ({self.sha256})" if self.sha256 else self.table
+
+    @property
+    def name(self) -> str:
+        """The table's name, as in `SCHEMAS`."""
+        return Path(self.table).stem
 
 
 class Evidence:
@@ -380,7 +388,7 @@ def _checked(name: str, table: pd.DataFrame, where: str, others: Sequence[str] =
     if name == "walking" and set(keys) - set(table) == {"metric"}:  # a row per style and seed, its figures side by side
         means = table.groupby(keys[:-1])[[check for check in CHECKS if check in table]].mean()
         table = means.melt(var_name="metric", ignore_index=False).reset_index()
-    if name in ("synthesis_time", "training_time"):
+    if name in TIMES:
         table = _with_interval_of_median(table)
     for needed in (*keys, "value"):
         if needed not in table:

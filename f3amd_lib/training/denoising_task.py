@@ -26,6 +26,7 @@ from f3amd_lib.data.windows import (
     spread_windows,
 )
 from f3amd_lib.diffusion.samplers import add_noise
+from f3amd_lib.ground.arrays import exact_products
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
@@ -198,7 +199,8 @@ class DenoisingTask(Task):
         size = (history.shape[0], 1, 1)
         chosen = jax.random.bernoulli(key_choice, self.config.history_damping, size)
         amount = jnp.where(chosen, jax.random.uniform(key_amount, size, maxval=0.8), 0.0)
-        mean = (style @ self.constants.mean_poses)[:, None, :]
+        with exact_products():
+            mean = (style @ self.constants.mean_poses)[:, None, :]
         # Where the root is and goes (9 numbers) stays; the pose alone loses its swing.
         pose = history[..., 9:] + amount * (mean - history[..., 9:])
         return orthonormalise(jnp.concatenate([history[..., :9], pose], axis=-1))
