@@ -816,6 +816,9 @@ def test_a_step_with_512_windows_teaches_little_more_than_one_with_128(queue):
     assert {name: len(gain) for name, gain in gains.items()} == {"text": 4, "CAMDM": 3, "four": 3}
     ends = {name: [round(100 * end(gain)) for end in (min, max)] for name, gain in gains.items()}
     assert ends == {"text": [1, 6], "CAMDM": [7, 9], "four": [2, 5]}
+    assert [round(100 * gain, 1) for gain in gains["CAMDM"]] == [6.5, 7.2, 9.2] and gains["text"][-1] == max(
+        gains["text"]
+    )
     # Against windows they are behind, by far.
     assert all(
         error[MAIN, "batch-512", at] > 1.12 * error[MAIN, "paper", at] for at in error[MAIN, "batch-512"].index[:6]
