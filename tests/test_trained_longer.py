@@ -804,7 +804,7 @@ FOUR = FIVE.removeprefix("history-anchor+")
 def test_a_step_with_512_windows_teaches_little_more_than_one_with_128(queue):
     """23.8: at equal steps, and what long training in such batches brought."""
     rows = queue.query("window_frames == 32 and seed == 0 and steps == 0 and metric == 'held_out_error'")
-    error = rows.set_index(["model", "recipe", "windows"])["value"]
+    error = rows.set_index(["model", "recipe", "windows"])["value"].sort_index()
     gains = {}
     for name, model, small, large in (
         ("text", MAIN, "paper", "batch-512"),
