@@ -740,8 +740,7 @@ def campaign(
         profile = motion.numbers()
         prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
-    how = {"folder": folder, "snapshots": snapshots, "stop_at": stop_at}
-    how |= {"batch_size": batch_size, "precision": precision}
+    how = {"snapshots": snapshots, "batch_size": batch_size, "precision": precision, "stop_at": stop_at}
     with locked(folder / ".campaign.lock", "running the campaign"):
         for measure_time in timed:
             if (table := measure_time(prepared, profile, stop_at=stop_at)) is None:
@@ -751,7 +750,7 @@ def campaign(
         if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
             return UNFINISHED
         classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
-        legs = run_campaign(prepared, profile, classifier, protocol, **how)
+        legs = run_campaign(prepared, profile, classifier, protocol, folder=folder, **how)
         for name, windows, state in legs:
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0

@@ -37,12 +37,9 @@ def test_quotients_at_1024_characters(times):
     for width in (32, 48, 64, 96, 128):
         paper, ours = gain[f"F3AMD-FNO-{width}", 8]
         assert 0.9 * paper < ours < paper
-    assert all(
-        gain[f"F3AMD-Transformer-{width}", 8][1] > gain[f"F3AMD-Transformer-{width}", 8][0] for width in (32, 48, 64)
-    )
-    for width in (96, 128):
+    for width in (32, 48, 64, 96, 128):
         paper, ours = gain[f"F3AMD-Transformer-{width}", 8]
-        assert abs(ours / paper - 1) < 0.02
+        assert ours > paper if width < 96 else abs(ours / paper - 1) < 0.02
     quicker = [paper / ours for paper, ours in rows.values() if ours > 0]
     assert (round(min(quicker)), round(max(quicker))) == (7, 11)
     ways = committed_table("bandai", "synthesis_ways", profile="gpu")[0]

@@ -217,12 +217,11 @@ def positions_from_redundant(vectors):
     turned = xp.swapaxes(rotations.matrix_from_yaw(-2.0 * summed(turn)[..., 0]), -1, -2)
     arriving = xp.concatenate([turned[..., 1:, :, :], turned[..., :1, :, :]], axis=-3)
     flat = xp.concatenate([velocity[..., :1], 0.0 * height, velocity[..., 1:]], axis=-1)
-    with exact_products():
-        ground = summed((flat[..., None, :] @ arriving)[..., 0, :])
     local = local.reshape(*local.shape[:-1], -1, 3)
-    root = xp.concatenate([ground[..., :1], height, ground[..., 2:]], axis=-1)
     with exact_products():
-        return xp.concatenate([root[..., None, :], local @ turned + ground[..., None, :]], axis=-2)
+        ground, standing = summed((flat[..., None, :] @ arriving)[..., 0, :]), local @ turned
+    root = xp.concatenate([ground[..., :1], height, ground[..., 2:]], axis=-1)
+    return xp.concatenate([root[..., None, :], standing + ground[..., None, :]], axis=-2)
 
 
 def grouped_statistics(vectors) -> tuple[np.ndarray, np.ndarray]:
