@@ -22,7 +22,8 @@ from f3amd_lib.training.recipe import learning_rate_schedule
 RECORDS = repository_root() / "paper_figures/bandai/laptop/records"
 MAIN, THOUSAND = "F3AMD-FNO-96", 1_000
 BOTH = "residual-prior+higher-learning-rate"
-FIVE = "history-anchor+residual-prior+higher-learning-rate+wide-decoder+history-input"
+FOUR = f"{BOTH}+wide-decoder+history-input"
+FIVE = f"history-anchor+{FOUR}"
 PAPERS_LENGTH = load_paper_file("paper")["training"]["windows"]["32"]
 
 
@@ -310,9 +311,6 @@ def test_what_single_changes_bring(row, queue):
     assert anchor[0]["joint_acceleration"] > 5 * anchor[1]["joint_acceleration"]
 
 
-FOUR = f"{BOTH}+wide-decoder+history-input"
-
-
 def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     error = lambda recipe, at=200, seed=0: row(MAIN, at, recipe, seed)["held_out_error"]
     camdm = row("CAMDM", 200)
@@ -332,15 +330,14 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
     assert round(error(BOTH, seed=1), 1) == 6.4
     # In what a walk needs they are near CAMDM at that length, but for the path.
     four = row(MAIN, 200, FOUR)
-    said(four, joint_acceleration=2.0, foot_sliding=0.66, foot_alternation=0.29, x0_error_ratio=0.17)
-    said(camdm, joint_acceleration=2.1, foot_sliding=0.61, foot_alternation=0.34)
+    said(four, joint_acceleration=2.0, foot_alternation=0.29, x0_error_ratio=0.17)
+    said(camdm, joint_acceleration=2.1, foot_alternation=0.34)
     assert [round(100 * one["trajectory_error"], 1) for one in (four, camdm)] == [9.2, 5.1]
-    assert [round(one["FID"]) for one in (four, row(MAIN, 200, FOUR, seed=1), camdm)] == [35, 65, 27]
     # In one step the four walk better than in eight, in both seeds.
     once = [row(MAIN, 200, FOUR, seed, steps=1) for seed in (0, 1)]
     for metric, (digits, printed) in {
         "joint_acceleration": (1, [1.6, 1.7]), "foot_alternation": (2, [0.57, 0.49]), "FID": (0, [25, 25]),
-        "trajectory_error": (3, [0.085, 0.081]), "diversity": (1, [0.4, 0.6]),
+        "diversity": (1, [0.4, 0.6]),
     }.items():  # fmt: skip
         assert [round(one[metric], digits) for one in once] == printed, metric
     for seed, one in enumerate(once):
@@ -348,28 +345,29 @@ def test_four_changes_learn_as_much_as_camdm_from_as_many_windows(long, row):
         assert one["joint_acceleration"] < min(eight["joint_acceleration"], camdm["joint_acceleration"])
         assert one["foot_alternation"] > max(eight["foot_alternation"], camdm["foot_alternation"])
         assert one["FID"] < min(eight["FID"], camdm["FID"]) and one["trajectory_error"] > camdm["trajectory_error"]
-    said(row("CAMDM", 200, steps=1), joint_acceleration=3.6, foot_alternation=0.05, FID=30)
     said(camdm, diversity=1.4)
+    # CAMDM's own one step is far behind at first, in feet, joints and FID, and about level later, ahead on the path.
+    theirs = row("CAMDM", 200, steps=1)
+    for one in once:
+        assert theirs["joint_acceleration"] > 2 * one["joint_acceleration"] and theirs["FID"] > one["FID"]
+        assert theirs["foot_alternation"] < 0.1 * one["foot_alternation"]
     once = [row(MAIN, 800, FOUR, steps=1), row("CAMDM", 800, steps=1)]
-    for metric, (digits, printed) in {
-        "joint_acceleration": (1, [1.4, 1.9]), "foot_alternation": (2, [0.57, 0.54]), "FID": (0, [22, 22]),
-        "trajectory_error": (3, [0.077, 0.047]), "foot_sliding": (2, [0.59, 0.53]),
-    }.items():  # fmt: skip
-        assert [round(one[metric], digits) for one in once] == printed, metric
-    feet = [round(row(MAIN, at, FIVE, steps=1)["foot_alternation"], 2) for at in (200, 400)]
-    assert feet == [0.34, 0.43]
+    assert [round(one["trajectory_error"], 3) for one in once] == [0.077, 0.047]
+    for metric, apart in {"foot_alternation": 0.08, "foot_sliding": 0.13, "FID": 0.02}.items():
+        assert once[0][metric] == pytest.approx(once[1][metric], rel=apart), metric
     # Longer.
     five, four, theirs = row(MAIN, 400, FIVE), row(MAIN, 800, FOUR), row("CAMDM", 800)
     said(row(MAIN, 400, FOUR), held_out_error=4.7)
-    said(five, held_out_error=4.6, foot_alternation=0.13)
     said(row("CAMDM", 400), held_out_error=4.5)
     assert (
         round(error(FOUR) - error(FOUR, seed=1), 2) == 0.15 and four["held_out_error"] - theirs["held_out_error"] > 0.3
     )
-    said(row(MAIN, 200, FIVE), foot_alternation=0.21)
-    said(four, held_out_error=4.1, foot_alternation=0.39, foot_sliding=0.62, joint_acceleration=2.0)
-    said(theirs, held_out_error=3.6, foot_alternation=0.94, foot_sliding=0.44, joint_acceleration=1.3)
-    assert [round(100 * one["trajectory_error"], 1) for one in (four, theirs)] == [8.5, 3.7]
+    said(four, held_out_error=4.1, foot_alternation=0.39)
+    said(theirs, held_out_error=3.6, foot_alternation=0.94)
+    assert theirs["joint_acceleration"] / four["joint_acceleration"] == pytest.approx(2 / 3, abs=0.02)
+    for metric in ("trajectory_error", "foot_sliding", "IRD_excess"):
+        assert theirs[metric] < four[metric], metric
+    assert abs(theirs["FID"] - four["FID"]) < 2.1
     # Eight times as many by the paper's text, and a little less than that is not enough.
     assert (
         long["held_out_error"].iloc[-2]
@@ -785,20 +783,27 @@ def test_width(queue, row):
     assert not (path.is_monotonic_increasing or path.is_monotonic_decreasing)
 
 
-def test_our_own_recipe_at_the_rate_of_the_queue(queue, row):
-    steady = [row("F3AMD-FNO-96-steady", at) for at in (200, 400)]
-    said(steady[0], held_out_error=4.9, joint_acceleration=1.1, FID=204)
-    said(steady[1], held_out_error=3.8, joint_acceleration=5.6, FID=2313)
-    once = [row("F3AMD-FNO-96-steady", at, steps=1) for at in (200, 400)]
-    assert [round(one["joint_acceleration"], 1) for one in once] == [2.8, 1.7]
-    assert [round(one["FID"]) for one in once] == [360, 280]
-    errors = queue.query("windows == 400_000 and metric == 'held_out_error'").set_index("model")["value"]
-    assert errors.idxmin() == "F3AMD-FNO-96-steady"
-    trained = read_table(RECORDS / "trained.csv")[0].query("model == 'F3AMD-FNO-96-steady' and metric == 'windows'")
+def test_our_own_recipe_errs_least_and_comes_apart_in_eight_steps(queue, row):
+    steady = "F3AMD-FNO-96-steady"
+    lengths = {200: (0, 1, 2), 400: (0,), 800: (0, 1, 2)}
+    for at, seeds in lengths.items():
+        drawn = [row(MAIN, at), row(MAIN, at, FOUR), row(MAIN, at, FIVE), row("CAMDM", at)]
+        least = min(one["held_out_error"] for one in drawn)
+        assert max(row(steady, at, seed=seed)["held_out_error"] for seed in seeds) < least, at
+    short = [row(steady, 200, seed=seed)["FID"] for seed in lengths[200]]
+    assert max(short) < 1_000 < min(row(steady, at, seed=seed)["FID"] for at in (400, 800) for seed in lengths[at])
+    once = [[row(steady, at, seed=seed, steps=1) for seed in seeds] for at, seeds in lengths.items()]
+    for metric, better in {"joint_acceleration": -1, "foot_alternation": 1, "FID": -1}.items():
+        ends = [[better * one[metric] for one in at_length] for at_length in once]
+        assert max(ends[0]) < min(ends[1]) and max(ends[1]) < min(ends[2]), metric
+    printed = {"foot_alternation": (2, 0.98, 1.03), "joint_acceleration": (1, 1.0, 1.1), "FID": (0, 159, 223),
+               "style_coverage": (0, 29, 58), "trajectory_error": (3, 0.021, 0.022),
+               "held_out_error": (1, 3.1, 3.2)}  # fmt: skip
+    for metric, (digits, *ends) in printed.items():
+        assert [round(end(one[metric] for one in once[-1]), digits) for end in (min, max)] == ends, metric
+    said(row("CAMDM", 800, steps=1), trajectory_error=0.047)
+    trained = read_table(RECORDS / "trained.csv")[0].query("model == @steady and metric == 'windows'")
     assert trained["value"].tolist() == [1600 * THOUSAND]
-
-
-FOUR = FIVE.removeprefix("history-anchor+")
 
 
 def test_a_step_with_512_windows_teaches_little_more_than_one_with_128(queue):
@@ -854,23 +859,15 @@ def test_long_training_in_the_papers_batch(queue, row, real):
     said(row(MAIN, 800, FOUR, steps=1), joint_acceleration=1.4, foot_alternation=0.57)
 
 
-def test_all_five_and_our_own_recipe_after_four_times_the_length(queue, row):
-    five = [row(MAIN, at, FIVE) for at in (200, 400, 800)]
-    assert [round(each["foot_alternation"], 2) for each in five] == [0.21, 0.13, 0.27]
-    assert [round(row(MAIN, at, FIVE, steps=1)["foot_alternation"], 2) for at in (200, 400, 800)] == [0.34, 0.43, 0.48]
-    said(five[2], held_out_error=4.0, IRD=2.2, trajectory_error=0.065)
-    said(row(MAIN, 800, FOUR), IRD=4.5)
-    seeds = [row("F3AMD-FNO-96-steady", 800, seed=seed) for seed in (1, 2)]
-    assert [round(each["held_out_error"], 1) for each in seeds] == [3.2, 3.1]
-    assert max(each["held_out_error"] for each in seeds) < row("CAMDM", 800)["held_out_error"]
-    assert [round(each["joint_acceleration"], 1) for each in seeds] == [9.0, 5.2]
-    assert [round(100 * each["trajectory_error"]) for each in seeds] == [19, 23]
-    once = [row("F3AMD-FNO-96-steady", 800, seed=seed, steps=1) for seed in (1, 2)]
-    assert [round(each["joint_acceleration"], 1) for each in once] == [1.0, 1.1]
-    assert [round(each["foot_alternation"], 2) for each in once] == [1.03, 0.98]
-    assert [round(100 * each["trajectory_error"], 1) for each in once] == [2.1, 2.2]
-    assert round(100 * row("CAMDM", 800, steps=1)["trajectory_error"], 1) == 4.7
-    assert [round(each["style_coverage"]) for each in once] == [29, 45]
+def test_the_anchor_keeps_the_path_and_sticks_at_the_seam(row, real):
+    anchored, free = row(MAIN, 800, FIVE), row(MAIN, 800, FOUR)
+    said(anchored, held_out_error=4.0, IRD=2.2, trajectory_error=0.065)
+    said(free, IRD=4.5, trajectory_error=0.085)
+    said(real, IRD=4.0)
+    for at in (200, 400, 800):
+        for steps in (1, 8):
+            feet = [row(MAIN, at, recipe, steps=steps)["foot_alternation"] for recipe in (FIVE, FOUR)]
+            assert feet[0] < feet[1], (at, steps)
 
 
 def test_camdm_with_f3amds_noise_and_with_the_seam_loss_after_twice_the_length(row):
