@@ -72,6 +72,12 @@ def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
         faults.append(f"execution counts {counts} are not those of one run from top to bottom")
     if any(output.output_type == "error" for cell in code for output in cell.outputs):
         faults.append("error output")
+    # Drawn and only saved: the picture was not the cell's last value. A semicolon says that a slider shows it.
+    for cell in code:
+        kept = re.search(r"\bkeep_figure\(.*", cell.source, flags=re.S)
+        shown = any("image/png" in output.get("data", {}) for output in cell.outputs)
+        if kept and not shown and not kept[0].rstrip().endswith(";"):
+            faults.append(f"a picture is drawn and not shown: {kept[0].splitlines()[0]}")
     if not any("nbval-check-output" in tags_of(cell) for cell in code):
         faults.append("no cell is tagged nbval-check-output")
     if not all(cell.outputs for cell in code if "nbval-check-output" in tags_of(cell)):
@@ -326,6 +332,8 @@ def test_a_good_notebook_has_no_faults(tmp_path):
     notebook = good_notebook()
     notebook["cells"].append(said(r"Divided by $\alpha_t$: two lines, $$a \\ b$$."))
     assert notebook_faults(save(tmp_path, notebook)) == []
+    notebook["cells"][1]["source"] = "print('agrees')\nkeep_figure(figure, results, 'name');"
+    assert notebook_faults(save(tmp_path, notebook)) == []
 
 
 def set_parameters(source):
@@ -356,6 +364,7 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
         (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
         (set_verdict(source="  "), "empty code cell"),
+        (set_verdict(source="keep_figure(figure, results, 'name')\ntable"), "drawn and not shown: keep_figure(figure"),
         (lambda notebook: notebook["cells"].append(said(r"Divided by $\\alpha_t$.")), r"\\alpha ends a line"),
         (set_verdict(metadata={"papermill": {}}), "papermill metadata"),
         (lambda notebook: notebook["metadata"].update(papermill={}), "papermill metadata"),
