@@ -707,6 +707,7 @@ def _measure_text(names, motion: Data, models, minutes) -> int:
 def campaign(
     motion: Data, minutes: float | None = None, batch_size: int = 128, only: Repeatable = (),
     packed: Path | None = None, times: bool = False, precision: str = "float32", out: Path | None = None,
+    queue: str = "campaign", package: str | None = None, measure: bool = False,
 ) -> int:  # fmt: skip
     """Train and measure the long queue of real motion in legs; a killed leg goes on where it stopped.
 
@@ -720,6 +721,9 @@ def campaign(
         trainings of the queue first; for a GPU.
       precision: of the matrix products of training; tf32 is quicker on a GPU.
       out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
+      queue: campaign, or readings: which reading of the paper behaves like the paper?
+      package: train this package of papers/f3amd/gpu_plan.toml and keep its weights, unmeasured, for a GPU.
+      measure: measure the weights of a package that lie in the folder, and train nothing.
     """
     stop_at, timed = _stop_at(minutes), ()
     if times:
@@ -728,11 +732,17 @@ def campaign(
 
         timed = (measure_synthesis_time, measure_training_time)
     from f3amd_lib.data.packed import load_packed
-    from f3amd_lib.experiments.campaign import check_precision, chosen, longest_first, queue, run_campaign
+    from f3amd_lib.experiments import campaign as long_queue
+    from f3amd_lib.experiments.campaign import check_precision, chosen, longest_first
     from f3amd_lib.experiments.measure import protocol_of
     from f3amd_lib.training.pipeline import PreparedData
 
-    snapshots = chosen(longest_first(queue()) if times else queue(), only)
+    check_known(queue, long_queue.QUEUES, "queue")
+    if package is None:
+        snapshots = long_queue.queue(long_queue.QUEUES[queue])
+    else:
+        snapshots, queue = long_queue.queue(long_queue.GPU_PLAN, package), "readings"
+    snapshots = chosen(longest_first(snapshots) if times else snapshots, only)
     check_precision(precision)
     if packed is None:
         prepared, profile = motion.open()
@@ -749,8 +759,12 @@ def campaign(
             log.info("%-12s %s", "times", table)
         if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
             return UNFINISHED
-        classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
-        legs = run_campaign(prepared, profile, classifier, protocol, folder=folder, **how)
+        if package is not None and not measure:
+            legs = long_queue.train_snapshots(prepared, profile, folder=folder, **how)
+        else:
+            classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
+            how |= {"table": queue, "found_alone": measure}
+            legs = long_queue.run_campaign(prepared, profile, classifier, protocol, folder=folder, **how)
         for name, windows, state in legs:
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0

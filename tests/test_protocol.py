@@ -147,7 +147,7 @@ def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, generator
     monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {})
     monkeypatch.setattr(module, "_style_means", lambda figures, styles: {})
     monkeypatch.setattr(module, "classify_windows", lambda classifier, motions, styles: told.append((motions, styles)))
-    monkeypatch.setattr(module, "_distribution_figures", lambda *given: {})
+    monkeypatch.setattr(module, "distribution_figures", lambda *given: {})
     monkeypatch.setattr(module, "_diversities", lambda *given: {})
     monkeypatch.setattr(module, "_rounds", lambda *given: None)
     keys = {METRICS[name].key: 0.0 for name in ("x0_error_ratio", "seed_spread")}

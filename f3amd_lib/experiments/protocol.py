@@ -220,7 +220,7 @@ def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol
     counts = [protocol.windows_per_style, protocol.num_frames // span]
     real = real_features(packed, classifier, protocol.styles, window)
     counts += [len(features) for features in real.values()]
-    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    clips, labels = held_out_clips(packed, protocol.styles, window)
     lengths = np.diff(packed.clip_start)[clips] // span
     counts += [int(lengths[labels == style].sum()) // 2 for style in protocol.styles]
     if min(counts) < 1:
@@ -230,14 +230,14 @@ def windows_that_fit(packed: PackedMotion, classifier: StyleClassifier, protocol
     return min(counts)
 
 
-def _held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) -> tuple[np.ndarray, np.ndarray]:
+def held_out_clips(packed: PackedMotion, styles: Sequence[str], window: int) -> tuple[np.ndarray, np.ndarray]:
     """Return clips of both held-out splits at the speeds that are asked for, and their styles."""
     splits = [split for split in ("test", "validation") if SPLITS.index(split) in np.asarray(packed.clip_split)]
     clips = sum((real_clips.reference_clips(packed, styles, window=window, split=split) for split in splits), [])
     return np.array(clips), np.array([packed.styles[packed.clip_style[clip]] for clip in clips])
 
 
-def _distribution_figures(
+def distribution_figures(
     seen: ClassifiedWindows, real: Mapping[int, np.ndarray], count: int, rng: np.random.Generator
 ) -> dict[str, float]:
     """Score windows against real ones of the same styles, `count` of each style on either side."""
@@ -314,7 +314,7 @@ def measure_model(
         figures = _style_means(each, styles)
         rng = np.random.default_rng([protocol.path_seed, seed])
         seen = classify_windows(classifier, motions, styles)
-        figures |= _distribution_figures(seen, real, protocol.windows_per_style, rng)
+        figures |= distribution_figures(seen, real, protocol.windows_per_style, rng)
         figures |= _diversities(generator, paths[seed], styles, protocol, seed)
         use = noise_use(generator, held_out, seed=seed)
         figures |= {name: use[METRICS[name].key] for name in ("x0_error_ratio", "seed_spread")}
@@ -382,7 +382,7 @@ def measure_real(
     """
     check_known(model, REFERENCE_MODELS, "reference")
     require_telling_styles(classifier)
-    clips, labels = _held_out_clips(packed, protocol.styles, window)
+    clips, labels = held_out_clips(packed, protocol.styles, window)
     motions, figures = [], []
     for clip in clips:
         whole = packed.motion(int(clip))
@@ -406,7 +406,7 @@ def measure_real(
             enough = 1 + int(np.searchsorted(held, protocol.windows_per_style))
             classified += order[: max(len(order) // 2, enough)].tolist()
         means = _style_means([figures[place] for place in half], labels[half])
-        means |= _distribution_figures(seen.of(classified), real, protocol.windows_per_style, rng)
+        means |= distribution_figures(seen.of(classified), real, protocol.windows_per_style, rng)
         rows += _rows(means, **columns, seed=repeat)
     return pd.DataFrame(rows)
 

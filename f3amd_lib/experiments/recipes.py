@@ -68,6 +68,8 @@ class Recipe:
         if preset == self.preset:
             return self
         own = [*self.network, *(name for name in ("loss", "diffusion") if name in self.training)]
+        if self.training.get("loss") == {"raw_features": True}:  # units are any model's
+            own.remove("loss")
         if own or self.preset != Recipe.preset:
             what = f"its {', '.join(own)}" if own else "a recipe of its own"
             raise ValueError(f"{self.name} changes {what} of {self.preset}, so that it is no change of {preset}")
@@ -90,10 +92,13 @@ def find_recipe(name: str) -> Recipe:
     if len(parts) == 1:
         return RECIPES[name]
     rows = [RECIPES[part] for part in parts]
-    changed = [field for row in rows for field in (*row.network, *row.training)]
-    if len(set(changed)) < len(changed) or len({row.preset for row in rows}) > 1:
+    losses = [row.training.get("loss", {}) for row in rows]
+    changed = [name for row, loss in zip(rows, losses, strict=True) for name in (*row.network, *row.training, *loss)]
+    if len(set(changed) - {"loss"}) < len(changed) - changed.count("loss") or len({row.preset for row in rows}) > 1:
         raise ValueError(f"{name}: these recipes change the same thing, or start from unlike networks; ask for each")
     together = {field: dict(ChainMap(*(getattr(row, field) for row in rows))) for field in ("network", "training")}
+    if "loss" in together["training"]:
+        together["training"]["loss"] = dict(ChainMap(*losses))
     words = [", ".join(getattr(row, field) for row in rows) for field in ("change", "source")]
     return Recipe(name, *words, rows[0].preset, **together)
 

@@ -50,7 +50,12 @@ class F3AMDConfig(ConditionedConfig):
       num_condition_heads: heads of the cross-attention to c; not in the paper, 1 here.
       num_heads: attention heads of a Transformer base block (Appendix A).
       feed_forward_factor: its hidden width over D; not in the paper, 4 as in Vaswani et al. 2017.
-      block_residual: add each block's input to its output (ours; the paper's Figure 2 has none).
+      block_residual: add each block's input to its output, which begins at 0 (ours; the paper's Figure 2 has none).
+      block_bypass: add each block's input to its output, and change nothing else (ours, a reading of Figure 2).
+      coordinate_channel: let the encoder see where in the window a frame is (a reading of section 3.4.2:
+        Li et al. 2021 give their operator the grid).
+      small_spectral_weights: let spectral weights begin in [0, 1) over D0 D1, as Li et al. 2021 do (a reading of
+        section 3.4.2), instead of at unit gain.
       history_anchor: add the last history frame, with a learned weight that starts as a decay over
         the window, so that the network predicts a change (ours).
       output_scaling: let the network estimate what is left of the clean features after a skip,
@@ -102,6 +107,9 @@ class F3AMDConfig(ConditionedConfig):
     num_heads: int = 1
     feed_forward_factor: int = 4
     block_residual: bool = False
+    block_bypass: bool = False
+    coordinate_channel: bool = False
+    small_spectral_weights: bool = False
     history_anchor: bool = False
     output_scaling: bool = False
     encoder_hidden_width: int = 0
@@ -124,7 +132,10 @@ class F3AMDConfig(ConditionedConfig):
             found = f"{self.block_frames} frames, got {self.num_kept_modes}"
             raise ValueError(f"num_kept_modes must be at most {modes} for blocks of {found}")
         check_num_heads(self.latent_width, self.num_heads)
-        for has, option in (("is residual", "block_residual"), ("normalises what a block reads", "pre_norm")):
+        if self.block_bypass and self.block_residual:
+            raise ValueError("block_residual has a bypass already: leave block_bypass off")
+        residual = [("is residual", option) for option in ("block_residual", "block_bypass")]
+        for has, option in (*residual, ("normalises what a block reads", "pre_norm")):
             if self.conditioning == "adaln_zero" and getattr(self, option):
                 raise ValueError(f"adaln_zero {has} already: leave {option} off")
         if self.film_from_identity and self.conditioning != "film":
@@ -211,7 +222,7 @@ class F3AMD(DenoisingNetwork):
         heads = config.num_condition_heads
         self.condition = ConditionEncoder(config, heads, config.frames_before, rngs=rngs)
         # Beside the features: the path, and whether a frame is given or noisy.
-        beside = PATH_CHANNELS + 1 if config.history_input else 0
+        beside = (PATH_CHANNELS + 1 if config.history_input else 0) + config.coordinate_channel
         if hidden := config.encoder_hidden_width:
             self.encoder_hidden = self._coder(config.channels + beside, hidden, rngs)
         self.encoder = self._coder(hidden or config.channels + beside, width, rngs)
@@ -236,7 +247,9 @@ class F3AMD(DenoisingNetwork):
         if config.encoder_decoder == "linear":
             return nnx.Linear(width_in, width_out, rngs=rngs)
         modes = min(config.num_kept_modes, count_modes("fourier", config.window + config.frames_before))
-        return FNOBlock(width_in, width_out, modes, config.kernel_size, rngs=rngs)
+        return FNOBlock(
+            width_in, width_out, modes, config.kernel_size, small_weights=config.small_spectral_weights, rngs=rngs
+        )
 
     def _base_block(self, rngs: nnx.Rngs):
         config, width = self.config, self.config.latent_width
@@ -245,7 +258,8 @@ class F3AMD(DenoisingNetwork):
             return TransformerBlock(width, config.num_heads, hidden, config.dropout, rngs=rngs)
         return FNOBlock(
             width, width, config.num_kept_modes, config.kernel_size, variant=config.spectral_variant,
-            rank=config.spectral_rank, initial_gain=config.initial_mode_gain, rngs=rngs,
+            rank=config.spectral_rank, initial_gain=config.initial_mode_gain,
+            small_weights=config.small_spectral_weights, rngs=rngs,
         )  # fmt: skip
 
     def encode(self, condition: Condition) -> EncodedCondition:
@@ -296,6 +310,9 @@ class F3AMD(DenoisingNetwork):
         z = scaled_input(config, x_noisy, sigma)
         if config.history_input:
             z = self._with_history(z, context)
+        if config.coordinate_channel:
+            place = jnp.linspace(0.0, 1.0, z.shape[1], dtype=z.dtype)[:, None]
+            z = jnp.concatenate([z, jnp.broadcast_to(place, (*z.shape[:2], 1))], axis=-1)
         # Fourier blocks are faster with frames first, and so from encoder to decoder; attention
         # wants the batch first.
         attends = config.conditioning == "cross_attention"
@@ -318,7 +335,7 @@ class F3AMD(DenoisingNetwork):
             if config.pre_norm:
                 base = _after_norm(base)
             update = conditioning(base, z, c)
-            z = z + update if config.block_residual else update
+            z = z + update if config.block_residual or config.block_bypass else update
             yield f"block {number + 1}", turn(z)
         # Frames of c go before the decoder; those of the history hold its period together.
         decoded = config.window + config.frames_before

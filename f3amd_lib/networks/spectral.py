@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -197,6 +198,7 @@ class SpectralConvolution(FrameLayer):
         complex weights and one learned gain per mode (Liu and Tang 2025).
       rank: r of "reduced_rank" (Appendix E: 8).
       initial_gain: where the gains of "weighted" start (Appendix E: 0.7).
+      small_weights: begin with weights in [0, 1) / (D0 D1), as Li et al. 2021 do, instead of at unit gain.
 
     Raises:
       ValueError: for an unknown variant, or a rank above min(D0, D1), which would save nothing.
@@ -204,15 +206,18 @@ class SpectralConvolution(FrameLayer):
 
     def __init__(
         self, width_in: int, width_out: int, num_kept_modes: int, variant: str = "fourier", *,
-        rank: int = 8, initial_gain: float = 0.7, rngs: nnx.Rngs,
+        rank: int = 8, initial_gain: float = 0.7, small_weights: bool = False, rngs: nnx.Rngs,
     ):  # fmt: skip
         count_modes(variant, 1)  # refuses an unknown one
         self.variant = variant
 
         def draw(rows: int, columns: int, parts: int = 2):
+            shape = (num_kept_modes, rows, columns)
+            if small_weights:
+                return nnx.Param(jax.random.uniform(rngs.params(), shape) / (rows * columns))
             # Unit gain: white input of variance 1 leaves with variance about 1 when no mode is cut.
             scale = float(1.0 / np.sqrt(parts * rows))
-            return nnx.Param(scaled_normal(rngs.params(), scale, (num_kept_modes, rows, columns)))
+            return nnx.Param(scaled_normal(rngs.params(), scale, shape))
 
         if variant == "cosine":
             self.weight = draw(width_in, width_out, parts=1)
@@ -270,7 +275,7 @@ class FNOBlock(FrameLayer):
       width_in, width_out: D0 and D1.
       num_kept_modes: m.
       kernel_size: k of Eq. 3.
-      **spectral: variant, rank and initial_gain of `SpectralConvolution`.
+      **spectral: variant, rank, initial_gain and small_weights of `SpectralConvolution`.
     """
 
     def __init__(

@@ -239,6 +239,8 @@ class DenoisingTask(Task):
           batch: of the windows, which says what was before them.
         """
         future_hat, last_history = self.normaliser.denormalise(x0_hat), batch.history[:, -1]
+        if self.config.loss.raw_features:
+            x0_hat, x0 = future_hat, future
         terms = loss_terms(
             self.skeleton, x0_hat, x0, future_hat, future, last_history, self.config.loss.ird_form, weights
         )

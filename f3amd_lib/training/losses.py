@@ -1,7 +1,8 @@
 """The training objective (paper section 4.1, Eq. 10; Appendix B, Eqs 11-14).
 
 Every term is a mean over batch, frames and entries. Positions are in metres, features in network
-units. Weights are fields of `LossWeights`; the paper sets them all to 1.
+units, or with `raw_features` in those of CAMDM's code. Weights are fields of `LossWeights`; the paper
+sets them all to 1.
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ class LossWeights:
       floor: lambda of our term against sinking; the paper has none.
       ird: lambda of Eq. 10.
       ird_form: "literal" is Eq. 10, the distance between the last frame before the seam and the
-        first after it, which asks the character to stand still there; "excess" measures the step
-        across the seam against the step that the data takes.
+        first after it, which asks the character to stand still there; "squared" is its square, as all
+        other terms are; "excess" measures the step across the seam against the step that the data takes.
+      raw_features: compare features in metres and 6D numbers, as CAMDM's code does, which the paper
+        adopts (section 4.1), instead of network units.
 
     Raises:
       ValueError: for a weight that is negative or not finite, or an unknown form.
@@ -45,6 +48,7 @@ class LossWeights:
     floor: float = 0.0
     ird: float = 1.0
     ird_form: str = "literal"
+    raw_features: bool = False
 
     def __post_init__(self):
         check_settings(self, "loss weight ")
@@ -64,7 +68,7 @@ def loss_terms(
 
     Args:
       skeleton: for forward kinematics.
-      x0_hat, x0: prediction and target in network units, [B, T, C].
+      x0_hat, x0: prediction and target in the units that `sample` and `feature_velocity` compare, [B, T, C].
       future_hat, future: the same in metres and 6D numbers, [B, T, C].
       last_history: the frame before the window, metres and 6D numbers, [B, C].
       ird_form: see `LossWeights`.
@@ -80,7 +84,7 @@ def loss_terms(
                           the reference toe moves under 1 cm in a frame)
         floor             E max(lowest reference toe of the window - FK(x0_hat)_toes, 0)^2 along +Y
                           (ours)
-        ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or its excess form
+        ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or another form
 
     Raises:
       ValueError: for an unknown `ird_form`.
@@ -90,7 +94,7 @@ def loss_terms(
     toes' end joints where ours looks at the toe joints, which every skeleton here has, and it counts a step of exactly
     1 cm as contact. The F3AMD text says none of the three; ours is the plain reading of Eq. 13.
     """
-    check_known(ird_form, ("literal", "excess"), "ird_form")
+    check_known(ird_form, ("literal", "squared", "excess"), "ird_form")
 
     def mean_square(difference):
         return _mean(difference * difference, weights)
@@ -107,6 +111,7 @@ def loss_terms(
     seam = positions_hat[:, 0] - before
     if ird_form == "excess":
         seam = seam - (positions[:, 0] - before)
+    jump = jnp.sum(seam * seam, axis=-1)  # under a root with a finite gradient at zero
     return {
         "sample": mean_square(x0_hat - x0),
         "position": mean_square(positions_hat - positions),
@@ -114,8 +119,7 @@ def loss_terms(
         "joint_velocity": mean_square(step_hat - step),
         "foot": mean_square(step_hat[:, :, toes] * contact[..., None]),
         "floor": _mean(below * below, weights),
-        # With a finite gradient at zero.
-        "ird": _mean(jnp.sqrt(jnp.sum(seam * seam, axis=-1) + 1e-12), weights),
+        "ird": _mean(jump if ird_form == "squared" else jnp.sqrt(jump + 1e-12), weights),
     }
 
 

@@ -7,6 +7,7 @@ goes with it is chosen here.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import optax
@@ -18,6 +19,9 @@ from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.losses import LossWeights
 from f3amd_lib.training.settings import check_settings
 
+PAPER_STEPS = 390_000
+"""Of 512 windows in the paper's 100 epochs: its windows of 100STYLE (section 4.5), counted by us."""
+
 
 @dataclass(frozen=True)
 class TrainingConfig:
@@ -28,7 +32,8 @@ class TrainingConfig:
       batch_size: windows a step (paper: 512).
       learning_rate: peak value (paper: 5e-4).
       schedule: "inverse_square" is the paper's text, lr (1 + step / decay_steps)^-2;
-        "inverse_sqrt" the usual reading of such schedules; "warmup_cosine" ours, for short runs;
+        "inverse_sqrt" the usual reading of such schedules; "compressed_..." either of them falling as far in
+        `num_steps` as the paper's 100 epochs let it fall; "warmup_cosine" ours, for short runs;
         "warmup_inverse_square" the paper's after a linear rise.
       decay_steps: the paper's decay constant, 1e5.
       warmup_steps: of the schedules that rise first.
@@ -130,9 +135,10 @@ def paper_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
       **settings: fields of `TrainingConfig` to change.
     """
     chosen = find_preset(preset)
-    return TrainingConfig.from_dict(
-        {"num_steps": num_steps, "diffusion": chosen.diffusion, **chosen.training, **settings}
-    )
+    settings = {"num_steps": num_steps, "diffusion": chosen.diffusion, **chosen.training, **settings}
+    if isinstance(settings.get("loss"), Mapping):  # what is said of a loss goes over what the preset says of its own
+        settings["loss"] = {**chosen.training.get("loss", {}), **settings["loss"]}
+    return TrainingConfig.from_dict(settings)
 
 
 def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
@@ -168,8 +174,10 @@ def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     if config.schedule == "warmup_cosine":
         warm, peak = min(config.warmup_steps, config.num_steps - 1), config.learning_rate
         return optax.warmup_cosine_decay_schedule(0.0, peak, warm, config.num_steps, 0.01 * peak)
-    power = {"inverse_square": -2.0, "warmup_inverse_square": -2.0, "inverse_sqrt": -0.5}[config.schedule]
-    falling = lambda step: config.learning_rate * (1.0 + step / config.decay_steps) ** power
+    power = -0.5 if config.schedule.endswith("inverse_sqrt") else -2.0
+    compressed = config.schedule.startswith("compressed")
+    decay_steps = config.decay_steps * config.num_steps / PAPER_STEPS if compressed else config.decay_steps
+    falling = lambda step: config.learning_rate * (1.0 + step / decay_steps) ** power
     if config.schedule != "warmup_inverse_square":
         return falling
     rising = optax.linear_schedule(0.0, 1.0, config.warmup_steps)

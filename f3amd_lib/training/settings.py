@@ -14,6 +14,7 @@ from f3amd_lib.networks.presets import find_preset
 _SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
 
 _RANGES = {
+    "true or false": lambda x: type(x) is bool,
     "positive and whole": lambda x: type(x) is int and x >= 1,
     "0 or more and whole": lambda x: type(x) is int and x >= 0,
     "positive and finite": lambda x: 0 < x < math.inf,
