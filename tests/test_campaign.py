@@ -284,7 +284,7 @@ def minutes(packed, monkeypatch, tmp_path):
         named = dict(zip(measurements.CANDIDATE_COLUMNS, dataclasses.astuple(one), strict=True))
         return pd.DataFrame([named | {"framework": "jax", "device": "CPU", "value": 1.0}]), {}
 
-    def measured(prepared, classifier, protocol, run, windows, *_):
+    def measured(prepared, classifier, protocol, run, windows, *_, **__):
         work(f"{run.name} {windows}")
         return pd.DataFrame({"value": [1.0]})
 
@@ -299,7 +299,7 @@ def minutes(packed, monkeypatch, tmp_path):
     trained = functools.cache(lambda: work("classifier"))  # kept, as the real one is
     monkeypatch.setattr(measure, "protocol_of", lambda *_: trained() or judges)
     monkeypatch.setattr(campaign, "_measured", measured)
-    monkeypatch.setattr(campaign, "queue", lambda: [(SEEDED, 4), (Run("CAMDM"), 4), (Run("CAMDM"), 8)])
+    monkeypatch.setattr(campaign, "queue", lambda *_: [(SEEDED, 4), (Run("CAMDM"), 4), (Run("CAMDM"), 8)])
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
