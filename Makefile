@@ -34,13 +34,13 @@ $(INSTALLED): requirements.lock pyproject.toml scripts/bootstrap.sh
 install: $(INSTALLED) ## Build .venv and nothing else
 
 figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DATA/PROFILE
-	$(PYTHON) -m f3amd_lib figures --data $(DATA) --profile $(PROFILE)
+	$(PYTHON) -m f3amd_companion figures --data $(DATA) --profile $(PROFILE)
 
 smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
-	$(PYTHON) -m f3amd_lib figures --data $(DATA) --profile smoke
+	$(PYTHON) -m f3amd_companion figures --data $(DATA) --profile smoke
 
 course: $(INSTALLED) ## Run the notebooks of the course on samplers (no data, nothing stored)
-	$(PYTHON) -m f3amd_lib course
+	$(PYTHON) -m f3amd_companion course
 
 # Tests run on the CPU, and their results go nowhere near paper_figures/. Notebooks have a process of
 # their own: their kernels must not inherit what tests/conftest.py sets, such as another MPLBACKEND.
@@ -52,11 +52,11 @@ SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
-	  $(PYTHON) -m f3amd_lib measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
+	  $(PYTHON) -m f3amd_companion measure $(MEASURE) --data $(DATA) --profile $(PROFILE)
 
 bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=options; bench-tools adds peers)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
-	  $(PYTHON) -m f3amd_lib bench --data $(DATA) --profile $(PROFILE) $(BENCH)
+	  $(PYTHON) -m f3amd_companion bench --data $(DATA) --profile $(PROFILE) $(BENCH)
 
 # Optional: benchmarks and tests that need one of these say so and go on without.
 bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more; docs/commands.md)
@@ -114,7 +114,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	rm -rf docs/_build
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
-	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_lib steer --overwrite --out docs/_build/html/steer.html
+	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_companion steer --overwrite --out docs/_build/html/steer.html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared

@@ -17,6 +17,7 @@ import hashlib
 import importlib
 import itertools
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -124,7 +125,7 @@ def _copy(tree: Path) -> None:
     """Copy what faults are planted in, and link the rest."""
     tree.mkdir()
     for item in ROOT.iterdir():
-        if item.name in ("f3amd_lib", "tests", "notebooks"):
+        if item.name in ("f3amd_lib", "f3amd_companion", "tests", "notebooks"):
             shutil.copytree(item, tree / item.name, ignore=shutil.ignore_patterns("__pycache__", "pretrained"))
         elif item.name not in (".git", ".venv", "runs"):
             (tree / item.name).symlink_to(item)
@@ -137,12 +138,13 @@ def _import_foreign(tree: Path) -> None:
     for name in (
         "builders",
         "pytest",
-        "f3amd_lib.__main__",
-        "f3amd_lib.experiments.measure",
-        "f3amd_lib.reports.claims",
+        "f3amd_companion.__main__",
+        "f3amd_companion.measuring.measure",
+        "f3amd_companion.ledger.claims",
     ):
         importlib.import_module(name)
-    ours = [name for name in sys.modules if name == "builders" or name.partition(".")[0] in ("f3amd_lib", "helpers")]
+    packages = ("builders", "f3amd_lib", "f3amd_companion", "f3amd_notebooks")
+    ours = [name for name in sys.modules if name.partition(".")[0] in packages]
     for name in ours:
         del sys.modules[name]
 
@@ -182,7 +184,7 @@ def page(faults: list[Fault], results: dict[str, dict[str, str]]) -> str:
     ]
     for fault, row in rows:
         by = row["by"].removeprefix("tests/") if row["caught"] == "yes" else "**nothing**"
-        lines.append(f"| {fault.area} | {fault.name} | `{fault.file.removeprefix('f3amd_lib/')}` | {by} |")
+        lines.append(f"| {fault.area} | {fault.name} | `{re.sub('^f3amd_(lib|companion)/', '', fault.file)}` | {by} |")
     return "\n".join([*lines, *_fuzzed()]) + "\n"
 
 

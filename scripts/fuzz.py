@@ -29,15 +29,15 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
-from f3amd_lib.data.humanml3d import read_caption_table, read_humanml3d, write_humanml3d
 from f3amd_lib.data.packed import load_packed, pack, save_packed
 from f3amd_lib.data.sources import open_dataset
-from f3amd_lib.data.text_motions import text_motions
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.records import kept_rows, read_table, write_table
 from f3amd_lib.motion.bvh import format_bvh, read_bvh
 from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.text.data.humanml3d import read_caption_table, read_humanml3d, write_humanml3d
+from f3amd_lib.text.data.text_motions import text_motions
 
 COUNTS = Path(__file__).resolve().parents[1] / "docs" / "fuzz.csv"
 
@@ -138,7 +138,7 @@ def _make_humanml3d(folder: Path) -> None:
 
 
 def _make_crowd(folder: Path) -> None:
-    from f3amd_lib.generation import crowd
+    from f3amd_companion.serving import crowd
     from f3amd_lib.training.checkpoints import describe_skeleton
 
     out, skeleton = folder / "crowd", walk().skeleton
@@ -150,7 +150,7 @@ def _make_crowd(folder: Path) -> None:
 
 
 def _read_crowd(folder: Path) -> None:
-    from f3amd_lib.generation.crowd import read_crowd
+    from f3amd_companion.serving.crowd import read_crowd
 
     crowd = read_crowd(folder / "crowd")
     if len(crowd) != 3 or crowd.num_frames != 40:
@@ -158,7 +158,7 @@ def _read_crowd(folder: Path) -> None:
 
 
 def _make_manifest(folder: Path) -> None:
-    from f3amd_lib.serving import artefact
+    from f3amd_companion.serving import artefact
 
     manifest = {"format": artefact.FORMAT, "files": {"round.mlirbc": {"bytes": 3, "sha256": "00"}}}
     text = json.dumps(manifest | {"sha256": artefact.manifest_digest(manifest)}, indent=1)
@@ -166,19 +166,19 @@ def _make_manifest(folder: Path) -> None:
 
 
 def _read_manifest(folder: Path) -> None:
-    from f3amd_lib.serving.artefact import read_manifest
+    from f3amd_companion.serving.artefact import read_manifest
 
     read_manifest(folder)
 
 
 def _read_control(folder: Path) -> None:
-    from f3amd_lib.generation.captioned_motion import read_control_csv
+    from f3amd_lib.text.sampling.captioned_motion import read_control_csv
 
     read_control_csv(folder / "control.csv", 40)
 
 
 def _read_queue(folder: Path) -> None:
-    from f3amd_lib.experiments.campaign import queue
+    from f3amd_companion.measuring.campaign import queue
 
     queue(folder / "queue.toml")
 
@@ -192,7 +192,7 @@ def _make_published(folder: Path) -> None:
 
 
 def _read_published(folder: Path) -> None:
-    from f3amd_lib.training.published import published_arrays
+    from f3amd_companion.measuring.published import published_arrays
 
     for path in (folder / "a.safetensors", folder / "a.npz"):
         published_arrays(path)

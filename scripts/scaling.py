@@ -19,8 +19,8 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
-from f3amd_lib.experiments.campaign import STEPS_MEASURED, queue
-from f3amd_lib.experiments.sweep import CAMPAIGN, Leg, plan
+from f3amd_companion.measuring.campaign import STEPS_MEASURED, queue
+from f3amd_companion.measuring.sweep import CAMPAIGN, Leg, plan
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import fill_tables, markdown_table

@@ -23,12 +23,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 from f3amd_lib.drawing.pictures import draw_crowd
 from f3amd_lib.drawing.stick_figures import TARGET_COLOR, Camera
 from f3amd_lib.drawing.style import model_style, plot_style
-from f3amd_lib.experiments.real_clips import follow_clip
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.real_clips import follow_clip
 from f3amd_lib.motion.skeleton import resample
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, prepare
 

@@ -17,12 +17,12 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
-from f3amd_lib.experiments.real_clips import follow_longest
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.files import write_whole
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.real_clips import follow_longest
 from f3amd_lib.motion.bvh import write_bvh
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model, weights_digest
 from f3amd_lib.training.pipeline import prepare
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Bundle three.js for the pages: f3amd_lib/serving/web/three.min.js, of the parts named in three_parts.js. For maintainers; it
+# Bundle three.js for the pages: f3amd_companion/serving/web/three.min.js, of the parts named in three_parts.js. For maintainers; it
 # needs Node, npm and the network. Package and result are checked against their hashes; `--update` writes the result's anew.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -8,7 +8,7 @@ three="0.187.0"
 three_integrity="sha512-Qiu7R+Cmh8CstZsY1uJOSWnVlfo7ZtNLV7mF8Jltk3LB3AtDu9cRZlcnRKkAk8Y4z6KKw35z7Y7Urd7jWY8etA=="
 esbuild="0.28.2"
 esbuild_integrity="sha512-HKVLS8dvII+xoKW9kmqxbRKrnWEXfJJr/FZhhJmiqIB0e053QNYFqOBouTMO/k5sID4MvCiUCvv8b9M4h32wIA=="
-web="f3amd_lib/serving/web"
+web="f3amd_companion/serving/web"
 tools="$(mktemp -d)"
 trap 'rm -rf "$tools"' EXIT
 

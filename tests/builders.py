@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.data.text_motions import TextMotions, text_motions
 from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.ground.profiles import repository_root
@@ -28,6 +27,7 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.text.data.text_motions import TextMotions, text_motions
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task
 from f3amd_lib.training.recipe import TrainingConfig

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.diffusion.phases import guided_noise
+from f3amd_lib.text.phases import guided_noise
 
 RIGHT = {}
 """By number: the answer in different forms."""

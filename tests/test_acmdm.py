@@ -8,7 +8,8 @@ from builders import stirred
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.acmdm import (
+from f3amd_lib.networks.attention import waves
+from f3amd_lib.text.networks.acmdm import (
     ACMDM,
     ACMDMConfig,
     TextCondition,
@@ -17,9 +18,8 @@ from f3amd_lib.networks.acmdm import (
     rotary_base,
     rotated,
 )
-from f3amd_lib.networks.acmdm_control import Control, control_branch, controlled
-from f3amd_lib.networks.attention import waves
-from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig, draw_hidden, frames_known, spoil
+from f3amd_lib.text.networks.acmdm_control import Control, control_branch, controlled
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig, draw_hidden, frames_known, spoil
 
 SIZE = {"num_joints": 5, "channels": 4, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 6}
 BATCH = 2

@@ -3,11 +3,12 @@
 import pandas as pd
 import pytest
 
+from f3amd_companion.ledger import claims
+from f3amd_companion.ledger.evidence import paper_evidence, recorded_evidence
+from f3amd_companion.ledger.judgements import FAILS, HOLDS, IN_PART, OPEN, REMARK, UNJUDGED, UNMEASURED, combine
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import write_table
-from f3amd_lib.reports import claims
-from f3amd_lib.reports.evidence import check_model, paper_evidence, recorded_evidence
-from f3amd_lib.reports.judgements import FAILS, HOLDS, IN_PART, OPEN, REMARK, UNJUDGED, UNMEASURED, combine
+from f3amd_lib.papers.printed import check_model
 
 S = "ACMDM-S-PS22"
 PAPER = "acmdm"

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 from builders import SKELETON, packed_from, refused, tiny_packed, tiny_trained, wandering_motion
 
+from f3amd_companion.measuring.campaign import Run, queue
+from f3amd_companion.serving.artefact import read_manifest
+from f3amd_companion.serving.crowd import _open_array
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import load_packed, pack, packed_dataset, save_packed
 from f3amd_lib.data.sources import open_dataset
-from f3amd_lib.experiments.campaign import Run, queue
-from f3amd_lib.generation.captioned_motion import read_control_csv
-from f3amd_lib.generation.crowd import _open_array
-from f3amd_lib.generation.rollout import MOST_STEPS, MotionGenerator
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.measures.metrics import camdm_metrics, camdm_orientation_error
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.root_paths import named_path, read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton, facing_yaw
-from f3amd_lib.serving.artefact import read_manifest
+from f3amd_lib.rollout.rollout import MOST_STEPS, MotionGenerator
+from f3amd_lib.text.sampling.captioned_motion import read_control_csv
 from f3amd_lib.training.checkpoints import describe, load_model, load_tree, save_tree
 from f3amd_lib.training.recipe import TrainingConfig
 

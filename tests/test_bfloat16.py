@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config, tiny_packed, tiny_trained
 
-from f3amd_lib.experiments import bfloat16
-from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_companion.measuring import bfloat16
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.config import cast_network
+from f3amd_lib.rollout.rollout import MotionGenerator
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 from builders import evaluate
+from f3amd_notebooks import bimodal_paths as toy
+from f3amd_notebooks.bimodal_paths import BimodalPaths
 from flax import nnx
-from helpers import bimodal_paths as toy
-from helpers.bimodal_paths import BimodalPaths
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine

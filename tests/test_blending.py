@@ -7,12 +7,12 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import motion_from_frames, split_frames, world_frames
-from f3amd_lib.experiments.rollout_measures import blending_table
-from f3amd_lib.generation.blending import blend_rollout, blend_seams, dying_offset
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.measures.metrics import ird, ird_excess
+from f3amd_lib.measures.rollout_measures import blending_table
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
+from f3amd_lib.rollout.blending import blend_rollout, blend_seams, dying_offset
+from f3amd_lib.rollout.rollout import MotionGenerator
 
 T = 16
 

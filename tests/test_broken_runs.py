@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
 
-from f3amd_lib import __main__ as command_line
+from f3amd_companion import __main__ as command_line
 from f3amd_lib.drawing import style
 from f3amd_lib.ground import files
 from f3amd_lib.ground.files import locked, whole_file

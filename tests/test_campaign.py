@@ -12,17 +12,17 @@ import pandas as pd
 import pytest
 from builders import packed_from, refused
 
-from f3amd_lib.__main__ import UNFINISHED, main
-from f3amd_lib.benchmarking import measurements
-from f3amd_lib.benchmarking.synthesis import Candidate
+from f3amd_companion.__main__ import UNFINISHED, main
+from f3amd_companion.measuring import campaign, measure
+from f3amd_companion.measuring.campaign import Run, chosen, longest_first, queue, run_campaign
+from f3amd_companion.speed import measurements
+from f3amd_companion.speed.synthesis import Candidate
 from f3amd_lib.data.packed import save_packed
-from f3amd_lib.experiments import campaign, measure
-from f3amd_lib.experiments.campaign import Run, chosen, longest_first, queue, run_campaign
-from f3amd_lib.experiments.denoising import held_out_condition, held_out_error, input_use
-from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use
+from f3amd_lib.measures.protocol import Protocol
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
 from f3amd_lib.training import checkpoints

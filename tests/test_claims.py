@@ -6,17 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_lib.benchmarking.timing import median_interval
-from f3amd_lib.diffusion import samplers
-from f3amd_lib.ground import papers
-from f3amd_lib.ground.records import read_table, write_table
-from f3amd_lib.networks.attention import TransformerBlock
-from f3amd_lib.networks.spectral import FNOBlock
-from f3amd_lib.reports import claims, theory
-from f3amd_lib.reports.evidence import (
-    NINE_METRICS,
+from f3amd_companion.ledger import claims, theory
+from f3amd_companion.ledger.evidence import (
     OF_TRAINED_NETWORKS,
-    REFERENCE_ROWS,
     Figure,
     NotMeasured,
     Setting,
@@ -28,7 +20,7 @@ from f3amd_lib.reports.evidence import (
     recorded_evidence,
     snapshot_evidence,
 )
-from f3amd_lib.reports.judgements import (
+from f3amd_companion.ledger.judgements import (
     FAILS,
     HOLDS,
     IN_PART,
@@ -44,6 +36,13 @@ from f3amd_lib.reports.judgements import (
     ordered,
     within,
 )
+from f3amd_companion.speed.timing import median_interval
+from f3amd_lib.diffusion import samplers
+from f3amd_lib.ground import papers
+from f3amd_lib.ground.records import read_table, write_table
+from f3amd_lib.networks.attention import TransformerBlock
+from f3amd_lib.networks.spectral import FNOBlock
+from f3amd_lib.papers.printed import NINE_METRICS, REFERENCE_ROWS
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -554,7 +553,7 @@ def test_each_rule_passes_its_oracle_and_fails_its_nonsense(tmp_path, claim_id, 
 @pytest.mark.parametrize("wanted", [HOLDS, FAILS])
 def test_each_computed_rule_passes_its_oracle_and_fails_its_nonsense(tmp_path, monkeypatch, claim_id, wanted):
     for name, value in COMPUTED[claim_id][wanted == FAILS].items():
-        monkeypatch.setattr(f"f3amd_lib.reports.theory.{name}", value)
+        monkeypatch.setattr(f"f3amd_companion.ledger.theory.{name}", value)
     judgement = judge(tmp_path, claim_id)
     assert judgement.verdict == wanted, judgement.ours
 
@@ -1320,14 +1319,14 @@ def test_the_verdicts_are_the_accepted_ones(committed):
     changes = claims.changed_verdicts(claims.ledger(committed), claims.accepted_verdicts())
     assert not changes, (
         "\n".join(changes) + "\nIf these are right, accept on purpose with "
-        "`python -m f3amd_lib.reports.claims --accept`"
+        "`python -m f3amd_companion.ledger.claims --accept`"
     )
 
 
 def test_the_committed_page_is_up_to_date(committed):
     page = claims.repository_root() / "paper_figures" / "claims.md"
     assert page.read_text(encoding="utf-8") == claims.ledger_markdown(committed), (
-        "paper_figures/claims.md is stale: run `python -m f3amd_lib.reports.claims`"
+        "paper_figures/claims.md is stale: run `python -m f3amd_companion.ledger.claims`"
     )
 
 

@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 from builders import WINDOW, tiny_trained
 
-from f3amd_lib import __main__ as command_line
-from f3amd_lib.__main__ import COMMANDS, main
-from f3amd_lib.benchmarking import machine, measurements
-from f3amd_lib.generation.crowd import read_crowd
-from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, closest_approach
+from f3amd_companion import __main__ as command_line
+from f3amd_companion.__main__ import COMMANDS, main
+from f3amd_companion.serving.crowd import read_crowd
+from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, closest_approach
+from f3amd_companion.speed import machine, measurements
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model
 
@@ -203,7 +203,7 @@ def test_export_without_iree_is_what_jax_alone_can_run(weights, tmp_path, monkey
 
 @pytest.mark.needs("iree.compiler", "iree.runtime")
 def test_export_is_an_artefact_that_loads(weights, tmp_path):
-    from f3amd_lib.serving.artefact import load_artefact
+    from f3amd_companion.serving.artefact import load_artefact
 
     out = tmp_path / "round"
     words = ["export", "--weights", weights, "--out", str(out), "--steps", "2"]
@@ -223,7 +223,7 @@ def test_onnx_goes_alone(weights, tmp_path, capsys):
 
 
 def test_steer_hands_the_model_its_steps_and_its_bits_to_the_page(weights, tmp_path, monkeypatch):
-    from f3amd_lib.serving import steer
+    from f3amd_companion.serving import steer
 
     asked = []
 
@@ -274,8 +274,8 @@ def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags
 def test_fast_flags_are_set_before_jax_looks_for_devices(words):
     script = f"""
 import os, sys
-from f3amd_lib.__main__ import main
-from f3amd_lib.benchmarking import machine
+from f3amd_companion.__main__ import main
+from f3amd_companion.speed import machine
 machine.fast_xla_flags = lambda: "--xla_force_host_platform_device_count=3"
 assert main({words!r}) == 2
 import jax
@@ -303,7 +303,7 @@ def test_a_misspelt_option_is_refused_with_the_nearest(capsys):
 def test_help_does_not_wait_for_jax():
     script = """
 import sys
-from f3amd_lib.__main__ import COMMANDS, main
+from f3amd_companion.__main__ import COMMANDS, main
 try:
     main(["--help"])
 except SystemExit:
@@ -314,6 +314,6 @@ except SystemExit:
 
 def test_the_ledger_is_judged_by_its_own_command(monkeypatch):
     seen = []
-    monkeypatch.setattr("f3amd_lib.reports.claims.main", lambda *words: seen.append(words) or 1)
+    monkeypatch.setattr("f3amd_companion.ledger.claims.main", lambda *words: seen.append(words) or 1)
     assert [main(["claims"]), main(["claims", "--accept", "--paper", "acmdm"])] == [1, 1]
     assert seen == [(False, None), (True, "acmdm")]

@@ -6,21 +6,23 @@ import shlex
 import pandas as pd
 import pytest
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.benchmarking import implementations, measurements, synthesis
-from f3amd_lib.experiments import measure, protocol, sensitivity
-from f3amd_lib.experiments.recipes import RECIPES
-from f3amd_lib.experiments.sensitivity import FOOT_BANDS, STRENGTHS
-from f3amd_lib.experiments.text_tables import TABLES
+from f3amd_companion.__main__ import main
+from f3amd_companion.ledger import claims
+from f3amd_companion.ledger.evidence import recorded_evidence
+from f3amd_companion.ledger.judgements import UNJUDGED, UNMEASURED
+from f3amd_companion.measuring import measure, sensitivity
+from f3amd_companion.measuring.recipes import RECIPES
+from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
+from f3amd_companion.measuring.text_tables import TABLES
+from f3amd_companion.speed import implementations, measurements, synthesis
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import write_table
+from f3amd_lib.measures import protocol
 from f3amd_lib.measures.corruptions import CORRUPTIONS
 from f3amd_lib.networks import presets
-from f3amd_lib.reports import claims
-from f3amd_lib.reports.evidence import NINE_METRICS, PUBLISHED_CAMDM, recorded_evidence
-from f3amd_lib.reports.judgements import UNJUDGED, UNMEASURED
+from f3amd_lib.papers.printed import NINE_METRICS, PUBLISHED_CAMDM
 
 COMMANDS = list(dict.fromkeys(run for runs in claims.load_commands().values() for run in runs))
 
@@ -179,7 +181,7 @@ def told(part, key: str) -> set[str]:
 def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, claim_id, monkeypatch):
     """The tables that are measured for it, or the models that have a row there; nothing is done."""
     asked: list[str] = []
-    monkeypatch.setattr("f3amd_lib.__main__._measure_text", lambda names, *rest: asked.extend(names) or 0)
+    monkeypatch.setattr("f3amd_companion.__main__._measure_text", lambda names, *rest: asked.extend(names) or 0)
     monkeypatch.setattr(claims, "main", lambda *words: 0)
     for run in claims.load_commands(paper)[claim_id]:
         assert main(shlex.split(run, comments=True)[1:]) == 0

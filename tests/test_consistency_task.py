@@ -9,13 +9,12 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_task, tiny_trained
 
+from f3amd_companion.measuring import consistency_task, measure
+from f3amd_companion.measuring.consistency_task import ConsistencyTask
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.experiments import measure
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
-from f3amd_lib.training import consistency_task
 from f3amd_lib.training.checkpoints import weights_digest
-from f3amd_lib.training.consistency_task import ConsistencyTask
 from f3amd_lib.training.optimise import advance, initial_state
 from f3amd_lib.training.pipeline import PreparedData
 

@@ -29,15 +29,18 @@ def test_contributing_names_files_that_are_there():
     files = named_files(CONTRIBUTING)
     assert len(files) > 20
     missing = {
-        name for name in files - PAPER_FILES if not any((ROOT / top / name).exists() for top in ("", "f3amd_lib"))
+        name
+        for name in files - PAPER_FILES
+        if not any((ROOT / top / name).exists() for top in ("", "f3amd_lib", "f3amd_companion"))
     }
     assert missing == set()
-    papers = [folder for folder in (ROOT / "f3amd_lib/papers").iterdir() if folder.is_dir()]
+    papers = [folder for folder in (ROOT / "f3amd_lib/papers").iterdir() if (folder / "paper.toml").is_file()]
     assert all((folder / name).exists() for folder in papers for name in PAPER_FILES)
 
 
 def test_contributing_names_functions_that_are_there():
-    source = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "f3amd_lib").rglob("*.py"))
+    files = [path for package in ("f3amd_lib", "f3amd_companion") for path in (ROOT / package).rglob("*.py")]
+    source = "\n".join(path.read_text(encoding="utf-8") for path in files)
     names = named_functions(CONTRIBUTING)
     assert {"_find_archive", "first_metrics", "ConditionedConfig"} <= names
     assert {name for name in names if not re.search(rf"\b{name}\b", source)} == set()

@@ -7,9 +7,9 @@ import pytest
 from builders import refused, wandering_motion
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.experiments.real_clips import own_path
 from f3amd_lib.measures import distributions, metrics
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt, frozen_pose, noisy_motion, shuffled_frames
+from f3amd_lib.measures.real_clips import own_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import synthesize

@@ -5,9 +5,9 @@ import pytest
 from builders import refused
 from scipy.spatial.distance import pdist
 
-from f3amd_lib.generation import crowd_planning
-from f3amd_lib.generation.crowd import crowd_paths, plan_crowd
-from f3amd_lib.generation.crowd_planning import MIN_DISTANCE, SPEED_BOUNDS, closest_approach, keep_apart
+from f3amd_companion.serving import crowd_planning
+from f3amd_companion.serving.crowd import crowd_paths, plan_crowd
+from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, SPEED_BOUNDS, closest_approach, keep_apart
 from f3amd_lib.motion.root_paths import tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 

@@ -15,8 +15,8 @@ from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.experiments import denoising
-from f3amd_lib.generation.rollout import MotionGenerator
+from f3amd_lib.measures import denoising
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.denoising_task import network_inputs
 
 SIGMAS = (0.1, 1.0, 10.0)

@@ -20,17 +20,17 @@ import pytest
 from builders import SKELETON, WINDOW, tiny_task, tiny_trained
 
 from f3amd_lib.diffusion.schedules import straight
-from f3amd_lib.generation.latent_motion import sample_student
-from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.generation.text_to_motion import sample_text
 from f3amd_lib.ground.records import write_table
 from f3amd_lib.measures.distributions import earth_movers_distance, frechet_distance
 from f3amd_lib.measures.metrics import first_metrics
 from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
+from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
+from f3amd_lib.text.sampling.motionpcm_sampling import sample_student
+from f3amd_lib.text.sampling.text_to_motion import sample_text
+from f3amd_lib.text.stages.acmdm_training import TextMotionTask
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import optimise
-from f3amd_lib.training.text_motion import TextMotionTask
 
 PARTS = ("windows", "weights", "samples")
 STEPS, RATE = 4, 1e-3

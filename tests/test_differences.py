@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from f3amd_lib.reports.equation_map import notebook_sections
+from f3amd_companion.ledger.equation_map import notebook_sections
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs/differences.md").read_text(encoding="utf-8")
@@ -41,8 +41,9 @@ def named(name: str) -> bool:
             entry["point"] for entry in tomllib.loads(readings.read_text(encoding="utf-8"))["reading"]
         ]
     module, *names = name.split(".")
-    path = (ROOT if module.startswith("tests/") else ROOT / "f3amd_lib") / f"{module}.py"
-    if not path.is_file():
+    folders = [ROOT] if module.startswith("tests/") else [ROOT / "f3amd_lib", ROOT / "f3amd_companion"]
+    path = next((path for folder in folders if (path := folder / f"{module}.py").is_file()), None)
+    if path is None:
         return False
     body = ast.parse(path.read_text(encoding="utf-8")).body
     for wanted in names:

@@ -249,10 +249,11 @@ def imported_packages(paths) -> set[str]:
 
 
 def test_what_is_imported_is_declared():
-    own = {"f3amd_lib", "tests", "conftest", "helpers"}
+    own = {"f3amd_lib", "f3amd_companion", "f3amd_notebooks", "tests", "conftest"}
     own |= {path.stem for path in (ROOT / "tests").glob("*.py")}
     declared = {IMPORT_NAMES.get(name, name) for name in all_requirements(PYPROJECT)}
-    files = [*(ROOT / "f3amd_lib").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    folders = ("f3amd_lib", "f3amd_companion", "notebooks/f3amd_notebooks", "tests")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     undeclared = imported_packages(files) - own - declared - set(sys.stdlib_module_names)
     assert undeclared == set()
 

@@ -8,14 +8,8 @@ import shutil
 import pandas as pd
 import pytest
 
-from f3amd_lib.ground import papers
-from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import run_record, write_table
-from f3amd_lib.networks.camdm import CAMDMConfig
-from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.presets import find_preset
-from f3amd_lib.reports import claims, evidence
-from f3amd_lib.reports.equation_map import (
+from f3amd_companion.ledger import claims, evidence
+from f3amd_companion.ledger.equation_map import (
     _OTHERS,
     _clauses,
     _mentions,
@@ -27,7 +21,13 @@ from f3amd_lib.reports.equation_map import (
     notebook_sections,
     running_times,
 )
-from f3amd_lib.reports.readings import fill_reading, readings_table
+from f3amd_lib.ground import papers
+from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.networks.camdm import CAMDMConfig
+from f3amd_lib.networks.f3amd import F3AMDConfig
+from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.papers.readings import fill_reading, readings_table
 from f3amd_lib.training.recipe import short_recipe
 
 
@@ -167,7 +167,7 @@ def test_every_numbered_equation_of_a_paper_has_code_or_a_reason(paper):
 
 def test_the_committed_page_is_what_the_code_says():
     page = (repository_root() / "docs/equations.md").read_text(encoding="utf-8")
-    assert page == equations_markdown(), "write it again: python -m f3amd_lib.reports.equation_map"
+    assert page == equations_markdown(), "write it again: python -m f3amd_companion.ledger.equation_map"
     for paper in papers.paper_folders():
         about = papers.load_paper_file("paper", paper)
         table = page.split(f"## {about['name']}\n")[1].split("\n## ")[0]
@@ -221,7 +221,9 @@ def test_equations_that_no_paper_has_are_found(text, unknown):
 def test_docstrings_and_tests_name_equations_that_are_printed():
     root, wrong, known = repository_root(), [], {paper: set(equation_labels(paper)) for paper in papers.paper_folders()}
     numbered = re.compile(r"^test_(?:([a-z0-9]+)_)?eq(\d\d)(?:_to_eq(\d\d))?_")
-    files = [*sorted((root / "f3amd_lib").rglob("*.py")), *sorted((root / "tests").glob("test_*.py"))]
+    packages = ("f3amd_lib", "f3amd_companion")
+    files = [path for package in packages for path in sorted((root / package).rglob("*.py"))]
+    files += sorted((root / "tests").glob("test_*.py"))
     for path in files:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
@@ -304,6 +306,7 @@ def test_open_points_name_all_of_our_recipes_that_set_them(form):
     assert preset.network["block_residual"]
 
 
+CONFIGS = {"F3AMDConfig": "f3amd_lib.networks.f3amd:F3AMDConfig"}
 READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}", "why": "so"}
 
 
@@ -320,8 +323,8 @@ READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}",
 )
 def test_a_broken_open_point_is_refused(changes, message):
     with pytest.raises(ValueError, match=f"f.toml, 'noise': .*{message}"):
-        fill_reading(READING | changes, "f.toml")
-    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml") == str(
+        fill_reading(READING | changes, "f.toml", CONFIGS)
+    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml", CONFIGS) == str(
         F3AMDConfig(channels=1, num_styles=1).dropout
     )
 

@@ -12,9 +12,9 @@ import course_answers_third
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import bimodal_paths
-from helpers.exercises import CHECKS, hint
-from helpers.exercises.printed_update import _distance_of_updates
+from f3amd_notebooks import bimodal_paths
+from f3amd_notebooks.exercises import CHECKS, hint
+from f3amd_notebooks.exercises.printed_update import _distance_of_updates
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture

@@ -13,8 +13,8 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
-from helpers.exercises import CHECKS, check, hint
-from helpers.exercises.judging import NotAnswered, agree
+from f3amd_notebooks.exercises import CHECKS, check, hint
+from f3amd_notebooks.exercises.judging import NotAnswered, agree
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
@@ -108,7 +108,7 @@ def test_solutions_lie_in_notebooks_of_their_own_each_with_its_reason():
 
 def test_a_check_speaks_in_a_script_too(tmp_path):
     script = tmp_path / "homework.py"
-    script.write_text('from helpers.exercises import check\ncheck("11.b", [4.0, 5.0])\ncheck("11.b", ...)\n')
+    script.write_text('from f3amd_notebooks.exercises import check\ncheck("11.b", [4.0, 5.0])\ncheck("11.b", ...)\n')
     ran = subprocess.run(
         [sys.executable, str(script)], cwd=NOTEBOOKS, env=os.environ | {"PYTHONPATH": search_path()},
         capture_output=True, text=True, check=True,

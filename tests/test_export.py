@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from builders import refused
 
+from f3amd_companion.serving import artefact as artefact_module
+from f3amd_companion.serving import export as export_module
+from f3amd_companion.serving.artefact import load_artefact, manifest_digest
+from f3amd_companion.serving.export import compile_iree, export_model, export_round, save_artefact
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.serving import artefact as artefact_module
-from f3amd_lib.serving import export as export_module
-from f3amd_lib.serving.artefact import load_artefact, manifest_digest
-from f3amd_lib.serving.export import compile_iree, export_model, export_round, save_artefact
+from f3amd_lib.rollout.rounds import sample_round
 
 BATCH = 2
 SIGMAS = variance_exploding().grid(2)
@@ -164,7 +164,7 @@ np.save("answer.npy", artefact(*given))
 def test_an_artefact_runs_without_the_library(runtime, request, tmp_path, jit_round):
     folder = request.getfixturevalue(f"{runtime}_folder")
     shutil.copy(artefact_module.__file__, tmp_path / "artefact.py")
-    refused = ("f3amd_lib", "flax") + (("jax",) if runtime == "iree" else ())
+    refused = ("f3amd_lib", "f3amd_companion", "flax") + (("jax",) if runtime == "iree" else ())
     script = _ALONE.format(refused=refused, folder=str(folder), runtime=runtime)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(

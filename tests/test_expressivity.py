@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import SKELETON, refused
+from f3amd_notebooks import expressivity as ex
 from flax import nnx
-from helpers import expressivity as ex
 
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.networks.conditioning import CONDITIONINGS, conditioning_layer

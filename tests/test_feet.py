@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from builders import packed_from, tiny_trained
 
+from f3amd_companion.measuring import measure
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.experiments import measure
-from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.synthetic import synthesize
+from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.training.pipeline import PreparedData
 
 WINDOW, HISTORY = 32, 10

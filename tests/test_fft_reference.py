@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, refused, tiny_camdm, tiny_config
 
-from f3amd_lib.benchmarking.fft_reference import fft_reference, fourier_transform_convolution, framework_convolution
+from f3amd_companion.speed.fft_reference import fft_reference, fourier_transform_convolution, framework_convolution
 from f3amd_lib.networks.spectral import spectral_convolution
 
 

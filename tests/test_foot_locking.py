@@ -8,14 +8,14 @@ from builders import SKELETON as SHORT_LEGS
 from builders import refused, straight_motion
 from scipy.spatial.transform import Rotation
 
+from f3amd_companion.serving.foot_locking import DEEPEST, FARTHEST, leg_chains, lock_feet, lock_rollout, plan_contacts
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.generation.foot_locking import DEEPEST, FARTHEST, leg_chains, lock_feet, lock_rollout, plan_contacts
-from f3amd_lib.generation.rollout import Rollout
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.measures.walking import floor_penetration, slide_speed, stepping_rate, toe_positions
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize, synthesize_with_contacts
+from f3amd_lib.rollout.rollout import Rollout
 
 FLOOR = 0.012
 """Height of the walker's resting toes."""

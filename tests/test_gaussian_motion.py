@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.gaussian_motion import ExactFrames, ExactHidden, GaussianMotion
+from f3amd_notebooks.gaussian_motion import ExactFrames, ExactHidden, GaussianMotion
 
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight
-from f3amd_lib.generation.text_to_motion import sample_blocks
-from f3amd_lib.networks.acmdm import TextCondition
+from f3amd_lib.text.networks.acmdm import TextCondition
+from f3amd_lib.text.sampling.text_to_motion import sample_blocks
 
 LAG = np.arange(6)[:, None] - np.arange(6)
 COVARIANCE = np.exp(-np.abs(LAG) / 4) + 0.2

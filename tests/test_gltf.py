@@ -9,11 +9,11 @@ from builders import refused, wandering_motion
 from scipy.spatial.transform import Rotation
 from test_skeleton import BANDAI, random_motion
 
+from f3amd_companion.serving.gltf import write_glb
+from f3amd_companion.serving.motion_csv import write_motion_csv
 from f3amd_lib.motion.body import make_body, pose_body
-from f3amd_lib.motion.motion_csv import write_motion_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
-from f3amd_lib.serving.gltf import write_glb
 
 SIZES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,), "MAT4": (4, 4)}
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

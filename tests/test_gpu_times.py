@@ -2,7 +2,7 @@
 
 import pytest
 
-from f3amd_lib.benchmarking.speed_tables import times_beside_paper, training_beside_paper
+from f3amd_companion.speed.speed_tables import times_beside_paper, training_beside_paper
 from f3amd_lib.ground.stored import committed_table
 
 

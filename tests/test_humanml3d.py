@@ -7,14 +7,14 @@ import shutil
 import numpy as np
 import pytest
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.data import humanml3d
+from f3amd_companion.__main__ import main
 from f3amd_lib.data.sources import open_dataset
-from f3amd_lib.data.text_motions import TextMotions
-from f3amd_lib.motion import redundant, synthetic
+from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import forward_kinematics, resample, turn
+from f3amd_lib.text.data import humanml3d, redundant
+from f3amd_lib.text.data.text_motions import TextMotions
 
 LENGTHS = {"000001": 60, "M000001": 60, "000002": 120, "000003": 30, "000004": 250}
 TEXTS = {

@@ -32,19 +32,20 @@ from test_reproduce import PARAMETERS, write_notebook
 from test_text_judge import OneVectorAWord
 from test_text_models import STYLES, TINY
 
-from f3amd_lib import __main__ as command_line
-from f3amd_lib.data import sources, text_encoders
+from f3amd_companion import __main__ as command_line
+from f3amd_companion.measuring import campaign, measure
+from f3amd_companion.measuring.campaign import Run
+from f3amd_lib.data import sources
 from f3amd_lib.data.packed import packed_dataset
-from f3amd_lib.experiments import campaign, measure
-from f3amd_lib.experiments.campaign import Run
-from f3amd_lib.experiments.protocol import Protocol
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.measures.protocol import Protocol
 from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
-from f3amd_lib.training import text_models
+from f3amd_lib.text.data import text_encoders
+from f3amd_lib.text.stages import text_models
 from f3amd_lib.training.pipeline import PreparedData
 
 pytestmark = [

@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 from test_text_judge import OneVectorAWord
 
-from f3amd_lib import __main__ as command_line
-from f3amd_lib.data.text_encoders import embed_captions, load_text_encoder
-from f3amd_lib.data.text_motions import text_motions
+from f3amd_companion import __main__ as command_line
+from f3amd_companion.measuring.text_probes import ONE_CAPTION, measure_one_caption
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
-from f3amd_lib.experiments.text_probes import ONE_CAPTION, measure_one_caption
-from f3amd_lib.generation import latent_motion
-from f3amd_lib.generation.latent_motion import (
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.skeleton import resample
+from f3amd_lib.networks import presets
+from f3amd_lib.networks.presets import Preset
+from f3amd_lib.text.data.text_encoders import embed_captions, load_text_encoder
+from f3amd_lib.text.data.text_motions import text_motions
+from f3amd_lib.text.sampling import motionpcm_sampling
+from f3amd_lib.text.sampling.motionpcm_sampling import (
     decode_latent,
     guidance_of,
     latent_motions,
@@ -26,15 +32,8 @@ from f3amd_lib.generation.latent_motion import (
     sample_teacher,
     steps_of,
 )
-from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.motion import synthetic
-from f3amd_lib.motion.skeleton import resample
-from f3amd_lib.networks import presets
-from f3amd_lib.networks.presets import Preset
-from f3amd_lib.training import captioned_models, latent_models, text_models
-from f3amd_lib.training.checkpoints import network_with, weights_digest
-from f3amd_lib.training.latent_models import (
+from f3amd_lib.text.stages import captioned_models, latent_models, text_models
+from f3amd_lib.text.stages.latent_models import (
     is_latent_preset,
     load_latent_model,
     named_model,
@@ -42,9 +41,10 @@ from f3amd_lib.training.latent_models import (
     stands_on,
     train_latent_model,
 )
-from f3amd_lib.training.latent_motion import frame_statistics
+from f3amd_lib.text.stages.motionpcm_training import frame_statistics
+from f3amd_lib.text.stages.text_models import text_model_files
+from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
-from f3amd_lib.training.text_models import text_model_files
 
 SIZES = {"window": 2, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}
 SMALL = {**SIZES, "time_features": 8}
@@ -118,9 +118,9 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
         asked.append((noise.shape, list(times)))
         return real(predict, schedule, noise, times)
 
-    real = latent_motion.phases.follow
+    real = motionpcm_sampling.phases.follow
     monkeypatch.setattr(command_line, "_write_shown", written)
-    monkeypatch.setattr(latent_motion.phases, "follow", follow)
+    monkeypatch.setattr(motionpcm_sampling.phases, "follow", follow)
     words = ["text", "a person raises the left hand", "--seconds", "1.2", "--seed", "3", "--out", str(tmp_path)]
     assert command_line.main([*words, "--model", "motionpcm", "--steps", "1"]) == 0
     ((name, motion),), ((shape, times),) = made, asked

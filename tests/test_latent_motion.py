@@ -9,19 +9,28 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable, text_motions
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
-from f3amd_lib.generation.latent_motion import sample_latent_student, sample_student, sample_teacher, teacher_prediction
 from f3amd_lib.motion import synthetic
-from f3amd_lib.motion.redundant import grouped_statistics
 from f3amd_lib.motion.skeleton import resample
-from f3amd_lib.networks.motionpcm import DiscriminatorConfig, LatentAutoencoderConfig, LatentDenoiserConfig, student_of
 from f3amd_lib.networks.presets import build_from_config
-from f3amd_lib.training import latent_motion
-from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.latent_motion import (
+from f3amd_lib.text.data.redundant import grouped_statistics
+from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable, text_motions
+from f3amd_lib.text.networks.motionpcm import (
+    DiscriminatorConfig,
+    LatentAutoencoderConfig,
+    LatentDenoiserConfig,
+    student_of,
+)
+from f3amd_lib.text.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
+from f3amd_lib.text.sampling.motionpcm_sampling import (
+    sample_latent_student,
+    sample_student,
+    sample_teacher,
+    teacher_prediction,
+)
+from f3amd_lib.text.stages import motionpcm_training
+from f3amd_lib.text.stages.motionpcm_training import (
     DistillationTask,
     LatentAutoencoderTask,
     LatentMotionTraining,
@@ -33,6 +42,7 @@ from f3amd_lib.training.latent_motion import (
     latent_table,
     reconstruction_terms,
 )
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
 from f3amd_lib.training.settings import part_recipe
 
@@ -231,7 +241,7 @@ class Looking:
 
 def test_a_teacher_is_asked_for_the_noise_at_the_level_that_it_is_told(monkeypatch):
     network = Looking()
-    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: network)
+    monkeypatch.setattr(motionpcm_training, "network_with", lambda config, params: network)
     task = TeacherTask(TEACHER, recipe(), latents(), SCHEDULE)
     clean, text = normal(3, 512, 2, 3), normal(4, 512, 4)
     loss, (terms, _) = task.loss({}, None, (clean, text), jax.random.key(2))
@@ -297,7 +307,7 @@ def test_the_target_is_the_moving_average(start):
 
 def test_each_sample_is_told_its_own_guidance_and_jumps_to_its_own_edge(batch, monkeypatch):
     network = Looking()
-    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: network)
+    monkeypatch.setattr(motionpcm_training, "network_with", lambda config, params: network)
     task, batch = distillation(adversarial_weight=0.0), batch._replace(edge=10 * jnp.arange(8))
     loss, _ = task.loss({"student": {}}, None, batch, None)
     for seen, wanted in zip(network.asked[0], (batch.state, batch.time, batch.text, batch.guidance), strict=True):
@@ -398,7 +408,7 @@ def test_the_critic_sees_the_students_end_carried_to_its_time_and_the_data_throu
 
     silent = lambda features: jnp.zeros(len(features[0]))
     monkeypatch.setattr(
-        latent_motion,
+        motionpcm_training,
         "network_with",
         lambda config, params: silent if isinstance(config, DiscriminatorConfig) else Reading(params),
     )
@@ -420,7 +430,7 @@ def test_the_critic_sees_the_students_end_carried_to_its_time_and_the_data_throu
 
 
 def test_the_critic_looks_from_end_to_end_of_phases_that_are_not_of_one_length(monkeypatch):
-    monkeypatch.setattr(latent_motion, "network_with", lambda config, params: Looking())
+    monkeypatch.setattr(motionpcm_training, "network_with", lambda config, params: Looking())
     count = 20_000
     drawn = distillation(num_phases=4).questions(
         {}, jnp.zeros((count, 1, 1)), jnp.zeros((count, 4)), jax.random.key(2)

@@ -8,17 +8,17 @@ from builders import captioned_walks
 from test_latent_models import TINY
 from test_text_judge import OneVectorAWord
 
-from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import PAPERS, measure_text_table, reconstruction_rows
-from f3amd_lib.generation.latent_motion import TEACHER_GUIDANCE
+from f3amd_companion.ledger import claims
+from f3amd_companion.measuring import text_tables
+from f3amd_companion.measuring.text_tables import PAPERS, measure_text_table, reconstruction_rows
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
-from f3amd_lib.reports import claims
-from f3amd_lib.reports.evidence import SCHEMAS
-from f3amd_lib.training.latent_models import is_latent_preset, stage_of
+from f3amd_lib.papers.printed import SCHEMAS
+from f3amd_lib.text.sampling.motionpcm_sampling import TEACHER_GUIDANCE
+from f3amd_lib.text.stages.latent_models import is_latent_preset, stage_of
 
 PROFILE = load_profile("smoke", "bandai", train_steps=20)
 TEACHER, STUDENT = (

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, wandering_motion
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.experiments import learning_curves, measure
+from f3amd_companion.__main__ import main
+from f3amd_companion.measuring import learning_curves, measure
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from helpers.exercises import CHECKS, hint
+from f3amd_notebooks.exercises import CHECKS, hint
 
-from f3amd_lib.reports.equation_map import notebook_sections
+from f3amd_companion.ledger.equation_map import notebook_sections
 
 IN_SESSIONS = [number for number in CHECKS if not number.startswith("C")]
 """Exercises of the three sessions; those of the course have numbers that begin with C."""

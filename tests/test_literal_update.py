@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, refused, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
-from helpers.seed_histories import seed_condition, walk_seed_histories
 
+from f3amd_companion.measuring import literal_update, measure
+from f3amd_companion.measuring.literal_update import UPDATES, WINDOW_METRICS, walk_windows, window_figures
+from f3amd_companion.measuring.seed_histories import seed_condition, walk_seed_histories
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.experiments import literal_update, measure
-from f3amd_lib.experiments.literal_update import UPDATES, WINDOW_METRICS, walk_windows, window_figures
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.motion.rotations import rotation_6d_from_yaw

@@ -8,9 +8,14 @@ import pytest
 from builders import SKELETON, wandering_motion
 from flax import nnx
 
-from f3amd_lib.motion.body_mesh import BodyMesh
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig, MeshConvolution, MeshPooling
+from f3amd_lib.text.data.body_mesh import BodyMesh
+from f3amd_lib.text.networks.mesh_autoencoder import (
+    MeshAutoencoder,
+    MeshAutoencoderConfig,
+    MeshConvolution,
+    MeshPooling,
+)
 
 SIZES = {"coarse_levels": (24, 8), "channels": (6, 8), "latent_channels": 5, "num_bases": 3,
          "around": (5, 4), "down": (16, 8), "up": (3, 2)}  # fmt: skip

@@ -11,14 +11,14 @@ import pandas as pd
 import pytest
 from builders import captioned_walks
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.data import text_encoders
+from f3amd_companion.__main__ import main
+from f3amd_companion.ledger import model_cards
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
-from f3amd_lib.reports import model_cards
-from f3amd_lib.training import text_models
+from f3amd_lib.text.data import text_encoders
+from f3amd_lib.text.stages import text_models
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 

@@ -10,7 +10,7 @@ from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.motionpcm import (
+from f3amd_lib.text.networks.motionpcm import (
     Discriminator,
     DiscriminatorConfig,
     LatentAutoencoder,

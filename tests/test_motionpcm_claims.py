@@ -3,9 +3,9 @@
 import pytest
 from test_claims import keep
 
-from f3amd_lib.reports import claims
-from f3amd_lib.reports.evidence import paper_evidence, recorded_evidence
-from f3amd_lib.reports.judgements import FAILS, HOLDS, OPEN, UNJUDGED, UNMEASURED, combine
+from f3amd_companion.ledger import claims
+from f3amd_companion.ledger.evidence import paper_evidence, recorded_evidence
+from f3amd_companion.ledger.judgements import FAILS, HOLDS, OPEN, UNJUDGED, UNMEASURED, combine
 
 PAPER, ENOUGH = "motionpcm", 5e7
 METRICS = ("text_FID", "R_precision_1", "matching_distance")

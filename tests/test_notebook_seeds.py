@@ -3,13 +3,14 @@
 Seed 0 is what nbval runs. A copy of the repository keeps the runs of these seeds apart from the reader's own.
 """
 
+import os
 import shutil
 from pathlib import Path
 
 import papermill
 import pytest
 
-from f3amd_lib import reproduce
+from f3amd_companion import reproduce
 from f3amd_lib.ground import profiles
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,7 +21,13 @@ PICTURES = shutil.ignore_patterns("*.png", "*.gif", "__pycache__", ".ipynb_check
 def copy(tmp_path_factory) -> Path:
     """A repository with library, notebooks and stored results, and no runs."""
     folder = tmp_path_factory.mktemp("repository")
-    for name in ("f3amd_lib", "notebooks", "paper_figures", "tests"):  # 00 counts the tests of each equation
+    for name in (
+        "f3amd_lib",
+        "f3amd_companion",
+        "notebooks",
+        "paper_figures",
+        "tests",
+    ):  # 00 counts the tests of each equation
         shutil.copytree(ROOT / name, folder / name, ignore=PICTURES)
     shutil.copy(ROOT / "pyproject.toml", folder)
     return folder
@@ -33,7 +40,7 @@ RUNS = [(path, seed) for path in NOTEBOOKS for seed in (1, 2)]
 @pytest.mark.long
 @pytest.mark.parametrize(("path", "seed"), RUNS, ids=lambda value: getattr(value, "stem", value))
 def test_notebooks_run_with_any_seed(copy, path, seed, tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(copy))
+    monkeypatch.setenv("PYTHONPATH", f"{copy}{os.pathsep}{copy / 'notebooks'}")
     monkeypatch.setenv(profiles.RESULTS_DIR_VARIABLE, str(tmp_path / "results"))
     # As a reader runs them, not as the other tests do.
     monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS", raising=False)

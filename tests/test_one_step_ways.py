@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 from builders import rows_of_one_step
-from helpers import bimodal_paths as toy
-from helpers import one_step_ways as ways
+from f3amd_notebooks import bimodal_paths as toy
+from f3amd_notebooks import one_step_ways as ways
 
 from f3amd_lib.diffusion.schedules import variance_exploding
 

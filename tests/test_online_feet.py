@@ -7,14 +7,14 @@ import pytest
 from builders import SKELETON as SHORT_LEGS
 from builders import refused
 
+from f3amd_companion.serving import online_feet
+from f3amd_companion.serving.foot_locking import FARTHEST, leg_chains
+from f3amd_companion.serving.online_feet import lock_frame, lock_frames, lock_rollout_online, start_feet
 from f3amd_lib.data.features import motion_from_frames, world_frames
-from f3amd_lib.generation import online_feet
-from f3amd_lib.generation.foot_locking import FARTHEST, leg_chains
-from f3amd_lib.generation.generated import Rollout
-from f3amd_lib.generation.online_feet import lock_frame, lock_frames, lock_rollout_online, start_feet
 from f3amd_lib.measures.walking import floor_penetration, slide_speed, toe_positions
 from f3amd_lib.motion.skeleton import global_rotations
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
+from f3amd_lib.rollout.generated import Rollout
 
 PAST = 10
 

@@ -12,11 +12,7 @@ import numpy as np
 import pytest
 from builders import refused
 
-from f3amd_lib.diffusion.samplers import walk
-from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.generation.rounds import sample_round
-from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.serving.onnx_export import (
+from f3amd_companion.serving.onnx_export import (
     CARD,
     PROGRAM,
     OnnxProgram,
@@ -25,6 +21,10 @@ from f3amd_lib.serving.onnx_export import (
     largest_difference,
     seeded_inputs,
 )
+from f3amd_lib.diffusion.samplers import walk
+from f3amd_lib.diffusion.schedules import variance_preserving_cosine
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.checkpoints import load_model
 
 PRETRAINED = Path(__file__).resolve().parents[1] / "f3amd_lib" / "pretrained"

@@ -10,21 +10,28 @@ import pytest
 from builders import refused, tiny_trained
 from flax import nnx
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.data.text_motions import AxisNormaliser
+from f3amd_companion.__main__ import main
+from f3amd_companion.serving.onnx_export import (
+    CARD,
+    PROGRAM,
+    OnnxProgram,
+    denoiser_program,
+    input_shapes,
+    seeded_inputs,
+)
+from f3amd_companion.serving.onnx_text import export_text_onnx, load_text_or_latent
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
-from f3amd_lib.generation.latent_motion import sample_student, sample_teacher
-from f3amd_lib.generation.text_to_motion import text_prediction
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
-from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
-from f3amd_lib.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
-from f3amd_lib.serving.onnx_export import CARD, PROGRAM, OnnxProgram, denoiser_program, input_shapes, seeded_inputs
-from f3amd_lib.serving.onnx_text import export_text_onnx, load_text_or_latent
+from f3amd_lib.text.data.text_motions import AxisNormaliser
+from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
+from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
+from f3amd_lib.text.sampling.motionpcm_sampling import sample_student, sample_teacher
+from f3amd_lib.text.sampling.text_to_motion import text_prediction
+from f3amd_lib.text.stages.latent_models import LatentModel, save_latent_model
+from f3amd_lib.text.stages.motion_codec import MotionCodec
+from f3amd_lib.text.stages.text_models import TextModel, save_text_model
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
-from f3amd_lib.training.latent_models import LatentModel, save_latent_model
-from f3amd_lib.training.motion_codec import MotionCodec
-from f3amd_lib.training.text_models import TextModel, save_text_model
 
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
 ABOUT = {"skeleton": SYNTHETIC_SKELETON, "fps": 20.0, "text_encoder": "tiny-8"}

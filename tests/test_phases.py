@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.phases import (
+from f3amd_lib.diffusion.schedules import variance_preserving_betas
+from f3amd_lib.text.phases import (
     LATENT_CONSISTENCY_TIMES,
     consistency_answer,
     consistency_scales,
@@ -23,7 +24,6 @@ from f3amd_lib.diffusion.phases import (
     shares,
     target_end,
 )
-from f3amd_lib.diffusion.schedules import variance_preserving_betas
 
 SCHEDULE = variance_preserving_betas()
 

@@ -9,7 +9,7 @@ import pytest
 from builders import refused
 
 import f3amd_lib.training.pipeline as pipeline
-from f3amd_lib.__main__ import main
+from f3amd_companion.__main__ import main
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground.profiles import load_profile
@@ -168,7 +168,7 @@ def test_command_refuses_unknown_style_in_one_line(trained_once, same_runs, tmp_
 @pytest.mark.slow
 def test_command_runs_as_a_module():
     done = subprocess.run(
-        [sys.executable, "-m", "f3amd_lib", "presets", "--channels", "129", "--styles", "22"],
+        [sys.executable, "-m", "f3amd_companion", "presets", "--channels", "129", "--styles", "22"],
         capture_output=True,
         text=True,
         check=True,

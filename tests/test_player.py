@@ -14,16 +14,16 @@ from builders import SKELETON, refused, straight_motion, wandering_motion
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from f3amd_companion.serving import player
+from f3amd_companion.serving.player import Character, Scene, player_page, rollout_scene, write_player
+from f3amd_companion.serving.web_page import FOLDER
 from f3amd_lib.drawing.pictures import film_strip, write_film_strip, write_gif
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, limb_side
-from f3amd_lib.generation.rollout import Rollout
 from f3amd_lib.motion.body import body_capsules, make_body
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
-from f3amd_lib.serving import player
-from f3amd_lib.serving.player import Character, Scene, player_page, rollout_scene, write_player
-from f3amd_lib.serving.web_page import FOLDER
+from f3amd_lib.rollout.rollout import Rollout
 
 FRAMES = 40
 
@@ -391,8 +391,8 @@ def test_the_page_is_made_of_files_that_are_installed():
 
     root = Path(__file__).resolve().parents[1]
     listed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
-    patterns = listed["package-data"]["f3amd_lib"]
-    package = root / "f3amd_lib"
+    patterns = listed["package-data"]["f3amd_companion"]
+    package = root / "f3amd_companion"
     found = {path for pattern in patterns for path in package.glob(pattern)}
     assert set((package / "serving" / "web").iterdir()) <= found
 

@@ -18,10 +18,10 @@ from builders import (
 )
 from scipy.spatial.transform import Rotation
 
+from f3amd_companion.measuring import measure, posterior
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.experiments import measure, posterior
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn

@@ -13,7 +13,7 @@ import pytest
 from builders import CHANNELS, SKELETON, network_of, packed_from, same_tree, tiny_config, wandering_motion
 from flax import nnx
 
-from f3amd_lib.__main__ import main
+from f3amd_companion.__main__ import main
 from f3amd_lib.data.windows import build_windows, fit_normaliser
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine, variance_preserving_linear
 from f3amd_lib.ground.papers import load_paper_table

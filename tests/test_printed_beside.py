@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 
 from f3amd_lib.ground import stored
-from f3amd_lib.reports import printed_beside
-from f3amd_lib.reports.printed_beside import beside_printed, judge_note
+from f3amd_lib.papers import printed_beside
+from f3amd_lib.papers.printed_beside import beside_printed, judge_note
 
 
 @pytest.fixture

@@ -9,12 +9,16 @@ import pandas as pd
 import pytest
 from builders import packed_from, refused
 
+from f3amd_companion.measuring import measure
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.windows import starting_poses
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.experiments import measure
-from f3amd_lib.experiments import protocol as module
-from f3amd_lib.experiments.protocol import (
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.measures import protocol as module
+from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.measures.protocol import (
     REFERENCE_MODELS,
     Protocol,
     evaluation_paths,
@@ -23,15 +27,11 @@ from f3amd_lib.experiments.protocol import (
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.experiments.real_clips import sideways_share
-from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.measures.real_clips import sideways_share
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData
 

@@ -8,14 +8,14 @@ from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf
 
+from f3amd_companion.measuring.published import PublishedFeatures, published_arrays, published_model, published_network
 from f3amd_lib.data.features import path_condition, split_frames
 from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.training.published import PublishedFeatures, published_arrays, published_model, published_network
+from f3amd_lib.rollout.rollout import MotionGenerator
 
 HEADS = 4
 

@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 from builders import refused
 
-from f3amd_lib.experiments.measure import ONE_STEP_MODELS
+from f3amd_companion.ledger.quality_bars import BAR_MODELS, quality_bars
+from f3amd_companion.measuring.measure import ONE_STEP_MODELS
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.reports.quality_bars import BAR_MODELS, quality_bars
 
 REAL = {
     "style_coverage": 99.0, "FID": 10.0, "EMD": 5.0, "IRD": 4.0, "IRD_excess": 0.7,

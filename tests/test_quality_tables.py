@@ -5,9 +5,7 @@ import pandas as pd
 import pytest
 from builders import refused
 
-from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.networks import presets
-from f3amd_lib.reports.quality_tables import (
+from f3amd_companion.ledger.quality_tables import (
     FIGURES,
     NOT_MEASURED,
     NOTE,
@@ -21,6 +19,8 @@ from f3amd_lib.reports.quality_tables import (
     side_by_side,
     wide_rows,
 )
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.networks import presets
 
 UNITS = {"style_coverage": "%", "trajectory_error": "m", "direction_error": "deg", "diversity": "cm", "IRD": "cm"}
 

@@ -7,11 +7,10 @@ import pytest
 from builders import CHANNELS, SKELETON, random_frames
 from test_campaign import PROFILE, STYLES, judges, packed, small  # noqa: F401  (fixtures)
 
+from f3amd_companion.measuring import campaign, fingerprint
+from f3amd_companion.measuring.campaign import Run, queue, run_campaign, train_snapshots
+from f3amd_companion.measuring.recipes import find_recipe
 from f3amd_lib.data.windows import spread_windows
-from f3amd_lib.experiments import campaign, fingerprint
-from f3amd_lib.experiments.campaign import Run, queue, run_campaign, train_snapshots
-from f3amd_lib.experiments.recipes import find_recipe
-from f3amd_lib.generation.generated import Rollout
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.conditioning import Condition
@@ -19,6 +18,7 @@ from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import SpectralConvolution
+from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.training.losses import loss_terms
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import learning_rate_schedule, paper_recipe

@@ -11,11 +11,11 @@ import pytest
 from builders import rows_of_one_step
 from PIL import Image
 
+from f3amd_companion.ledger.claims import load_claims
+from f3amd_companion.ledger.model_cards import committed_quality
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.networks.presets import find_preset
-from f3amd_lib.reports.claims import load_claims
-from f3amd_lib.reports.model_cards import committed_quality
 from f3amd_lib.training.checkpoints import load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 

@@ -7,8 +7,8 @@ import pytest
 from builders import packed_from, refused, stiff_walk, walks_and_runs
 
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.experiments import real_clips
-from f3amd_lib.experiments.real_clips import path_statistics
+from f3amd_lib.measures import real_clips
+from f3amd_lib.measures.real_clips import path_statistics
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion, tangent_yaw
 
 TRAIN = 0

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_trained, wandering_motion
 
+from f3amd_companion.measuring import measure, recipes
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.experiments import measure, recipes
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets

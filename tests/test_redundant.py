@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from f3amd_lib.motion import redundant, synthetic
+from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, shortest_turn
 from f3amd_lib.motion.skeleton import Motion, Skeleton, resample, turn
+from f3amd_lib.text.data import redundant
 
 
 def walk(style="neutral", seconds=4.0, seed=0) -> Motion:

@@ -15,7 +15,9 @@ import pytest
 import f3amd_lib
 
 ROOT = Path(__file__).resolve().parents[1]
-LIBRARY = ROOT / "f3amd_lib"
+PACKAGES = (ROOT / "f3amd_lib", ROOT / "f3amd_companion")
+NOTEBOOKS = ROOT / "notebooks" / "f3amd_notebooks"
+"""Modules alone, beside the notebooks that import them."""
 NAME = f"f3amd_lib-{f3amd_lib.__version__}"
 AROUND = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "NOTICE")
 """Files that building reads beside the library."""
@@ -32,13 +34,15 @@ def files_of(folder: Path) -> set[str]:
 def left_out(folder: Path) -> set[str]:
     """Files of a package that are neither modules of it nor package data."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    taken = {path for pattern in settings["package-data"]["f3amd_lib"] for path in folder.glob(pattern)}
+    taken = {path for pattern in settings["package-data"].get(folder.name, []) for path in folder.glob(pattern)}
     taken |= {path for path in folder.rglob("*.py") if (path.parent / "__init__.py").is_file()}
     return files_of(folder) - {path.relative_to(folder.parent).as_posix() for path in taken}
 
 
-def test_every_file_of_the_library_is_a_module_or_package_data(tmp_path):
-    assert left_out(LIBRARY) == set()
+def test_every_file_of_the_packages_is_a_module_or_package_data(tmp_path):
+    assert [left_out(package) for package in PACKAGES] == [set(), set()]
+    assert not [name for name in left_out(NOTEBOOKS) if name.endswith(".py")]
+    tmp_path = tmp_path / "f3amd_lib"
     for name in ("__init__.py", "room/module.py", "room/values.toml", "room/notes.txt", "pretrained/set/model.md"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -49,7 +53,9 @@ def test_every_file_of_the_library_is_a_module_or_package_data(tmp_path):
 def built(tmp_path_factory):
     """(names in the wheel, names in the source archive, the wheel's metadata), built offline from a copy."""
     tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("dist")
-    shutil.copytree(LIBRARY, tree / "f3amd_lib", ignore=shutil.ignore_patterns("__pycache__"))
+    for package in (*PACKAGES, NOTEBOOKS):
+        place = tree / package.relative_to(ROOT)
+        shutil.copytree(package, place, ignore=shutil.ignore_patterns("__pycache__"))
     for name in (*AROUND, *BESIDE):
         shutil.copy(ROOT / name, tree / name)
     (tree / "tests").mkdir()
@@ -70,7 +76,8 @@ def built(tmp_path_factory):
 def test_a_wheel_holds_the_library_its_weights_and_their_terms_and_nothing_else(built):
     wheel, _, metadata = built
     own = {name for name in wheel if not name.startswith(f"{NAME}.dist-info/")}
-    assert own == files_of(LIBRARY)
+    modules = {name for name in files_of(NOTEBOOKS) if name.endswith(".py")}
+    assert own == set().union(*map(files_of, PACKAGES), modules)
     assert {"f3amd_lib/pretrained/bandai/CAMDM.safetensors", "f3amd_lib/pretrained/bandai/CAMDM.md"} <= own
     told = {name.removeprefix(f"{NAME}.dist-info/") for name in wheel - own}
     wanted = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt", "licenses/LICENSE", "licenses/NOTICE"}
@@ -82,4 +89,5 @@ def test_a_wheel_holds_the_library_its_weights_and_their_terms_and_nothing_else(
 def test_a_source_archive_builds_the_same_and_has_no_tests_data_or_figures(built):
     _, source, _ = built
     own = {name for name in source if not name.startswith("f3amd_lib.egg-info/")}
-    assert own == files_of(LIBRARY) | set(AROUND) | BESIDE | {"PKG-INFO", "setup.cfg"}
+    modules = {f"notebooks/{name}" for name in files_of(NOTEBOOKS) if name.endswith(".py")}
+    assert own == set().union(*map(files_of, PACKAGES), modules) | set(AROUND) | BESIDE | {"PKG-INFO", "setup.cfg"}

@@ -132,6 +132,10 @@ def test_git_state_of_a_checkout(tmp_path, monkeypatch):
     assert records._git_state() == (commit, False)
     (tmp_path / "table.csv").write_text("result\n")
     assert records._git_state() == (commit, False)
+    (tmp_path / "f3amd_companion").mkdir()
+    (tmp_path / "f3amd_companion" / "measure.py").write_text("one\n")
+    assert records._git_state() == (commit, True)
+    (tmp_path / "f3amd_companion" / "measure.py").unlink()
     (library / "records.py").write_text("two\n")
     assert records._git_state() == (commit, True)
 

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 from builders import refused
 
-from f3amd_lib import reproduce
-from f3amd_lib.__main__ import main
+from f3amd_companion import reproduce
+from f3amd_companion.__main__ import main
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.records import read_table

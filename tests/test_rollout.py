@@ -8,9 +8,9 @@ from builders import CHANNELS, HISTORY, SKELETON, WINDOW, make_condition, refuse
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.motion.root_paths import RootPath, named_path
 from f3amd_lib.motion.rotations import wrap_angle
+from f3amd_lib.rollout.rollout import MotionGenerator
 
 POSE = np.tile(np.float32([1, 0, 0, 0, 1, 0]), SKELETON.num_joints)
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from builders import SKELETON, stiff_walk, walks_and_runs
 
+from f3amd_companion.ledger import quality_tables
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.experiments import real_clips, rollout_measures
-from f3amd_lib.generation.generated import Rollout
+from f3amd_lib.measures import real_clips, rollout_measures
 from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.motion.root_paths import RootPath, path_from_motion
-from f3amd_lib.reports import quality_tables
+from f3amd_lib.rollout.generated import Rollout
 
 WINDOW = 8
 

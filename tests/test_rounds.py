@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.generation.rounds import sample_round, sample_round_on_devices
+from f3amd_lib.rollout.rounds import sample_round, sample_round_on_devices
 
 BATCH = 4
 SIGMAS = np.asarray(variance_exploding().grid(3), np.float32)

@@ -5,7 +5,7 @@ import logging
 import pandas as pd
 import pytest
 
-from f3amd_lib.experiments.runner import Records
+from f3amd_companion.measuring.runner import Records
 from f3amd_lib.ground.records import read_table, run_record
 
 KEYS = ["model", "steps"]

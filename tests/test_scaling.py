@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from builders import refused
 
-from f3amd_lib.experiments.sweep import Leg
+from f3amd_companion.measuring.sweep import Leg
 
 ROOT = Path(__file__).resolve().parents[1]
 _spec = importlib.util.spec_from_file_location("scaling", ROOT / "scripts" / "scaling.py")

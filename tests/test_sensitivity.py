@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 from builders import packed_from, refused, straight_motion, wandering_motion
 
-from f3amd_lib.experiments.protocol import Protocol
-from f3amd_lib.experiments.sensitivity import (
+from f3amd_companion.measuring.sensitivity import (
     foot_spectrum,
     graded_corruptions,
     rank_agreement,
     settling,
     summarise_corruptions,
 )
+from f3amd_lib.measures.protocol import Protocol
 
 SPAN = 20
 

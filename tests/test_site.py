@@ -139,7 +139,8 @@ def test_every_public_module_is_on_one_page_of_the_library():
         if match[1] == "room"
     ]
     shown = [name for room in rooms for name in pages.modules_of(room)]
-    files = [path.relative_to(ROOT).with_suffix("") for path in (ROOT / "f3amd_lib").rglob("*.py")]
+    paths = [path for package in ("f3amd_lib", "f3amd_companion") for path in (ROOT / package).rglob("*.py")]
+    files = [path.relative_to(ROOT).with_suffix("") for path in paths]
     public = {".".join(path.parts) for path in files if not path.name.startswith("_")}
     assert len(shown) == len(set(shown))
     assert public <= set(shown)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from builders import refused
 
+from f3amd_companion.serving.foot_locking import lock_feet
 from f3amd_lib.data.features import world_frames
-from f3amd_lib.generation.foot_locking import lock_feet
 from f3amd_lib.motion import rotations, skeleton
 from f3amd_lib.motion.bvh import format_bvh
 from f3amd_lib.motion.skeleton import Motion, Skeleton

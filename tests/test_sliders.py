@@ -8,7 +8,7 @@ import nbformat
 import numpy as np
 import pytest
 from builders import refused
-from helpers.sliders import slide
+from f3amd_notebooks.sliders import slide
 
 from f3amd_lib.drawing.style import new_figure
 from f3amd_lib.ground.profiles import repository_root

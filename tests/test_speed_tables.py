@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from builders import refused
 
-from f3amd_lib.benchmarking.speed_tables import (
+from f3amd_companion.speed.speed_tables import (
     fastest_implementations,
     speed_bars,
     speedups,

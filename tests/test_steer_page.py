@@ -16,19 +16,19 @@ import numpy as np
 import pytest
 from builders import refused
 
+from f3amd_companion.serving import npm_packages, steer
+from f3amd_companion.serving.foot_locking import leg_chains
+from f3amd_companion.serving.npm_packages import package_file
+from f3amd_companion.serving.online_feet import lock_frame, start_feet
+from f3amd_companion.serving.onnx_export import model_card
+from f3amd_companion.serving.steer import steer_page, write_steer
+from f3amd_companion.serving.steering import Steering, Target, first_pose, move_target
+from f3amd_companion.serving.web_page import FOLDER
 from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.generation.blending import blend_seams
-from f3amd_lib.generation.foot_locking import leg_chains
-from f3amd_lib.generation.online_feet import lock_frame, start_feet
-from f3amd_lib.generation.steering import Steering, Target, first_pose, move_target
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
-from f3amd_lib.serving import npm_packages, steer
-from f3amd_lib.serving.npm_packages import package_file
-from f3amd_lib.serving.onnx_export import model_card
-from f3amd_lib.serving.steer import steer_page, write_steer
-from f3amd_lib.serving.web_page import FOLDER
+from f3amd_lib.rollout.blending import blend_seams
 from f3amd_lib.training.checkpoints import describe_skeleton
 
 SIGMAS = variance_exploding().grid(3)

@@ -5,9 +5,9 @@ import jax
 import numpy as np
 import pytest
 
-from f3amd_lib.generation.blending import blend_seams
-from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.generation.steering import FPS, MAX_TURN, Steering, Target, first_pose, move_target, usual_pace
+from f3amd_companion.serving.steering import FPS, MAX_TURN, Steering, Target, first_pose, move_target, usual_pace
+from f3amd_lib.rollout.blending import blend_seams
+from f3amd_lib.rollout.rollout import MotionGenerator
 
 STILL = Target(np.zeros((1, 2)), np.zeros(1), np.zeros(1), np.zeros(1))
 

@@ -22,15 +22,15 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, refused, same_tree, tiny_packed, tiny_trained
 
-from f3amd_lib import __main__ as command_line
-from f3amd_lib.experiments import campaign, measure, sweep
-from f3amd_lib.experiments.campaign import Run, run_campaign
-from f3amd_lib.experiments.protocol import Protocol
-from f3amd_lib.experiments.runner import Records
-from f3amd_lib.experiments.sweep import Leg, Work, gather, plan, run_leg, run_sweep
+from f3amd_companion import __main__ as command_line
+from f3amd_companion.measuring import campaign, measure, sweep
+from f3amd_companion.measuring.campaign import Run, run_campaign
+from f3amd_companion.measuring.runner import Records
+from f3amd_companion.measuring.sweep import Leg, Work, gather, plan, run_leg, run_sweep
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile, results_dir
 from f3amd_lib.ground.records import read_table, run_record
+from f3amd_lib.measures.protocol import Protocol
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PreparedData

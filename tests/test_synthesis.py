@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, network_of, refused, tiny_camdm, tiny_config
 
-from f3amd_lib.benchmarking import implementations, measurements, synthesis
-from f3amd_lib.benchmarking.implementations import NotPossible, Workload, prepare_round, random_condition
-from f3amd_lib.benchmarking.synthesis import Candidate, plan, time_group
-from f3amd_lib.benchmarking.time_breakdown import PARTS, time_breakdown, without
+from f3amd_companion.speed import implementations, measurements, synthesis
+from f3amd_companion.speed.implementations import NotPossible, Workload, prepare_round, random_condition
+from f3amd_companion.speed.synthesis import Candidate, plan, time_group
+from f3amd_companion.speed.time_breakdown import PARTS, time_breakdown, without
 from f3amd_lib.diffusion.samplers import num_evaluations
-from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.rollout.rounds import sample_round
 
 QUICK = {"min_rounds": 3, "min_seconds": 0.0, "fewest_rounds": 2, "warmup": 1}
 

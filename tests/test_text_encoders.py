@@ -6,8 +6,8 @@ import socket
 import numpy as np
 import pytest
 
-from f3amd_lib.data import text_encoders
-from f3amd_lib.data.text_encoders import TextEmbeddings, check_words, embed_captions, load_text_encoder
+from f3amd_lib.text.data import text_encoders
+from f3amd_lib.text.data.text_encoders import TextEmbeddings, check_words, embed_captions, load_text_encoder
 
 
 class Letters:

@@ -5,13 +5,13 @@ import zlib
 import numpy as np
 import pytest
 
-from f3amd_lib.data.text_encoders import TextEmbeddings
-from f3amd_lib.data.text_motions import text_motions
-from f3amd_lib.measures import text_judge
 from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample, turn
-from f3amd_lib.training.evaluator_task import EvaluatorTraining
+from f3amd_lib.text.data.text_encoders import TextEmbeddings
+from f3amd_lib.text.data.text_motions import text_motions
+from f3amd_lib.text.judge import text_judge
+from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
 
 STYLES = synthetic.STYLES[:4]
 SIZES = {"movement_width": 16, "motion_hidden": 16, "text_hidden": 16, "embedding_width": 8}

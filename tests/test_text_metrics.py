@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.measures import registry, text_metrics
+from f3amd_lib.measures import registry
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.text.judge import text_metrics
 
 SKELETON = Skeleton(("Hips", "LeftToe", "RightToe"), (-1, 0, 0), [[0, 0, 0], [0.1, -0.9, 0], [-0.1, -0.9, 0]])
 

@@ -10,19 +10,15 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.data.text_motions import AxisNormaliser, ClipTable
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
-from f3amd_lib.generation.text_to_motion import sample_control
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.acmdm import ACMDMConfig, TextCondition
-from f3amd_lib.networks.acmdm_control import Control, ControlBranch
-from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
-from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig
-from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.motion_codec import MotionCodec, with_latent
-from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
-from f3amd_lib.training.settings import part_recipe
-from f3amd_lib.training.text_motion import (
+from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable
+from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
+from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
+from f3amd_lib.text.sampling.text_to_motion import sample_control
+from f3amd_lib.text.stages.acmdm_training import (
     AutoencoderTask,
     ControlTask,
     TextMotionTask,
@@ -35,6 +31,10 @@ from f3amd_lib.training.text_motion import (
     frame_error,
     noisy_state,
 )
+from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.settings import part_recipe
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
 CLIPS, FRAMES, JOINTS = 6, 40, 3

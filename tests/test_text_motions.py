@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from f3amd_lib.data import captions, text_motions
 from f3amd_lib.data.packed import pack
 from f3amd_lib.data.sources import assign_splits, open_dataset
-from f3amd_lib.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.drawing.pictures import film_strip
-from f3amd_lib.motion.redundant import positions_from_redundant
 from f3amd_lib.motion.skeleton import Motion, Skeleton, turn
+from f3amd_lib.text.data import captions, text_motions
+from f3amd_lib.text.data.redundant import positions_from_redundant
+from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
 
-WORDS = tomllib.loads((resources.files("f3amd_lib.data") / "captions.toml").read_text(encoding="utf-8"))
+WORDS = tomllib.loads((resources.files("f3amd_lib.text.data") / "captions.toml").read_text(encoding="utf-8"))
 SKELETON = Skeleton(
     ("Hips", "LeftHip", "RightHip", "LeftWrist", "RightWrist", "Head"),
     (-1, 0, 0, 0, 0, 0),

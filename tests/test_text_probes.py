@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from test_text_judge import OneVectorAWord
 
-from f3amd_lib.__main__ import main
-from f3amd_lib.data.text_motions import text_motions
-from f3amd_lib.experiments import text_probes
-from f3amd_lib.experiments.text_probes import counted_hands, measure_hands, mirrored_positions, probes_of
+from f3amd_companion.__main__ import main
+from f3amd_companion.measuring import text_probes
+from f3amd_companion.measuring.text_probes import counted_hands, measure_hands, mirrored_positions, probes_of
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.measures.text_metrics import raised_hands
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import Motion, resample
+from f3amd_lib.text.data.text_motions import text_motions
+from f3amd_lib.text.judge.text_metrics import raised_hands
 
 PROFILE = load_profile("smoke", "bandai")
 

@@ -10,8 +10,9 @@ import pytest
 from builders import captioned_walks, refused
 from test_text_models import ENCODER, PROFILE, TINY
 
-from f3amd_lib.experiments import text_tables
-from f3amd_lib.experiments.text_tables import (
+from f3amd_companion.ledger import claims
+from f3amd_companion.measuring import text_tables
+from f3amd_companion.measuring.text_tables import (
     PAPERS,
     UNCONTROLLED,
     Bench,
@@ -21,13 +22,12 @@ from f3amd_lib.experiments.text_tables import (
 )
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.measures.text_judge import load_judge
-from f3amd_lib.measures.text_metrics import control_errors
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
-from f3amd_lib.reports import claims
-from f3amd_lib.reports.evidence import SCHEMAS
-from f3amd_lib.training import text_models
+from f3amd_lib.papers.printed import SCHEMAS
+from f3amd_lib.text.judge.text_judge import load_judge
+from f3amd_lib.text.judge.text_metrics import control_errors
+from f3amd_lib.text.stages import text_models
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 

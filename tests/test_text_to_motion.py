@@ -11,7 +11,9 @@ from test_acmdm import BATCH, condition, config_of, fresh, normal
 
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
-from f3amd_lib.generation.text_to_motion import (
+from f3amd_lib.text.networks.acmdm_control import Control, control_branch, controlled
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.text.sampling.text_to_motion import (
     continue_prefix,
     control_prediction,
     sample_blocks,
@@ -21,8 +23,6 @@ from f3amd_lib.generation.text_to_motion import (
     text_prediction,
     with_guidance,
 )
-from f3amd_lib.networks.acmdm_control import Control, control_branch, controlled
-from f3amd_lib.networks.masked_acmdm import MaskedACMDMConfig
 
 SCHEDULE, NOISE = straight(), normal(1, BATCH, 8, 5, 4)
 EULER = {"sampler": "ddim", "num_steps": 2}

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from builders import refused
 
-from f3amd_lib.benchmarking import machine
-from f3amd_lib.benchmarking.machine import describe_machine, fast_xla_flags, matmul_precision, matmul_probe
-from f3amd_lib.benchmarking.timing import take_turns
+from f3amd_companion.speed import machine
+from f3amd_companion.speed.machine import describe_machine, fast_xla_flags, matmul_precision, matmul_probe
+from f3amd_companion.speed.timing import take_turns
 
 
 class Clock:
@@ -127,7 +127,7 @@ def test_fast_flags_start_jax_with_as_many_devices():
 
 
 def test_a_flag_that_xla_does_not_know_is_left_out(monkeypatch):
-    monkeypatch.setattr("f3amd_lib.benchmarking.machine._FAST_FLAGS", ("--xla_no_such_flag=1",))
+    monkeypatch.setattr("f3amd_companion.speed.machine._FAST_FLAGS", ("--xla_no_such_flag=1",))
     assert "no_such_flag" not in fast_xla_flags(2)
 
 

@@ -12,14 +12,14 @@ import pytest
 from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, refused, tiny_camdm, tiny_config
 from flax import nnx
 
-from f3amd_lib.benchmarking import implementations
+from f3amd_companion.speed import implementations
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.generation.rounds import sample_round
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.rollout.rounds import sample_round
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
-torch_camdm = pytest.importorskip("f3amd_lib.benchmarking.torch_camdm")
+torch_camdm = pytest.importorskip("f3amd_companion.speed.torch_camdm")
 pytestmark = pytest.mark.needs("torch", "onnxscript", "onnxruntime")
 
 SIGMAS = variance_preserving_cosine(4).grid(4)
@@ -270,7 +270,7 @@ def test_wrong_shapes_are_refused_by_name():
 
 
 def test_what_is_not_installed_is_named_with_its_extra(monkeypatch):
-    name = "f3amd_lib.benchmarking.torch_camdm"
+    name = "f3amd_companion.speed.torch_camdm"
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError, match=r'pip install "f3amd_lib\[bench\]"'):

@@ -7,14 +7,14 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from f3amd_lib.experiments.campaign import Run
-from f3amd_lib.experiments.learning_curves import power_law
+from f3amd_companion.ledger.quality_tables import FIGURES, of_queue
+from f3amd_companion.measuring.campaign import Run
+from f3amd_companion.measuring.learning_curves import power_law
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.camdm import CAMDMConfig
-from f3amd_lib.reports.quality_tables import FIGURES, of_queue
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.recipe import learning_rate_schedule

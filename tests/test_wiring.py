@@ -27,14 +27,15 @@ from builders import (
 )
 from builders import wandering_motion as wandering
 
+from f3amd_companion.measuring import learning_curves
 from f3amd_lib.data import windows as windows_module
 from f3amd_lib.data.features import Normaliser, world_frames
 from f3amd_lib.data.windows import gather_windows
-from f3amd_lib.experiments import learning_curves, real_clips
-from f3amd_lib.generation.rollout import MotionGenerator
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.measures import real_clips
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training import denoising_task as task_module
 from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, advance, held_out_terms, initial_state

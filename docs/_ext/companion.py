@@ -136,7 +136,7 @@ def plain_docstring(app, what, name, obj, options, lines) -> None:
 
 def import_library() -> None:
     """Import every module before autodoc does: some packages stumble over its stand-ins."""
-    for path in sorted((ROOT / "f3amd_lib").rglob("*.py")):
+    for path in sorted(path for name in ("f3amd_lib", "f3amd_companion") for path in (ROOT / name).rglob("*.py")):
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         if "__" not in name:
             try:

@@ -46,7 +46,7 @@ def modules_of(room: str) -> list[str]:
     if path.with_suffix(".py").is_file():
         return [room]
     if not path.is_dir():
-        raise ValueError(f"insert: room {room}: there is no such package or module; see f3amd_lib/")
+        raise ValueError(f"insert: room {room}: there is no such package or module of the house")
     names = []
     for file in sorted(path.rglob("*.py")):
         parts = file.relative_to(ROOT).with_suffix("").parts
@@ -63,7 +63,7 @@ def room_markdown(room: str) -> str:
     """Return one section a module, each with its docstrings."""
     sections = []
     for name in modules_of(room):
-        title = name.removeprefix("f3amd_lib.")
+        title = name.partition(".")[2]
         sections.append(f"## `{title}`\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n")
     return "\n".join(sections)
 

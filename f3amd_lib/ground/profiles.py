@@ -153,7 +153,7 @@ def results_dir(dataset: str, profile: str, *, root=None) -> Path:
     """Return the folder that results of a data set and profile go to, and make it.
 
     Results go to the ignored `runs/` unless somebody asks otherwise: the committed `paper_figures/`
-    is written only by `make figures` (`f3amd_lib.reproduce`), which sets `F3AMD_RESULTS_DIR`.
+    is written only by `make figures` (`f3amd_companion.reproduce`), which sets `F3AMD_RESULTS_DIR`.
 
     Args:
       dataset: one of `DATASETS`.

@@ -30,6 +30,7 @@ log = logging.getLogger("f3amd")
 
 _LIBRARY = Path(__file__).resolve().parents[1]
 _REPOSITORY = _LIBRARY.parent
+_BESIDE = ("f3amd_companion", "notebooks")
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
 _EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
@@ -252,7 +253,7 @@ def _git_state() -> tuple[str | None, bool | None]:
         return None, None
     commit = git("rev-parse", "HEAD")
     # Only code counts: results written by the run itself do not make it dirty.
-    status = git("status", "--porcelain", "--", str(_LIBRARY), str(_REPOSITORY / "notebooks"))
+    status = git("status", "--porcelain", "--", str(_LIBRARY), *(str(_REPOSITORY / name) for name in _BESIDE))
     return commit, None if commit is None or status is None else bool(status)
 
 

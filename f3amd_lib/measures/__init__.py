@@ -1,1 +1,1 @@
-"""Root paths, autoregressive rollout and the measures of motion quality."""
+"""The measures of motion quality, and the protocol by which motion is measured."""

@@ -2,13 +2,14 @@
 
 A preset is a row of a table in a paper (or one of ours, which says so): a network, the noise it is
 trained with, and what its training does differently. All stand in `papers/*/presets.toml`; another
-paper brings a file of its own and, where its network is a new one, a line of `FAMILIES`.
+paper brings a file of its own and, where its network is a new one, a line of `[families]` in it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import pkgutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,28 +24,18 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.ground.papers import check_entry, find_entry
-from f3amd_lib.networks import motionpcm
-from f3amd_lib.networks.acmdm import ACMDM, ACMDMConfig
-from f3amd_lib.networks.camdm import CAMDM, CAMDMConfig
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.counting import count_flops
-from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
-from f3amd_lib.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
-from f3amd_lib.networks.mesh_autoencoder import MeshAutoencoder, MeshAutoencoderConfig
-from f3amd_lib.networks.motion_autoencoder import AutoencoderConfig, MotionAutoencoder
-from f3amd_lib.networks.text_motion import TextMotionConfig, TextMotionNetwork
 
-FAMILIES = {
-    config.family: (config, network)
-    for config, network in (
-        (F3AMDConfig, F3AMD), (CAMDMConfig, CAMDM), (ACMDMConfig, ACMDM), (MaskedACMDMConfig, MaskedACMDM),
-        (AutoencoderConfig, MotionAutoencoder), (MeshAutoencoderConfig, MeshAutoencoder),
-        (motionpcm.LatentAutoencoderConfig, motionpcm.LatentAutoencoder),
-        (motionpcm.LatentDenoiserConfig, motionpcm.LatentDenoiser),
-        (motionpcm.DiscriminatorConfig, motionpcm.Discriminator), (TextMotionConfig, TextMotionNetwork),
-    )
-}  # fmt: skip
-"""Config and network of each family."""
+FAMILIES: dict[str, tuple[str, str]] = {}
+"""Where config and network of each family are, "module:class", as `[families]` of `papers/*/presets.toml` says."""
+
+
+@functools.cache
+def find_family(name: str) -> tuple[type[CheckedConfig], type[nnx.Module]]:
+    """Return config and network of a family; their module is imported when the family is first asked for."""
+    config, network = map(pkgutil.resolve_name, FAMILIES[name])
+    return config, network
 
 
 @dataclass(frozen=True)
@@ -60,7 +51,7 @@ class Preset:
       training: fields of the training config that differ, whatever the length of the run.
       source: where the paper has it, or "ours".
       paper_names: how the paper's tables call it, where that is not `name`.
-      windows: window lengths that the paper trains it with, frames (of the latent where there is one).
+      several_windows: window lengths that the paper trains it with, where they are several.
       latent: the preset of the autoencoder whose latent it makes, "" where it makes motion itself; of a form, what
         follows that preset's name.
     """
@@ -73,8 +64,15 @@ class Preset:
     training: Mapping
     source: str
     paper_names: tuple[str, ...] = ()
-    windows: tuple[int, ...] = (32,)
+    several_windows: tuple[int, ...] = ()
     latent: str = ""
+
+    @property
+    def windows(self) -> tuple[int, ...]:
+        """Window lengths that the paper trains it with, frames (of the latent where there is one)."""
+        if self.several_windows:
+            return self.several_windows
+        return (self.network.get("window", getattr(find_family(self.family)[0], "window", 0)),)
 
 
 def laid_over(lower: Mapping, upper: Mapping) -> dict:
@@ -89,8 +87,7 @@ def _preset(name: str, paper: str, family: str, diffusion=None, network=None, tr
     # CAMDM is told the number of a level, and so must know the levels of its schedule.
     if family == "CAMDM" and schedule.levels is not None:
         network = {"noise_levels": tuple(schedule.levels.tolist()), **network}
-    window = network.get("window", getattr(FAMILIES[family][0], "window", 0))
-    own = {"windows": [window], **own}
+    own = {"several_windows" if key == "windows" else key: value for key, value in own.items()}
     own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return Preset(name, paper, family, schedule, network, training or {}, **own)
 
@@ -103,7 +100,7 @@ def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
     """
     table = read_toml(path)
     rows, named = {}, {"forms": {}, "presets": {}}
-    keys = [field.name for field in dataclasses.fields(Preset)] + ["like"]
+    keys = [field.name for field in dataclasses.fields(Preset)] + ["like", "windows"]
     for kind in named:
         for name, row in table.get(kind, {}).items():
             where = f"{path}: {kind}.{name}"
@@ -126,6 +123,7 @@ FORMS: dict[str, Preset] = {}
 """What may follow the name of a paper's preset, and what it changes (see `find_preset`)."""
 
 for _path in sorted((Path(__file__).parents[1] / "papers").glob("*/presets.toml")):
+    FAMILIES |= {name: tuple(places) for name, places in read_toml(_path).get("families", {}).items()}
     _presets, _forms = read_presets(_path)
     PRESETS |= _presets
     FORMS |= _forms
@@ -186,7 +184,7 @@ def build_config(name: str, **settings) -> CheckedConfig:
       ValueError: for an unknown name (with the nearest ones) or field, or one that is needed and missing.
     """
     preset = find_preset(name)
-    return FAMILIES[preset.family][0].from_dict({**preset.network, **settings})
+    return find_family(preset.family)[0].from_dict({**preset.network, **settings})
 
 
 def config_from_dict(values: Mapping) -> CheckedConfig:
@@ -197,7 +195,7 @@ def config_from_dict(values: Mapping) -> CheckedConfig:
     """
     family = values.get("family")
     check_known(family, FAMILIES, "model family")
-    return FAMILIES[family][0].from_dict(dict(values))
+    return find_family(family)[0].from_dict(dict(values))
 
 
 def build(name: str, *, key, **settings) -> nnx.Module:
@@ -213,7 +211,7 @@ def build(name: str, *, key, **settings) -> nnx.Module:
 
 def build_from_config(config: CheckedConfig, key) -> nnx.Module:
     """Return a freshly initialised network of a config."""
-    return FAMILIES[config.family][1](config, rngs=LayerKeys(key))
+    return find_family(config.family)[1](config, rngs=LayerKeys(key))
 
 
 @functools.lru_cache(maxsize=32)
@@ -262,13 +260,13 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
     Raises:
       ValueError: for an unknown paper, a setting of no family, or one that is needed and missing.
     """
-    known = {name for config, _ in FAMILIES.values() for name in config.from_data}
+    known = {name for family in FAMILIES for name in find_family(family)[0].from_data}
     for name in settings:
         find_entry(dict.fromkeys(known), name, "setting of the data", "presets")
     columns = "model window latent_width depth parameters mflop_per_evaluation diffusion sampler source"
     rows = []
     for preset in of_paper(paper).values():
-        family = FAMILIES[preset.family][0]
+        family = find_family(preset.family)[0]
         if not hasattr(family, "state_shape"):  # an autoencoder denoises nothing
             continue
         # A latent of meshes has the vertices that it has, whatever the data.

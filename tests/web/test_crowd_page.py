@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from conftest import DESKTOP, PHONE
 
+from f3amd_companion.serving.crowd import plan_crowd
+from f3amd_companion.serving.player import Character, Scene, write_player
 from f3amd_lib.drawing.pictures import crowd_colors
-from f3amd_lib.generation.crowd import plan_crowd
 from f3amd_lib.motion.skeleton import turn
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.serving.player import Character, Scene, write_player
 
 COUNT, FRAMES = 100, 60
 STYLES = ("Neutral", "Old", "March", "Zombie", "ArmsWide")

@@ -10,10 +10,10 @@ import pytest
 from builders import wandering_motion
 from conftest import DESKTOP, PHONE
 
+from f3amd_companion.serving.player import Character, Scene, player_page, write_player
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.root_paths import path_from_motion
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.serving.player import Character, Scene, player_page, write_player
 
 FRAMES = 90
 TITLES = ["Real", "CAMDM, 8 steps", "F3AMD, 8 steps", "F3AMD, 1 step"]

@@ -6,13 +6,13 @@ import builders  # noqa: F401  (tests/ is on the path)
 import numpy as np
 import pytest
 
+from f3amd_companion.serving import steer
+from f3amd_companion.serving.onnx_export import denoiser_program
+from f3amd_companion.serving.steer import write_steer
+from f3amd_companion.serving.steering import FPS, Steering, first_pose
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.generation.rollout import MotionGenerator
-from f3amd_lib.generation.steering import FPS, Steering, first_pose
 from f3amd_lib.measures.walking import seam_kick, slide_speed
-from f3amd_lib.serving import steer
-from f3amd_lib.serving.onnx_export import denoiser_program
-from f3amd_lib.serving.steer import write_steer
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import find_model
 

@@ -1,0 +1,547 @@
+"""The claims ledger: what a paper says, judged from records: `python -m f3amd_companion.ledger.claims`.
+
+Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
+paper, what decides it, and the statements it stands for, each with its kind of judgement. A verdict
+follows from recorded figures alone, and from none of ours to none of the paper's: models of our own
+(`-plus`, `-steady`, `-raw`, ...) decide nothing. The same statements are judged from the paper's own tables,
+which do not always say what its text says.
+
+The verdicts are committed. When a new measurement changes one, a test fails until somebody has
+looked at it and accepts the change on purpose (`--accept`).
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pandas as pd
+import tyro
+
+from f3amd_companion.ledger import judgements as judging
+from f3amd_companion.ledger import theory
+from f3amd_companion.ledger.evidence import (
+    Evidence,
+    NotMeasured,
+    Setting,
+    Source,
+    paper_evidence,
+    recorded_evidence,
+    snapshot_evidence,
+)
+from f3amd_companion.ledger.gate import LEAST_SHARE, why_not_judged
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
+from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
+from f3amd_lib.ground.profiles import load_profile, repository_root
+from f3amd_lib.ground.tables import compact_table, markdown_table
+from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.papers.printed import SCHEMAS, TIMES, check_model
+
+log = logging.getLogger("f3amd")
+
+DATASET_ORDER = ("bandai", "synthetic", "folder")
+"""Whose records decide: Bandai's motion first; CAMDM's published weights walk on a folder alone. All
+statements of a claim come from one data set, but for times, which another may have taken on another device."""
+
+PROFILE_ORDER = ("gpu", "laptop")
+"""Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
+
+_MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A part of a claim, and what some evidence says of it.
+
+    Attributes:
+      says: the sentence, in our words.
+      rule: its kind of judgement with its parameters, from evidence to verdict and figure.
+      optional: where it was not measured, nobody misses it.
+      remark: it decides nothing.
+      verdict: of `VERDICTS`; "" for a remark, and before it is judged.
+      figure: what was found, or why nothing was.
+      reasons: why no verdict is drawn from it -> the models of which that is true.
+      sources: tables that it rests on.
+      known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
+    """
+
+    says: str
+    rule: Callable[[Evidence], judging.Finding]
+    optional: bool = False
+    remark: bool = False
+    verdict: str = judging.REMARK
+    figure: str = ""
+    reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    sources: tuple[Source, ...] = ()
+    known: int = 0
+
+    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor=()) -> Statement:
+        """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
+        evidence.forget()
+        try:
+            verdict, figure = self.rule(evidence)
+        except NotMeasured as gap:
+            return replace(self, verdict=judging.UNMEASURED, figure=str(gap), known=gap.known)
+        reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
+        verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
+        known, sources = 2 if verdict == judging.UNJUDGED else 3, tuple(dict.fromkeys(evidence.sources))
+        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources, known=known)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of a paper.
+
+    Attributes:
+      paper: its folder.
+      group: what the claim is about.
+      id: first letter of the group, and a number.
+      text: what is claimed, in our words.
+      where: sections and tables of the paper.
+      decided_by: the quantity that decides it.
+      statements: what it stands for, not judged yet.
+      paper_says: the paper's figure, if it names one.
+      computed: the library decides it by computing, without records.
+      poor: (model, window) of networks that it says do badly; they need not walk to be judged.
+    """
+
+    paper: str
+    group: str
+    id: str
+    text: str
+    where: str
+    decided_by: str
+    statements: tuple[Statement, ...]
+    paper_says: str = ""
+    computed: bool = False
+    poor: tuple[tuple[str, int], ...] = ()
+
+    def judge(self, evidence: Evidence) -> list[Statement]:
+        """Return its statements as this evidence has them."""
+        windows = load_paper_file("paper", self.paper).get("training", {}).get("windows", {})
+        return [statement.judge(evidence, windows, self.poor) for statement in self.statements]
+
+
+# ------------------------------------------------------------------------------------- the paper's file
+
+_KINDS = judging.KINDS | theory.KINDS
+_MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
+
+
+def _read_models(value, families: Mapping, where: str) -> Setting | judging.Family | list[Setting]:
+    if isinstance(value, list):
+        return [_read_models(item, families, where) for item in value]
+    value = {"model": value} if isinstance(value, str) else value
+    if "family" in value:
+        check_entry(value, where, ("family",), ("window",))
+        family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
+        chosen = {key: [{"model": model, "window": window} for model in family[key]] for key in ("models", "required")}
+        return judging.Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
+    check_entry(value, where, ("model",), ("steps", "window"))
+    check_model(value["model"], where)
+    return Setting(**value)
+
+
+def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
+    where = f"{where}, {entry.get('says')!r}"
+    check_entry(entry, where, ("says", "kind"), entry)
+    parameters, thresholds = dict(entry), about.get("thresholds", {})
+    says = parameters.pop("says")
+    kind = find_entry(_KINDS, parameters.pop("kind"), "kind of judgement", where)
+    optional, remark = (parameters.pop(key, False) for key in ("optional", "remark"))
+    for key in set(_MODELS) & set(parameters):
+        parameters[key] = _read_models(parameters[key], about.get("families", {}), where)
+    for key, known in (("metric", METRICS), ("table", SCHEMAS)):
+        if key in parameters:
+            find_entry(known, parameters[key], key, where)
+    ranges = [key for key in judging.RANGES if key in parameters]
+    if len(ranges) > 1:
+        raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
+    number = lambda bound: find_entry(thresholds, bound, "threshold", where) if isinstance(bound, str) else bound
+    for key in ranges:
+        value = parameters.pop(key)
+        numbers = map(number, value if isinstance(value, list) else [value])
+        try:
+            bound = inspect.signature(judging.RANGES[key]).bind(*numbers)
+        except TypeError:
+            raise ValueError(f"{where}: {key}: {value!r} is another number of numbers than it takes") from None
+        parameters["bounds"] = judging.RANGES[key](*bound.args)
+    try:
+        inspect.signature(kind).bind(None, **parameters)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}; {kind.__name__} takes {inspect.signature(kind)}") from None
+    return Statement(says, functools.partial(kind, **parameters), optional or remark, remark)
+
+
+def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
+    """Return the claims of a file by their ids, checked.
+
+    Args:
+      about: the file as read: groups, thresholds, families and claims.
+      paper: the paper's folder.
+      where: the file, for messages.
+
+    Raises:
+      ValueError: for what is missing, unknown or twice; the message says file, claim and statement.
+    """
+    check_entry(about, where, ("groups", "claim"), ("page", "thresholds", "families"))
+    check_entry(about.get("page", {}), f"{where}, page", (), tuple(_TEXTS["page"]))
+    claims: dict[str, Claim] = {}
+    for entry in about["claim"]:
+        here = f"{where}, claim {entry.get('id')}"
+        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed", "poor"))
+        if entry["id"] in claims or entry["id"][0] not in about["groups"]:
+            raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
+        fields = {key: value for key, value in entry.items() if key != "statement"}
+        fields["poor"] = tuple((one.model, one.window) for one in _read_models(entry.get("poor", []), {}, here))
+        statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
+        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
+    return claims
+
+
+@functools.cache
+def load_commands(paper: str = "f3amd") -> dict[str, tuple[str, ...]]:
+    """Return what one types to measure each claim again: id -> command lines, in the order of `commands.toml`.
+
+    Raises:
+      ValueError: for a claim without a command, or a command of an unknown claim.
+    """
+    where, known = f"{paper}/commands.toml", {claim_id: [] for claim_id in load_claims(paper)}
+    for entry in load_paper_file("commands", paper)["command"]:
+        check_entry(entry, where, ("run", "claims"))
+        for claim_id in entry["claims"]:
+            find_entry(known, claim_id, "claim", where).append(entry["run"])
+    if lacking := [claim_id for claim_id, runs in known.items() if not runs]:
+        raise ValueError(f"{where}: no command measures {', '.join(lacking)}; add one")
+    return {claim_id: tuple(runs) for claim_id, runs in known.items()}
+
+
+@functools.cache
+def load_claims(paper: str = "f3amd") -> dict[str, Claim]:
+    """Return the claims of a paper by their ids, in the order of its file; ValueError as `read_claims`."""
+    return read_claims(load_paper_file("claims", paper), paper, f"{paper}/claims.toml")
+
+
+# ------------------------------------------------------------------------------------------ judging
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A claim with what our records and the paper's own tables say of it.
+
+    Attributes:
+      claim: what is judged.
+      ours: statements from our records (or computed).
+      paper: the same statements from the paper's tables; none for a computed claim.
+      dataset: whose records decided; "" if none did.
+      times_of: other data sets whose times fill gaps.
+    """
+
+    claim: Claim
+    ours: tuple[Statement, ...]
+    paper: tuple[Statement, ...]
+    dataset: str
+    times_of: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The verdict of our records."""
+        return judging.combine(statement.verdict for statement in self.ours)
+
+    @property
+    def paper_verdict(self) -> str:
+        """The verdict of the paper's own tables."""
+        return judging.combine(statement.verdict for statement in self.paper)
+
+
+def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
+    """Leave out what was not measured and need not be."""
+    return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
+
+
+def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
+    """Take each statement from the evidence that knows most of it, of equals the first."""
+    judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
+    return tuple(max(statements, key=lambda statement: statement.known) for statements in judged)
+
+
+def _is_of_times(statement: Statement) -> bool:
+    """Say whether a judged statement rests on times alone, which hang on the device and hardly on the data."""
+    return bool(statement.sources) and all(source.name in TIMES for source in statement.sources)
+
+
+def _filled(
+    ours: Sequence[Statement], others: Mapping[str, Sequence[Statement]]
+) -> tuple[tuple[Statement, ...], tuple[str, ...]]:
+    """Put times of other data sets where there are none, the first that has some; return whose, too."""
+    filled, of = [], {}
+    for place, statement in enumerate(ours):
+        theirs = {data: some[place] for data, some in others.items() if _is_of_times(some[place])}
+        if statement.verdict == judging.UNMEASURED and theirs:
+            data, statement = next(iter(theirs.items()))
+            of[data] = None
+        filled.append(statement)
+    return tuple(filled), tuple(of)
+
+
+def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
+    """Judge a claim.
+
+    Args:
+      claim: which.
+      evidences: data set -> its evidence, at least one; the first that can decide anything decides.
+
+    Returns:
+      The judgement; where nothing was decided, with what the first data set has that says most:
+      figures without a verdict, a row that is missing, or a table.
+    """
+    paper = _seen(claim.judge(paper_evidence(claim.paper)))
+    if claim.computed:
+        return Judgement(claim, paper, (), "computed")
+    tried = {data: _merged(claim, some) for data, some in evidences.items()}
+    dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
+    ours, times_of = _filled(tried[dataset], {data: some for data, some in tried.items() if data != dataset})
+    ours = _seen(ours)
+    nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
+    return Judgement(claim, ours, paper, "" if nothing else dataset, times_of)
+
+
+def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
+    """Judge all claims from recorded results.
+
+    Args:
+      root: folder of results; `paper_figures/` of the checkout by default.
+      dataset: whose records decide, or several of which the first that can does.
+      profile: of `profiles.PROFILES`, or several, without "smoke".
+      paper: whose claims.
+
+    Returns:
+      One judgement a claim, in the order of the paper's file.
+
+    Raises:
+      ValueError: for unknown names, or records that are broken or lie in the wrong folder.
+    """
+    root = repository_root() / "paper_figures" if root is None else Path(root)
+    datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
+    evidences = {}
+    for data in datasets:
+        snapshots = [late for name in profiles for late in snapshot_evidence(root, data, name)]
+        evidences[data] = [recorded_evidence(root, data, name) for name in profiles] + snapshots
+    return [judge_claim(claim, evidences) for claim in load_claims(paper).values()]
+
+
+# ------------------------------------------------------------------------------------------ writing
+
+
+def _figures(statements: Sequence[Statement]) -> str:
+    """Return all figures in one line, each with a mark for its verdict; or why there are none, or no verdict."""
+    measured = [
+        f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (judging.UNMEASURED, judging.REMARK)
+    ]
+    gaps = [s.figure for s in statements if s.verdict == judging.UNMEASURED]
+    if measured:
+        if gaps:
+            measured.append(f"{len(gaps)} of {len(gaps) + len(measured)} not measured")
+        return "; ".join([*dict.fromkeys(reason for s in statements for reason in s.reasons), *measured])
+    first, *others = dict.fromkeys(gaps) or [""]
+    return first + (f"; and {len(others)} more" if others else "")
+
+
+def _row(judgement: Judgement) -> dict:
+    claim = judgement.claim
+    # Without a data set a remark may have looked into a table, and decided nothing.
+    sources = [source for statement in judgement.ours for source in statement.sources if judgement.dataset]
+    said = {"id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where}
+    said["decided_by"] = claim.decided_by
+    judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
+    judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
+    names = [name for name in (judgement.dataset, *judgement.times_of) if name]
+    dataset = "; ".join(name + " (procedural, no real motion)" * (name == "synthetic") for name in names)
+    hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
+    record = "; ".join(dict.fromkeys(map(str, sources)))
+    return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}
+
+
+def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
+    """Return the claims ledger as a table.
+
+    Args:
+      judgements: from `judge_claims`.
+
+    Returns:
+      One row a claim: id, group, claim, where, decided_by, verdict, ours (figures with their
+      intervals, or why there are none), paper_says, paper_verdict and paper_figure (the same rule
+      on the paper's own tables), dataset, hardware, record (file and the first digits of its
+      SHA-256).
+    """
+    return pd.DataFrame(map(_row, judgements))
+
+
+def _found(statement: Statement) -> str:
+    """Return in one text what was found of a statement, its verdict, and why it has none."""
+    if statement.verdict == judging.UNMEASURED:
+        return f"{judging.UNMEASURED} ({statement.figure})"
+    text = f"{statement.figure} · {statement.verdict}" if statement.verdict else statement.figure
+    why = "; ".join(f"{reason}: {', '.join(models)}" for reason, models in statement.reasons.items())
+    return f"{text} ({why})" if why else text
+
+
+def statement_table(judgement: Judgement) -> pd.DataFrame:
+    """Return the statements behind a judgement: statement, ours, the paper's tables."""
+    sides = {"ours": judgement.ours, "the paper's tables": judgement.paper}
+    found = {column: {one.says: _found(one) for one in statements} for column, statements in sides.items()}
+    rows = []
+    for statement in judgement.claim.statements:
+        texts = {column: known.get(statement.says, "") for column, known in found.items()}
+        if any(texts.values()):
+            rows.append({"statement": f"({statement.says})" if statement.remark else statement.says} | texts)
+    return pd.DataFrame(rows)
+
+
+_TEXTS = read_toml(Path(__file__).with_name("claims_page.toml"))
+"""Head of the page, and what it says where `[page]` of a paper's claims does not."""
+
+
+def ledger_markdown(judgements: Sequence[Judgement]) -> str:
+    """Render the ledger of one paper as Markdown: counts, a table for each group, then every statement.
+
+    Args:
+      judgements: from `judge_claims`, at least one.
+    """
+    frame, paper = ledger(judgements), judgements[0].claim.paper
+    counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
+    counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
+    marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
+    about, words = load_paper_file("paper", paper), _TEXTS["page"] | load_paper_file("claims", paper).get("page", {})
+    gpu, training = load_profile("gpu", "100style"), about.get("training", {})
+    seen, whole = gpu.train_steps * gpu.batch_size, training.get("windows", {}).get("32")
+    fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "least": 100.0 * LEAST_SHARE}
+    fields["share"] = f", {100.0 * seen / whole:.0f} % of the paper's length" if whole else ""
+    fields["windows"] = training.get("says", "their number is not known")
+    head = _TEXTS["head"].format(
+        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks,
+        **{key: text.strip().format(**fields) for key, text in words.items()},
+    )  # fmt: skip
+    parts = [head, markdown_table(counted.reset_index())]
+    frame["ours"] = frame["verdict"] + ": " + frame["ours"]
+    printed = frame["paper_verdict"] + ": " + frame["paper_figure"]
+    frame["the paper's tables"] = printed.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
+    frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
+    short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
+    for group in frame["group"].unique():
+        parts.append(f"## {group}\n\n{compact_table(short[frame['group'] == group])}")
+    parts.append("## Statement by statement\n")
+    for judgement in judgements:
+        claim = judgement.claim
+        typed = "\n".join(load_commands(paper)[claim.id])
+        parts.append(
+            f"### {claim.id} · {claim.text}\n\nPaper {claim.where}. Decided by {claim.decided_by}. Measured by"
+            f"\n\n```sh\n{typed}\n```\n\n{compact_table(statement_table(judgement))}"
+        )
+    return "\n".join(parts)
+
+
+def ledger_path(paper: str = "f3amd") -> Path:
+    """Return where a paper's ledger is committed; its accepted verdicts lie beside it as JSON."""
+    return repository_root() / "paper_figures" / ("claims.md" if paper == "f3amd" else f"claims_{paper}.md")
+
+
+def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
+    """Read the verdicts that were accepted.
+
+    Args:
+      path: of the ledger (`.md`) beside which they lie; `paper_figures/claims.md` by default.
+
+    Returns:
+      Claim id -> verdict, figure, paper_verdict, paper_figure; empty if nothing was accepted yet.
+    """
+    path = (ledger_path() if path is None else Path(path)).with_suffix(".json")
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """List the verdicts that are not the accepted ones, one sentence each.
+
+    Args:
+      frame: from `ledger`.
+      accepted: from `accepted_verdicts`.
+    """
+    sides = (("verdict", "our records", "ours"), ("paper_verdict", "the paper's tables", "paper_figure"))
+    changes = []
+    for row in frame.to_dict("records"):
+        before = accepted.get(row["id"], {})
+        for key, whose, figure in sides:
+            if before.get(key) != row[key]:
+                was = f"{before[key]!r}" if key in before else "not accepted yet"
+                changes.append(f"{row['id']} by {whose}: was {was}, is {row[key]!r} ({row[figure]})")
+    known = set(frame["id"])
+    return changes + [f"{name}: is no claim any more" for name in accepted if name not in known]
+
+
+def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
+    """Write the ledger as Markdown, and accept its verdicts if asked to.
+
+    Args:
+      path: where to, ending in .md. The accepted verdicts lie beside it as JSON.
+      judgements: from `judge_claims`.
+      accept: take changed verdicts for right and write them down.
+
+    Returns:
+      What changed, as from `changed_verdicts`. Without `accept` a change leaves both files alone.
+
+    Raises:
+      ValueError: if the name does not end in .md.
+    """
+    path, frame = named_file(path, ".md", "ledgers"), ledger(judgements)
+    changes = changed_verdicts(frame, accepted_verdicts(path))
+    if changes and not accept:
+        return changes
+    columns = ["verdict", "ours", "paper_verdict", "paper_figure"]
+    verdicts = frame.set_index("id")[columns].rename(columns={"ours": "figure"}).to_dict("index")
+    page, kept = ledger_markdown(judgements), json.dumps(verdicts, indent=2, ensure_ascii=False)
+    write_whole(path, page)
+    write_whole(path.with_suffix(".json"), f"{kept}\n")
+    return changes
+
+
+def main(accept: bool = False, paper: str | None = None) -> int:
+    """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
+
+    Args:
+      accept: take changed verdicts for right and write them down.
+      paper: whose claims; each paper's if none.
+
+    Returns:
+      Exit status: 0 if the ledger was written, 1 if a verdict changed and was not accepted, 2 for
+      records, or a paper's file, that are broken.
+    """
+    papers = [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]
+    return max(_written(name, accept) for name in papers)
+
+
+def _written(paper: str, accept: bool) -> int:
+    """Write a paper's ledger; return the exit status of `main`."""
+    path = ledger_path(paper)
+    try:
+        changes = write_ledger(path, judge_claims(paper=paper), accept=accept)
+    except ValueError as error:
+        log.error("Stopped: %s", error)
+        return 2
+    for change in changes:
+        log.info("%s", change)
+    if changes and not accept:
+        log.error("Nothing was written. If these are right: --accept")
+        return 1
+    log.info("%s is up to date", path.relative_to(repository_root()))
+    return 0
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    sys.exit(tyro.cli(main))

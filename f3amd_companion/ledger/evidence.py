@@ -1,0 +1,470 @@
+"""What claims are judged by: figures with intervals, read from our records or the paper's tables.
+
+Both come in one form, so that one rule judges both: tidy tables of `SCHEMAS`, models by their
+presets' names. A figure that is not there is `NotMeasured`, with the reason; a table that says
+nothing about its origin, or something else than the folder it lies in, is an error.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.ground.names import asked_network, check_known, counted_cores
+from f3amd_lib.ground.papers import load_paper_file, paper_folders
+from f3amd_lib.ground.profiles import DATASETS, PROFILES
+from f3amd_lib.ground.records import folder_reason, read_table
+from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.papers.printed import (
+    NINE_METRICS,
+    OF_TEXT,
+    PUBLISHED_CAMDM,
+    REFERENCE_ROWS,
+    SCHEMAS,
+    checked_table,
+    printed_tables,
+)
+
+
+class NotMeasured(LookupError):
+    """A figure that a claim needs is not among the records; the message says which."""
+
+    known = 1
+
+
+class NoTable(NotMeasured):
+    """The whole table is not there: the least that can be said."""
+
+    known = 0
+
+
+def known(look: Callable, *arguments, **named):
+    """Return what a look into the records finds, None where it was not measured."""
+    try:
+        return look(*arguments, **named)
+    except NotMeasured:
+        return None
+
+
+# ---------------------------------------------------------------------------- figures and intervals
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number with the interval it lies in.
+
+    Attributes:
+      value: mean over seeds, or median time.
+      low, high: 95 % interval of that mean or median; both equal to `value` where there was a single
+        repeat, so that nothing is known about its spread.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(value, low=float("nan"), high=float("nan")) -> Figure:
+        """Make a figure; bounds that are NaN (a single repeat) become the value itself.
+
+        Raises:
+          ValueError: for a value that is no finite number or lies outside its interval.
+        """
+        value = float(value)
+        low, high = (value if np.isnan(bound) else float(bound) for bound in (low, high))
+        if not (np.isfinite(value) and low <= value <= high):
+            raise ValueError(f"a figure needs low <= value <= high, got {low}, {value}, {high}")
+        return Figure(value, low, high)
+
+    def map(self, function: Callable[[float], float]) -> Figure:
+        """Return the figure under a rising function."""
+        return Figure(*(function(bound) for bound in (self.value, self.low, self.high)))
+
+
+def _combine_logs(figures: Sequence[Figure], weights) -> Figure:
+    """Return exp of the weighted sum of logarithms of positive figures, with its interval."""
+    weights = np.asarray(weights, dtype=np.float64)
+    value = np.log([figure.value for figure in figures])
+    with np.errstate(divide="ignore"):
+        below = value - np.log([max(figure.low, 0.0) for figure in figures])
+        above = np.log([figure.high for figure in figures]) - value
+    down = np.where(weights > 0, below, above)
+    up = np.where(weights > 0, above, below)
+    middle = weights @ value
+    reach = [np.sqrt(np.sum((weights * side)[weights != 0] ** 2)) for side in (down, up)]
+    return Figure(*(float(np.exp(x)) for x in (middle, middle - reach[0], middle + reach[1])))
+
+
+def ratio(numerator: Figure, denominator: Figure) -> Figure:
+    """Return the quotient of two figures with its interval, both being independent.
+
+    The interval is recovered from those of the two logarithms: distances from value to bound add
+    up in squares.
+
+    Args:
+      numerator, denominator: not negative.
+
+    Returns:
+      The quotient; infinite for a denominator of 0, and 1 for 0 / 0.
+
+    Raises:
+      ValueError: for a negative figure.
+
+    Source: Zou and Donner 2008, "Construction of confidence intervals about effect measures".
+    """
+    if min(numerator.value, denominator.value) < 0:
+        raise ValueError(f"a ratio of {numerator.value} and {denominator.value} means nothing")
+    if numerator.value > 0 and denominator.value > 0:
+        return _combine_logs([numerator, denominator], [1.0, -1.0])
+    # Logarithms have no say about 0: take the widest quotients that the bounds allow.
+    divide = lambda a, b: a / b if b > 0 else (float("inf") if a > 0 else 1.0)
+    value = divide(numerator.value, denominator.value)
+    low = divide(max(numerator.low, 0.0), denominator.high)
+    high = divide(numerator.high, max(denominator.low, 0.0))
+    return Figure(value, min(low, value), max(high, value))
+
+
+def difference(first: Figure, second: Figure) -> Figure:
+    """Return first - second with its interval, both being independent (as `ratio`)."""
+    value = first.value - second.value
+    down = np.hypot(first.value - first.low, second.high - second.value)
+    up = np.hypot(first.high - first.value, second.value - second.low)
+    return Figure(value, float(value - down), float(value + up))
+
+
+def mean_figure(figures: Sequence[Figure]) -> Figure:
+    """Return the geometric mean of positive figures with its interval."""
+    return _combine_logs(figures, np.full(len(figures), 1.0 / len(figures)))
+
+
+def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
+    """Fit figure = c x^p by least squares of logarithms and return p with its interval.
+
+    Args:
+      x: positive, at least two different ones.
+      figures: positive, one for each x.
+    """
+    spread = np.log(x) - np.mean(np.log(x))
+    fitted = _combine_logs(figures, spread / np.sum(spread**2))
+    return fitted.map(lambda bound: float(np.log(bound)))
+
+
+# ------------------------------------------------------------------------------------------- tables
+
+
+_LEAST_STEPS = 10_000
+"""Optimiser steps below which a comparison of recipes decides nothing."""
+
+
+OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm")
+"""Tables that say how well a network does: it must have passed the gate (`ledger.gate`)."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A model as it is used: preset, denoising steps, window."""
+
+    model: str
+    steps: int = 8
+    window: int = 32
+
+    @property
+    def columns(self) -> dict:
+        """Its row in a table of `SCHEMAS`."""
+        return {"model": self.model, "window_frames": self.window, "steps": self.steps}
+
+    def __str__(self) -> str:
+        steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
+        window = f", {self.window} frames" if self.window != 32 else ""
+        return f"{self.model} ({steps}{window})"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where figures come from.
+
+    Attributes:
+      table: path of the CSV below the results' root, or a table of the paper.
+      sha256: first digits of its checksum; "" for a table of the paper.
+      hardware: what it was measured on.
+    """
+
+    table: str
+    sha256: str
+    hardware: str
+
+    def __str__(self) -> str:
+        return f"{self.table} ({self.sha256})" if self.sha256 else self.table
+
+    @property
+    def name(self) -> str:
+        """The table's name, as in `SCHEMAS`."""
+        return Path(self.table).stem
+
+
+class Evidence:
+    """Figures of one data set and profile, or of a paper, looked up by what they are about.
+
+    Attributes:
+      framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
+      sources: the tables that were looked into since `forget`, in that order and as often.
+      trained: (model, window) of the trained networks whose quality was looked up since then.
+      told: of text to motion, model -> (what was trained in its place, motions it saw), since then.
+    """
+
+    def __init__(self, framework: str, load: Callable):
+        """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
+        self.framework = framework
+        self._load = functools.cache(load)
+        # A ledger asks for thousands of figures, by few devices and values.
+        self._of_device = functools.cache(self._of_device)
+        self._holding = functools.cache(self._holding)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was looked up; whoever wants to know what a rule looks up calls this first."""
+        self.sources: list[Source] = []
+        self.trained: list[tuple[str, int]] = []
+        self.told: dict[str, tuple[str, int]] = {}
+
+    @property
+    def printed(self) -> bool:
+        """Whether these are a paper's tables."""
+        return self.framework != "jax"
+
+    def called(self, name: str) -> str:
+        """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
+        return "the paper prints" if self.printed else f"{name}.csv has"
+
+    def table(self, name: str, device: str | None = None) -> pd.DataFrame:
+        """Return a table of `SCHEMAS`, checked, and note it among the sources.
+
+        Args:
+          name: a key of `SCHEMAS`.
+          device: keep the rows of "CPU" or "GPU".
+
+        Raises:
+          NotMeasured: if there is no such table, or none with rows of that device.
+          ValueError: if the table is broken or not what its folder says.
+        """
+        _, record, path = self._load(name)
+        table = self._of_device(name, device)
+        if device is not None and table.empty:
+            raise NotMeasured(f"{self.called(name)} no rows of a {device}")
+        self.sources.append(Source(path, record.get("table", {}).get("sha256", "")[:12], _hardware(record, device)))
+        return table
+
+    def _of_device(self, name: str, device: str | None) -> pd.DataFrame:
+        table, _, _ = self._load(name)
+        return table if device is None else table[table["device"] == device]
+
+    def _holding(self, name: str, device: str | None, column: str, value) -> np.ndarray:
+        return (self._of_device(name, device)[column] == value).to_numpy()
+
+    def rows(self, name: str, device: str | None = None, **row) -> pd.DataFrame:
+        """Return those rows of a table that have these values in these columns; maybe none."""
+        table = self.table(name, device)
+        # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
+        wanted = [(column, value) for column, value in row.items() if column != "dataset" or self.printed]
+        if wanted:
+            which = np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])
+            table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
+        if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
+            self.trained.append((asked_network(row["model"]), row.get("window_frames", 32)))
+        if name in OF_TEXT and not self.printed:
+            self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
+        return table
+
+    def figure(self, name: str, device: str | None = None, value: str = "value", **row) -> Figure:
+        """Return one figure of a table.
+
+        Args:
+          name: a key of `SCHEMAS`.
+          device: "CPU" or "GPU", for times.
+          value: the column; any but the usual one comes without interval.
+          row: columns of the schema and what stands in them.
+
+        Raises:
+          NotMeasured: if there is no such row; the message says which.
+        """
+        found = self.rows(name, device, **row)
+        if value in found and found[value].isna().any():
+            found = found[found[value].notna()]
+        if len(found) and value in found:
+            bounds = ["value", "low", "high"] if value == "value" else [value]
+            return Figure.of(*(found[bound].iat[0] for bound in bounds))
+        what = "" if value == "value" else f"{value} of "
+        where = f", {device}" if device else ""
+        raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")
+
+    def quality(self, setting: Setting, metric: str) -> Figure:
+        """Return a metric of a model; the published one has a window and a number of steps of its own."""
+        columns = setting.columns
+        if setting.model == PUBLISHED_CAMDM and (rows := self.rows("quality", model=setting.model))["steps"].size:
+            columns = rows.loc[rows["steps"].idxmax(), list(columns)].to_dict()
+        return self.figure("quality", **columns, metric=metric)
+
+    def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
+        """Return the time of a round in ms; by default in the framework of this evidence."""
+        row = setting.columns | {"framework": framework or self.framework, "characters": characters}
+        return self.figure("synthesis_time", device, **row)
+
+    def counts(self, setting: Setting, device: str, framework: str | None = None) -> set[int]:
+        """Return the numbers of characters that a model was timed with; maybe none."""
+        rows = self.rows("synthesis_time", device, **setting.columns, framework=framework or self.framework)
+        return {int(count) for count in rows["characters"]}
+
+    def speedup(self, slow: Setting, fast: Setting, device: str, characters: int) -> Figure:
+        """Return how many times as fast `fast` is."""
+        return ratio(self.time(slow, device, characters), self.time(fast, device, characters))
+
+
+_WORDS = {
+    "steps": "{} step{s}",
+    "characters": "{:,} character{s}",
+    "window_frames": "{} frames",
+    "batch_size": "batch {}",
+}
+
+
+def _row_text(row: Mapping) -> str:
+    words = (_WORDS.get(column, "{}").format(value, s="" if value == 1 else "s") for column, value in row.items())
+    return ", ".join(words)
+
+
+def _hardware(record: Mapping, device: str | None) -> str:
+    if "paper_setting" in record:
+        return record["paper_setting"]
+    if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
+        return f"CPU, {counted_cores(record)}" if "cores" in record else "CPU"
+    kind = str(record.get("device_kind"))
+    return kind if kind != "cpu" else "GPU"
+
+
+@functools.cache
+def _others() -> frozenset[str]:
+    """Return the models of other authors that any paper's tables name."""
+    return frozenset(name for paper in paper_folders() for name in load_paper_file("paper", paper).get("others", ()))
+
+
+def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
+    """Return what was recorded on one data set in one profile.
+
+    Args:
+      root: folder of results, such as `paper_figures/`.
+      dataset: of `profiles.DATASETS`.
+      profile: "laptop" or "gpu"; a smoke run is a check and decides nothing.
+
+    Returns:
+      Evidence that reads `<root>/<data set>/<profile>/records/` when it is asked. A table of other
+      weights, or of another classifier, than `quality.csv` beside it is not measured.
+
+    Raises:
+      ValueError: for an unknown data set or profile; later, for a table without a run record, one
+        that its record does not describe, or a record of another data set, profile or device.
+    """
+    check_known(dataset, DATASETS, "data set")
+    check_known(profile, [name for name in PROFILES if name != "smoke"], "profile")
+
+    def load(name: str):
+        path = Path(root) / dataset / profile / "records" / f"{name}.csv"
+        # A record alone is a table that got lost; `read_table` says so.
+        if not path.exists() and not path.with_suffix(".json").exists():
+            raise NoTable(f"no {name}.csv yet")
+        table, record = read_table(path)
+        for key, here in (("dataset", dataset), ("profile", profile)):
+            if record.get(key) != here:
+                raise ValueError(f"{path}: is a record of {key} {record.get(key)!r}, yet lies among those of {here!r}")
+        if reason := folder_reason(path, record):
+            raise NotMeasured(f"{name}.csv {reason}: measure it again")
+        if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
+            raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
+        others = _others() if name in OF_TEXT else ()
+        table = checked_table(name, table, str(path), others)
+        if "device" in table and record.get("device_platform") == "cpu":
+            # PyTorch finds its own device; the record tells that of JAX.
+            own = table.get("framework", pd.Series("jax", index=table.index)) != "torch"
+            if (own & (table["device"] == "GPU")).any():
+                raise ValueError(f"{path}: has rows of a GPU, but its record knows only a CPU")
+        return table, record, path.relative_to(root).as_posix()
+
+    return Evidence("jax", load)
+
+
+def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
+    """Return what the long queue recorded of the paper's networks, those that saw most windows first.
+
+    Args:
+      root, dataset, profile: as for `recorded_evidence`.
+
+    Returns:
+      Evidence of `quality` for each number of windows: networks by the paper's text alone, means over their seeds.
+      Then evidence of `quality_by_epoch`: of each network the run with most snapshots. A queue that went on elsewhere
+      has rows of several style classifiers; how little most of them differ is in `records/classifiers.csv`.
+    """
+    path = Path(root) / dataset / profile / "records" / "campaign.csv"
+    if not path.exists():
+        return []
+    table, record = read_table(path)
+    table = table[table["recipe"] == "paper"].fillna({"unit": ""})
+    every, table = table, table[table["steps"] > 0]
+    place = path.relative_to(root).as_posix()
+
+    def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
+        networks = rows[["model", "window_frames"]].drop_duplicates()
+        tables = {
+            "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
+            "trained": lambda: networks.assign(metric="windows", value=windows),
+        }
+        trainings = rows.groupby(["model", "window_frames"])["seed"].nunique()
+        most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
+        where = f"{place} at {windows:,} windows, {most} a network"
+
+        def load(name: str):
+            if name not in tables:
+                raise NoTable(f"no {name}.csv of them")
+            return checked_table(name, tables[name](), where), record, where
+
+        return Evidence("jax", load)
+
+    by_length = [evidence(windows, rows) for windows, rows in table.groupby("windows")]
+    return [*reversed(by_length), _snapshot_curves(every, record, place)]
+
+
+def _snapshot_curves(rows: pd.DataFrame, record: dict, where: str) -> Evidence:
+    """Return the learning curves among rows of the long queue."""
+    rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
+    rows = rows[rows["steps"].isin([0, 8])]  # the loss has no steps
+    lengths = rows.groupby(["model", "run"])["windows"].nunique()
+    longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
+    curves = rows[rows["run"].isin(longest)].rename(columns={"epochs": "epoch"})
+    curves = curves[[*SCHEMAS["quality_by_epoch"], "value"]]
+
+    def load(name: str):
+        if name != "quality_by_epoch" or curves.empty:
+            raise NoTable(f"no {name}.csv of them")
+        return checked_table(name, curves, where), record, where
+
+    return Evidence("jax", load)
+
+
+@functools.cache
+def paper_evidence(paper: str = "f3amd") -> Evidence:
+    """Return a paper's own tables in the form of our records, with intervals where it prints some.
+
+    Raises:
+      ValueError: if two tables print different figures of one row, or one is of no known form.
+    """
+    tables, about = printed_tables(paper), load_paper_file("paper", paper)
+
+    def load(name: str):
+        if name not in tables:
+            raise NoTable("the paper has no table of it")
+        return tables[name], {"paper_setting": about["setting"]}, "the paper's tables"
+
+    return Evidence("iree", load)

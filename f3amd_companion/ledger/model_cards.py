@@ -1,0 +1,319 @@
+"""A card for every model that ships: what it is, its data, how well it does, its limits.
+
+    f3amd cards        # writes cards, checksums and the table of docs/results.md
+
+Everything on a card is read from the weights file and from committed results; nothing is typed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+
+from f3amd_companion.ledger.gate import LEAST_SHARE
+from f3amd_companion.ledger.quality_tables import figure_column, measured_table
+from f3amd_lib.ground.files import read_toml, write_whole
+from f3amd_lib.ground.names import counted_cores
+from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.profiles import repository_root
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.measures.registry import METRICS, SHOWN
+from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.text.judge.text_judge import load_judge
+from f3amd_lib.text.stages.latent_models import is_latent_preset, load_latent_model
+from f3amd_lib.text.stages.text_models import JUDGE, load_text_model
+from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
+
+log = logging.getLogger("f3amd")
+
+_CARDS = read_toml(Path(__file__).with_name("cards.toml"))
+_OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
+
+
+def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a model's figures beside real motion's."""
+    shown = SHOWN["card"]
+    columns = {"figure": ["Dir. (degrees)" if metric.name == "direction_error" else metric.title for metric in shown]}
+    for steps in sorted(measured["steps"].unique(), reverse=True):
+        rows = measured[measured["steps"] == steps]
+        columns[f"{steps} steps" if steps > 1 else "1 step"] = figure_column(rows, shown)
+    return pd.DataFrame(columns | {"real motion": figure_column(real, shown)})
+
+
+def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
+    """Return sentences on what a model does badly with most steps, as far as its figures say so."""
+    value = measured[measured["steps"] == measured["steps"].max()].set_index("metric")["value"]
+    real = real.set_index("metric")["value"]
+    limits = []
+    for limit in _CARDS["limit"]:
+        figure, source = value.get(limit["metric"], np.nan), real.get(limit["metric"], np.nan)
+        bound = limit["bound"] * (source if limit.get("of_real") else 1.0)
+        # What was not measured is beyond no bound.
+        if figure > bound if limit["sign"] == ">" else figure < bound:
+            limits.append(limit["says"].format(value=figure, real=source))
+    return limits
+
+
+def _filled(name: str, path: Path, trained, params, **fields) -> str:
+    """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
+    record = trained.record
+    non_commercial = "NC" in re.split(r"[\s-]+", record["dataset_licence"])
+    return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
+        trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
+        count=sum(leaf.size for leaf in jax.tree.leaves(params)),
+        weights_type=describe(path).get("weights", "bfloat16"), date=record["date_utc"][:10],
+        terms=": **non-commercial use only**" if non_commercial else "",
+        commit=(record["git_commit"] or "unknown")[:10],
+        tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        cores=counted_cores(record), **fields,
+    )  # fmt: skip
+
+
+def _training(path: Path, record: Mapping, recipe: Mapping, examples: str, data: str) -> dict:
+    """Return what a card says of a training: how many examples it saw, in how many steps, and its last held-out loss.
+
+    Args:
+      path: the weights, with the history beside them.
+      record, recipe: of the run.
+      examples, data: keys of the record: examples seen, and examples in the data.
+    """
+    # A model may be trained in several legs, of which the recipe is the last's.
+    seen, legs = record.get(examples, recipe["num_steps"] * recipe["batch_size"]), record.get("schedule_note")
+    loss = read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
+    shares = {"steps": seen // recipe["batch_size"], "passes": seen / record[data]}
+    return {"recipe": recipe, "loss": loss, "seen": seen, "legs": f" ({legs})" if legs else "", **shares}
+
+
+def _text_training(path: Path, trained, recipe: Mapping, paper: str) -> dict:
+    """Return what a card of a model of text to motion says of its training, beside the paper's."""
+    about = load_paper_file("paper", paper)["training"]
+    fields = _training(path, trained.record, recipe, "motions_seen", "num_train_clips")
+    fields |= {"paper": about["says"], "share": 100 * fields["seen"] / about["windows"]["text"]}
+    return fields | {"seconds": trained.most_frames / trained.fps, "words": len(trained.words)}
+
+
+def model_card(path: Path, quality: pd.DataFrame | None) -> str:
+    """Write the card of one weights file.
+
+    Args:
+      path: the weights.
+      quality: from `committed_quality`, or None; rows of other weights are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    trained = load_model(path)
+    training = _training(path, trained.record, trained.record["training"], "windows_seen", "num_train_windows")
+    figures, limits = "Not measured by the protocol yet.", []
+    if quality is not None:
+        weights = weights_digest(trained.params)
+        measured = quality[(quality["model"] == trained.name) & (quality["weights"] == weights)]
+        real = quality[quality["model"] == "real"]
+        if len(measured):
+            figures = _CARDS["measured"]["model"].format(table=markdown_table(_figures(measured, real)))
+            limits = _limits(measured, real)
+    limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
+    whole = load_paper_file("paper")["training"]["windows"].get(str(trained.config.window))
+    if whole and training["seen"] < LEAST_SHARE * whole:
+        limits.append(f"It saw {100 * training['seen'] / whole:.2g} % of the windows that the paper's models saw.")
+    return _filled(
+        "model_card", path, trained, trained.params, **training,
+        styles=", ".join(trained.styles), measured=figures, limits="\n".join(f"- {limit}" for limit in limits),
+    )  # fmt: skip
+
+
+def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
+    """Write the card of a model of text to motion.
+
+    Args:
+      path: the weights.
+      hands: `records/hands.csv`, or None; rows of other weights are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    trained = load_text_model(path)
+    record, recipe = trained.record, trained.record["identity"]["training"]
+    training, codec = _text_training(path, trained, recipe, "acmdm"), trained.codec
+    measured = "Not measured yet."
+    if hands is not None:
+        own = hands[(hands["weights"] == weights_digest(trained.params)) | hands["model"].isin(["real clips"])]
+        if own["weights"].notna().any():
+            columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
+            counts = own.fillna({"wording": "clips"}).groupby(["model", "wording"], sort=False)[columns].sum()
+            counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
+            measured = _CARDS["measured"]["text"].format(table=markdown_table(counts))
+    state = "positions of joints" + (" and redundant features" if codec.redundancy else "")
+    if codec.frames_per_state > 1:
+        state = f"latent of {codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
+    elif codec.mesh:
+        state = f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
+    guidance = f"{record['guidance']:g}" if "guidance" in record else "the paper's 3"
+    return _filled(
+        "text_model_card", path, trained, (trained.params, codec.params), **training,
+        state=state, guidance=guidance, measured=measured,
+    )  # fmt: skip
+
+
+def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
+    """Write the card of a model of MotionPCM.
+
+    Args:
+      path: the weights.
+      tables: `records/text_pcm*.csv` by name, those that there are.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    trained = load_latent_model(path)
+    training, phases = _text_training(path, trained, trained.training, "motionpcm"), trained.training["num_phases"]
+    shown = [*_OF_JUDGE, "sampling_seconds"]
+    rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
+            for name, table in tables.items() if "steps" in table]  # fmt: skip
+    measured = "Not measured yet."
+    if rows and len(own := pd.concat(rows)):
+        own = own.assign(text=own["value"].map("{:.3g}".format))
+        wide = own.drop_duplicates(["steps", "metric"]).pivot(index="steps", columns="metric", values="text")
+        wide = wide[[metric for metric in shown if metric in wide]].fillna("–")
+        wide = wide.rename(columns=lambda metric: METRICS[metric].title)
+        measured = _CARDS["measured"]["latent"].format(table=markdown_table(wide.reset_index()))
+    movement = "Its autoencoder was trained as briefly, and vague where that was too short"
+    if (table := tables.get("text_pcm3")) is not None:
+        values = table.set_index(["trained", "metric"])["value"]
+        if (kept := values.get((find_preset(trained.name).latent, "kept_movement"))) is not None:
+            movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
+    is_student = bool(trained.config.guidance_features)
+    what = f"student of {phases} step{'s' * (phases > 1)}" if is_student else "teacher, sampled by DDIM"
+    return _filled(
+        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params), **training,
+        what=what, measured=measured, latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}",
+        movement=movement,
+    )  # fmt: skip
+
+
+def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
+    """Write the card of a judge of text to motion.
+
+    Args:
+      path: its file.
+      seen: `records/text_judge.csv` with its record, or None; figures of another judge are not used.
+
+    Returns:
+      Markdown.
+
+    Raises:
+      ValueError: if the file is broken.
+    """
+    judge = load_judge(path)
+    digest, measured = weights_digest(judge.params), "Not measured yet."
+    if seen is not None and seen[1]["judge_weights"] == digest:
+        table, titles = seen[0], {name: METRICS[name].title for name in _OF_JUDGE}
+        wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), _OF_JUDGE]
+        as_text = markdown_table(wide.rename(columns=titles).reset_index())
+        measured = _CARDS["measured"]["judge"].format(repeats=seen[1]["settings"]["repeats"], table=as_text)
+    return _filled("judge_card", path, judge, judge.params, digest=digest, measured=measured)
+
+
+def checksums(folder: Path) -> str:
+    """Return lines for `sha256sum --check` of all weights below a folder."""
+    files = sorted(folder.rglob("*.safetensors"))
+    digest = lambda file: hashlib.sha256(file.read_bytes()).hexdigest()
+    return "".join(f"{digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files)
+
+
+def committed_quality(dataset: str) -> pd.DataFrame | None:
+    """Return what is on record for the models of a data set, with the weights of each row.
+
+    Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
+    """
+    tables = []
+    if found := committed_table(dataset, "quality"):
+        keys = ["model", "window_frames", "steps"]
+        by_seed, _ = committed_table(dataset, "quality_by_seed")
+        weights = by_seed[[*keys, "weights"]].drop_duplicates(keys)
+        tables.append(found[0].merge(weights, on=keys, how="left"))
+    if found := committed_table(dataset, "walking"):
+        tables.append(_walking_rows(found[0]))
+    return pd.concat(tables, ignore_index=True) if tables else None
+
+
+def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
+    """Sum `records/walking.csv` up in the form of the protocol's table."""
+    figures = [metric.name for metric in SHOWN["card"] if metric.name in walking]
+    figures.remove("joint_acceleration")  # the protocol has its own
+    columns = ["model", "window_frames", "steps", "weights"]
+    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
+    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
+
+
+def card_of(path: Path) -> str:
+    """Return the card of a shipped file, `<data set>/NAME` or `<data set>/text/NAME`, from committed results."""
+    if path.parent.name != "text":
+        return model_card(path, committed_quality(path.parent.name))
+    dataset = path.parent.parent.name
+    if path.stem == JUDGE:
+        return judge_card(path, committed_table(dataset, "text_judge"))
+    if is_latent_preset(path.stem):
+        records = repository_root() / "paper_figures" / dataset / "laptop" / "records"
+        return latent_model_card(
+            path, {file.stem: read_table(file)[0] for file in sorted(records.glob("text_pcm*.csv"))}
+        )
+    hands, _ = committed_table(dataset, "hands") or (None, None)
+    return text_model_card(path, hands)
+
+
+def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
+    """Write the card beside every weights file below a folder, and `checksums.txt`.
+
+    Args:
+      folder: with a folder for each data set.
+
+    Returns:
+      The cards.
+    """
+    weights = sorted(folder.rglob("*.safetensors"))
+    cards = [write_whole(path.with_suffix(".md"), card_of(path)) for path in weights]
+    write_whole(folder / "checksums.txt", checksums(folder))
+    return cards
+
+
+def write_measured_table(path: Path, quality: pd.DataFrame) -> None:
+    """Put the table of measured figures between its two marks on a page.
+
+    Args:
+      path: of the page; all other text stays.
+      quality: from `committed_quality`.
+
+    Raises:
+      ValueError: if the marks are not there.
+    """
+    page = fill_tables(path.read_text(encoding="utf-8"), {"measured": measured_table(quality)}, str(path))
+    path.write_text(page, encoding="utf-8")
+
+
+def main() -> int:
+    """Write all cards and the table of docs/results.md; see the module's first lines."""
+    for card in write_cards():
+        log.info("%s", card)
+    write_measured_table(repository_root() / "docs" / "results.md", committed_quality("bandai"))
+    return 0

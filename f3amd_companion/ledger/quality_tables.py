@@ -1,0 +1,278 @@
+"""The paper's tables of motion quality with our figures under each row.
+
+Our figures come from `records/quality.csv` (see `measures.protocol`): means over seeds with 95 %
+intervals. Real motion and the deliberately bad generators, which the paper does not have, stand on
+top, since no other row says what a figure is worth. Functions of tables only: nothing is read from
+disk but the paper's numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.ground.names import row_label
+from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
+from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.measures.registry import SHOWN, Metric
+from f3amd_lib.networks import presets
+
+QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
+"""The paper's tables of motion quality, by number."""
+
+PAPER_SOURCE = "paper, 100STYLE"
+NOT_MEASURED = "not measured"
+
+FIGURES = {metric.name: metric.title for metric in SHOWN["paper"]}
+"""The nine figures of the paper's quality tables in its order, with its headings."""
+
+NOTE = (
+    "FID and EMD: data, classifier and number of windows are not the paper's, so that absolute "
+    "values do not compare. Arrows are the paper's; the real row says what can be had."
+)
+"""What a reader of every such table must know."""
+
+
+_KEYS = ["model", "window_frames", "steps", "metric"]
+
+
+def figure_text(value: float, low: float = np.nan, high: float = np.nan, decimals: int | None = None) -> str:
+    """Write a mean with its interval: "7.386 ± 0.121", three decimals or four digits.
+
+    Args:
+      value: the mean; NaN gives a dash.
+      low, high: 95 % interval, symmetric about the mean as Student's t gives it; NaN (a single
+        repeat) leaves it out.
+      decimals: so many in place of those.
+
+    Raises:
+      ValueError: for an interval that does not hold its mean in the middle.
+    """
+    if np.isnan(value):
+        return "–"
+    decimals = max(0, 3 - int(np.log10(max(abs(value), 1.0)))) if decimals is None else decimals
+    text = f"{value:.{decimals}f}"
+    if np.isnan(low) or np.isnan(high):
+        return text
+    half = 0.5 * (high - low)
+    if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
+        raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
+    return f"{text} ± {half:.{decimals}f}"
+
+
+def figure_column(rows: pd.DataFrame, metrics: Sequence[Metric], *, fixed: bool = False) -> list[str]:
+    """Write metrics of one system, a dash for one that it lacks.
+
+    Args:
+      rows: tidy, the system's own: metric, value, low, high. Of two of one metric the first counts.
+      metrics: which, in this order.
+      fixed: each with as many decimals as the registry says, in place of four digits.
+    """
+    figures = rows.drop_duplicates("metric").set_index("metric")[["value", "low", "high"]]
+    figures = figures.reindex([metric.name for metric in metrics]).to_numpy()
+    return [figure_text(*figure, metric.decimals if fixed else None)
+            for metric, figure in zip(metrics, figures, strict=True)]  # fmt: skip
+
+
+def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.DataFrame:
+    """Set our figures under each row of a quality table of the paper.
+
+    Args:
+      table: its number, one of `QUALITY_TABLES`.
+      quality: from `protocol.summarise`: model (presets, "real", bad generators with steps 0),
+        window_frames, steps, metric, unit, value, low, high.
+      dataset_label: what ours were measured on, such as "bandai, laptop".
+
+    Returns:
+      Tidy rows: line (0, 1, ... down the page), model (the paper's name in its rows, our preset's
+      in ours), window_frames, steps (0 for motion that no network made), source, metric, unit,
+      better (the paper's), printed (text: the paper's own, or ours as `figure_text`; "not
+      measured" where our table has no such row, "" where the paper prints a dash or ours has no
+      such metric), value, low, high. Nine rows a line.
+
+    Raises:
+      ValueError: for a table that has no quality, an empty label or the paper's, a missing column,
+        a figure that is there twice, or a unit that is not the paper's.
+
+    Source: F3AMD paper, Tables 3, 5, 6, 8 to 12; what a paper's name means is `presets.find_preset`'s.
+    """
+    if table not in QUALITY_TABLES:
+        raise ValueError(f"the paper's quality tables are {', '.join(map(str, QUALITY_TABLES))}, not {table!r}")
+    if not dataset_label or dataset_label == PAPER_SOURCE:
+        raise ValueError(f"dataset_label must say what ours were measured on, unlike {PAPER_SOURCE!r}")
+    paper = load_paper_table(table)
+    paper = paper[paper["metric"].isin(FIGURES)]
+    about = paper.drop_duplicates("metric").set_index("metric")[["unit", "better"]]
+    ours = quality[quality["metric"].isin(FIGURES)]
+    unlike = ours[ours["unit"].fillna("") != ours["metric"].map(about["unit"])]
+    if len(unlike):
+        metric, unit = unlike[["metric", "unit"]].iloc[0]
+        theirs = about["unit"][metric]
+        raise ValueError(f"{metric} is in {unit or 'no unit'} here and in {theirs or 'no unit'} in the paper")
+    lines = []
+    for frames in paper["window_frames"].unique():
+        unmade = ours[(ours["steps"] == 0) & (ours["window_frames"] == frames)]
+        lines += [(model, frames, 0, dataset_label) for model in dict.fromkeys(["real", *unmade["model"]])]
+    for model, *setting in paper[_KEYS[:3]].drop_duplicates().itertuples(index=False):
+        lines += [(model, *setting, PAPER_SOURCE), (presets.find_preset(model).name, *setting, dataset_label)]
+    rows = pd.DataFrame(lines, columns=[*_KEYS[:3], "source"]).rename_axis("line").reset_index()
+    rows = rows.merge(about.loc[list(FIGURES)].reset_index(), how="cross")
+    values = ["value", "low", "high"]
+    ours = ours.assign(source=dataset_label, printed=[figure_text(*each) for each in ours[values].to_numpy(float)])
+    known = pd.concat([paper.assign(source=PAPER_SOURCE), ours])[[*_KEYS, "source", "printed", *values]]
+    rows = rows.merge(known, how="left", on=[*_KEYS, "source"], validate="many_to_one")
+    systems = set(ours[_KEYS[:3]].itertuples(index=False, name=None))
+    asked = rows[_KEYS[:3]].itertuples(index=False, name=None)
+    gaps = pd.Series("" if system in systems else NOT_MEASURED for system in asked)
+    undefined = rows["value"].isna() & (rows["source"] == dataset_label)
+    return rows.assign(printed=rows["printed"].mask(undefined, gaps))
+
+
+def of_queue(campaign: pd.DataFrame, windows: int) -> pd.DataFrame:
+    """Return rows of the long queue as `beside_paper` takes them: each network after equally many windows.
+
+    Args:
+      campaign: `records/campaign.csv`.
+      windows: seen by each network.
+
+    Returns:
+      As from `protocol.summarise`, repeats being trainings: a mean over seeds, with an interval where there are two or
+      more. FID, EMD and style coverage of a queue that went on elsewhere are through several style classifiers;
+      how little that changes on Bandai is in `records/classifiers.csv`.
+    """
+    kept = (campaign["recipe"] == "paper") & (campaign["windows"] == windows) & campaign["metric"].isin(FIGURES)
+    return intervals_over_repeats(campaign[kept].fillna({"unit": ""}), [*_KEYS, "unit"])
+
+
+def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Spread `beside_paper` to a line a system, fit for the page.
+
+    A row of the paper that we have not measured says so in its own line, in place of an empty one
+    below. Frames and steps are columns only where they differ.
+
+    Args:
+      rows: from `beside_paper`.
+
+    Returns:
+      Columns model, frames and steps where needed, source, and the nine figures; all text.
+    """
+    made = rows[rows["steps"] > 0]
+    headings = {"window_frames": "frames", "steps": "steps"}
+    varied = {column: heading for column, heading in headings.items() if made[column].nunique() > 1}
+    lines: list[dict] = []
+    for _, cells in rows.groupby("line", sort=False):
+        first = cells.iloc[0]
+        missing = (cells["printed"] == NOT_MEASURED).all()
+        if missing and first["steps"] > 0:
+            lines[-1]["source"] += f"; ours {NOT_MEASURED}"
+            continue
+        shown = {"model": first["model"]} | {heading: str(first[column] or "") for column, heading in varied.items()}
+        shown["source"] = first["source"] + (f": {NOT_MEASURED}" if missing else "")
+        for metric, better, text in cells[["metric", "better", "printed"]].itertuples(index=False):
+            shown[FIGURES[metric] + ARROWS[better]] = "" if missing else text
+        lines.append(shown)
+    return pd.DataFrame(lines)
+
+
+def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> str:
+    """Render a quality table of the paper with ours under each row.
+
+    Args:
+      table, quality, dataset_label: as for `beside_paper`.
+
+    Returns:
+      Markdown: a title, the table, and the note without which it would mislead.
+
+    Raises:
+      ValueError: as `beside_paper`.
+    """
+    rows = beside_paper(table, quality, dataset_label)
+    frames = rows.loc[rows["steps"] > 0, "window_frames"].unique()
+    about = load_paper_table(table).attrs
+    title = f"**Table {table}.** {about['title']}"
+    title += f", windows of {frames[0]} frames." if len(frames) == 1 else "."
+    note = f"{NOTE} {about['note']}".strip()
+    return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
+
+
+MEASURED_COLUMNS = pd.read_csv(Path(__file__).with_name("results_columns.csv"))
+"""Headings of the columns of docs/results.md, with their model and steps."""
+
+
+def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
+    """Render the table of what was measured on real motion, our own figures alone.
+
+    Args:
+      quality: from `protocol.summarise`.
+      window: of the models, frames.
+
+    Returns:
+      Markdown: means with 95 % intervals; a figure that a column does not have is a dash.
+    """
+    own = quality[quality["window_frames"] == window]
+    shown = SHOWN["results"]
+    columns = {"": ["style coverage (%)" if metric.name == "style_coverage" else metric.title for metric in shown]}
+    for title, model, steps in MEASURED_COLUMNS.itertuples(index=False):
+        columns[title] = figure_column(own[(own["model"] == model) & (own["steps"] == steps)], shown, fixed=True)
+    return markdown_table(pd.DataFrame(columns))
+
+
+# ------------------------------------------------------- rollouts beside real clips, a column a system
+
+
+def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.DataFrame]) -> pd.DataFrame:
+    """Collect the figures of several systems, real motion first.
+
+    Args:
+      real: from `rollout_measures.measure_clips`.
+      measured: (model, steps) -> what `rollout_measures.measure_rollout` returned.
+
+    Returns:
+      Tidy rows: label, model, steps (0 for real motion), metric, unit, better, value (mean over
+      characters), spread (standard deviation over characters, NaN for one), characters (those with
+      a number).
+    """
+    rows = []
+    for (model, steps), figures in {("real", 0): real, **measured}.items():
+        label = row_label(model, steps) if steps else "real"
+        for metric in SHOWN["first"]:
+            values = figures[metric.key].dropna().to_numpy()
+            row = {"label": label, "model": model, "steps": steps, "metric": metric.name, "unit": metric.unit}
+            row |= {"better": metric.better, "value": values.mean() if len(values) else np.nan}
+            spread = values.std(ddof=1) if len(values) > 1 else np.nan
+            rows.append(row | {"spread": spread, "characters": len(values)})
+    return pd.DataFrame(rows)
+
+
+def paper_rows() -> pd.DataFrame:
+    """Return the rows of Table 3 for F3AMD-FNO-96 and CAMDM, 32 frames, with the labels that `side_by_side` wants.
+
+    Returns:
+      Tidy rows of the paper's table, with `label` naming paper, model and steps.
+    """
+    printed = load_paper_table(3)
+    kept = printed[printed["model"].isin(["F3AMD-FNO-96", "CAMDM"]) & (printed["window_frames"] == 32)]
+    labels = [f"paper, {m}, {s} steps" for m, s in zip(kept["model"], kept["steps"], strict=True)]
+    return kept.assign(label=labels)
+
+
+def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Spread a tidy table to one row a metric and one column a label, the paper's last.
+
+    Args:
+      ours: columns label, metric, unit, better, value.
+      paper: from `paper_rows`; metrics that ours lacks are left out.
+
+    Returns:
+      A DataFrame: metric (with its unit), then the labels; a figure that is not there is NaN.
+    """
+    named = ours[["metric", "unit", "better"]].itertuples(index=False)
+    headings = {metric: metric_heading(metric, unit, better) for metric, unit, better in named}
+    both = pd.concat([ours, paper])  # which leaves out a paper that is None
+    table = both.pivot(index="metric", columns="label", values="value")
+    table = table.reindex(index=list(headings), columns=both["label"].unique()).rename(headings)
+    return table.rename_axis(columns=None).reset_index()

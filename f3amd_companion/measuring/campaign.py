@@ -1,0 +1,353 @@
+"""The long queue: all that is trained on real motion, in order, in legs that go on where the last one stopped.
+
+The queue stands in `papers/f3amd/campaign.toml`. Runs without a recipe follow the paper's text, but
+for `-steady`. The learning rate depends on the step and not on the length of a run, so that each
+snapshot of a long run is a fair row at its length. Snapshots are
+kept as weights and measured by the protocol of `measures.protocol` with one seed; how far their
+answers move with the noisy input, and with the noise level, and how far they are off, is measured
+as well. All of it is one table, `records/campaign.csv`. A second queue, `readings_queue.toml`, compares readings of
+the paper and fills `records/readings.csv` with what `measuring.fingerprint` says of each. Packages for a GPU that is
+at hand for minutes stand in `gpu_plan.toml`; their weights are measured elsewhere, as readings are.
+
+A queue may take months and machines: each
+row names its commit and the style classifier that it was seen through (`records/classifiers.csv` has
+how little two of one recipe differ).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import pandas as pd
+
+import f3amd_lib
+from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
+from f3amd_companion.measuring.learning_curves import snapshot
+from f3amd_companion.measuring.recipes import find_recipe
+from f3amd_companion.measuring.runner import Records
+from f3amd_companion.speed.machine import device_name, matmul_precision
+from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.papers import check_entry
+from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.classifier import StyleClassifier
+from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use, noise_use
+from f3amd_lib.measures.protocol import Protocol, held_out_clips, measure_model
+from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.networks import presets
+from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.training.checkpoints import TrainedModel, errors_name, load_model, save_model, weights_digest
+from f3amd_lib.training.optimise import compile_steps, held_out_terms
+from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.recipe import TrainingConfig
+
+log = logging.getLogger("f3amd")
+
+EPOCHS = 100
+"""Of the whole run that the recipe is made for (section 4.5); snapshots come long before."""
+
+STEPS_MEASURED = (8, 1)
+"""Denoising steps with which a snapshot is measured."""
+
+_EVERY = {"CPU": 400}
+"""Steps between checkpoints, and looks at the held-out loss, by device: on a GPU 1,000, which takes it seconds."""
+
+_PRECISIONS = ("float32", "tf32")
+
+_QUEUES = Path(f3amd_lib.__file__).parent / "papers" / "f3amd"
+QUEUES = {"campaign": _QUEUES / "campaign.toml", "readings": _QUEUES / "readings_queue.toml"}
+"""Table of records -> its queue."""
+
+GPU_PLAN = _QUEUES / "gpu_plan.toml"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training of the queue.
+
+    Attributes:
+      preset: the model.
+      recipe: row of `recipes.toml` that it is trained by; "paper" for the paper's text.
+      window: frames of a window.
+      seed: of weights and batches.
+      length: thousands of windows after which a rate that hangs on a run's length has fallen; None: 100 epochs.
+    """
+
+    preset: str
+    recipe: str = "paper"
+    window: int = 32
+    seed: int = 0
+    length: int | None = None
+
+    @property
+    def name(self) -> str:
+        """A name for files and tables: what differs from the usual is in it."""
+        parts = [self.preset, "" if self.recipe == "paper" else self.recipe]
+        parts += ["" if self.window == 32 else f"{self.window}frames", f"{self.length}k" if self.length else ""]
+        parts.append(f"seed{self.seed}")
+        return "-".join(filter(None, parts))
+
+    @property
+    def names(self) -> set[str]:
+        """What `chosen` may call it: its preset, its recipe, or this run alone."""
+        return {self.preset, self.recipe, self.name}
+
+    def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
+        """Return the training config of `EPOCHS` epochs over so many windows, or of the run's own length."""
+        steps = (1000 * self.length if self.length else EPOCHS * num_windows) // batch_size
+        return find_recipe(self.recipe).on(self.preset).config(steps, batch_size, self.seed)
+
+
+def queue(path: Path = QUEUES["campaign"], package: str | None = None) -> list[tuple[Run, int]]:
+    """Return (run, windows seen) of every snapshot, in the order in which they are to be trained.
+
+    Args:
+      path: of the queue.
+      package: of a plan, its runs alone.
+
+    Raises:
+      ValueError: naming the file, and the run in it, for what is no TOML, an unknown key, preset or recipe, or a value
+        that makes no sense.
+    """
+    snapshots = []
+    with errors_name(path):
+        table = read_toml(path)
+        if package is not None:
+            check_known(package, table, "package of the plan")
+            table = table[package]
+        check_entry(table, str(path), ["run"], [] if package is None else ["note"])
+        for number, row in enumerate(table["run"], 1):
+            where = f"{path}: run {number}"
+            check_entry(row, where, ["windows"], ["presets", "recipes", "seeds", "window", "length"])
+            row = {"seeds": [0], "window": 32, **row}
+            numbers = ("windows", row["windows"], 1), ("seeds", row["seeds"], 0), ("window", [row["window"]], 2)
+            numbers += (("length", [row["length"]], 1),) if "length" in row else ()
+            for key, values, least in numbers:
+                if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
+                    raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
+            if not (row.get("presets") or row.get("recipes")):
+                raise ValueError(f"{where}: names neither presets nor recipes")
+            named = [presets.find_preset(name).name for name in row.get("presets", ())]
+            for recipe in row.get("recipes") or ["paper"]:
+                for preset, seed in itertools.product(named or [find_recipe(recipe).preset], row["seeds"]):
+                    run = Run(preset, recipe, row["window"], seed, row.get("length"))
+                    run.config(1000, 8)  # refuses a change that is none of this model's
+                    snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
+    return snapshots
+
+
+def chosen(snapshots: Iterable[tuple[Run, int]], only: Collection[str]) -> list[tuple[Run, int]]:
+    """Return the snapshots of a queue whose preset, recipe or run is named; all of them where none is.
+
+    Raises:
+      ValueError: for a name that is none of the queue's.
+    """
+    snapshots = list(snapshots)
+    for name in only:
+        check_known(name, {name for run, _ in snapshots for name in run.names}, "name in the queue")
+    return [(run, windows) for run, windows in snapshots if not only or not run.names.isdisjoint(only)]
+
+
+def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]:
+    """Return the snapshots of a queue, longest runs first; those of a run stay in their order."""
+    snapshots = list(snapshots)
+    longest: dict[Run, int] = {}
+    for run, windows in snapshots:
+        longest[run] = max(windows, longest.get(run, 0))
+    return sorted(snapshots, key=lambda snapshot: -longest[snapshot[0]])
+
+
+def check_precision(precision: str) -> None:
+    """Raise ValueError for a precision of training that is unknown, or that this device does not have."""
+    check_known(precision, _PRECISIONS, "precision of training")
+    if precision == "tf32" and device_name() == "CPU":
+        raise ValueError("tf32 is for a GPU: on this CPU products are float32, leave --precision out")
+
+
+def run_campaign(
+    prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
+    snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, precision: str = "float32",
+    stop_at: float | None = None, known: Path | None = None, table: str = "campaign", found_alone: bool = False,
+    progress: bool = True,
+) -> Iterator[tuple[str, int, str]]:  # fmt: skip
+    """Train and measure snapshots that are not on record, until all are or the time is over.
+
+    Args:
+      prepared, profile: the data, and where records go.
+      classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
+      folder: where training states and weights lie, a folder a run.
+      snapshots: of `queue`, in the order in which they are trained.
+      batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
+      precision: of the matrix products of training, a key of `machine.PRECISIONS`: float32, or tf32 on a GPU.
+      stop_at: the run under way stops with a checkpoint after this time (`time.monotonic`).
+      known: folder of another run's records, whose snapshots count as measured.
+      table: a key of `QUEUES`: what is measured, and the record that it goes to.
+      found_alone: measure snapshots whose weights lie in the folder, and train none.
+      progress: show progress bars.
+
+    Yields:
+      (run, windows, state) for each snapshot: "measured before", "measured", "not there" of weights that are not
+      found, or "unfinished", which is the last.
+    """
+    check_precision(precision)
+    protocol = dataclasses.replace(protocol, num_seeds=1)
+    record = run_record(
+        profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement=table,
+        batch_size=batch_size, protocol=dataclasses.asdict(protocol),
+    )  # fmt: skip
+    folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {table: ["run", "windows"]}
+    records = Records(folder_of_records, record, keys, known=known)
+    measure = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
+    if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
+        clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
+        real = real_rows(prepared.packed, clips, window=prepared.window)
+        records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
+    for run, windows in snapshots:
+        key = {"run": run.name, "windows": windows}
+        if records.has(table, key):
+            yield run.name, windows, "measured before"
+            continue
+        if found_alone and not _weights(folder, run, windows).exists():
+            yield run.name, windows, "not there"
+            continue
+        if stop_at is not None and time.monotonic() >= stop_at:
+            yield run.name, windows, "unfinished"
+            return
+        how = batch_size, precision, record, folder, stop_at, progress
+        rows = _measured(prepared, classifier, protocol, run, windows, *how, measure=measure)
+        if rows is None:
+            yield run.name, windows, "unfinished"
+            return
+        records.put(table, key, rows)
+        yield run.name, windows, "measured"
+
+
+def train_snapshots(
+    prepared: PreparedData, profile: Profile, snapshots: Iterable[tuple[Run, int]], *, folder, batch_size: int = 128,
+    precision: str = "float32", stop_at: float | None = None, progress: bool = True,
+) -> Iterator[tuple[str, int, str]]:  # fmt: skip
+    """Train snapshots and keep their weights, for a GPU that is at hand for minutes: measured where there is time.
+
+    The programs of all runs are compiled side by side while the first one trains, if JAX keeps a cache of them.
+
+    Args:
+      prepared, profile, snapshots, folder, batch_size, precision, stop_at, progress: as for `run_campaign`.
+
+    Yields:
+      (run, windows, state), state "kept", "kept before", or "unfinished", which is the last.
+    """
+    check_precision(precision)
+    snapshots = list(snapshots)
+    record = run_record(profile=profile, dataset=prepared.packed, seed=0, measurement="package", batch_size=batch_size)
+
+    def compiled(run: Run) -> None:
+        config = run.config(prepared.windows("train").num_windows, batch_size)
+        with matmul_precision(precision):
+            compile_steps(prepared.task(run.preset, config, network=find_recipe(run.recipe).network), 50)
+
+    with ThreadPoolExecutor() as pool:
+        if jax.config.jax_compilation_cache_dir:
+            list(pool.map(compiled, dict.fromkeys(run for run, _ in snapshots)))
+        for run, windows in snapshots:
+            state = "kept before"
+            if not _weights(folder, run, windows).exists():
+                done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
+                state = "unfinished" if done is None else "kept"
+            yield run.name, windows, state
+            if state == "unfinished":
+                return
+
+
+def _weights(folder, run: Run, windows: int) -> Path:
+    return Path(folder) / run.name / f"{windows}.safetensors"
+
+
+def _trained(
+    prepared, run: Run, windows: int, batch_size: int, precision: str, record, folder, stop_at, progress
+) -> tuple[PreparedData, TrainedModel, float, TrainingConfig] | None:
+    """Train a run to a snapshot and keep its weights, or take those that are there.
+
+    Returns:
+      (the data in the run's windows, model, held-out loss, config); None where the time was over before.
+    """
+    data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
+    config = run.config(data.windows("train").num_windows, batch_size)
+    network, steps = find_recipe(run.recipe).network, max(1, windows // config.batch_size)
+    file = _weights(folder, run, windows)
+    if file.exists() and (found := load_model(file)).record["training"] == config.to_dict():
+        task, state = (
+            data.task(run.preset, config, network=network),
+            SimpleNamespace(averaged=found.params, statistics=None),
+        )
+        return data, found, held_out_terms(task, state, data.windows(data.held_out_split))["loss"], config
+    with matmul_precision(precision):
+        trained, loss = snapshot(
+            data, run.preset, config, steps, record,
+            folder=file.parent, network=network, every=_EVERY.get(device_name(), 1000),
+            stop_at=stop_at, progress=progress,
+        )  # fmt: skip
+    if trained is None:
+        return None
+    save_model(file, trained, jnp.bfloat16)
+    return data, trained, loss, config
+
+
+def _measured(
+    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, precision: str, record, folder, stop_at,
+    progress, *, measure: Callable | None = None,
+) -> pd.DataFrame | None:  # fmt: skip
+    """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
+    done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
+    if done is None:
+        return None
+    data, trained, loss, config = done
+    log.info("measuring %s after %s windows", run.name, f"{windows:,}")
+    held_out = data.windows(data.held_out_split)
+    rows = (measure or _campaign_rows)(trained, data, classifier, protocol, held_out)
+    error = held_out_error(trained, held_out, seed=protocol.path_seed)
+    of_windows = pd.DataFrame({"steps": 0, "metric": ["held_out_loss", "held_out_error"], "value": [loss, error]})
+    seen = max(1, windows // config.batch_size) * config.batch_size
+    columns = {
+        "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
+        "epochs": seen / data.windows("train").num_windows, "weights": weights_digest(trained.params),
+        "classifier": weights_digest(classifier.params),
+        "device": jax.devices()[0].device_kind, "precision": precision, "commit": (record["git_commit"] or "")[:10],
+    }  # fmt: skip
+    return pd.concat([rows, of_windows]).assign(**columns)
+
+
+def _input_use(trained: TrainedModel, held_out: WindowSet, seed: int) -> pd.DataFrame:
+    use = input_use(trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=seed)
+    return use.assign(steps=STEPS_MEASURED[0])
+
+
+def _campaign_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
+    tables = [
+        measure_model(MotionGenerator(trained, count), data.packed, classifier, protocol, held_out)[0]
+        for count in STEPS_MEASURED
+    ]
+    tables.append(_input_use(trained, held_out, protocol.path_seed))
+    return pd.concat(tables)[["steps", "metric", "unit", "value"]]
+
+
+def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
+    use = noise_use(MotionGenerator(trained, STEPS_MEASURED[0]), held_out, seed=protocol.path_seed)
+    names = ("x0_error_ratio", "seed_spread")
+    figures = {"metric": names, "unit": ["", "cm"], "value": [use[METRICS[name].key] for name in names], "steps": 0}
+    tables = [walk_rows(trained, data.packed, classifier, seed=protocol.path_seed), pd.DataFrame(figures)]
+    if trained.diffusion.kind == "variance_exploding":
+        tables.append(window_rows(trained, held_out, seed=protocol.path_seed))
+    tables.append(_input_use(trained, held_out, protocol.path_seed)[["metric", "unit", "value", "steps"]])
+    return pd.concat(tables, ignore_index=True)

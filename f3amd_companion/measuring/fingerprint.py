@@ -1,0 +1,136 @@
+"""What one trained network does in 8, 4, 2 and 1 steps, under both grids and both updates of Appendix F.
+
+Table 5 prints two plateaus, {8, 4} and {2, 1} steps. Whether ours has any may hang on where the steps lie and on
+which state the network is shown; both cost no training, so that every reading of the paper is measured under all four.
+Walks amplify a millimetre to a per cent: single windows are compared in centimetres beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+import pandas as pd
+
+from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.measures import real_clips
+from f3amd_lib.measures.classifier import StyleClassifier
+from f3amd_lib.measures.metrics import foot_sliding
+from f3amd_lib.measures.protocol import classify_windows, distribution_figures, evaluation_paths, real_features
+from f3amd_lib.measures.registry import BY_KEY, METRICS
+from f3amd_lib.measures.rollout_measures import motion_figures
+from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.rollout.rollout import MotionGenerator, Rollout
+from f3amd_lib.training.checkpoints import TrainedModel
+
+GRIDS = ("endpoints", "uniform")
+"""Where the steps lie: t = linspace(0, 1, N), and t = i / N."""
+
+STEPS = (8, 4, 2, 1)
+NUM_FRAMES = 640
+FURTHEST = 5.0
+"""Metres between a root and its target, or 1 m of height from where it began, that no walk comes back from."""
+
+WINDOWS_PER_STYLE = 10
+"""Windows of 60 frames that 640 frames hold, of each style on either side of FID."""
+
+
+def _figures(motion: Motion, path: RootPath, window: int, floor: float) -> dict[str, float]:
+    """Measure one walk; the names are those of records."""
+    figures = motion_figures(motion, path, window, floor)
+    figures["foot_all_frames"] = foot_sliding(motion.positions, motion.skeleton, contact_height=np.inf)[0]
+    return {BY_KEY[key].name: float(value) for key, value in figures.items()}
+
+
+def diverged(rollout: Rollout) -> np.ndarray:
+    """Tell which characters of a rollout have left their path for good, or the earth, [B] booleans."""
+    wanted = np.stack([path.position for path in rollout.paths])
+    away = np.linalg.norm(rollout.frames[..., [0, 2]] - wanted, axis=-1).max(axis=-1)
+    height = np.abs(rollout.frames[..., 1] - rollout.history[:, -1:, 1]).max(axis=-1)
+    # A number that is none is in no range.
+    return ~((away <= FURTHEST) & (height <= 1.0) & np.isfinite(rollout.frames).all(axis=(-2, -1)))
+
+
+def _table(figures: pd.DataFrame, **columns) -> pd.DataFrame:
+    """Return mean and median over walks of each figure."""
+    rows = [
+        {"metric": name, "unit": METRICS[name].unit, "value": values.mean(), "median": values.median()}
+        for name, values in figures.items()
+    ]
+    return pd.DataFrame(rows).assign(**columns)
+
+
+def walk_rows(
+    trained: TrainedModel, packed: PackedMotion, classifier: StyleClassifier, *, num_frames: int = NUM_FRAMES,
+    seed: int = 0,
+) -> pd.DataFrame:  # fmt: skip
+    """Walk every style under both grids and updates in each number of steps.
+
+    Args:
+      trained: the model; one that was not trained with F3AMD's noise keeps its own sampler.
+      packed: the data set.
+      classifier: for FID and coverage of the styles that it knows.
+      num_frames: of each walk.
+      seed: of paths, noise and starting poses.
+
+    Returns:
+      Columns grid, update, steps, walks, diverged, metric, unit, value, median: means and medians over the walks that
+      did not diverge. One step is the same under all four, and stands once.
+    """
+    styles = list(packed.styles)
+    paths = evaluation_paths(packed, styles, num_frames, seed=seed)
+    floors = [real_clips.style_floor(packed, style) for style in styles]
+    known = [style for style in styles if style in classifier.styles]
+    real = real_features(packed, classifier, known, trained.config.window)
+    told = getattr(trained.config, "noise_levels", ())
+    own = trained.diffusion.sampler
+    updates = {own: own} if told or own != UPDATES["rescaled"] else UPDATES
+    tables = []
+    for steps, grid, (update, sampler) in product(STEPS, GRIDS, updates.items()):
+        if steps == 1 and (grid, update) != (GRIDS[0], next(iter(updates))):
+            continue
+        rollout = MotionGenerator(trained, steps, spacing=grid, sampler=sampler).rollout(paths, styles, seed=seed)
+        gone = diverged(rollout)
+        motions = {place: rollout.motion(place) for place in np.flatnonzero(~gone)}
+        columns = {"grid": grid, "update": update, "steps": steps, "walks": len(gone), "diverged": int(gone.sum())}
+        figures = [_figures(motion, paths[k], rollout.window, floors[k]) for k, motion in motions.items()]
+        tables.append(_table(pd.DataFrame(figures, columns=None if figures else ["IRD"]), **columns))
+        if all(k in motions for k, style in enumerate(styles) if style in known):
+            seen = classify_windows(classifier, [motions[styles.index(style)] for style in known], known)
+            count = min(WINDOWS_PER_STYLE, num_frames // classifier.config.window, *(len(one) for one in real.values()))
+            scores = distribution_figures(seen, real, count, np.random.default_rng([seed, 0]))
+            tables.append(_table(pd.DataFrame([scores]), **columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def window_rows(trained: TrainedModel, held_out: WindowSet, *, num_windows: int = 64, seed: int = 0) -> pd.DataFrame:
+    """Compare single windows from one noise between N and N / 2 steps; columns as of `walk_rows`, walks and diverged 0.
+
+    Args:
+      trained: the model, trained with F3AMD's noise.
+      held_out: windows.
+      num_windows: conditions.
+      seed: of the noise.
+    """
+    tables = []
+    for grid in GRIDS:
+        made, real = walk_windows(
+            trained, held_out, STEPS, spacing=grid, num_windows=num_windows, num_seeds=4, seed=seed
+        )
+        tables.append(window_figures(made, real).query("update != 'real'").assign(grid=grid))
+    table = pd.concat(tables, ignore_index=True)
+    return table.assign(metric="window_" + table["metric"], median=np.nan, walks=0, diverged=0)
+
+
+def real_rows(packed: PackedMotion, clips: Sequence[int], *, window: int = 32) -> pd.DataFrame:
+    """Measure real clips by the same figures, each against its own smoothed path; grid and update are "real"."""
+    figures = []
+    for clip in clips:
+        motion = packed.motion(clip)
+        figures.append(_figures(motion, real_clips.own_path(motion), window, float(packed.floor_shift[clip])))
+    columns = {"grid": "real", "update": "real", "steps": 0, "walks": len(figures), "diverged": 0}
+    return _table(pd.DataFrame(figures), **columns)

@@ -1,0 +1,699 @@
+"""Measure what takes too long for a notebook: `f3amd measure learning`.
+
+A measurement writes a tidy table with its run record under `<results>/records/`, after every row,
+so that a run that was stopped goes on where it was (see `runner`). Notebooks only read these tables.
+Results go to the ignored `runs/` unless `F3AMD_RESULTS_DIR` says otherwise (`make measure` sends
+them to `paper_figures/`).
+
+Every measurement is a function of the prepared data, a profile, which says how much is measured and
+where models and results lie, and the presets that are asked for: by default all that have weights
+for this data set and window, shipped or in `runs/`. One that is asked for by name is measured again,
+and trained if it has no weights. Rows of weights that have changed since are measured again as well.
+Each returns the path of its table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+
+from f3amd_companion.measuring import literal_update, sensitivity
+from f3amd_companion.measuring.bfloat16 import compare_precisions
+from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
+from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve, snapshot
+from f3amd_companion.measuring.posterior import POSTERIOR, posterior_table
+from f3amd_companion.measuring.published import NAME as PUBLISHED
+from f3amd_companion.measuring.published import published_model
+from f3amd_companion.measuring.recipes import RECIPE_STEPS, RECIPES, train_recipe
+from f3amd_companion.measuring.runner import Records
+from f3amd_companion.serving.foot_locking import lock_rollout
+from f3amd_companion.serving.online_feet import lock_rollout_online
+from f3amd_companion.speed.timing import take_turns
+from f3amd_lib.data.features import num_channels
+from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import spread_windows
+from f3amd_lib.ground.names import asked_network
+from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
+from f3amd_lib.ground.records import run_record, set_aside_table, whole_table, write_table
+from f3amd_lib.measures import denoising
+from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
+from f3amd_lib.measures.protocol import (
+    REFERENCE_MODELS,
+    Protocol,
+    evaluation_paths,
+    measure_model,
+    measure_real,
+    summarise,
+    windows_that_fit,
+)
+from f3amd_lib.measures.real_clips import reference_clips, style_floor
+from f3amd_lib.measures.registry import SHOWN
+from f3amd_lib.measures.walking import walking_figures
+from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.motion.synthetic import walk_along
+from f3amd_lib.networks import presets
+from f3amd_lib.rollout.blending import blend_rollout
+from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.rollout.rounds import sample_round
+from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
+from f3amd_lib.training.denoising_task import network_inputs
+from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
+from f3amd_lib.training.recipe import profile_recipe
+
+log = logging.getLogger("f3amd")
+
+STEPS = (8, 4, 2, 1)
+"""Numbers of denoising steps that the paper compares (Table 5)."""
+
+LEADING = ", leading"
+"""Added to the name of a network of K levels in rows whose fewer steps count from the least noisy one."""
+
+SPACINGS = ("endpoints", "uniform")
+"""Both readings of where N steps lie, ours first (see `NoiseSchedule.times`)."""
+
+SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
+"""Noise levels at which an x0 error is measured, for networks that take any level."""
+
+WALKING_SEEDS = 3
+"""Seeds of path and noise in `measure_walking`."""
+
+PRECISION_SEEDS = 5
+"""Seeds of path and noise in `measure_precision`."""
+
+SNAPSHOTS = 10
+"""Measurements on the way of a training in `measure_quality_by_epoch`."""
+
+ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-steady": (1,)}
+"""Models that `measure_one_step` distils -> the numbers of phases, each a student of its own. A continuous schedule's
+grid of 2 steps does not visit the middle of its grid of 8, so that its student has one phase."""
+
+STUDENT_STEPS, STUDENT_BATCH = {"smoke": 4, "laptop": 300, "gpu": 20_000}, 32
+"""Optimiser steps of a student by profile, and windows of each."""
+
+_TIMED_CHARACTERS = 32
+
+_PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
+
+
+def _records_dir(profile: Profile) -> Path:
+    return results_dir(profile.dataset, profile.name) / "records"
+
+
+def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
+    return list(profile.evaluation_styles or prepared.packed.primary_styles[: profile.num_characters])
+
+
+def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
+    if models:
+        raise ValueError(f"{reason}: leave --model out")
+
+
+def models_with_weights(profile: Profile, option: str = "--model") -> list[str]:
+    """List the presets that have weights; ValueError, with what to do (name one with `option`), if there are none."""
+    if names := available_models(profile):
+        return names
+    raise ValueError(
+        f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one (`f3amd train --data "
+        f"{profile.dataset} --profile {profile.name}`) or name one with {option}"
+    )
+
+
+def _record(prepared: PreparedData, profile: Profile, measurement: str, **settings) -> dict:
+    return run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement, **settings)
+
+
+def _asked(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False,
+    among: Iterable[str] = (),
+) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
+    """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
+    names = asked = list(models or ())
+    if not asked:
+        known = (models_with_weights if at_least_one else available_models)(profile)
+        names = [name for name in among if name in known] if among else known
+    return asked, {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+
+
+def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
+    return {name: weights_digest(model.params) for name, model in trained.items()}
+
+
+def _with_weights(rows: Iterable[dict], trained: Mapping[str, TrainedModel], *, other: str = "") -> list[dict]:
+    """Add to what is to be measured the digest of its network's weights, `other` where there is no network."""
+    digests = _digests(trained)
+    return [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in rows]
+
+
+def _write_anew(
+    prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, trained: Mapping[str, TrainedModel],
+    **settings,
+) -> Path:  # fmt: skip
+    """Write a table that is measured as a whole; its record names the weights of its models.
+
+    A table with models that this one lacks is kept under another name.
+    """
+    path = _records_dir(profile) / f"{name}.csv"
+    if (there := whole_table(path)) and not set(there[0].get("model", ())) <= set(table["model"]):
+        log.warning("%s has other models as well: kept as %s", path, set_aside_table(path).name)
+    digests = {model: [digest] for model, digest in _digests(trained).items()}
+    record = _record(prepared, profile, name, **settings, weights_digests=digests)
+    return write_table(path, table, record)
+
+
+def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> list[tuple[str, Motion]]:
+    """Return (style, motion) of the real clips that stand beside rollouts."""
+    clips = reference_clips(packed, styles, window=profile.window)
+    return [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
+
+
+def protocol_of(prepared: PreparedData, profile: Profile, measurement: str) -> tuple[StyleClassifier, Protocol, dict]:
+    """Return the style classifier, the protocol of a profile and the record of a measurement."""
+    packed = prepared.packed
+    classifier, _ = obtain_classifier(packed, profile)
+    protocol = Protocol(
+        tuple(_styles(prepared, profile)), num_frames=profile.rollout_frames, **_PROTOCOL.get(profile.name, {})
+    )
+    fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
+    protocol = dataclasses.replace(protocol, windows_per_style=fitting)
+    record = run_record(
+        profile=profile, dataset=packed, seed=protocol.path_seed, measurement=measurement,
+        protocol=dataclasses.asdict(protocol), classifier=classifier.record["classifier_training"],
+        classifier_weights=weights_digest(classifier.params),
+        classifier_accuracy=classifier.accuracy,
+    )  # fmt: skip
+    return classifier, protocol, record
+
+
+def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Train every preset for a short while and keep its learning curve (see `measuring.learning_curves`).
+
+    Returns:
+      The table, `records/learning.csv`.
+    """
+    record = _record(prepared, profile, "learning", **SHORT_RUN)
+    asked = list(models or ())
+    records = Records(_records_dir(profile), record, {"learning": ["model"]}, again=asked)
+
+    def curve(row: Mapping) -> dict:
+        return {"learning": learning_curve(prepared, row["model"], seed=profile.seed)}
+
+    return records.measure([{"model": name} for name in asked or presets.of_paper()], curve)
+
+
+def measure_quality(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, published=None
+) -> Path:
+    """Run the evaluation protocol: real and broken motion, and models at 8, 4, 2 and 1 steps.
+
+    See `measures.protocol`. A row takes about a minute on 2 cores; its seconds are in the table.
+    `published` is the file of CAMDM's published weights (`measuring.published`), measured beside them.
+
+    Returns:
+      The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
+      `quality_by_round.csv`.
+    """
+    packed = prepared.packed
+    classifier, protocol, record = protocol_of(prepared, profile, "quality")
+    held_out = prepared.windows(prepared.held_out_split)
+    asked, trained = _asked(prepared, profile, models)
+    if published is not None:
+        trained[PUBLISHED] = published_model(published, packed)
+    if not trained:
+        where = profile.dataset, profile.name
+        log.warning("no trained model of %s at %s: only real motion is measured; name models with --model", *where)
+    todo = [(model, 0) for model in REFERENCE_MODELS]
+    for name, model in trained.items():
+        levels = len(getattr(model.config, "noise_levels", ()))
+        counts = [steps for steps in STEPS if steps <= (levels or max(STEPS))]
+        todo += [(name, steps) for steps in counts]
+        if levels:  # respaced in the other way that is in use, see `NoiseSchedule.times`
+            todo += [(name + LEADING, steps) for steps in counts if steps < levels]
+    keys = ["model", "window_frames", "steps"]
+    records = Records(
+        _records_dir(profile), record, {"quality_by_seed": keys, "quality_by_round": keys}, again=asked,
+        summaries={"quality": ("quality_by_seed", summarise)},
+    )  # fmt: skip
+
+    def score(row: Mapping) -> dict:
+        started, tables = time.perf_counter(), {}
+        if row["steps"]:
+            name = row["model"].removesuffix(LEADING)
+            spacing = "endpoints" if name == row["model"] else "leading"
+            generator = MotionGenerator(trained[name], row["steps"], spacing=spacing)
+            rows, tables["quality_by_round"] = measure_model(generator, packed, classifier, protocol, held_out)
+        else:
+            rows = measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
+        return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
+
+    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in todo]
+    # Real motion has no weights, but it is seen through the classifier's.
+    return records.measure(_with_weights(rows, trained, other=record["classifier_weights"]), score)
+
+
+TREATMENTS: dict[str, tuple[int, Callable | None]] = {
+    "as made": (0, None),
+    "blended": (4, None),
+    "feet locked": (0, lock_rollout),
+    "blended, feet locked": (4, lock_rollout),
+    "blended, feet locked online": (4, lock_rollout_online),
+}
+"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
+is the steer page's: it sees no frame ahead."""
+
+
+def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure feet, floor and seams of every model that has weights, at 8 steps and at 1.
+
+    Three paths with noise of their own, a quarter of the profile's rounds each; see
+    `measures.walking`. The row "real" is the walker itself on the same paths for `synthetic`,
+    held-out clips for captured data.
+
+    Returns:
+      The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
+      of the weights.
+    """
+    return _measure_walks(prepared, profile, models, "walking", {"window_frames": profile.window}, ["as made"])
+
+
+def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure what blending and foot locking do to feet, floor and seams, on the rollouts of `measure_walking`.
+
+    Never a row of the paper's: what is treated is not what the network made.
+
+    Returns:
+      The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
+      clips.
+    """
+    return _measure_walks(prepared, profile, models, "feet", {}, TREATMENTS)
+
+
+def _measure_walks(
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, also: dict,
+    treatments: Iterable[str],
+) -> Path:  # fmt: skip
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated; `also` names rows, too."""
+    packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
+    num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
+    floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
+    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
+    record = _record(prepared, profile, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
+    asked, trained = _asked(prepared, profile, models)
+
+    def walks(row: Mapping):
+        """Yield (treatment, seed, style, motion)."""
+        if row["steps"]:
+            generator = MotionGenerator(trained[row["model"]], row["steps"])
+            for seed, lines in paths.items():
+                rollout = generator.rollout(lines, styles, seed=seed)
+                for treatment in treatments:
+                    blend_frames, lock = TREATMENTS[treatment]
+                    treated = blend_rollout(rollout, blend_frames)
+                    treated = lock(treated) if lock else treated
+                    yield from ((treatment, seed, style, treated.motion(k)) for k, style in enumerate(styles))
+        elif made and name == "walking":  # its source walks any path
+            for seed, lines in paths.items():
+                for style, line in zip(styles, lines, strict=True):
+                    yield "as made", seed, style, walk_along(style, line.position, line.yaw)
+        else:
+            yield from (("as made", 0, style, motion) for style, motion in _real_walks(packed, profile, styles))
+
+    def measured(row: Mapping) -> dict:
+        rows = [
+            (row if name == "walking" else {"treatment": treatment}) | {"seed": seed, "style": style}
+            | walking_figures(motion, profile.window, floors[style])
+            for treatment, seed, style, motion in walks(row)
+        ]  # fmt: skip
+        return {name: pd.DataFrame(rows)}
+
+    rows = [("real", 0), *itertools.product(trained, (8, 1))]
+    todo = [{"model": model, **also, "steps": steps} for model, steps in rows]
+    records = Records(_records_dir(profile), record, {name: list(todo[0])}, again=asked)
+    return records.measure(_with_weights(todo, trained), measured)
+
+
+def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Write down how long every model that has weights was trained, and whether its held-out loss was flat by then.
+
+    Nothing is computed: both stand in the history beside the weights.
+
+    Returns:
+      The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
+      the held-out loss fell over the last quarter of training (NaN where none was watched).
+    """
+    asked = list(models or ())
+    record = _record(prepared, profile, "trained")
+    found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
+
+    def sum_up(row: Mapping) -> dict:
+        trained, history, _ = found[row["model"]]
+        last, fall = history["step"].max(), np.nan
+        if len(looks := history.reindex(columns=["step", "held_out_loss"]).dropna()):
+            # Between two looks the loss is taken to fall evenly with the logarithm of the steps.
+            step, loss = np.log(looks["step"].to_numpy()), looks["held_out_loss"].to_numpy()
+            fall = 1.0 - loss[-1] / np.interp(np.log(0.75 * last), step, loss, left=np.nan)
+        figures = {"windows": trained.windows_seen, "held_out_fall": fall}
+        return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
+
+    records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
+    todo = [{"model": name, "window_frames": profile.window} for name in found]
+    return records.measure(_with_weights(todo, {name: model for name, (model, *_) in found.items()}), sum_up)
+
+
+def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Ask the metrics themselves (see `measuring.sensitivity`), some minutes in all.
+
+    Whether FID and EMD order graded corruptions, and how many windows they need before they settle.
+
+    Returns:
+      The table `records/corruptions.csv`; beside it `settling.csv`, where every style has windows to halve. Both are
+      measured anew.
+
+    Raises:
+      ValueError: if models are named.
+    """
+    _refuse_models(models, "the metrics are asked about real motion")
+    classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
+    graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
+    folder = _records_dir(profile)
+    if sensitivity.most_windows(classifier):
+        write_table(folder / "settling.csv", sensitivity.settling(classifier), record)
+    else:
+        log.warning("settling is not measured: a style has fewer than two windows on a side")
+    return write_table(folder / "corruptions.csv", sensitivity.summarise_corruptions(graded), record)
+
+
+def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure how lively feet are in each band of frequency, real and generated with the profile's steps.
+
+    Returns:
+      The table `records/foot_spectrum.csv` (see `sensitivity.foot_spectrum`), measured anew.
+    """
+    packed, styles, seed = prepared.packed, _styles(prepared, profile), profile.seed
+    paths = evaluation_paths(packed, styles, profile.rollout_frames, seed=seed)
+    feet = {("real", profile.window, 0): _real_walks(packed, profile, styles)}
+    _, trained = _asked(prepared, profile, models)
+    for name, model in trained.items():
+        log.info("foot spectrum of %s", name)
+        rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
+        walks = [(style, rollout.motion(character)) for character, style in enumerate(styles)]
+        feet[name, profile.window, profile.num_steps] = walks
+    settings = {"num_frames": profile.rollout_frames, "styles": styles}
+    return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
+
+
+def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure what history, path and style leave open, on real motion and by trained models.
+
+    Some minutes in all.
+
+    Returns:
+      The table `records/posterior.csv` (see `posterior.posterior_table`), measured anew.
+    """
+    settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
+    _, trained = _asked(prepared, profile, models)
+    table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
+    return _write_anew(
+        prepared, profile, "posterior", table, trained, held_out_split=prepared.held_out_split, settings=settings,
+        numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
+    )  # fmt: skip
+
+
+def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Walk trained models with the printed update, rescaled and taken literally, side by side.
+
+    See `measuring.literal_update` and Appendix F of the paper. Rollouts by the evaluation protocol
+    with 8, 4, 2 and 1 steps on both readings of the grid, and single windows from the same noise.
+    One step is the same in all four; it is walked once. A rollout takes about a minute on 2 cores,
+    13 of them a model. Models whose own sampler is not DDIM are left out.
+
+    Returns:
+      The table of means and intervals, `records/literal_update.csv`; beside it
+      `literal_update_by_seed.csv` and `literal_update_windows.csv`.
+
+    Raises:
+      ValueError: for a model asked for by name whose sampler is not DDIM.
+    """
+    classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
+    held_out = prepared.windows(prepared.held_out_split)
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
+    for name, model in list(trained.items()):
+        if model.diffusion.sampler != literal_update.UPDATES["rescaled"]:
+            if asked:
+                raise ValueError(
+                    f"{name} samples by {model.diffusion.sampler!r}, which has no printed "
+                    "update: name models that sample by DDIM in the VE state"
+                )
+            del trained[name]
+
+    def summary(rows: pd.DataFrame) -> pd.DataFrame:
+        groups = rows.groupby(["spacing", "update"], sort=False)
+        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
+
+    way = ["model", "spacing", "update", "steps"]
+    records = Records(
+        _records_dir(profile), record, {"literal_update_by_seed": way, "literal_update_windows": way[:2]}, again=asked,
+        summaries={"literal_update": ("literal_update_by_seed", summary)},
+    )  # fmt: skip
+
+    def walk_windows(row: Mapping) -> dict:
+        walks = literal_update.walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
+        return {"literal_update_windows": literal_update.window_figures(*walks)}
+
+    def walk_rollouts(row: Mapping) -> dict:
+        generator = MotionGenerator(
+            trained[row["model"]], row["steps"], spacing=row["spacing"], sampler=literal_update.UPDATES[row["update"]]
+        )
+        rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out, name=row["model"])
+        return {"literal_update_by_seed": rows}
+
+    windows = [{"model": name, "spacing": spacing} for name, spacing in itertools.product(trained, SPACINGS)]
+    rollouts = [
+        {"model": name, "spacing": spacing, "update": update, "steps": steps}
+        for name, spacing, update, steps in itertools.product(trained, SPACINGS, literal_update.UPDATES, STEPS)
+        if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
+    ]
+    records.measure(_with_weights(windows, trained), walk_windows, into="literal_update_windows")
+    return records.measure(_with_weights(rollouts, trained), walk_rollouts)
+
+
+def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Ask trained models whether they use their noisy input; single windows, seconds a model.
+
+    Returns:
+      The table `records/noise_use.csv`, a row per model and number of steps (see
+      `denoising.window_row`); beside it `x0_by_sigma.csv`, the x0 error against the noise level, at
+      the levels that a model was told where it was told some, and `input_use.csv`, how far the
+      estimates move with noisy input and noise level (see `denoising.input_use`).
+    """
+    record = _record(prepared, profile, "noise_use")
+    held_out = prepared.windows(prepared.held_out_split)
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
+
+    def ask(row: Mapping) -> dict:
+        model = trained[row["model"]]
+        levels = getattr(model.config, "noise_levels", ()) or SIGMAS
+        steps = [count for count in (8, 1) if count <= len(levels)]
+        condition = denoising.held_out_condition(held_out, model)
+        return {
+            "x0_by_sigma": denoising.x0_error_by_sigma(model, held_out, levels),
+            "input_use": denoising.input_use(model, condition, seed=profile.seed),
+            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
+        }
+
+    # The table that says what was measured is written last.
+    keys = dict.fromkeys(["noise_use", "x0_by_sigma", "input_use"], ["model"])
+    records = Records(_records_dir(profile), record, keys, again=asked)
+    rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
+    return records.measure(_with_weights(rows, trained), ask)
+
+
+def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Measure the gradient of the loss that is not scaled against the noise level, at trained weights (claim T5).
+
+    Returns:
+      The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), measured anew.
+
+    Raises:
+      ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
+    """
+    asked, by_name = _asked(prepared, profile, models or ["F3AMD-FNO-96"])
+    if len(asked) > 1:
+        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(asked)}: name one with --model")
+    (trained,) = by_name.values()
+    task = prepared.task(trained.name, profile_recipe(profile, trained.name), normaliser=trained.normaliser)
+    held_out = prepared.windows(prepared.held_out_split)
+    table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
+    return _write_anew(prepared, profile, "gradient_norm", table.assign(model=trained.name), by_name)
+
+
+def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Train anew by the profile's recipe, and measure on the way (claim E13); long.
+
+    Ten snapshots of each model, one rollout of each style at each, with the steps of the profile.
+
+    Returns:
+      The table `records/quality_by_epoch.csv`: the nine metrics of Table 3 and the held-out loss,
+      against epochs over the training windows. By default of `F3AMD-FNO-96` and `CAMDM`.
+    """
+    classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
+    protocol = dataclasses.replace(protocol, num_seeds=1)
+    held_out = prepared.windows(prepared.held_out_split)
+    asked = list(models or ())
+    folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
+    keys = ["model", "snapshot"]
+    records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
+
+    def score(row: Mapping) -> dict:
+        recipe = profile_recipe(profile, row["model"])
+        steps = max(1, round(recipe.num_steps * row["snapshot"] / SNAPSHOTS))
+        trained, loss = snapshot(prepared, row["model"], recipe, steps, record, folder=folder)
+        epoch = steps * recipe.batch_size / prepared.windows("train").num_windows
+        generator = MotionGenerator(trained, profile.num_steps)
+        rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out)
+        rows = rows[rows["metric"].isin([metric.name for metric in SHOWN["paper"]])][["metric", "value"]]
+        rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
+        return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
+
+    names = asked or ["F3AMD-FNO-96", "CAMDM"]
+    todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
+    return records.measure(todo, score)
+
+
+def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Train `F3AMD-FNO-96` with one change each, for a short while (see `measuring.recipes`).
+
+    Unfinished runs are gone on with; a row takes some minutes on 2 cores. Rows are recipes, and all
+    are measured.
+
+    Returns:
+      The table `records/recipes.csv`.
+
+    Raises:
+      ValueError: if models are named.
+    """
+    _refuse_models(models, "recipes are rows of their own")
+    record = _record(prepared, profile, "recipes", num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size)
+    held_out = prepared.windows(prepared.held_out_split)
+    folder = runs_dir(profile.dataset, profile.name) / "recipes"
+
+    def train_and_ask(row: Mapping) -> dict:
+        trained = train_recipe(prepared, profile, row["recipe"], folder=folder)
+        rows = denoising.window_row(trained, held_out, seed=profile.seed)
+        return {"recipes": rows.assign(**row, weights=weights_digest(trained.params))}
+
+    records = Records(_records_dir(profile), record, {"recipes": ["recipe"]})
+    return records.measure([{"recipe": name, "change": RECIPES[name].change} for name in RECIPES], train_and_ask)
+
+
+def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Compare float32 and bfloat16 on trained models, with 1 step and with 8 (see `measuring.bfloat16`).
+
+    Returns:
+      The table `records/precision.csv`.
+    """
+    packed, styles = prepared.packed, _styles(prepared, profile)
+    seeds = range(profile.seed, profile.seed + PRECISION_SEEDS)
+    asked, trained = _asked(prepared, profile, models, at_least_one=True)
+    record = _record(prepared, profile, "precision", styles=styles, num_seeds=PRECISION_SEEDS)
+
+    def compare(row: Mapping) -> dict:
+        settings = {"steps": row["steps"], "num_frames": profile.rollout_frames, "seeds": seeds}
+        return {"precision": compare_precisions(trained[row["model"]], packed, styles, **settings)}
+
+    records = Records(_records_dir(profile), record, {"precision": ["model", "steps"]}, again=asked)
+    todo = [{"model": name, "steps": steps} for name, steps in itertools.product(trained, (1, 8))]
+    return records.measure(_with_weights(todo, trained), compare)
+
+
+DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
+"""Added to the name of a network in rows of its students of few steps, and of the walk that they learned."""
+
+
+def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Distil trained models into few steps and run the evaluation protocol on the students; long.
+
+    A student has as many phases as steps (`measuring.consistency_task`). Where a model's own sampler adds noise on the
+    way, the walk without it, which the students learned, has a row, too.
+
+    Returns:
+      The table `records/one_step.csv`; beside it `one_step_by_seed.csv`, and `one_step_input_use.csv`, how far the
+      students' estimates move with noisy input and noise level (see `denoising.input_use`).
+    """
+    packed, num_steps = prepared.packed, STUDENT_STEPS[profile.name]
+    held_out = prepared.windows(prepared.held_out_split)
+    classifier, protocol, record = protocol_of(prepared, profile, "one_step")
+    asked, trained = _asked(prepared, profile, models, among=ONE_STEP_MODELS)
+    folder = runs_dir(profile.dataset, profile.name) / "one_step"
+    record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
+    keys = ["model", "window_frames", "steps"]
+    records = Records(
+        _records_dir(profile), record, {"one_step_by_seed": keys, "one_step_input_use": keys}, again=asked,
+        summaries={"one_step": ("one_step_by_seed", summarise)},
+    )  # fmt: skip
+
+    def score(row: Mapping) -> dict:
+        walker, steps = trained[asked_network(row["model"])], row["steps"]
+        made = {"sampler": "ddim"}
+        if row["model"].endswith(DISTILLED):
+            settings = {"num_steps": num_steps, "num_phases": steps, "batch_size": STUDENT_BATCH}
+            walker, _ = distil(prepared, profile, walker, folder / f"M{steps}", **settings)
+            made |= {"spacing": STUDENT_SPACING}
+        generator = MotionGenerator(walker, steps, **made)
+        rows, _ = measure_model(generator, packed, classifier, protocol, held_out, name=row["model"])
+        use = denoising.input_use(walker, denoising.held_out_condition(held_out, walker), seed=profile.seed)
+        return {"one_step_input_use": use, "one_step_by_seed": rows}
+
+    todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
+    walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
+    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in walks + todo]
+    return records.measure(_with_weights(rows, trained), score)
+
+
+def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
+    """Time a window for 32 characters at 8, 4, 2 and 1 steps, by turns: what a student of one step is compared by.
+
+    A student is as large as its teacher and takes its teacher's time at one step.
+
+    Returns:
+      The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
+    """
+    _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
+    batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
+
+    def compiled(model: TrainedModel, steps: int) -> Callable:
+        sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
+        _, condition = network_inputs(batch, model.normaliser)
+
+        @jax.jit
+        def draw(params, condition, key):
+            return sample_round(network_with(model.config, params), condition, sigmas, key, sampler=sampler)
+
+        return lambda: draw(model.params, condition, jax.random.key(0)).block_until_ready()
+
+    rounds = {(name, steps): compiled(model, steps) for name, model in trained.items() for steps in STEPS}
+    rows = [
+        {"model": name, "steps": steps, "characters": _TIMED_CHARACTERS, "milliseconds": 1000.0 * timing.median}
+        | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}
+        for (name, steps), timing in take_turns(rounds, min_rounds=30, min_seconds=5.0).items()
+    ]
+    return _write_anew(prepared, profile, "round_times", pd.DataFrame(rows), trained)
+
+
+MEASUREMENTS: dict[str, Callable] = {
+    measure.__name__.removeprefix("measure_"): measure
+    for measure in (
+        measure_learning, measure_precision, measure_literal_update, measure_posterior, measure_noise_use,
+        measure_gradient_norm, measure_recipes, measure_quality, measure_quality_by_epoch, measure_walking,
+        measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
+        measure_round_times,
+    )
+}  # fmt: skip
+"""Name -> function of (prepared data, profile, models or None) that returns its table's path."""

@@ -1,0 +1,364 @@
+"""Presets x measurements on several processes or machines, by Dask distributed: `f3amd sweep`.
+
+A leg is the most that a dead worker costs: one snapshot of the campaign's queue, the training of a
+preset, one measurement of a preset. Legs write into folders of their own, so that no two write one
+table. What finished legs left is gathered into the tables that one process would have written, row
+by row in the order of the plan. All machines see one folder and run one checkout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import json
+import logging
+import os
+import shutil
+import threading
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import pandas as pd
+
+from f3amd_companion.measuring.campaign import Run, run_campaign
+from f3amd_companion.measuring.measure import MEASUREMENTS, models_with_weights, protocol_of
+from f3amd_lib.ground.files import locked, whole_file
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
+from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
+from f3amd_lib.networks import presets
+from f3amd_lib.training.checkpoints import weights_digest
+from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model, prepare
+
+log = logging.getLogger("f3amd")
+
+INSTALL = 'make sweep-tools, or pip install "f3amd_lib[sweep]"'
+
+CAMPAIGN, TRAIN = "campaign", "train"
+"""Legs that are no measurement of `measure`: a snapshot of the queue, and the training of a preset."""
+
+NOT_BY_PRESET = ("recipes", "sensitivity", "gradient_norm")
+"""Measurements whose table is not one of presets side by side."""
+
+CONNECT_S = 10
+"""Seconds after which a scheduler counts as not reached."""
+
+_TRAIN_THEMSELVES = ("learning", "quality_by_epoch")
+
+_WAIT_S = 1.0
+
+_ALONE = threading.Lock()  # a process has one results folder: its legs run one after the other
+
+
+@dataclass(frozen=True)
+class Leg:
+    """What one worker does in one go.
+
+    Attributes:
+      measurement: of `MEASUREMENTS`, or `CAMPAIGN`, or `TRAIN`.
+      preset: the model.
+      run, windows: of the campaign's snapshot.
+      after: name of the leg that has to be over before.
+    """
+
+    measurement: str
+    preset: str
+    run: Run | None = None
+    windows: int = 0
+    after: str | None = None
+
+    @property
+    def name(self) -> str:
+        """A name for a folder and for people."""
+        return f"{self.measurement}-{self.preset if self.run is None else f'{self.run.name}-{self.windows}'}"
+
+    def own(self, table: pd.DataFrame) -> pd.Series:
+        """Tell which rows of a table are the leg's: not those of real motion, or of other snapshots."""
+        if self.run is not None:
+            return (table["run"] == self.run.name) & (table["windows"] == self.windows)
+        return table["model"].str.partition(", ")[0] == self.preset
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the legs of a sweep share.
+
+    Attributes:
+      profile: how much, on which data.
+      source: folder or archive, where the data set needs one.
+      results: folder of the results, for all data sets and profiles.
+      folder: where legs lie, and states and weights of the queue; all workers see it.
+      batch_size: windows a step of the queue's trainings.
+    """
+
+    profile: Profile
+    source: str | None
+    results: Path
+    folder: Path
+    batch_size: int = 128
+
+    def records(self, root: Path) -> Path:
+        """Return the folder of the records under a folder of results."""
+        return root / self.profile.dataset / self.profile.name / "records"
+
+    def place(self, leg: Leg) -> Path:
+        """Return the folder of a leg's results."""
+        return self.folder / "sweep" / leg.name
+
+
+def plan(
+    names: Sequence[str], models: Iterable[str], profile: Profile, snapshots: Sequence[tuple[Run, int]]
+) -> list[Leg]:
+    """Return the legs of a sweep, in the order in which one process would take them.
+
+    Args:
+      names: of `MEASUREMENTS`, or `CAMPAIGN`.
+      models: presets; by default all of the queue, and for measurements those that have weights.
+      profile: whose weights.
+      snapshots: the queue.
+
+    Raises:
+      ValueError: for an unknown name or preset, a measurement that is not by preset, or nothing to do.
+    """
+    swept = [name for name in MEASUREMENTS if name not in NOT_BY_PRESET]
+    if not names:
+        raise ValueError(f"name what to sweep: {CAMPAIGN}, {', '.join(swept)}")
+    for name in names:
+        if name in NOT_BY_PRESET:
+            raise ValueError(f"{name} is not measured by preset: f3amd measure {name}")
+        check_known(name, [CAMPAIGN, *swept], "measurement")
+    asked = list(dict.fromkeys(presets.find_preset(model).name for model in models))
+    # Of two measurements of a preset that train it, the training is one leg.
+    legs: dict[str, Leg] = {}
+    for name in dict.fromkeys(names):
+        if name == CAMPAIGN:
+            wanted = list(_of_queue(asked, snapshots))
+        else:
+            wanted = []
+            for model in asked or models_with_weights(profile, "--preset"):
+                training = Leg(TRAIN, model)
+                alone = name in _TRAIN_THEMSELVES
+                wanted += [Leg(name, model)] if alone else [training, Leg(name, model, after=training.name)]
+        legs |= {leg.name: leg for leg in wanted}
+    return list(legs.values())
+
+
+def _of_queue(asked: Sequence[str], snapshots: Sequence[tuple[Run, int]]) -> Iterator[Leg]:
+    """Yield the legs of the queue: each snapshot goes on from the one before of its run."""
+    for model in asked:
+        check_known(model, {run.preset for run, _ in snapshots}, "model of the queue")
+    last: dict[str, str] = {}
+    for run, windows in snapshots:
+        if not asked or run.preset in asked:
+            leg = Leg(CAMPAIGN, run.preset, run, windows, last.get(run.name))
+            last[run.name] = leg.name
+            yield leg
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(profile: Profile, source: str | None) -> PreparedData:
+    """Open the data once a process."""
+    return prepare(profile, path=source)
+
+
+def run_leg(work: Work, leg: Leg, before: dict | None = None) -> dict:
+    """Do one leg, or find it done; a worker calls this.
+
+    Args:
+      work, leg: what.
+      before: what the leg returned that had to be over first.
+
+    Returns:
+      state ("done" or "done before"), seconds, device, state_bytes (of the training state, 0 without one) and weights
+      (their digest, of a training).
+
+    """
+    place = work.place(leg)
+    log.setLevel(logging.INFO)  # what it says is forwarded to whoever started the sweep
+    with _ALONE, _locked(place / ".lock", leg.name), _results_at(place):
+        log.info("begun: %s", leg.name)
+        prepared, started = _opened(work.profile, work.source), time.perf_counter()
+        weights, kept = (before or {}).get("weights", ""), None
+        if leg.measurement == TRAIN:
+            trained, _, origin = obtain_model(prepared, work.profile, preset=leg.preset, progress=False)
+            state = "done" if origin == "trained now" else "done before"
+            weights, kept = weights_digest(trained.params), model_files(work.profile, leg.preset).state
+        elif leg.run is not None:
+            state = _snapshot(work, leg, prepared)
+            kept = work.folder / CAMPAIGN / leg.run.name / f"{leg.preset}.state.safetensors"
+        else:
+            state = _measured(work, leg, prepared, weights)
+        return {
+            "state": state, "seconds": round(time.perf_counter() - started, 1), "device": jax.devices()[0].device_kind,
+            "state_bytes": kept.stat().st_size if kept and kept.exists() else 0, "weights": weights,
+        }  # fmt: skip
+
+
+@contextlib.contextmanager
+def _locked(path: Path, name: str) -> Iterator[None]:
+    """Hold a leg's lock; wait while a worker that the scheduler has lost, or a stopped sweep's, still does the leg."""
+    with contextlib.ExitStack() as held:
+        for tried in itertools.count():
+            try:
+                held.enter_context(locked(path, f"doing {name}"))
+                break
+            except ValueError as error:
+                if not tried:
+                    log.info("waits: %s", error)
+                time.sleep(_WAIT_S)
+        yield
+
+
+@contextlib.contextmanager
+def _results_at(place: Path) -> Iterator[None]:
+    """Send results of this process to a folder."""
+    earlier = os.environ.get(RESULTS_DIR_VARIABLE)
+    os.environ[RESULTS_DIR_VARIABLE] = str(place)
+    try:
+        yield
+    finally:
+        del os.environ[RESULTS_DIR_VARIABLE]
+        if earlier is not None:
+            os.environ[RESULTS_DIR_VARIABLE] = earlier
+
+
+def _snapshot(work: Work, leg: Leg, prepared: PreparedData) -> str:
+    """Train the queue's run up to a snapshot and measure it, unless somebody has."""
+    classifier, protocol, _ = protocol_of(prepared, work.profile, CAMPAIGN)
+    ((*_, state),) = run_campaign(
+        prepared, work.profile, classifier, protocol, folder=work.folder / CAMPAIGN, batch_size=work.batch_size,
+        # What `f3amd campaign` has measured counts: a training that is further on is not begun anew.
+        snapshots=[(leg.run, leg.windows)], known=work.records(work.results), progress=False,
+    )  # fmt: skip
+    return "done before" if state == "measured before" else "done"
+
+
+def _measured(work: Work, leg: Leg, prepared: PreparedData, weights: str) -> str:
+    """Measure a preset, unless it was with the same weights, data and profile."""
+    place, finished = work.place(leg), work.place(leg) / "finished.json"
+    asked = {"profile": dataclasses.asdict(work.profile), "data": prepared.packed.fingerprint, "weights": weights}
+    asked = json.dumps(asked, indent=1) + "\n"
+    if finished.exists() and finished.read_text(encoding="utf-8") == asked:
+        return "done before"
+    finished.unlink(missing_ok=True)
+    shutil.rmtree(work.records(place), ignore_errors=True)  # of a leg that was killed, or of other weights
+    MEASUREMENTS[leg.measurement](prepared, work.profile, [leg.preset])
+    with whole_file(finished) as file:
+        file.write_text(asked, encoding="utf-8")
+    return "done"
+
+
+def gather(work: Work, legs: Iterable[Leg]) -> list[Path]:
+    """Put what finished legs left into the tables of the results, rows in the order of the legs.
+
+    Rows of other models and snapshots that were measured before with the same settings stay, first.
+
+    Returns:
+      The tables.
+
+    Raises:
+      ValueError: if a leg was measured with other settings than the first.
+    """
+    left: dict[str, list[tuple[Leg, pd.DataFrame, dict]]] = {}
+    for leg in legs:
+        for path in sorted(work.records(work.place(leg)).glob("*.csv")):
+            if "." not in path.stem:  # what was set aside has a number there
+                left.setdefault(path.name, []).append((leg, *read_table(path)))
+    written = []
+    for name, parts in left.items():
+        record, target = parts[0][2], work.records(work.results) / name
+        for leg, _, its in parts:
+            if record_hash(its) != record_hash(record):
+                raise ValueError(f"{work.place(leg)}: measured with other settings; remove it and sweep again")
+        tables, digests = [], {}
+        if (earlier := kept_rows(target, record)) is not None:
+            for leg, *_ in parts:
+                earlier = earlier[~leg.own(earlier)]
+            tables, digests = [earlier], read_table(target)[1].get("weights_digests") or {}
+        for leg, table, its in parts:
+            mine = leg.own(table)
+            if leg.run is None:  # every leg measures real motion, alike: the first one's rows are kept
+                mine |= ~table["model"].isin({model for known in tables for model in known["model"]})
+            tables.append(table[mine])
+            for key, found in (its.get("weights_digests") or {}).items():
+                digests[key] = found if leg.run is None else list(dict.fromkeys([*digests.get(key, ()), *found]))
+        told = {"weights_digests": digests} if "weights_digests" in record else {}
+        written.append(write_table(target, pd.concat([each for each in tables if len(each)]), record | told))
+    return written
+
+
+def run_sweep(
+    work: Work, legs: Sequence[Leg], *, workers: int = 2, scheduler: str | None = None
+) -> Iterator[tuple[Leg, dict]]:
+    """Do all legs, each as soon as a worker is free and what it stands on is over.
+
+    A leg whose worker died is done again by another, from what it left.
+
+    Args:
+      work, legs: see `plan`.
+      workers: processes on this machine.
+      scheduler: address of a cluster that is there already, such as tcp://host:8786, instead.
+
+    Yields:
+      (leg, what `run_leg` returned) as legs are over; of one that failed, state is "failed" and why.
+
+    Raises:
+      ImportError: without Dask distributed.
+      ValueError: for fewer workers than one, or a scheduler that does not answer.
+    """
+    if workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {workers}")
+    with _client(workers, scheduler) as client:
+        from distributed import as_completed
+
+        futures, names = {}, {}
+        for leg in legs:
+            key = f"{leg.name}-{uuid.uuid4().hex}"  # a cluster may still hold an earlier sweep's
+            names[key] = leg
+            futures[leg.name] = client.submit(run_leg, work, leg, futures.get(leg.after), key=key, pure=False)
+        failed = set()
+        for future in as_completed(futures.values()):
+            leg = names[future.key]
+            try:
+                yield leg, future.result()
+            except Exception as error:  # a failed leg is no reason to stop the others
+                failed.add(leg.name)
+                why = f"{leg.after} failed" if leg.after in failed else f"{error or type(error).__name__}"
+                yield leg, {"state": f"failed, {why}"}
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None):
+    """Yield a client of a scheduler, by default of one of its own with so many worker processes."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise ImportError(f"f3amd sweep needs Dask distributed: {INSTALL}") from None
+    # What concerns the user comes back as a leg's state.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as held:
+        address = scheduler
+        if address is None:
+            # Dask would give each worker one thread of linear algebra: sums would end in other last digits.
+            held.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": {}}))
+            address = held.enter_context(
+                LocalCluster(
+                    n_workers=workers, threads_per_worker=1, memory_limit=None, dashboard_address=None,
+                    silence_logs=logging.CRITICAL, env={"TQDM_DISABLE": "1"},
+                )
+            )  # fmt: skip
+        try:
+            client = held.enter_context(Client(address, timeout=CONNECT_S))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--scheduler {scheduler}: not reached ({error}); `dask scheduler` starts one") from None
+        client.forward_logging(log.name)
+        found = len(client.nthreads())
+        log.info("workers      %d%s", found, "" if found else ", so far: legs wait for the first")
+        yield client

@@ -1,0 +1,539 @@
+"""Tables of text to motion: `f3amd measure text_table1`, rows from `papers/PAPER/experiments.toml`.
+
+Each row's model is trained first, if it is not, by `text.stages.text_models` or, for MotionPCM's, by
+`text.stages.latent_models`; then it makes a motion for each held-out clip's caption, and the judge looks. A row is kept
+as soon as it is measured; a leg that is out of time goes on there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from f3amd_companion.measuring.runner import Records
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.networks import presets
+from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
+from f3amd_lib.text.data.text_motions import TextMotions, frame_mask, pad_motions
+from f3amd_lib.text.judge import text_metrics
+from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
+from f3amd_lib.text.judge.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
+from f3amd_lib.text.networks.acmdm import TextCondition
+from f3amd_lib.text.networks.acmdm_control import Control
+from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
+from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions, latent_sampler, reconstruction
+from f3amd_lib.text.sampling.noise_optimisation import control_distance, optimise_noise
+from f3amd_lib.text.sampling.text_to_motion import continue_prefix, sample_control, sample_text
+from f3amd_lib.text.stages import text_models
+from f3amd_lib.text.stages.latent_models import LatentModel, is_latent_preset, train_latent_model
+from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, TextModel, train_text_model
+from f3amd_lib.training.checkpoints import weights_digest
+
+PAPERS = {
+    "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),
+    "motionpcm": ("text_pcm1", "text_pcm2", "text_pcm3", "text_pcm4", "text_guidance"),
+}
+"""Paper -> its tables that `measure_text_table` knows."""
+
+TABLES = tuple(name for names in PAPERS.values() for name in names)
+
+HELD = ("pelvis", "left_foot", "right_foot")
+"""Joints that stay where they are in upper-body editing (ACMDM section 4.4)."""
+
+BRANCHES = {"trained on pelvis": PELVIS, "trained on all joints": CONTROL, "upper-body edit": CONTROL}
+"""The branch that a section of Table 3 asks; noise is optimised without one."""
+
+UNCONTROLLED = "without control"
+"""A section of ours: how far the network without a branch is from places that it was not told."""
+
+_VARIETY_DRAWS = 2
+"""Of as many motions as there are clips; of each caption of the group there are several in each."""
+
+_EULER_STEPS = 10
+"""Of the sampler whose noise is optimised (ACMDM Appendix F)."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all rows of a table share.
+
+    Attributes:
+      judge, encoder: what looks, and what embeds captions.
+      real: the clips whose captions are told, and with which motions are compared.
+      settings: of the profile, from the paper's file.
+      seed: of captions and noise.
+    """
+
+    judge: TextJudge
+    encoder: TextEncoder
+    real: TextMotions
+    settings: Mapping
+    seed: int
+
+    def captions(self, repeat: int) -> tuple[list[str], np.ndarray]:
+        """Return a caption of each clip and their embeddings [N, W], drawn anew in each repeat."""
+        generator = np.random.default_rng([self.seed, repeat, 2])
+        told = [said[generator.integers(len(said))] for said in self.real.captions]
+        return told, embed_captions(told, self.encoder).pooled
+
+    def quality(self, make: Callable | None) -> pd.DataFrame:
+        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3].
+
+        None makes the real clips themselves.
+        """
+        lengths = self.real.lengths
+
+        def system(repeat: int):
+            told, pooled = self.captions(repeat)
+            key = jax.random.fold_in(jax.random.key(self.seed), repeat)
+            made = map(self.real.clip, range(len(lengths))) if make is None else make(pooled, lengths, key)
+            return [motion[:length] for motion, length in zip(made, lengths, strict=True)], told
+
+        return self._seen(system, self.settings["repeats"])
+
+    def _seen(self, system: Callable, repeats: int) -> pd.DataFrame:
+        """Return metric, value, low and high of a system as `judge_motions` knows it, foot skating among them."""
+        skating = []
+
+        def watched(repeat: int):
+            motions, told = system(repeat)
+            shares = [text_metrics.foot_skating_ratio(self.real.skeleton, each, self.real.fps) for each in motions]
+            skating.append({"metric": "foot_skating", "value": np.mean(shares)})
+            return motions, told
+
+        table = self.judged({"made": watched}, repeats)
+        table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
+        return table[["metric", "value", "low", "high"]]
+
+    def judged(self, systems: dict, repeats: int) -> pd.DataFrame:
+        """Return what `judge_motions` says of systems beside real motion."""
+        return judge_motions(
+            self.judge, self.encoder, self.real, systems, repeats=repeats, seed=self.seed,
+            group=self.settings["group"], bar=self.settings["sight"],
+        )  # fmt: skip
+
+    def variety(self, make: Callable) -> pd.DataFrame:
+        """Return how far motions of one caption lie from each other before the judge, over one group of captions.
+
+        As many motions are made at once as in `quality`, so that nothing is compiled again.
+        """
+        count = min(self.settings["group"], self.real.num_clips // 2)
+        clips, made = np.arange(self.real.num_clips) % count, []
+        pooled, lengths = self.captions(0)[1][clips], self.real.lengths[clips]
+        for number in range(_VARIETY_DRAWS):
+            key = jax.random.fold_in(jax.random.key(self.seed), self.settings["repeats"] + number)
+            motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
+            embedded = self.judge.embed_motions(motions)
+            made.append(embedded[: len(clips) // count * count].reshape(-1, count, embedded.shape[-1]))
+        far = text_metrics.multimodality(np.swapaxes(np.concatenate(made), 0, 1), np.random.default_rng([self.seed, 4]))
+        return pd.DataFrame([{"metric": "multimodality", "value": far}])
+
+    def look(self, motions, told) -> dict[str, float]:
+        """Return the figures of one motion [L, J, 3] for each clip, made of the captions `told`."""
+        return dict(self._seen(lambda repeat: (motions, told), 1).set_index("metric")["value"])
+
+    def record(self, profile: Profile, data: TextMotions, measurement: str, **extra) -> dict:
+        """Return the record of a measurement with this judge."""
+        return run_record(
+            profile=profile, dataset=data, seed=profile.seed, measurement=measurement, settings=dict(self.settings),
+            judge_weights=weights_digest(self.judge.params), text_encoder=self.encoder.identity, **extra,
+        )  # fmt: skip
+
+    def num_steps(self, trained: TextModel) -> int | None:
+        """Return Euler's steps of a flow; other schedules walk the levels that they have."""
+        return self.settings["num_steps"] if trained.schedule.kind == "straight" else None
+
+
+# --------------------------------------------------------------------------------------------------------- whole motion
+
+
+def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
+    """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
+    how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
+    draw = motion_drawer(trained, **how)
+    make = lambda *asked: draw_motions(trained, *asked, draw=draw)
+    return pd.concat([bench.quality(make), bench.variety(make)])
+
+
+def prefix_drawer(trained: TextModel, most_frames: int, num_steps: int | None) -> Callable:
+    """Return what goes on from first frames in the clips' own places, window after window (prefix form).
+
+    Args:
+      trained: a model of the prefix form.
+      most_frames: of motion that is wanted.
+      num_steps: of Euler's method.
+
+    Returns:
+      `draw(starts, pooled, key)`, compiled once for a shape: of first frames [N, F, J, 3], metres, at least as many as
+      its prefix has, and captions [N, W] it makes [N, L, J, 3], metres, L `most_frames` or more.
+    """
+    codec, config = trained.codec, trained.config
+    given = next(iter(trained.starts.values())).shape[0]
+    frames = given * codec.frames_per_state
+    windows = -(-(most_frames // codec.frames_per_state - given) // (config.window - given))
+    how = {} if num_steps is None else {"sampler": trained.schedule.sampler, "num_steps": num_steps}
+
+    @jax.jit
+    def draw(starts, pooled, key):
+        prefix = codec.encode(codec.axes.normalise(starts[:, :frames]), jnp.ones((len(starts), frames), bool))
+        captions = [pooled] * max(1, windows)
+        parts = continue_prefix(trained.network(), trained.schedule, prefix, captions, key, **how)
+        state = jnp.concatenate([prefix, *parts], axis=1)
+        return codec.decode(state, jnp.ones((len(state), state.shape[1] * codec.frames_per_state), bool))
+
+    return lambda starts, pooled, key: codec.axes.restore(
+        np.asarray(draw(jnp.asarray(starts), jnp.asarray(pooled), key))
+    )
+
+
+def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return the figures of an autoregressive form; the prefix form goes on from true or from generated frames."""
+    if not trained.starts:
+        return whole_rows(bench, trained, row, about, first)
+    count = next(iter(trained.starts.values())).shape[0] * trained.codec.frames_per_state
+    true = np.asarray(pad_motions([bench.real.clip(k)[:count] for k in range(bench.real.num_clips)], count).motion)
+    draw = prefix_drawer(trained, int(bench.real.lengths.max()), bench.num_steps(trained))
+    begin = None if first is None else motion_drawer(first, num_steps=bench.num_steps(first))
+
+    def make(pooled, lengths, key):
+        if begin is None:
+            return draw(true, pooled, key)
+        return draw(draw_motions(first, pooled, count, jax.random.fold_in(key, 1), draw=begin), pooled, key)
+
+    return bench.quality(make)
+
+
+def mesh_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return the figures of a model that makes vertices: its joints before the judge, and LSD of its meshes."""
+    mesh, apart = trained.codec.mesh, []
+    draw = motion_drawer(trained, num_steps=bench.num_steps(trained), mesh=True)
+
+    def make(pooled, lengths, key):
+        made = draw_motions(trained, pooled, lengths, key, draw=draw, mesh=True)
+        each = (text_metrics.laplacian_surface_distance(one[:length], mesh.body.vertices, mesh.body.faces).mean()
+                for one, length in zip(made, lengths, strict=True))  # fmt: skip
+        apart.append({"metric": "LSD", "value": float(np.mean(list(each)))})
+        return mesh.joints(made)
+
+    table = bench.quality(make)
+    return pd.concat([table, intervals_over_repeats(pd.DataFrame(apart), ["metric"])[table.columns]])
+
+
+# -------------------------------------------------------------------------------------------------------------- control
+
+
+def asked_frames(generator: np.random.Generator, lengths, how_many) -> np.ndarray:
+    """Return which frames of each motion are asked for, [N, L]: a number of frames, or a share of them (a float)."""
+    asked = np.zeros((len(lengths), max(lengths)), bool)
+    for row, length in zip(asked, lengths, strict=True):
+        count = round(how_many * length) if isinstance(how_many, float) else min(how_many, length)
+        row[generator.choice(length, max(1, count), replace=False)] = True
+    return asked
+
+
+def _controlled_states(bench: Bench, trained: TextModel, section: str, condition, mask) -> Callable:
+    """Return `states(noise, control)` of a section of Table 3: by the branch, by optimised noise, or by neither."""
+    schedule = trained.schedule
+    how = {"sampler": schedule.sampler, "num_steps": bench.settings["num_steps"]}
+    if section == UNCONTROLLED:
+        return lambda noise, control: sample_text(trained.network(), schedule, condition, noise, **how)
+    if section != "noise optimisation":
+        branch = trained.control_branch()
+        return lambda noise, control: sample_control(
+            trained.network(), branch, schedule, condition, control, noise, **how
+        )
+
+    def optimised(noise, control):
+        network, how = trained.network(), {"sampler": schedule.sampler, "num_steps": _EULER_STEPS}
+        sample = lambda noise: sample_text(network, schedule, condition, noise, **how)
+        distance = control_distance(trained.codec, mask, control)
+        return optimise_noise(sample, distance, noise, num_steps=bench.settings["optimise_steps"]).state
+
+    return optimised
+
+
+def control_drawer(bench: Bench, trained: TextModel, section: str, clips, pooled) -> tuple[Callable, np.ndarray]:
+    """Return what draws motions of some clips' captions under a control, and the true motions, [N, L, J, 3].
+
+    Args:
+      bench, trained, section: as in `control_rows`.
+      clips, pooled: numbers [N] of the clips, captions [N, W].
+
+    Returns:
+      (`draw(asked [N, L, J], key)` -> positions in metres, compiled once; true motions, zero in padding).
+    """
+    codec, config = trained.codec, trained.config
+    batch = pad_motions([bench.real.clip(clip) for clip in clips], int(bench.real.lengths[clips].max()))
+    condition = TextCondition(jnp.asarray(pooled), codec.state_mask(batch.mask))
+    wanted = jnp.asarray(codec.axes.normalise(batch.motion))
+    states = _controlled_states(bench, trained, section, condition, batch.mask)
+
+    @jax.jit
+    def draw(asked, key):
+        noise = jax.random.normal(key, (*condition.mask.shape, config.num_joints, config.channels))
+        return codec.decode(states(noise, Control.of(wanted, asked)), batch.mask)
+
+    return lambda asked, key: codec.axes.restore(np.asarray(draw(jnp.asarray(asked), key))), np.asarray(batch.motion)
+
+
+def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> dict[str, pd.DataFrame]:
+    """Return figures by joint and number of frames that are asked for, and their means over numbers of frames.
+
+    The judge looks, too, where all clips are controlled. The mean over joints has the seconds of one sentence. With
+    "upper-body edit" pelvis and feet are held in all frames of all clips.
+
+    Returns:
+      {"text_table3": means over the five numbers of frames, "text_control": each of them}.
+    """
+    real, section = bench.real, row["section"]
+    joints = text_models.controlled_joints(real.skeleton) if trained.branch is None else trained.controlled
+    num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
+
+    def asked_of(joints, frames):
+        asked = np.zeros((*frames.shape, num_joints), bool)
+        asked[..., joints] = frames[..., None]
+        return asked
+
+    if section == "upper-body edit":
+        held = asked_of([joints[name] for name in HELD], np.arange(max(real.lengths)) < real.lengths[:, None])
+
+        def make(pooled, lengths, key):
+            return control_drawer(bench, trained, section, np.arange(len(lengths)), pooled)[0](held, key)
+
+        return {"text_table3": bench.quality(make).assign(joint="pelvis and feet")}
+    few = bench.settings["optimised_clips" if section == "noise optimisation" else "control_clips"]
+    clips = np.arange(min(few, real.num_clips))
+    told, pooled = bench.captions(0)
+    pooled, lengths, rows = pooled[clips], real.lengths[clips], []
+    draw, wanted = control_drawer(bench, trained, section, clips, pooled)
+    for number, how_many in enumerate((*about["frames"], *about["shares"])):
+        frames = f"{how_many:.0%}" if isinstance(how_many, float) else str(how_many)
+        for name, joint in joints.items():
+            generator = np.random.default_rng([bench.seed, number, joint])
+            asked = asked_of([joint], asked_frames(generator, lengths, how_many))
+            made = draw(asked, jax.random.fold_in(key, number))
+            figures = text_metrics.control_errors(made, wanted, asked)
+            if len(clips) == real.num_clips:
+                figures |= bench.look([one[:length] for one, length in zip(made, lengths, strict=True)], told)
+            named = {"joint": name.replace("_", " "), "frames": frames}
+            rows += [named | {"metric": metric, "value": value} for metric, value in figures.items()]
+    table = pd.DataFrame(rows)
+    if len(joints) > 1:
+        table = pd.concat([table, table.assign(joint="average")])
+    each = table.groupby(["joint", "frames", "metric"], sort=False)["value"].mean().reset_index()
+    draw, _ = control_drawer(bench, trained, section, clips[:1], pooled[:1])
+    asked = asked_of([0], np.ones((1, lengths[0]), bool))
+    draw(asked, key)  # compiles
+    started = time.perf_counter()
+    draw(asked, jax.random.fold_in(key, 1))
+    taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": time.perf_counter() - started}
+    means = each.groupby(["joint", "metric"], sort=False)["value"].mean().reset_index()
+    return {"text_table3": pd.concat([means, pd.DataFrame([taken])]), "text_control": each}
+
+
+# ------------------------------------------------------------------------------------------------------------ MotionPCM
+
+_SENTENCES = 30
+
+
+def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> float:
+    """Return the seconds of one sentence by itself, from caption to vectors of a frame; joints are not counted.
+
+    The median of 30, after one that compiles; all are as long as the model's longest clip.
+    """
+    told, times = bench.captions(0)[0], []
+    mask = frame_mask([trained.most_frames], trained.most_frames)
+    for number in range(_SENTENCES + 1):
+        started = time.perf_counter()
+        pooled = embed_captions([told[number % len(told)]], bench.encoder).pooled
+        jax.block_until_ready(draw(pooled, mask, jax.random.key(number)))
+        times.append(time.perf_counter() - started)
+    return float(np.median(times[1:]))
+
+
+def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return the figures of a teacher or a student of MotionPCM in so many steps; without a model, of real motion."""
+    if trained is None:
+        return bench.quality(None)
+    draw = latent_sampler(trained, row.get("steps"), row.get("guidance"))
+    made = bench.quality(lambda *asked: latent_motions(trained, *asked, draw=draw))
+    if not about.get("timed"):
+        return made
+    taken = {"metric": "sampling_seconds", "value": sentence_seconds(bench, trained, draw)}
+    return pd.concat([made, pd.DataFrame([taken])])
+
+
+def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
+    """Return how well an autoencoder gives held-out motion back: FID, joint and feature error (MotionPCM Table 3).
+
+    Joints are compared after the roots of each frame were laid on each other. The feature error is the norm of a clip's
+    difference in network units, summed over clips, divided by their frames (MotionLCM V2's code). Kept movement (ours)
+    is the variance over a clip's frames, over that of the real clip: a pose that only glides along has nearly none.
+    """
+    real, most = bench.real, int(bench.real.lengths.max())
+    vectors = real.redundant_vectors()
+    clips = [vectors[first:last] for first, last in zip(real.start[:-1], real.start[1:], strict=True)]
+    motions, apart, moved = [], [], []
+    spread = lambda vectors: np.sum(np.var(vectors / np.asarray(trained.statistics.deviation), axis=0))
+    for begin in range(0, len(clips), 64):
+        padded = pad_motions(clips[begin : begin + 64], most)
+        made, positions = reconstruction(trained, padded.motion, padded.mask)
+        for number, length in enumerate(np.asarray(padded.length)):
+            motions.append(positions[number, :length])
+            away = (made[number, :length] - clips[begin + number]) / np.asarray(trained.statistics.deviation)
+            apart.append(np.linalg.norm(away))
+            moved.append([spread(made[number, :length]), spread(clips[begin + number])])
+    local = lambda motion: motion - motion[:, :1]
+    errors = [
+        np.linalg.norm(local(motion) - local(real.clip(number)), axis=-1).mean(axis=-1)
+        for number, motion in enumerate(motions)
+    ]
+    made = np.asarray(pad_motions(motions, most).motion)
+    own = pd.DataFrame([
+        {"metric": "reconstruction_error", "value": 1000.0 * float(np.concatenate(errors).mean())},
+        {"metric": "feature_error", "value": float(np.sum(apart) / real.lengths.sum())},
+        {"metric": "kept_movement", "value": float(np.divide(*np.sum(moved, axis=0)))},
+    ])  # fmt: skip
+    return pd.concat([bench.quality(lambda *asked: made), own])
+
+
+# ----------------------------------------------------------------------------------------------------------- the runner
+
+KINDS = {
+    "whole": whole_rows, "mesh": mesh_rows, "autoregressive": autoregressive_rows, "control": control_rows,
+    "latent": latent_rows, "reconstruction": reconstruction_rows,
+}  # fmt: skip
+
+
+def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> TextJudge | None:
+    """Return the judge of a data set: the user's own, else the one that ships, else trained on the training split.
+
+    The one that ships must know these very motions and this encoder. None where `stop_at` comes first.
+    """
+    files = text_models.text_model_files(profile, text_models.JUDGE, folder=folder)
+    if files.model.exists():
+        return load_judge(files.model)
+    if shipped := text_models.shipped_for(files.model.stem, data, encoder, load_judge):
+        return shipped
+    # A check of the way needs no judge that sees.
+    training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
+    judge = train_judge(data, encoder, training, checkpoint=files.state, **leg)
+    if judge is not None:
+        save_judge(files.model, judge)
+    return judge
+
+
+REAL = "Real"
+"""The row of real motion, which no model makes."""
+
+
+def _judged(model: TextModel | LatentModel):
+    """Return the weights that a row is about."""
+    if isinstance(model, LatentModel):
+        return model.autoencoder_params if model.config is None else model.params
+    return model.params if model.branch is None else model.branch
+
+
+def bench_of(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> Bench | None:
+    """Return what rows are measured with; the judge is trained if it is not, None where `stop_at` comes first.
+
+    Args:
+      data, encoder, profile: as of `measure_text_table`; the judge learns from whole clips and is asked about the first
+        `most_frames` of so many held-out ones as the profile's settings say.
+      folder: where the judge lies instead of `runs/`.
+      **leg: stop_at and progress, as for `optimise`.
+    """
+    judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
+    if judge is None:
+        return None
+    settings = load_paper_file("experiments", "acmdm")["settings"][profile.name]
+    real = judged_clips(data.cut(settings["most_frames"]))
+    chosen = np.random.default_rng(profile.seed).permutation(real.num_clips)[: settings["clips"]]
+    return Bench(judge, encoder, real.select(np.sort(chosen)), settings, profile.seed)
+
+
+def measure_text_table(
+    name: str, data: TextMotions, encoder: TextEncoder, profile: Profile, *,
+    models: Iterable[str] | None = None, folder=None, rows: Iterable[Mapping] | None = None, **leg,
+) -> Path | None:  # fmt: skip
+    """Train and measure the rows of a table that it still lacks.
+
+    Args:
+      name: of `TABLES`.
+      data, encoder: captioned motion, and what embeds captions.
+      profile: says how long each row is trained and how often it is measured.
+      models: rows of these models alone, which are measured again.
+      folder: where judge and weights lie instead of `runs/`.
+      rows: instead of the file's.
+      **leg: stop_at and progress, as for `optimise`.
+
+    Returns:
+      The table, `records/<name>.csv`; None where the time was over first.
+    """
+    about = load_paper_file("experiments", next(paper for paper, names in PAPERS.items() if name in names))[name]
+    asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, **leg)
+    if bench is None:
+        return None
+    settings, record = bench.settings, bench.record(profile, data, name)
+    # ACMDM's models of a table are all trained alike, and briefly, apart from those that `f3amd text` is to find.
+    apart = folder or runs_dir(profile.dataset, profile.name) / "text_tables"
+    cut, most_frames = data.cut(settings["most_frames"]), settings["most_frames"]
+    brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
+    rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
+    for model in asked:
+        check_known(model, [row["model"] for row in rows], f"model of {name}")
+    keys = [column for column in rows[0] if column not in ("trained", "first")]
+    tables = dict.fromkeys((name, *about.get("beside", ())), keys)
+    records = Records(results_dir(profile.dataset, profile.name) / "records", record, tables, again=asked)
+
+    def trained(preset: str) -> TextModel | LatentModel | None:
+        base = text_models.preset_and_branch(preset)[0]
+        if is_latent_preset(base):  # these see clips of a length of their own
+            return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
+        form = presets.find_preset(base)
+        # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
+        own = "prefix_frames" in form.training or "block_frames" in form.network
+        where = {"window": None if own else most_frames, "folder": apart, **leg}
+        if form.latent and "autoencoder_steps" in settings:
+            steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
+            if train_text_model(cut, encoder, steps, form.latent, **where) is None:
+                return None
+        return train_text_model(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
+
+    for row in rows:
+        if asked and row["model"] not in asked:
+            continue
+        model = first = None
+        if row["trained"] != REAL:
+            model = trained(row["trained"] + BRANCHES.get(row.get("section"), ""))
+            if model is not None and "first" in row:
+                first = trained(row["first"])
+                model = None if first is None else model
+            if model is None:
+                return None
+        if leg.get("stop_at") is not None and time.monotonic() >= leg["stop_at"]:
+            return None
+        named = row | {"windows": 0, "weights": weights_digest(bench.judge.params)}
+        if model is not None:
+            told = model.record["identity"]["training"]
+            steps = model.record.get("stopped_at_step", told["num_steps"])
+            named |= {"windows": steps * told["batch_size"], "weights": weights_digest(_judged(model))}
+
+        def measured(row: Mapping, model=model, first=first) -> dict:
+            made = KINDS[about["kind"]](bench, model, row, about, first)
+            return made if isinstance(made, dict) else {name: made}
+
+        records.measure([named], measured)
+    return records.path(name)

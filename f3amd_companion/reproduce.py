@@ -1,0 +1,323 @@
+"""The main job: run the numbered notebooks in order and leave their results where they belong.
+
+    f3amd figures --data synthetic --profile laptop
+    f3amd figures --data bandai --profile laptop --only 04 --set train_steps=4000
+
+Executed copies and logs go to the ignored `runs/<data set>/<profile>/notebooks/`, where a new run
+replaces the last one's. Results of `laptop` and `gpu` go to `paper_figures/`, those of `smoke` to
+`runs/`; `F3AMD_RESULTS_DIR` overrules both.
+"""
+
+from __future__ import annotations
+
+import ast
+import collections
+import contextlib
+import os
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import nbformat
+import pandas as pd
+import papermill
+from nbclient.exceptions import DeadKernelError
+from papermill.exceptions import PapermillExecutionError
+from tqdm import tqdm
+
+from f3amd_companion.speed.machine import describe_machine
+from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.data.sources import DATA_DIR_VARIABLE
+from f3amd_lib.ground import profiles
+from f3amd_lib.ground.files import locked
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
+from f3amd_lib.ground.records import run_record, write_table
+
+KERNEL = "python3"
+_SETTLED = 60.0
+"""Seconds at the usual pace that are taken for granted before a run's own pace counts."""
+
+
+class NotebookFailed(RuntimeError):
+    """A notebook stopped; the message names the notebook, the cell, the error and the log."""
+
+
+def find_notebooks(folder) -> list[Path]:
+    """Return the numbered notebooks of a folder in their order.
+
+    Args:
+      folder: where `00_....ipynb`, `01_....ipynb` and so on lie.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    found = sorted(Path(folder).glob("[0-9][0-9]_*.ipynb"))
+    if not found:
+        raise ValueError(f"{folder}: no numbered notebooks here; run this in a checkout of the repository")
+    return found
+
+
+def select_notebooks(notebooks: Sequence[Path], only: Iterable[str] = ()) -> list[Path]:
+    """Keep the notebooks that are asked for, in their own order.
+
+    Args:
+      notebooks: from `find_notebooks`.
+      only: numbers ("03", "3") or names ("03_architecture", with or without ending); empty keeps
+        all.
+
+    Raises:
+      ValueError: if something asked for is not there, with the nearest name.
+    """
+    chosen = set()
+    for wanted in only:
+        stem = wanted.removesuffix(".ipynb")
+        hits = {path for path in notebooks if path.stem == stem or path.stem[:2] == stem.zfill(2)}
+        if not hits:
+            raise ValueError(f"no notebook {wanted!r}{nearest_hint(stem, [path.stem for path in notebooks])}")
+        chosen |= hits
+    return [path for path in notebooks if path in chosen] if chosen else notebooks
+
+
+def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
+    """Refuse a parameter that a notebook does not have, before any of them runs.
+
+    Papermill itself injects an unknown name, logs a line and goes on with the default.
+
+    Args:
+      notebooks: which will run.
+      names: of the parameters that will be passed to each of them.
+
+    Raises:
+      ValueError: naming notebook, parameter and the nearest one that the notebook has.
+    """
+    for path in notebooks:
+        known = papermill.inspect_notebook(str(path))
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}")
+
+
+def written_since(folder: Path, start: float) -> dict[str, int]:
+    """Count the files under each folder of results that were written after a moment.
+
+    Args:
+      folder: results of one data set and profile.
+      start: seconds since the epoch.
+
+    Returns:
+      "figures", "tables", ... -> number of files, only where there are some; records beside tables
+      do not count.
+    """
+    files = (path for path in Path(folder).rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
+    written = (path.relative_to(folder).parts[0] for path in files if path.stat().st_mtime >= start)
+    return dict(collections.Counter(written))
+
+
+def _news(path: Path, seconds: float, wrote: Mapping[str, int], left: float | None) -> str:
+    """Put into one line what a notebook took and wrote, and how long the rest will take."""
+    files = ", ".join(f"{count} {kind}" for kind, count in sorted(wrote.items())) or "no file"
+    rest = "" if not left else f"; about {_duration(left)} left"
+    return f"{path.stem:24s} {_duration(seconds):>11s}   wrote {files}{rest}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
+
+
+def _usual_seconds(results: Path) -> dict[str, float]:
+    """Return how long each notebook took in the last whole run, if there was one."""
+    summary = results / "tables" / "run_summary.csv"
+    return pd.read_csv(summary, index_col="notebook")["seconds"].to_dict() if summary.is_file() else {}
+
+
+def what_to_open(results: Path) -> list[str]:
+    """Return the files of a run that are worth opening first, as lines "what: path"."""
+    worth = {
+        "a walk to look at": results / "media/00_first_walk.gif",
+        "and the longer one of notebook 05": results / "media/05_rollout.gif",
+        "a crowd to turn around, in a browser": results / "media/14_crowd.html",
+        "film strips": results / "figures/05_film_strip.png",
+        "do they walk, in numbers": results / "tables/05_walks.csv",
+        "each claim of the paper with a verdict": profiles.repository_root() / "paper_figures/claims.md",
+    }
+    return [f"{what}: {_short(path)}" for what, path in worth.items() if path.is_file()]
+
+
+def reproduce(
+    dataset: str, profile: str, *, only: Iterable[str] = (), parameters: Mapping | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> pd.DataFrame:  # fmt: skip
+    """Run the numbered notebooks with a data set and a profile; stop at the first that fails.
+
+    A run of all notebooks leaves `tables/run_summary.csv` among the results; a run of some, or one
+    that failed, leaves it in `runs/<data set>/<profile>/`.
+
+    Args:
+      dataset: one of `profiles.DATASETS`, passed to the notebooks as `data`.
+      profile: one of `profiles.PROFILES`, passed as `profile`.
+      only: see `select_notebooks`.
+      parameters: more of them, passed to every selected notebook.
+      say: called with each line of news.
+
+    Returns:
+      One row per notebook: notebook, seconds (wall time), cells, finished.
+
+    Raises:
+      ValueError: for a name that does not exist (data set, profile, notebook, parameter), or a notebook that
+        another process runs with this data set and profile.
+      NotebookFailed: if a notebook stops.
+    """
+    defaults = load_profile(profile, dataset)  # refuses unknown names before anything starts
+    parameters = {"profile": profile, "data": dataset, **(parameters or {})}
+    available = find_notebooks(profiles.repository_root() / "notebooks")
+    selected = select_notebooks(available, only)
+    check_parameters(selected, parameters)
+
+    own_folder, results = runs_dir(dataset, profile), results_dir(dataset, profile)
+    executed_folder = own_folder / "notebooks"
+    executed_folder.mkdir(parents=True, exist_ok=True)
+    rows, failure = [], None
+    usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
+    typical = sum(usual.values()) / len(usual) if usual else 0.0  # for a notebook that the last whole run did not have
+    # Bars are for people: a log file gets the lines of `say` instead.
+    alone = _alone_with(selected, executed_folder)
+    for number, path in enumerate(tqdm(alone, total=len(selected), desc="notebooks", disable=None)):
+        began, start = time.time(), time.monotonic()
+        try:
+            _execute(path, executed_folder / path.name, parameters)
+        except NotebookFailed as error:
+            failure = error
+        seconds = time.monotonic() - start
+        cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
+        rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": failure is None})
+        if failure:
+            break
+        if path.name in usual:
+            took, usually = took + seconds, usually + usual[path.name]
+        rest = sum(usual.get(later.name, typical) for later in selected[number + 1 :])
+        say(_news(path, seconds, written_since(results, began), rest * took / usually))
+
+    summary = pd.DataFrame(rows)
+    complete = failure is None and len(selected) == len(available)
+    # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
+    # its memory from the notebooks.
+    record = run_record(
+        profile=profile, dataset=dataset, seed=parameters.get("seed", defaults.seed), parameters=parameters,
+        notebooks=[path.name for path in selected], machine=describe_machine(),
+    )  # fmt: skip
+    write_table((results / "tables" if complete else own_folder) / "run_summary.csv", summary, record)
+    if failure:
+        raise failure
+    return summary
+
+
+def _alone_with(notebooks: list[Path], folder: Path) -> Iterator[Path]:
+    """Yield notebooks while none of them is run into the same folder by another process."""
+    with contextlib.ExitStack() as held:
+        for path in notebooks:
+            held.enter_context(locked(folder / f".{path.stem}.lock", f"running {path.name}"))
+        yield from notebooks
+
+
+def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda line: None) -> list[Path]:
+    """Run the notebooks of `notebooks/course/`, which take no parameters and write nothing; stop at one that fails.
+
+    Args:
+      only: see `select_notebooks`.
+      say: called with each line of news.
+
+    Returns:
+      The executed copies, in `runs/course/`.
+
+    Raises:
+      ValueError: for a notebook that is not there.
+      NotebookFailed: if a notebook stops.
+    """
+    root = profiles.repository_root()
+    selected = select_notebooks(find_notebooks(root / "notebooks/course"), only)
+    copies = [root / "runs/course" / path.name for path in selected]
+    copies[0].parent.mkdir(parents=True, exist_ok=True)
+    for path, copy in zip(selected, copies, strict=True):
+        start = time.monotonic()
+        _execute(path, copy, {})
+        say(f"{path.stem:24s} {_duration(time.monotonic() - start):>11s}")
+    return copies
+
+
+def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
+    """Run one notebook into a copy; where it fails, write a log beside the copy and say so."""
+    log = copy.with_suffix(".log")
+    log.unlink(missing_ok=True)  # an old log beside a good copy would mislead
+    try:
+        papermill.execute_notebook(
+            str(path),
+            str(copy),
+            parameters=dict(parameters),
+            kernel_name=KERNEL,
+            cwd=str(path.parent),  # as in JupyterLab and nbval
+            # A kernel warns of its own connection to this process, and reports the interrupt that comes before its
+            # shutdown as an error, if that finds it busy with papermill's last question. No reader can act on either.
+            extra_arguments=["--log-level=CRITICAL"],
+            progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
+        )
+    except PapermillExecutionError as error:
+        cell = f"cell In [{error.exec_count}], {_first_line(error.source)!r}"
+        cause, trace = f"{error.ename}: {error.evalue}", str(error)
+    except DeadKernelError as error:
+        # The kernel was killed (by the system, when memory runs out) and left no traceback.
+        cell, cause = _last_started_cell(copy), f"{error} (was the machine out of memory?)"
+        trace = f"{cell}\n{cause}\n"
+    else:
+        return
+    log.write_text(trace, encoding="utf-8")
+    raise NotebookFailed(
+        f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n  executed so far: {_short(copy)}"
+    )
+
+
+def _last_started_cell(copy: Path) -> str:
+    """Find where a notebook without a traceback stopped, from papermill's start times."""
+    cells = (cell for cell in nbformat.read(copy, as_version=4).cells if cell.cell_type == "code")
+    started = [cell for cell in cells if cell.source.strip() and cell.metadata.papermill.start_time]
+    return f"cell In [{len(started)}], {_first_line(started[-1].source)!r}"
+
+
+def _first_line(source: str) -> str:
+    return next((line for line in source.splitlines() if line.strip()), "")
+
+
+def _short(path: Path) -> str:
+    """Return a path as it is typed at the repository's root."""
+    root = profiles.repository_root()
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+
+
+def parse_assignment(text: str) -> tuple[str, object]:
+    """Split "name=value"; a value that is no Python literal is a string.
+
+    Raises:
+      ValueError: for another form, or a name that has an option of its own.
+    """
+    name, equals, value = text.partition("=")
+    if not (equals and name.isidentifier()):
+        raise ValueError(f"--set {text!r} is not NAME=VALUE")
+    if name in ("profile", "data"):
+        raise ValueError(f"use --{name} for {name!r}")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def set_folders(profile: str) -> None:
+    """Tell the notebooks, which run in a folder of their own, where data lie and results go.
+
+    Results go to the committed `paper_figures/`, but those of `smoke`, a check, stay in `runs/`.
+    Where a variable is set already, it wins.
+    """
+    if profile != "smoke" and not os.environ.get(profiles.RESULTS_DIR_VARIABLE):
+        os.environ[profiles.RESULTS_DIR_VARIABLE] = str(profiles.repository_root() / "paper_figures")
+    for variable in (profiles.RESULTS_DIR_VARIABLE, DATA_DIR_VARIABLE, CACHE_DIR_VARIABLE):
+        if os.environ.get(variable):
+            os.environ[variable] = str(Path(os.environ[variable]).resolve())

@@ -1,0 +1,353 @@
+"""Ahead-of-time export: a whole round of synthesis as a program without Python.
+
+    network -> jax.export -> StableHLO -> IREE -> CPU, CUDA or Vulkan
+
+The paper measures its models this way (section 4.5). The program takes history, path, style and
+noise and returns clean features; weights and noise levels are constants in it, so that compilers
+may fold and repack them. Noise comes from outside: a program then gives the same numbers on every
+device, and has no loop of random bits. What is written here is loaded by `artefact`, which needs
+nothing of this library.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.util
+import json
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import export
+from jax.extend.mlir import ir, passmanager
+from jax.extend.mlir.dialects import stablehlo
+
+from f3amd_companion.serving import artefact
+from f3amd_lib.diffusion.samplers import ddpm_step
+from f3amd_lib.ground.files import read_toml, whole_folder
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import NetworkConfig
+from f3amd_lib.rollout.rounds import sample_round
+from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+
+_ENTRY = "main"
+"""What JAX calls the program's one public function."""
+
+
+TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
+"""Targets by name. "cuda-sm_NN" is a generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
+
+
+def _find_target(name: str) -> dict:
+    """Return a target as `targets.toml` has it, with `backend`, IREE's name of the code generator."""
+    if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
+        flags = [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"]
+        return {"backend": "cuda", "driver": "cuda", "flags": flags}
+    check_known(name, [*TARGETS, "cuda-sm_80"], "target")
+    return {"backend": name, **TARGETS[name]}
+
+
+@dataclass(frozen=True)
+class ExportedRound:
+    """One round of synthesis as a program.
+
+    Attributes:
+      config: of the network.
+      sigmas: noise levels that the sampler visits, [N + 1].
+      sampler: a name of `samplers.SAMPLERS`.
+      batch: B, characters.
+      inputs: shapes by name, in the order of a call.
+      weights_digest: tells one set of weights from another.
+      exported: the program, for JAX; without the places of its operations in source files.
+    """
+
+    config: NetworkConfig
+    sigmas: tuple[float, ...]
+    sampler: str
+    batch: int
+    inputs: dict[str, tuple[int, ...]]
+    weights_digest: str
+    exported: export.Exported
+
+    @property
+    def stablehlo(self) -> bytes:
+        """The program as a portable StableHLO artefact (MLIR bytecode)."""
+        return self.exported.mlir_module_serialized
+
+
+def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: bool = True) -> ExportedRound:
+    """Export a whole round of synthesis with the weights inside.
+
+    The program is `rounds.sample_round` with history, path, style and noise as inputs. DDPM draws
+    fresh noise at every step; its program takes that as a fifth input, `step_noise` [N, B, T, C],
+    of which the step to sigma = 0 uses nothing.
+
+    Args:
+      network: a denoiser of `models`, with its weights.
+      sigmas: [N + 1], falling, from a noise schedule's `grid`.
+      batch: B, characters of one call.
+      sampler: a name of `samplers.SAMPLERS`.
+      unroll: write the steps out one by one. A program with a loop is smaller, and only the JAX
+        runtime is safe with it (see `compile_iree`).
+
+    Returns:
+      The program, in float32, lowered for the CPU without anything that only a CPU has.
+
+    Raises:
+      ValueError: for less than one character, sigmas that make no step, or an unknown sampler.
+    """
+    if type(batch) is not int or batch < 1:
+        raise ValueError(f"batch must be a whole number of characters, at least 1, got {batch!r}")
+    sigmas = np.asarray(sigmas, np.float64)
+    if sigmas.ndim != 1 or len(sigmas) < 2 or not np.isfinite(sigmas).all():
+        what = f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}"
+        raise ValueError(f"{what}; take them from a noise schedule's grid")
+    config = network.config
+    shape = (batch, config.window, config.channels)
+    inputs = {name: part.shape for name, part in config.condition_shapes(batch)._asdict().items()} | {"noise": shape}
+    if sampler == "ddpm":
+        inputs["step_noise"] = (len(sigmas) - 1, *shape)
+    # Split here and merged inside: the weights then are constants of the program.
+    graph, state = nnx.split(network)
+
+    def one_round(history, path, style, noise, step_noise=None):
+        denoiser, condition = nnx.merge(graph, state), Condition(history, path, style)
+        if step_noise is not None:
+            return _sample_ddpm(denoiser, condition, sigmas, noise, step_noise)
+        return sample_round(denoiser, condition, sigmas, noise=noise, sampler=sampler, unroll=unroll)
+
+    program = export.export(
+        jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
+    )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
+    return ExportedRound(
+        config=config, sigmas=tuple(sigmas.tolist()), sampler=sampler, batch=batch, inputs=inputs,
+        weights_digest=weights_digest(state),
+        exported=dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized)),
+    )  # fmt: skip
+
+
+def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
+    """Walk as the sampler "ddpm" does, with its noise [N, B, T, C] given."""
+    context = network.encode(condition)
+    levels = jnp.asarray(sigmas, noise.dtype)
+    x_noisy = levels[0] * noise
+    for sigma, sigma_next, fresh in zip(levels[:-1], levels[1:], step_noise, strict=True):
+        x0_hat = network(x_noisy, sigma, context)
+        x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
+    return x_noisy
+
+
+@contextlib.contextmanager
+def _parsed(program: bytes) -> Iterator[ir.Module]:
+    with ir.Context() as context:
+        try:
+            module = stablehlo.deserialize_portable_artifact(context, program)
+        except Exception as error:  # the bindings promise no type
+            raise ValueError(f"not a portable StableHLO program: {error}") from None
+        yield module
+
+
+def _without_places(program: bytes) -> bytes:
+    """Return a program that no longer says which lines of which files made it."""
+    with _parsed(program) as module:
+        passmanager.PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
+        # As `jax.export` does: readers of the last four weeks and later ones.
+        version = stablehlo.get_version_from_compatibility_requirement(
+            stablehlo.StablehloCompatibilityRequirement.WEEK_4
+        )
+        return stablehlo.serialize_portable_artifact(module, version)
+
+
+def _has_loop(program: bytes) -> bool:
+    with _parsed(program) as module:
+        return "stablehlo.while" in module.operation.get_asm(large_elements_limit=8)
+
+
+def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[str]]:
+    """Compile a program with IREE.
+
+    Args:
+      program: a portable StableHLO artefact, such as `ExportedRound.stablehlo`.
+      target: a name of `TARGETS`, or "cuda-sm_NN" for a generation of NVIDIA GPUs, which this
+        release of IREE may or may not know. None needs the device to be there, except that
+        "llvm-cpu" compiles for the CPU that it runs on.
+
+    Returns:
+      (the compiled module, IREE's "vmfb"; the flags that it was compiled with).
+
+    Raises:
+      ImportError: if IREE's compiler is not installed, saying how to install it.
+      ValueError: for an unknown target, one that this release of IREE cannot compile for, or a
+        program with a loop for a target that runs on the CPU: IREE's local-task driver was seen to
+        return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
+    """
+    settings = _find_target(target)
+    if settings["driver"] == "local-task" and _has_loop(program):
+        what = f"the program has a loop (stablehlo.while), of which IREE makes NaN or garbage now and then on {target}"
+        raise ValueError(f"{what}: export it with unroll=True, and give it its noise instead of a random key")
+    if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
+        raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
+    # Tiles are faster, but some programs do not compile in them.
+    tiling = settings.get("tiling", [])
+    ways = [[*settings["flags"], *tiling], settings["flags"]] if tiling else [settings["flags"]]
+    with tempfile.TemporaryDirectory() as folder:
+        source, compiled = Path(folder) / artefact.STABLEHLO, Path(folder) / "round.vmfb"
+        source.write_bytes(program)
+        for flags in ways:
+            # In a process of its own: IREE's compiler and JAX each bring bindings of MLIR, and a
+            # process that holds both dies when it ends.
+            command = [sys.executable, "-m", "iree.compiler.tools.scripts.iree_compile", str(source), "-o"]
+            command += [str(compiled), "--iree-input-type=stablehlo", "--iree-vm-bytecode-module-strip-source-map"]
+            command += [f"--iree-hal-target-backends={settings['backend']}", *flags]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode == 0:
+                return compiled.read_bytes(), flags
+    found = re.findall(r"error: (.*)", done.stderr) or [done.stderr.strip()[-500:]]
+    raise ValueError(f"IREE {artefact.iree_version()} cannot compile this program for {target}: {found[0]}")
+
+
+def save_artefact(
+    folder, exported: ExportedRound, *, name: str, targets: Iterable[str] = ("llvm-cpu",),
+    trained: TrainedModel | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Write a round as a folder that `artefact.load_artefact` runs, whole or not at all.
+
+    The folder holds the program as StableHLO and for JAX, a compiled module per target, the scales
+    of the features and the style names of a trained model, and a manifest with checksums.
+
+    Args:
+      folder: to make; missing ones above it are made, too.
+      exported: from `export_round`.
+      name: of the model.
+      targets: to compile for, see `compile_iree`; none leaves the program to JAX.
+      trained: the model whose network was exported, so that real motion can be fed in; without it
+        the artefact takes and returns network units only.
+      overwrite: replace an earlier artefact of that name; anything else is never replaced.
+
+    Returns:
+      The folder.
+
+    Raises:
+      ImportError, ValueError: as `compile_iree`; if the folder exists and `overwrite` is false, or
+        is not an artefact; or if the trained model is not the one that was exported.
+    """
+    folder = Path(folder)
+    _check_free(folder, overwrite)
+    if trained is not None and weights_digest(trained.params) != exported.weights_digest:
+        raise ValueError(f"the exported round does not hold the weights of the trained model {trained.name}")
+    files = {artefact.STABLEHLO: exported.stablehlo, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
+    compiled = {}
+    for target in dict.fromkeys(targets):
+        file, settings, started = f"round.{target}.vmfb", _find_target(target), time.perf_counter()
+        files[file], flags = compile_iree(exported.stablehlo, target)
+        host = {"machine": platform.machine(), "features": list(artefact.cpu_features())}
+        compiled[target] = {
+            "file": file,
+            "entry": _ENTRY,
+            "driver": settings["driver"],
+            "iree_version": artefact.iree_version(),
+            "flags": flags,
+            "compile_seconds": round(time.perf_counter() - started, 1),
+            "cpu": host if settings["backend"] == "llvm-cpu" else None,
+        }
+    if trained is not None:
+        scales = trained.normaliser._asdict()
+        scales = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
+        features = {"normaliser": scales, "styles": list(trained.styles)}
+        files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
+    manifest = _manifest(exported, name, files, compiled, trained)
+    files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
+    place = folder.resolve()  # of a link, what it points to
+    earlier = place.with_name(f".{place.name}.{uuid.uuid4().hex}.earlier")
+    try:
+        with whole_folder(place) as temporary:
+            for file, content in files.items():
+                (temporary / file).write_bytes(content)
+            if place.exists():  # an artefact, see `_check_free`; kept until the new one has its place
+                place.rename(earlier)
+    finally:
+        if earlier.exists() and not place.exists():
+            earlier.rename(place)
+    shutil.rmtree(earlier, ignore_errors=True)
+    return folder
+
+
+def _manifest(
+    exported: ExportedRound, name: str, files: dict[str, bytes], targets: dict[str, dict], trained: TrainedModel | None
+) -> dict:
+    training, config = trained.record if trained else {}, exported.config
+    dataset, seed = training.get("dataset", "none"), training.get("seed", 0)
+    record = run_record(profile="export", dataset=dataset, seed=seed, training=training)
+    record |= {key: training.get(key) for key in ("dataset_fingerprint", "dataset_licence", "dataset_credit")}
+    manifest = {
+        "format": artefact.FORMAT,
+        "model": name,
+        "config": config.to_dict(),
+        "num_steps": len(exported.sigmas) - 1,
+        "sampler": exported.sampler,
+        "sigmas": list(exported.sigmas),
+        "batch": exported.batch,
+        "inputs": [{"name": item, "shape": list(shape), "dtype": "float32"} for item, shape in exported.inputs.items()],
+        "output": {"name": "x0_hat", "shape": [exported.batch, config.window, config.channels], "dtype": "float32"},
+        "weights": exported.weights_digest,
+        "targets": targets,
+        "files": {
+            name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()
+        },
+        "record": record,
+    }
+    return manifest | {"sha256": artefact.manifest_digest(manifest)}
+
+
+def _check_free(folder: Path, overwrite: bool) -> None:
+    """Raise ValueError if something lies there that may not be replaced."""
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
+    ours = {artefact.MANIFEST, *artefact.read_manifest(folder)["files"]}
+    others = sorted({item.name for item in folder.iterdir()} - ours)
+    if others:
+        raise ValueError(f"{folder}: holds {others[0]}, which is no part of the artefact; it is not overwritten")
+
+
+def export_model(
+    trained: TrainedModel, folder, *, num_steps: int = 8, batch: int = 1, sampler: str | None = None,
+    targets: Iterable[str] = ("llvm-cpu",), overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Export a trained model: what `f3amd export` does.
+
+    Args:
+      trained: the model.
+      folder, targets, overwrite: as for `save_artefact`.
+      num_steps: N, steps of the sampler.
+      batch: B, characters of one call.
+      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the model's noise schedule.
+
+    Returns:
+      The folder.
+
+    Raises:
+      ImportError, ValueError: as `export_round`, `compile_iree` and `save_artefact`.
+    """
+    schedule, targets = trained.diffusion, tuple(targets)
+    # Before the minutes of compiling.
+    _check_free(Path(folder), overwrite)
+    for target in targets:
+        _find_target(target)
+    exported = export_round(trained.network(), schedule.grid(num_steps), batch, sampler or schedule.sampler)
+    return save_artefact(folder, exported, name=trained.name, targets=targets, trained=trained, overwrite=overwrite)

@@ -1,0 +1,369 @@
+"""Foot locking, a post-process that one may ask for: feet that carry the body stand still.
+
+Ours, and never used where a row of the paper is measured: there, feet slide as the network lets
+them. Here each toe gets a new path p beside its old one o. While its foot carries, p is one point
+on the floor, and which point is left open; else p stays as near to o as a smooth path can:
+
+    sum |d'' |^2 + a^-2 sum |d'|^2 + l^-4 sum |d|^2  least,   d = p - o,
+
+with differences between frames for d' and d''. On the ground a is infinite and l 0.15 s; in height
+a is 0.07 s and l 0.2 s, which keeps a swing as high as it was. So a foot stands where that asks
+least of the leg, and corrections fade by themselves, without a jump in value or velocity. A contact
+that would move a toe by more than `FARTHEST` is cut in two with a small step between, and where a
+leg is too short a contact is let go.
+
+The leg follows by rotations of hip, knee and ankle; bones keep their lengths, knees their side and
+feet their orientation. The root keeps its path over the ground and is lowered, by `DEEPEST` at
+most, where a leg is too short.
+
+Source: ours, in the order of L. Kovar, J. Schreiner and M. Gleicher, "Footskate Cleanup for Motion
+Capture Editing", SCA 2002 (plan, root, legs), with least squares in place of their blends, and no
+stretched bones.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy import sparse
+from scipy.ndimage import maximum_filter1d, median_filter, percentile_filter, uniform_filter1d
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from f3amd_lib.data.features import frame_positions, world_frames
+from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.measures.walking import STEP_PROMINENCE, toe_positions
+from f3amd_lib.motion.anatomy import joint_chain
+from f3amd_lib.motion.curves import smooth_above, unit
+from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, global_rotations
+from f3amd_lib.rollout.generated import Rollout
+
+FARTHEST = 0.25
+"""How far a standing toe is moved over the ground at most, metres."""
+
+DEEPEST = 0.04
+"""How far the root is lowered at most where a leg is too short, metres."""
+
+_SHORTEST, _GAP = 0.1, 0.07  # seconds: shorter contacts are none, shorter gaps are closed
+_STRAIGHT = 0.985  # share of a leg's length beyond which the root gives way
+_STEP_SECONDS, _STEP_HEIGHT = 0.27, 0.009  # of the step between two halves of a contact; metres
+_HELD = 1e4  # weight of a height that is given, beside 1 for an acceleration
+
+
+def leg_chains(skeleton: Skeleton) -> np.ndarray:
+    """Return the joints hip, knee, ankle and toe of the left and the right leg, [2, 4].
+
+    Raises:
+      ValueError: where toes or hips are not known, or legs are not made of these four.
+    """
+    chains = []
+    for side in ("left", "right"):
+        chain = joint_chain(skeleton, skeleton.role(f"{side}_toe"), skeleton.role(f"{side}_hip"))
+        if len(chain) != 4:
+            there = ", ".join(skeleton.names[joint] for joint in chain)
+            raise ValueError(f"the {side} leg must be hip, knee, ankle, toe; this skeleton has {there}")
+        chains.append(chain)
+    return np.array(chains)
+
+
+def _runs(mask) -> list[tuple[int, int]]:
+    """Return start and stop of each stretch of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _drop_short(contact, fps: float) -> None:
+    for start, stop in _runs(contact):
+        if stop - start < _SHORTEST * fps:
+            contact[start:stop] = False
+
+
+# ------------------------------------------------------------------------------- when feet stand
+
+
+def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) -> np.ndarray:
+    """Tell when each foot should stand, of motion whose feet may slide, sink and float.
+
+    A foot stands while its toe is low, slow, or clearly lower and slower than the other one. Low is
+    meant over the lowest the toe gets within a second or so; slow, beside how fast the motion's
+    slower foot usually is, as speeds in a contact are what is wrong with the motion. Steps that
+    `walking.stepping_rate` would count are never contacts. At its ends a contact is cut to frames
+    as high and as fast as the rest of it.
+
+    Args:
+      positions: [T, J, 3], metres.
+      skeleton: the joints.
+      fps: frames per second.
+      floor: height of a resting toe, metres; a toe 4 cm above it and more is never low. By default
+        a low percentile of the toes' heights.
+
+    Returns:
+      Boolean [T, 2], left and right as in `Skeleton.toes`; no contact in fewer than 3 frames.
+
+    Raises:
+      ValueError: for positions that do not fit, or a number that is not finite.
+    """
+    positions = finite_array("positions", positions, ("frame", skeleton.num_joints, 3))
+    toes = toe_positions(positions, skeleton)
+    height = toes[..., 1]
+    contacts = np.zeros(height.shape, dtype=bool)
+    if len(toes) < 3:
+        return contacts
+
+    def frames(seconds):  # an odd number of them
+        return 2 * round(0.5 * seconds * fps) + 1
+
+    floor = np.percentile(height, 12) if floor is None else finite_array("floor", floor, ())
+    lowest = percentile_filter(height, 12, size=(frames(1.2), 1), mode="nearest")
+    above = height - np.minimum(lowest, floor + 0.04)
+    speed = fps * np.linalg.norm(np.gradient(toes[..., [0, 2]], axis=0), axis=-1)
+    calm = median_filter(speed, size=(frames(0.15), 1), mode="nearest")
+    usual = median_filter(calm.min(axis=-1), size=frames(2.0), mode="nearest")
+    unrest = np.maximum(above, 0.0) / 0.03 + calm / np.maximum(3.0 * usual, 0.45)[:, None]
+    other = unrest[:, ::-1]
+    sure = (unrest < 0.8) | ((unrest < 0.6 * other) & (above < 0.06))
+    likely = (unrest < 1.5) | ((unrest < 0.8 * other) & (above < 0.08))
+    from scipy.signal import find_peaks, peak_widths  # here: half a second that few callers need
+
+    for foot in range(2):
+        smooth = uniform_filter1d(height[:, foot], frames(0.1), mode="nearest")
+        peaks = find_peaks(smooth, prominence=STEP_PROMINENCE)[0]
+        for start, stop in zip(*peak_widths(smooth, peaks, rel_height=0.5)[2:], strict=True):
+            likely[int(np.ceil(start)) : int(stop) + 1, foot] = False
+        contact = contacts[:, foot]
+        for start, stop in _runs(likely[:, foot]):
+            if not sure[start:stop, foot].any():
+                continue
+            differs = speed[:, foot] > 1.5 * np.median(speed[start:stop, foot]) + 0.3
+            differs |= height[:, foot] > np.median(height[start:stop, foot]) + 0.02
+            alike = np.flatnonzero(~differs[start:stop])
+            contact[start + alike[0] : start + alike[-1] + 1] = True
+        for start, stop in _runs(~contact):
+            if 0 < start and stop < len(contact) and stop - start < _GAP * fps:
+                contact[start:stop] = True
+        _drop_short(contact, fps)
+    return contacts
+
+
+# ------------------------------------------------------------------------------ where feet stand
+
+
+def _settle(toe, contact, heights, fps: float) -> np.ndarray:
+    """Return the path of this module's text, [T, 3], never under `heights` [T]."""
+    frames = len(toe)
+    slope = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(frames - 1, frames))
+    bend = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
+    bend, slope, same = bend.T @ bend, slope.T @ slope, sparse.eye_array(frames)
+    path = toe.copy()
+
+    cost = bend + same / (0.15 * fps) ** 4
+    # Frames of one contact share one unknown.
+    first = np.concatenate([[True], ~(contact[1:] & contact[:-1])])
+    share = sparse.csr_array((np.ones(frames), (np.arange(frames), np.cumsum(first) - 1)))
+    reduced = splu((share.T @ cost @ share).tocsc())
+    path[:, [0, 2]] = share @ reduced.solve(share.T @ (cost @ toe[:, [0, 2]]))
+
+    cost = bend + slope / (0.07 * fps) ** 2 + same / (0.2 * fps) ** 4
+    # Toes may roll off the floor in the first and the last frames of a contact.
+    roll = round(0.07 * fps)
+    held = ~maximum_filter1d(~contact, 2 * roll + 1, mode="nearest")
+    for _ in range(20):  # frames that end up under the floor are held there in their turn
+        weight = sparse.diags_array(_HELD * held)
+        solver = splu((cost + weight).tocsc())
+        path[:, 1] = solver.solve(cost @ toe[:, 1] + weight @ heights)
+        sunk = ~held & (path[:, 1] < heights - 1e-4)
+        if not sunk.any():
+            break
+        held |= sunk
+    path[:, 1] = np.maximum(path[:, 1], heights)
+    return path
+
+
+def _plan_toe(hip, ankle, toe, contact, floor: float, limit, fps: float):
+    """Settle a toe, with contacts cut where they ask too much.
+
+    Args:
+      hip, ankle, toe: as they were, [T, 3].
+      contact: [T].
+      floor: height of a resting toe.
+      limit: how far an ankle may be from its hip, [T].
+      fps: frames per second.
+
+    Returns:
+      Where the ankle shall be, [T, 3], and how far the hip has to come down for it, [T].
+    """
+    foot, contact, wanted = toe - ankle, contact.copy(), toe.copy()
+    heights = floor + np.maximum(foot[:, 1], 0.0)  # neither toe nor ankle under the floor
+    gap = max(3, round(_STEP_SECONDS * fps))
+    while True:
+        target = _settle(wanted, contact, heights, fps) - foot
+        across = np.square((target - hip)[:, [0, 2]]).sum(axis=-1)
+        lack = (hip - target)[:, 1] - np.sqrt(np.maximum(limit**2 - across, 0.0))
+        moved = np.linalg.norm((target - ankle)[:, [0, 2]], axis=-1)
+        release = np.zeros(len(contact), dtype=bool)
+        for start, stop in _runs(contact):
+            if moved[start:stop].max() > FARTHEST:
+                middle = max(start, (start + stop - gap) // 2)
+                step = np.arange(middle, min(middle + gap, stop))
+                wanted[step, 1] += _STEP_HEIGHT * np.sin(np.pi * (step - middle + 0.5) / gap) ** 2
+                release[step] = True
+            else:  # where a foot would have to stand too far away, a lack says nothing yet
+                release[start:stop] = lack[start:stop] > DEEPEST
+        if not release.any():
+            return target, np.where(contact, np.maximum(lack, 0.0), 0.0)
+        # A foot that stood again a frame or two later would hop.
+        for start, stop in _runs(release):
+            if start > 0 and stop < len(contact) and contact[start - 1] and contact[stop]:
+                apart = max(0, gap + 1 - (stop - start)) // 2
+                release[max(0, start - apart) : stop + apart] = True
+        contact &= ~release
+        _drop_short(contact, fps)
+
+
+# -------------------------------------------------------------------------------------- the legs
+
+
+def _shortest_turn(first, second) -> np.ndarray:
+    """Return the smallest rotations that turn unit vectors [T, 3] into others, [T, 3, 3]."""
+    axis = np.cross(first, second)
+    angle = np.arctan2(np.linalg.norm(axis, axis=-1), (first * second).sum(axis=-1))
+    return Rotation.from_rotvec(unit(axis) * angle[:, None]).as_matrix()
+
+
+def knee_axes(hip, knee, ankle, thigh_turn, across) -> np.ndarray:
+    """Return the axis of each knee's bend, as the thigh sees it, [T, 3]; the longer, the more it bends.
+
+    Args:
+      hip, knee, ankle: [T, 3].
+      thigh_turn: the thigh's global rotations, [T, 3, 3].
+      across: from the right hip to the left one, [T, 3]: the axis of a leg that is straight throughout.
+    """
+    axis = np.cross(unit(knee - hip), unit(ankle - knee))
+    return np.einsum("tba,tb->ta", thigh_turn, axis + 1e-3 * across)
+
+
+def leg_reach(hip, knee, ankle) -> np.ndarray:
+    """Return how long the line from hip to ankle may become, [T, 2]: what `bend_leg` takes.
+
+    A leg yields from the first length on and never gets longer than the second; one that is straighter already stays.
+    """
+    length = np.linalg.norm(knee - hip, axis=-1) + np.linalg.norm(ankle - knee, axis=-1)
+    before = np.linalg.norm(ankle - hip, axis=-1)
+    return np.stack([np.maximum(before, share * length) for share in (_STRAIGHT, 0.9995)], axis=-1)
+
+
+def bend_leg(hip, knee, ankle, usual, line, reach):
+    """Bend a knee and turn a hip until the ankle lies where it shall.
+
+    Args:
+      hip, knee, ankle: as they were, [T, 3].
+      usual: the axis about which this knee usually bends, of length 1, [T, 3].
+      line: from hip to ankle as it shall be, [T, 3].
+      reach: how long that line may be, [T, 2]: yields from the first length on, to the second.
+
+    Returns:
+      Rotations to multiply from the left to the global ones of thigh and shank, [T, 3, 3] each.
+    """
+    thigh, shank = unit(knee - hip), unit(ankle - knee)
+    upper, lower = np.linalg.norm(knee - hip, axis=-1), np.linalg.norm(ankle - knee, axis=-1)
+    near, far = reach.T
+    length, room = np.linalg.norm(line, axis=-1), np.maximum(far - near, 1e-9)
+    length = np.minimum(length, near) - room * np.expm1(-np.maximum(length - near, 0.0) / room)
+    cosine = (length**2 - upper**2 - lower**2) / (2.0 * upper * lower)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
+    # The knee's axis; in a straight leg the usual one of this motion, which keeps the knee's side.
+    axis = np.cross(thigh, shank)
+    straight = np.maximum(0.03 - (axis * usual).sum(axis=-1, keepdims=True), 0.0)
+    axis = axis + straight * usual
+    axis = unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
+    bent = np.cos(angle) * thigh + np.sin(angle) * np.cross(axis, thigh)
+    knee_turn = _shortest_turn(shank, bent)
+    hip_turn = _shortest_turn(unit(upper[:, None] * thigh + lower[:, None] * bent), unit(line))
+    return hip_turn, hip_turn @ knee_turn
+
+
+def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
+    """Let feet stand still while they carry, and never under the floor.
+
+    Args:
+      motion: any motion of a skeleton whose legs are hip, knee, ankle, toe.
+      contacts: when each foot should stand, [T, 2]; by default `plan_contacts` of the motion.
+      floor: height of a resting toe, metres; by default the median of toes in contact.
+
+    Returns:
+      The motion, float64: hips, knees and ankles turned, the root's height lowered here and there.
+      Toes stand still in the contacts, as far as `FARTHEST`, `DEEPEST` and the legs allow. Fewer
+      than 3 frames stay as they are.
+
+    Raises:
+      ValueError: for a skeleton with other legs, contacts of another shape, or a floor that is not
+        finite.
+    """
+    skeleton, fps = motion.skeleton, motion.fps
+    chains = leg_chains(skeleton)
+    positions = np.asarray(motion.positions, np.float64)
+    if contacts is None:
+        contacts = plan_contacts(positions, skeleton, fps, floor)
+    contacts = finite_array("contacts", contacts, (motion.num_frames, 2), bool)
+    if floor is None:
+        height = toe_positions(positions, skeleton)[..., 1]
+        floor = np.median(height[contacts]) if contacts.any() else height.min()
+    floor = float(finite_array("floor", floor, ()))
+    if motion.num_frames < 3:
+        return motion
+
+    lowered, targets, reaches = np.zeros(motion.num_frames), [], []
+    for foot, chain in enumerate(chains):
+        hip, _, ankle, toe = np.moveaxis(positions[:, chain], 1, 0)
+        reach = leg_reach(*np.moveaxis(positions[:, chain[:3]], 1, 0))
+        target, lack = _plan_toe(hip, ankle, toe, contacts[:, foot], floor, reach[:, 0], fps)
+        lowered = np.maximum(lowered, lack)
+        targets.append(target)
+        reaches.append(reach)
+    lowered = smooth_above(lowered, fps)
+    drop = lowered[:, None] * np.array([0.0, -1.0, 0.0])
+
+    rotations = np.array(motion.needed_rotations("locking feet"), np.float64)
+    turned = global_rotations(skeleton, rotations)
+    across = positions[:, chains[0, 0]] - positions[:, chains[1, 0]]
+    for chain, target, reach in zip(chains, targets, reaches, strict=True):
+        hip, knee, ankle, _ = np.moveaxis(positions[:, chain], 1, 0)
+        usual = turned[:, chain[0]] @ unit(knee_axes(hip, knee, ankle, turned[:, chain[0]], across).sum(axis=0))
+        turns = bend_leg(hip, knee, ankle, usual, target - hip - drop, reach)
+        frames = [turned[:, skeleton.parents[chain[0]]]]
+        frames += [turn @ turned[:, joint] for turn, joint in zip(turns, chain[:2], strict=True)]
+        frames += [turned[:, chain[2]]]
+        for above, own, joint in zip(frames[:3], frames[1:], chain[:3], strict=True):
+            rotations[:, joint] = np.swapaxes(above, -1, -2) @ own
+    root = np.asarray(motion.root_position, np.float64) + drop
+    return motion.replace(root_position=root, rotations=rotations)
+
+
+# ----------------------------------------------------------------------------------- of a rollout
+
+
+def lock_rollout(rollout: Rollout) -> Rollout:
+    """Lock the feet of all characters of a rollout; blend it before, if at all, not after.
+
+    The floor is where the lowest toe rests in a character's history, which is real motion, and where none does, as for
+    `lock_feet`.
+
+    Args:
+      rollout: as the network made it, or blended.
+
+    Returns:
+      The rollout with other frames; its `feet_locked` says so. The history, which counts as the past of
+      contacts, is as it was.
+
+    Raises:
+      ValueError: for a rollout whose feet are locked already, or as `lock_feet`.
+    """
+    if rollout.feet_locked:
+        raise ValueError("the feet of this rollout are locked already")
+    past = frame_positions(rollout.skeleton, np.asarray(rollout.history, np.float64))
+    height, resting = toe_positions(past, rollout.skeleton)[..., 1], contact_labels(rollout.skeleton, past)
+    frames = []
+    for character, (toes, rests) in enumerate(zip(height, resting, strict=True)):
+        floor = toes[rests].min() if rests.any() else None
+        locked = lock_feet(rollout.motion(character, with_history=True), floor=floor)
+        frames.append(world_frames(locked)[rollout.history.shape[1] :])
+    return dataclasses.replace(rollout, frames=np.asarray(frames, rollout.frames.dtype), feet_locked=True)

@@ -1,0 +1,385 @@
+"""Motion that a reader can turn around: a player as one HTML page.
+
+`player_page` makes the page, `write_player` writes it. The page is whole: scripts, style and all motion stand in it, a
+content security policy forbids it any request, and it works offline and inside an iframe. It is drawn with three.js
+(MIT, `web/three.min.js`), of which each page carries 220 kB; the scripts beside it are ours.
+
+How motion is stored (`"version": 2`). The page holds a JSON object with titles, skeletons, frame rate and, under
+`tracks`, the numbers: base64 of one zlib stream. Inflated, the stream holds for each character of each scene, in the
+page's order:
+
+| track | type | shape | what |
+|---|---|---|---|
+| root | int32 | [T, 3] | global position of the root joint, millimetres |
+| turns | int16 | [T, J, 3] | rotation vector of each joint (the root's is global), `turns` steps a radian |
+| contacts | uint8 | [T, 1] | bit 0: left toe in contact, bit 1: right toe; if `contacts` is true |
+| path | int32 | [T, 2] | target x and z, millimetres; if `path` is true |
+
+A track is stored as its first frame followed by the differences from frame to frame, modulo the type's range; then
+channel by channel, T numbers each; then all lowest bytes first, followed by all next ones, as little endian has them.
+Differences of smooth motion are small, which lets zlib shorten them. Joints come back to about a millimetre,
+those of a crowd to a few.
+"""
+
+import base64
+import dataclasses
+import html
+import re
+import string
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from f3amd_companion.serving.web_page import POLICY, module_scripts, page_json, read_web
+from f3amd_lib.drawing import stick_figures
+from f3amd_lib.drawing.pictures import film_strip
+from f3amd_lib.drawing.style import save_figure
+from f3amd_lib.ground.files import named_file, write_whole
+from f3amd_lib.motion.body import body_capsules
+from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+_MILLIMETRES = 1000.0
+_FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
+_FEW = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """One skeleton in motion, and what is drawn with it.
+
+    Attributes:
+      motion: what it does, T frames.
+      path: its target path: a `RootPath` of T frames, or [T, 2] (x, z) in metres.
+      name: for messages; by default the motion's.
+      color: "#rrggbb" of body and trail, to tell characters apart; of sticks, limbs keep the colours of left and right.
+      ghost: another motion that is drawn with this one and can be seen through, such as the real clip.
+    """
+
+    motion: Motion
+    path: object = None
+    name: str = ""
+    color: str | None = None
+    ghost: Motion | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One panel of the player: characters that share a ground.
+
+    Attributes:
+      characters: a `Character` or a `Motion`, or a list of them.
+      title: stands over the panel.
+      note: a line below the title, such as a measured time.
+      boundaries: frames at which a new window begins, such as `range(32, 240, 32)`; ticks on the
+        scrubber.
+    """
+
+    characters: Sequence[Character | Motion] | Character | Motion
+    title: str = ""
+    note: str = ""
+    boundaries: Sequence[int] = field(default=())
+
+
+def rollout_scene(rollout, title: str = "") -> Scene:
+    """Make a scene of all characters of a `rollout.generated.Rollout`, with target paths and window boundaries."""
+    characters = [Character(rollout.motion(k), path=path) for k, path in enumerate(rollout.paths)]
+    boundaries = range(rollout.window, rollout.frames.shape[1], rollout.window)
+    return Scene(characters, title=title, boundaries=boundaries)
+
+
+def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = True, follow: bool | None = None) -> str:
+    """Make the player as one HTML page.
+
+    Several scenes play side by side, in step and under one camera. All motions of a page have the
+    same frame rate and number of frames.
+
+    Args:
+      scenes: a `Scene`, `Character` or `Motion`, or a list of them; a character or motion alone
+        becomes a scene under its name.
+      title: of the page.
+      credit: a line at its foot: whose motion this is, and under which terms.
+      autoplay: start at once, unless the reader's system asks for reduced motion.
+      follow: let the camera go along with one character of each scene; by default it does where every scene has one.
+
+    Returns:
+      The page, HTML; it needs no file and no network.
+
+    Raises:
+      ValueError: for no scene or no character, unlike frame rates or lengths (of motions or paths), motion
+        without rotations, numbers not finite or too far out, boundaries that are no frames of the motion, or a colour
+        that is none.
+    """
+    scenes = _as_scenes(scenes)
+    first = scenes[0].characters[0].motion
+    skeletons: list[Skeleton] = []
+    tracks: list[bytes] = []
+    described = []
+    steps = _FINE if sum(len(scene.characters) for scene in scenes) <= _FEW else _COARSE
+    for scene in scenes:
+        boundaries = _checked_boundaries(scene, first.num_frames)
+        described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
+        for character, ghost in _with_ghosts(scene.characters):
+            _check_in_step(character, first)
+            skeleton = character.motion.skeleton
+            if skeleton not in skeletons:
+                skeletons.append(skeleton)
+            about, pieces = _encode_character(character, ghost, steps)
+            described[-1]["characters"].append({"skeleton": skeletons.index(skeleton), **about})
+            tracks.extend(pieces)
+    data = {
+        "version": 2,
+        "fps": float(first.fps),
+        "frames": first.num_frames,
+        "turns": steps,
+        "autoplay": bool(autoplay),
+        "follow": all(len(scene.characters) == 1 for scene in scenes) if follow is None else follow,
+        "around": _first_azimuth(first),
+        "skeletons": [describe_for_web(skeleton) for skeleton in skeletons],
+        "scenes": described,
+        "tracks": base64.b64encode(zlib.compress(b"".join(tracks), 9)).decode("ascii"),
+    }
+    named = title or ", ".join(scene.title for scene in scenes if scene.title) or "Motion"
+    return string.Template(read_web("player.html")).substitute(
+        policy=POLICY,
+        title=html.escape(named),
+        heading=_element("h1", title),
+        colors=_color_rules(),
+        style=read_web("player.css"),
+        panels="\n".join(_panel(scene, first) for scene in scenes),
+        legend=_legend(described),
+        credit=_element('p class="credit"', credit),
+        data=page_json(data),
+        modules=module_scripts("player"),
+    )
+
+
+def write_player(path, scenes, *, strip: bool = True, **options) -> Path:
+    """Write the player as one HTML file, and beside it a film strip of the same name as PNG.
+
+    Args:
+      path: ends in .html; folders are made, files that are there are replaced.
+      scenes, options: as for `player_page`.
+      strip: write the film strip, for readers without a browser (`scenes_strip`).
+
+    Returns:
+      The path of the page.
+
+    Raises:
+      ValueError: for a wrong suffix, or as for `player_page`.
+    """
+    path = named_file(path, ".html", "players")
+    page = player_page(scenes, **options)
+    figure = scenes_strip(scenes) if strip else None  # before anything is written: it may refuse
+    write_whole(path, page)
+    if strip:
+        save_figure(figure, path.with_suffix(".png"))
+    return path
+
+
+def scenes_strip(scenes):
+    """Draw a film strip of the first character of up to four scenes: what the player shows, on paper.
+
+    Args:
+      scenes: as for `player_page`.
+
+    Returns:
+      A matplotlib Figure (see `pictures.film_strip`).
+    """
+    scenes = _as_scenes(scenes)[:4]
+    firsts = [scene.characters[0] for scene in scenes]
+    titles = [scene.title or None for scene in scenes]
+    return film_strip([one.motion for one in firsts], paths=[one.path for one in firsts], titles=titles)
+
+
+# ---------------------------------------------------------------------------------- what comes in
+
+
+def _as_scenes(scenes) -> list[Scene]:
+    """Bring whatever `player_page` takes into scenes of characters."""
+    if isinstance(scenes, (Scene, Character, Motion)):
+        scenes = [scenes]
+    whole = [_as_scene(scene, f"scene {place}") for place, scene in enumerate(scenes)]
+    if not whole:
+        raise ValueError("a player needs at least one scene")
+    return whole
+
+
+def _as_scene(given, label: str) -> Scene:
+    if not isinstance(given, Scene):
+        character = _as_character(given, label)
+        return Scene([character], title=character.name)
+    label = f"{label} ({given.title})" if given.title else label
+    characters = given.characters
+    if isinstance(characters, (Character, Motion)):
+        characters = [characters]
+    if not characters:
+        raise ValueError(f"{label} has no character")
+    characters = [_as_character(one, f"{label}, character {k}") for k, one in enumerate(characters)]
+    return dataclasses.replace(given, characters=characters)
+
+
+def _as_character(given, label: str) -> Character:
+    """Give a character the name that messages call it by."""
+    if isinstance(given, Motion):
+        given = Character(given)
+    if not isinstance(given, Character) or not isinstance(given.motion, Motion):
+        raise ValueError(f"{label} is a {type(given).__name__}; give a Scene, Character or Motion")
+    if given.color is not None and not re.fullmatch(r"#[0-9a-fA-F]{6}", given.color):
+        raise ValueError(f"{label}: color must be like '#1b4f8f', got {given.color!r}")
+    return dataclasses.replace(given, name=given.name or given.motion.name or label)
+
+
+def _check_in_step(character: Character, first: Motion) -> None:
+    motion, there = character.motion, "where the player's first motion has"
+    if abs(motion.fps - first.fps) > 1e-6:
+        raise ValueError(f"{character.name}: {motion.fps:g} frames a second, {there} {first.fps:g}; resample it")
+    if motion.num_frames != first.num_frames:
+        raise ValueError(f"{character.name}: {motion.num_frames} frames, {there} {first.num_frames}; use Motion.slice")
+
+
+def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
+    for frame in scene.boundaries:
+        if frame not in range(1, num_frames):
+            what = f"no frame between 1 and {num_frames - 1}, where a new window could begin"
+            raise ValueError(f"boundary {frame} of scene {scene.title!r} is {what}")
+    return sorted({int(frame) for frame in scene.boundaries})
+
+
+# ------------------------------------------------------------------------------ what is drawn of it
+
+
+def _with_ghosts(characters) -> Iterator[tuple[Character, bool]]:
+    """Put each ghost behind its character: (who, whether it can be seen through)."""
+    for one in characters:
+        yield one, False
+        if isinstance(one.ghost, Motion):
+            yield Character(one.ghost, name=f"{one.name}, ghost"), True
+
+
+def describe_for_web(skeleton: Skeleton) -> dict:
+    """Describe a skeleton with its body and sticks as `web/body.js` wants it, metres, ready for JSON."""
+
+    def numbers(values):
+        return [round(float(value), 5) for value in values]
+
+    tips = [offset for _, offset in skeleton.end_sites]
+    offsets = [*skeleton.offsets, *tips]
+    capsules = [
+        [one.joint, numbers(one.start), numbers(one.end), numbers(one.radii), numbers(one.wide)]
+        for one in body_capsules(skeleton)
+    ]
+    return {
+        "names": list(skeleton.names),
+        "parents": list(skeleton.parents),
+        "offsets": [numbers(offset) for offset in skeleton.offsets],
+        "sides": [stick_figures.limb_side(name) for name in skeleton.names],
+        "capsules": capsules,
+        "bones": [[parent, numbers(offsets[child]), side] for parent, child, side in stick_figures.bones_of(skeleton)],
+        "head": stick_figures.head_and_parent(skeleton),
+        "toes": stick_figures.toes_of(skeleton) or None,
+    }
+
+
+def _first_azimuth(motion: Motion) -> float:
+    """Where the camera stands at first: 50 degrees to the right of where the first one faces."""
+    yaw = stick_figures.yaw_of(motion)
+    return round((0.0 if yaw is None else float(yaw[0])) - np.deg2rad(50.0), 4)
+
+
+# ----------------------------------------------------------------------------------- as numbers
+
+
+def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[dict, list[bytes]]:
+    """Describe a character and turn its tracks into bytes."""
+    motion, label = character.motion, character.name
+    num_frames, has_contacts = motion.num_frames, bool(stick_figures.toes_of(motion.skeleton)) and not ghost
+    rotations = motion.needed_rotations("the player")
+    turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
+    turns = np.rint(steps * turns).reshape(num_frames, -1)
+    pieces = [_track(_whole_millimetres(motion.root_position, label, "root"), "<i4"), _track(turns, "<i2")]
+
+    if has_contacts:
+        pieces.append(_track((motion.contacts.astype(bool) @ np.array([1, 2]))[:, None], "u1"))
+
+    if character.path is not None:
+        try:
+            path = stick_figures.path_on_ground(character.path)
+        except ValueError as error:
+            raise ValueError(f"{label}: {error}") from None
+        fps = getattr(character.path, "fps", motion.fps)
+        if len(path) != num_frames or abs(fps - motion.fps) > 1e-6:
+            there = f"{len(path)} frames at {fps:g} a second, the motion {num_frames} at {motion.fps:g}"
+            raise ValueError(f"{label}: the target path has {there}")
+        pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
+    about = {"name": label, "color": character.color, "ghost": ghost}
+    return about | {"contacts": has_contacts, "path": character.path is not None}, pieces
+
+
+def _whole_millimetres(metres: np.ndarray, label: str, what: str) -> np.ndarray:
+    """Round to millimetres, int64, and refuse what int32 cannot hold."""
+    largest = np.abs(metres).max()
+    if not largest * _MILLIMETRES < np.iinfo(np.int32).max:  # also catches NaN
+        frame = int(np.argmax(~(np.abs(metres) < 2e6).reshape(len(metres), -1).all(axis=1)))
+        raise ValueError(f"{label}: {what} at frame {frame} is not finite, or over 2000 km from the origin")
+    return np.rint(metres * _MILLIMETRES).astype(np.int64)
+
+
+def _track(values: np.ndarray, dtype: str) -> bytes:
+    """Differences along time, channel by channel, lowest bytes first (see the module's text)."""
+    values = values.reshape(len(values), -1)
+    steps = np.concatenate([values[:1], np.diff(values, axis=0)])
+    narrow = np.ascontiguousarray(steps.T).astype(np.int64).astype(dtype)  # wraps round, and back when added up
+    return np.ascontiguousarray(narrow.reshape(-1, 1).view(np.uint8).T).tobytes()
+
+
+# -------------------------------------------------------------------------------------- as HTML
+
+
+def _color_rules() -> str:
+    """The pictures' colours, so that strips, GIFs and the player look alike; CSS has dark ones."""
+    others = {name: getattr(stick_figures, f"{name.upper()}_COLOR") for name in ("contact", "target", "trail")}
+    colors = stick_figures.LIMB_COLORS | others
+    return ":root { " + " ".join(f"--{name}: {color};" for name, color in colors.items()) + " }"
+
+
+def _panel(scene: Scene, first: Motion) -> str:
+    count = len(scene.characters)
+    shown = (
+        f"{scene.title or 'Motion'}: {count} {'character' if count == 1 else 'characters'} of "
+        f"{scene.characters[0].motion.skeleton.num_joints} joints, {first.num_frames / first.fps:.1f} seconds"
+    )
+    title = _element("strong", scene.title)
+    return (
+        f'<figure class="panel"><figcaption>{title}{_element("span", scene.note)}</figcaption>'
+        f'<div class="labels" role="img" aria-label="{html.escape(shown, quote=True)}"></div></figure>'
+    )
+
+
+def _element(opening: str, text: str) -> str:
+    """Put text into an element, such as 'p class="credit"'; nothing if there is no text."""
+    return f"<{opening}>{html.escape(text)}</{opening.split()[0]}>" if text else ""
+
+
+def _legend(scenes: list[dict]) -> str:
+    """Say what the colours mean, of those that are there."""
+    characters = [character for scene in scenes for character in scene["characters"]]
+    keys = [
+        ("line", "left", "left", True),
+        ("line", "right", "right", True),
+        ("dot", "contact", "toe in contact", any(character["contacts"] for character in characters)),
+        ("line", "trail", "walked", not all(character["color"] for character in characters)),
+        ("line", "flesh", "ghost: the real clip", any(character["ghost"] for character in characters)),
+        ("dash", "target", "target path", any(character["path"] for character in characters)),
+        ("tick", None, "a window begins", any(scene["boundaries"] for scene in scenes)),
+    ]
+    items = []
+    for kind, color, text, is_there in keys:
+        rule = "border-color" if kind == "dash" else "background"
+        style = f' style="{rule}:var(--{color})"' if color else ""
+        if is_there:
+            items.append(f'<span><i class="{kind}"{style}></i>{text}</span>')
+    return "".join(items) + '<span id="grid-key"></span>'

@@ -1,0 +1,156 @@
+"""A page on which one steers a trained model: the network runs in the browser.
+
+`steer_page` makes one HTML file with everything in it: the weights as ONNX, ONNX Runtime for WebAssembly, three.js, and
+our own modules (`serving/web`). All of it is gzipped and in base64, so that the page works from a disk and asks nothing
+of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
+"""
+
+import base64
+import gzip
+import html
+import re
+import string
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from f3amd_companion.serving.foot_locking import leg_chains
+from f3amd_companion.serving.npm_packages import package_credit, package_file
+from f3amd_companion.serving.onnx_export import denoiser_program, model_card
+from f3amd_companion.serving.steering import first_pose, usual_pace
+from f3amd_companion.serving.web_page import FOLDER, page_json
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.training.checkpoints import TrainedModel
+
+_PAGE = read_toml(Path(__file__).with_name("steer.toml"))
+MODULES = _PAGE["modules"]
+"""Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
+
+RUNTIMES = _PAGE["runtimes"]
+"""What runs the network -> the script of ONNX Runtime, and its program; the second one also runs without WebGPU."""
+
+_MARKS = {"past": "#b5651d", "taken": "#1b7f4d", "dropped": "#4f7fbf", "target": TARGET_COLOR, "seam": "#d33f3f"}
+
+
+def steer_page(
+    trained: TrainedModel, *, num_steps: int = 8, weights: str = "int8", program: bytes | None = None,
+    runtime: str = "wasm",
+) -> str:  # fmt: skip
+    """Return a page on which one steers characters of a model, HTML; it needs no other file and no network.
+
+    Args:
+      trained: a model of history, path and style that is sampled by DDIM.
+      num_steps: of the sampler; the page also offers 1.
+      weights: how they are stored, see `onnx_export.WEIGHTS`.
+      program: from `onnx_export.denoiser_program`, for any number of characters, instead of exporting here.
+      runtime: "wasm"; or "webgpu", which takes the graphics card where the browser lends it, and WebAssembly where it
+        does not. That page is larger.
+
+    Raises:
+      ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, an unknown runtime, or a
+        model that lacks a starting pose for one of its styles.
+    """
+    check_known(runtime, RUNTIMES, "runtime")
+    if trained.diffusion.sampler != "ddim":
+        raise ValueError(f"{trained.name} is sampled by {trained.diffusion.sampler!r}, the page walks by 'ddim' alone")
+    card = model_card(trained, num_steps)
+    if missing := [style for style in trained.styles if style not in trained.start_poses]:
+        raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
+    if program is None:
+        program = denoiser_program(trained.network(), weights=weights)
+    paces = {style: usual_pace(trained, style) for style in trained.styles}
+    poses = [first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in paces.items()]
+    legs = _legs(trained.skeleton)
+    files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
+    files |= {
+        "worker": _worker(RUNTIMES[runtime][0]).encode(),
+        "wasm": package_file("onnxruntime-web", RUNTIMES[runtime][1]),
+        "program": program,
+        "poses": np.asarray(poses, np.float32).tobytes(),
+    }
+    data = {
+        "card": {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
+        | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
+        | {"legs": legs, "webgpu": runtime == "webgpu"},
+        "modules": [(name, specifier) for name, specifier, _ in MODULES],
+        "bones": bones_of(trained.skeleton),
+        "head": head_and_parent(trained.skeleton),
+        "paces": list(paces.values()),
+        "colors": LIMB_COLORS,
+        "marks": _MARKS,
+        "first_styles": _first_styles(trained.styles),
+    }
+    choice = '<label><input type="radio" name="steps" value="{0}"{1}>{0}</label>'
+    offered = sorted(map(int, card["sigmas"]), reverse=True)
+    steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
+    credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
+    count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
+    return string.Template((FOLDER / "steer.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(f"Steer {trained.name}"),
+        name=html.escape(trained.name),
+        about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
+        window=trained.config.window,
+        history=trained.config.num_history,
+        runtime=html.escape(package_credit("onnxruntime-web").split(":")[0]),
+        credit=html.escape(". ".join(filter(None, credits))),
+        licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
+        steps=steps,
+        feet=" checked" if legs else " disabled",
+        about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
+        style=string.Template((FOLDER / "steer.css").read_text(encoding="utf-8")).substitute(
+            marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
+        ),
+        data=page_json(data),
+        files=page_json(
+            {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode("ascii") for name, file in files.items()}
+        ),
+        loader=(FOLDER / "loader.js").read_text(encoding="utf-8"),
+    )
+
+
+def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **options) -> Path:
+    """Write `steer_page` as a file.
+
+    Raises:
+      ImportError, ValueError: as `steer_page`; for a suffix other than .html, or a file that is there already.
+    """
+    path = named_file(path, ".html", "pages")
+    return write_whole(path, steer_page(trained, **options), overwrite=overwrite)
+
+
+def _worker(script: str) -> str:
+    """Return the worker, with a bundle of ONNX Runtime, as one classic script: a page on a disk may start no other.
+
+    Raises:
+      ValueError: if ONNX Runtime's bundle is not written as expected.
+    """
+    bundle = package_file("onnxruntime-web", script).decode("utf-8")
+    body, _, names = bundle.partition("export{")
+    names, closed, rest = names.partition("};")
+    pairs = [name.split(" as ") for name in names.split(",")]
+    if not closed or "export" in rest or any(len(pair) != 2 for pair in pairs):
+        raise ValueError("onnxruntime-web: the bundle's exports are not where they are expected; pin another version")
+    # It asks for its address only to find files that the page hands it.
+    body = body.replace("import.meta.url", '"https://page.invalid/"')
+    exported = ",".join(f"{name}:{own}" for own, name in pairs)
+    motion = (FOLDER / "motion.js").read_text(encoding="utf-8")
+    worker = (FOLDER / "steer_worker.js").read_text(encoding="utf-8")
+    ours = re.sub(r"^export ", "", motion, flags=re.M) + re.sub(r"^import .*\n", "", worker, flags=re.M)
+    return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
+
+
+def _legs(skeleton) -> list[list[int]] | None:
+    """Return hip, knee, ankle and toe of both legs, or None where they are others."""
+    try:
+        return leg_chains(skeleton).tolist()
+    except ValueError:
+        return None
+
+
+def _first_styles(styles) -> tuple[str, str]:
+    """Return the two styles that the slider blends at first."""
+    first = "Neutral" if "Neutral" in styles else styles[0]
+    return first, next((style for style in ("Proud", *styles) if style in styles and style != first), first)

@@ -1,0 +1,249 @@
+"""Autoregressive rollout of many characters at once (paper sections 3.1 and 4.4).
+
+Each round makes one window of frames for every character: encode the condition once, start from
+noise, denoise in a few steps, keep the last frames as the next history. All rounds run inside one
+jitted scan.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition, turn_frames
+from f3amd_lib.diffusion.samplers import SAMPLERS
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.config import cast_network
+from f3amd_lib.rollout.blending import blend_rollout
+from f3amd_lib.rollout.generated import Rollout
+from f3amd_lib.rollout.rounds import sample_round
+from f3amd_lib.training.checkpoints import TrainedModel
+
+MOST_STEPS = 1000
+"""Most steps a round: as many levels as diffusion models are trained on; thousands would compile for minutes."""
+
+
+class MotionGenerator:
+    """Style and path in, motion out.
+
+    Args:
+      trained: a trained model.
+      num_steps: steps a round (the paper: 8, 4, 2 or 1); an evaluation each, but for "heun".
+      schedule: noise levels; by default those the model was trained with.
+      spacing: where the steps lie, see the schedule's `grid`.
+      sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule (F3AMD
+        DDIM, CAMDM ancestral DDPM).
+      dtype: of the network's arithmetic; jnp.bfloat16 is faster where the hardware has it.
+    """
+
+    def __init__(
+        self, trained: TrainedModel, num_steps: int = 8, *, schedule: NoiseSchedule | None = None,
+        spacing: str = "endpoints", sampler: str | None = None, dtype=jnp.float32,
+    ):  # fmt: skip
+        self.trained = trained
+        if num_steps > MOST_STEPS:
+            raise ValueError(f"num_steps must be at most {MOST_STEPS}, got {num_steps}: more only take longer")
+        self.num_steps = num_steps
+        schedule = schedule or trained.diffusion
+        self.sampler = sampler or schedule.sampler
+        check_known(self.sampler, SAMPLERS, "sampler")
+        self.sigmas = schedule.grid(num_steps, spacing)
+        # A walk that is told a low level from the first starts from noise alone all the same: of variance 1 in the
+        # preserving state, and of 1 + sigma^2 in ours.
+        self._start = float(np.hypot(1.0, self.sigmas[0])) if spacing == "leading" else None
+        self.dtype = jnp.dtype(dtype)
+        network = trained.network()
+        self._network = network if dtype == jnp.float32 else cast_network(network, dtype)
+        self._run = jax.jit(self._rounds)
+        self.sample = jax.jit(self.sample_window)  # compiled once for each number of rows
+
+    def sample_window(self, key, condition: Condition, noise=None):
+        """Sample one window, [B, T, C] in network units, for an already normalised condition.
+
+        Args:
+          key: of all random numbers; None if `noise` is given and the sampler draws none.
+          condition: normalised.
+          noise: standard normal numbers to start from, [B, T, C].
+        """
+        condition = jax.tree.map(lambda leaf: leaf.astype(self.dtype), condition)
+        noise = None if noise is None else noise.astype(self.dtype)
+        x0_hat = sample_round(
+            self._network, condition, self.sigmas, key, noise=noise, start=self._start, sampler=self.sampler
+        )
+        return x0_hat.astype(jnp.float32)
+
+    def sample_window_each(self, keys, condition: Condition):
+        """Sample one window for each character as if it were alone, [B, T, C]; keys [B]."""
+        if self.sampler == "ddpm":
+
+            def alone(key, condition):
+                return self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], condition))[0]
+
+            return jax.vmap(alone)(keys, condition)
+
+        # Where only the start is drawn, all can walk together from noise of their own.
+        config = self.trained.config
+
+        def draw(key):
+            return jax.random.normal(jax.random.split(key)[0], (config.window, config.channels))
+
+        return self.sample_window(None, condition, noise=jax.vmap(draw)(keys))
+
+    def _rounds(self, history, positions, yaws, before, style, key):
+        normaliser = self.trained.normaliser
+
+        def one_round(history, inputs):
+            target, yaw, target_before, number = inputs
+            origin = history[:, -1, jnp.array([0, 2])]
+            # Start where the character is and bend back to the line.
+            position = bend_path(target - target_before[:, None, :], target_before - origin)
+            path = normaliser.normalise_path(path_condition(position, yaw))
+            condition = Condition(normaliser.normalise(center_window(history, origin)), path, style)
+            if key.ndim:
+                keys = jax.vmap(jax.random.fold_in, (0, None))(key, number)
+                x0_hat = self.sample_window_each(keys, condition)
+            else:
+                x0_hat = self.sample_window(jax.random.fold_in(key, number), condition)
+            future = orthonormalise(normaliser.denormalise(x0_hat))
+            future = center_window(future, -origin)
+            history = jnp.concatenate([history, future], axis=1)[:, -history.shape[1] :]
+            return history, future
+
+        numbers = jnp.arange(positions.shape[0])
+        _, futures = jax.lax.scan(one_round, history, (positions, yaws, before, numbers))
+        rounds, batch, frames, channels = futures.shape
+        return jnp.moveaxis(futures, 0, 1).reshape(batch, rounds * frames, channels)
+
+    def generate(self, position, yaw, style_index, history, key) -> np.ndarray:
+        """Run all rounds on arrays; `rollout` and `serving.crowd` check and prepare them.
+
+        Compiled once per number of characters and of rounds.
+
+        Args:
+          position: targets on the ground, [B, F, 2], metres, float64. The last round walks on as
+            the last step went, and is cut to F frames.
+          yaw: facing, [B, F], radians, float64.
+          style_index: places in the one-hot vector, [B].
+          history: world frames to start from, [B, H, C].
+          key: JAX random key of the noise: one for the batch, or one a character, [B]. With the
+            latter a character's noise does not depend on who else is there.
+
+        Returns:
+          World frames, [B, F, C], float32.
+        """
+        window = self.trained.config.window
+        batch, num_frames = yaw.shape
+        rounds = -(-num_frames // window)
+        start = path_start(position)
+        missing = rounds * window - num_frames
+        if missing:
+            ahead = np.arange(1, missing + 1)[None, :, None]
+            pace = position[:, -1:] - position[:, -2:-1]
+            position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
+            yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
+        shape = (batch, rounds, window)
+        targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
+        before = np.concatenate([start[None], targets[:-1, :, -1]])
+        arrays = (history, targets, np.moveaxis(yaw.reshape(shape), 1, 0), before)
+        style = jax.nn.one_hot(style_index, len(self.trained.styles))
+        frames = self._run(*(jnp.asarray(array, jnp.float32) for array in arrays), style, key)
+        return np.asarray(frames)[:, :num_frames]
+
+    def rollout(
+        self, paths: RootPath | Sequence[RootPath], styles: str | Sequence[str], *, seed: int = 0,
+        history: np.ndarray | None = None, blend_frames: int = 0,
+    ) -> Rollout:  # fmt: skip
+        """Animate one or many characters along their paths.
+
+        Args:
+          paths: one path for all, or one each; frame k of a path is the target of generated frame
+            k. The last round is cut to the path's length. All must have the same length.
+          styles: one style name for all, or one each.
+          seed: of the noise and of the choice among the starting poses.
+          history: world frames to start from, [B, H, C]; by default a stored starting pose of the
+            style, moved to the start of the path.
+          blend_frames: blend so many frames after each window boundary (see `blending`); 0, as in
+            all figures that do not say otherwise, leaves the frames as the network made them.
+
+        Returns:
+          The rollout, [B, frames of the path, C].
+
+        Raises:
+          ValueError: for an unknown style, unlike lengths or counts, a wrong history, or more
+            blend_frames than a window has.
+        """
+        trained, config, seed = self.trained, self.trained.config, checked_seed(seed)
+        paths = [paths] if isinstance(paths, RootPath) else list(paths)
+        styles = [styles] if isinstance(styles, str) else list(styles)
+        batch = max(len(paths), len(styles))
+        if not paths or not styles:
+            raise ValueError("a rollout needs at least one path and one style")
+        paths = paths * batch if len(paths) == 1 else paths
+        styles = styles * batch if len(styles) == 1 else styles
+        if len(paths) != batch or len(styles) != batch:
+            raise ValueError(f"got {len(paths)} paths and {len(styles)} styles; give one, or as many")
+        lengths = {len(path.yaw) for path in paths}
+        if len(lengths) != 1:
+            raise ValueError(f"paths must have the same length, got {sorted(lengths)} frames")
+        if any(abs(path.fps - 30.0) > 1e-3 for path in paths):
+            raise ValueError("paths must be at 30 frames per second, as the models are")
+        num_frames = lengths.pop()
+        if num_frames < 2:
+            raise ValueError("a path needs at least 2 frames")
+        indices = np.array([trained.style_index(style) for style in styles])
+        position, yaw = (np.stack([getattr(path, name) for path in paths]) for name in ("position", "yaw"))
+        start = path_start(position)
+        if history is None:
+            speed = np.linalg.norm(position[:, 0] - start, axis=-1)
+            history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
+        shape = (batch, config.num_history, num_channels(trained.skeleton))
+        history = finite_array("history", history, shape, np.float32)
+        frames = self.generate(position, yaw, indices, history, jax.random.key(seed))
+        rollout = Rollout(trained.skeleton, frames, history, tuple(paths), tuple(styles), config.window)
+        return blend_rollout(rollout, blend_frames)
+
+    def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
+        """Pick a stored pose for each character; those of one style take others in turn."""
+        taken = dict.fromkeys(styles, 0)
+        poses = []
+        for character, style in enumerate(styles):
+            if style not in self.trained.start_poses:
+                raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
+            choices = self.trained.start_poses[style]
+            choices = choices[as_fast_as(choices, speed[character])]
+            order = np.random.default_rng([seed, self.trained.style_index(style)])
+            number = order.permutation(len(choices))[taken[style] % len(choices)]
+            taken[style] += 1
+            pose = turn_frames(choices[number], yaw[character])
+            poses.append(center_window(pose, -start[character]))
+        return np.stack(poses).astype(np.float32)
+
+
+def path_start(position):
+    """Return where a path [..., F, 2] would have been one frame before its first, [..., 2]."""
+    return 2.0 * position[..., 0, :] - position[..., 1, :]
+
+
+def as_fast_as(poses: np.ndarray, speed) -> np.ndarray:
+    """Tell which starting poses move about as fast as a path.
+
+    Args:
+      poses: [K, H, C], metres.
+      speed: of the path, [...], metres a frame.
+
+    Returns:
+      Booleans, [..., K]; at least one is true for each speed.
+    """
+    gap = np.abs(pose_speed(poses) - np.asarray(speed)[..., None])
+    return gap <= gap.min(axis=-1, keepdims=True) + 0.1 / 30.0
+
+
+def pose_speed(poses: np.ndarray) -> np.ndarray:
+    """Return how fast starting poses [K, H, C] move over the ground, [K], metres a frame."""
+    travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
+    return travelled / max(1, poses.shape[1] - 1)

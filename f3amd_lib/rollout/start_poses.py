@@ -1,0 +1,46 @@
+"""A rollout that begins where a motion of the user's ends: `f3amd rollout --start my.bvh`."""
+
+import numpy as np
+
+from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames, turn_frames, world_frames
+from f3amd_lib.motion.retarget import retarget
+from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.motion.skeleton import Motion, resample
+from f3amd_lib.rollout.rollout import path_start
+from f3amd_lib.training.checkpoints import TrainedModel
+
+
+def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tuple[np.ndarray, str]:
+    """Make a motion's last frames the history of a rollout along a path.
+
+    A motion of the model's own skeleton is taken as it is; one of another humanoid is retargeted.
+
+    Args:
+      trained: the model.
+      motion: at any frame rate.
+      path: what is to be followed; the history is moved to its start and turned to face as it does.
+
+    Returns:
+      World frames, [1, H, C], for `MotionGenerator.rollout(history=...)`, and a sentence that says what was done.
+
+    Raises:
+      ValueError: for a motion shorter than the history, or a skeleton whose joints we cannot name.
+    """
+    motion, frames = resample(motion, 30.0), trained.config.num_history
+    if motion.num_frames < frames:
+        needed = f"{frames}, {frames / 30.0:.1f} s"
+        raise ValueError(f"{motion.name}: {motion.num_frames} frames at 30 fps; a start needs {needed}")
+    motion = motion.slice(motion.num_frames - frames, motion.num_frames)
+    if motion.skeleton == trained.skeleton:
+        note = f"{motion.name}: the model's own skeleton, taken as it is"
+    else:
+        pose = next(iter(trained.start_poses.values()))[0]
+        made = retarget(motion, motion_from_frames(trained.skeleton, pose))
+        joints = f"{motion.skeleton.num_joints} joints, the model's has {trained.skeleton.num_joints}"
+        off = f"legs scaled by {made.scale:.2f}, joints off by {made.error.mean():.1f} cm on average"
+        note = f"{motion.name}: another skeleton ({joints}), retargeted by role; {off}"
+        motion = made.motion
+    world = world_frames(motion)
+    turn = path.yaw[0] - frame_yaw(trained.skeleton, world)[-1]
+    turned = turn_frames(center_window(world, world[-1, [0, 2]]), turn)
+    return center_window(turned, -path_start(path.position))[None].astype(np.float32), note

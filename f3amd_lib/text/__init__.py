@@ -1,0 +1,1 @@
+"""Motion from text: ACMDM and MotionPCM, with the judge of both."""

@@ -1,0 +1,1 @@
+"""Captioned motions, encoders of captions, redundant vectors and meshes."""

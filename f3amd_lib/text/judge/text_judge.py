@@ -1,0 +1,272 @@
+"""The judge of text to motion: a trained evaluator, what it may be asked, and figures with intervals.
+
+The published evaluators cannot be had, so one of the same shape is trained here on the training split.
+It says what it sees before it judges: R-precision is refused where real held-out motion is not found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from f3amd_lib.ground.arrays import in_batches
+from f3amd_lib.ground.records import run_record
+from f3amd_lib.measures.distributions import frechet_distance, intervals_over_repeats
+from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.text.data import text_motions
+from f3amd_lib.text.data.redundant import canonical_start, essential_features
+from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions
+from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, pad_motions
+from f3amd_lib.text.judge import text_metrics
+from f3amd_lib.text.judge.evaluator_task import EvaluatorTask, EvaluatorTraining, embedded_captions
+from f3amd_lib.text.judge.judge_network import TextMotionConfig
+from f3amd_lib.training import checkpoints
+from f3amd_lib.training.optimise import optimise
+
+_BATCH = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TextJudge:
+    """A trained judge.
+
+    Attributes:
+      config: of its network.
+      params: weights.
+      normaliser: of its motion features; deviations averaged over each part.
+      skeleton: of the motion it was trained on; no other is accepted.
+      text_encoder: identity of the encoder whose token vectors it reads.
+      record: how it was trained, on what.
+    """
+
+    config: TextMotionConfig
+    params: Any
+    normaliser: AxisNormaliser
+    skeleton: Skeleton
+    text_encoder: str
+    record: dict
+
+    def embed_motions(self, motions: Sequence[np.ndarray]) -> np.ndarray:
+        """Return motions as vectors, [N, D].
+
+        Args:
+          motions: positions [L, J, 3] of each, metres, on the judge's skeleton; moved to the canonical
+            start first, so that only the motion counts.
+
+        Raises:
+          ValueError: for another number of joints, fewer than 4 frames, or numbers not finite.
+        """
+        for number, motion in enumerate(motions):
+            if len(motion) < text_motions.UNIT:
+                raise ValueError(f"motion {number} has {len(motion)} frames; the judge needs {text_motions.UNIT}")
+        canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
+        features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
+        return in_batches(
+            lambda rows: _embed_motion(self.config, self.params, *pad_motions([features[row] for row in rows])[:2]),
+            len(features), _BATCH,
+        ).astype(np.float64)  # fmt: skip
+
+    def embed_texts(self, embedded: TextEmbeddings) -> np.ndarray:
+        """Return embedded captions as vectors, [N, D]."""
+        tokens, mask = embedded.tokens, embedded.mask
+        return in_batches(
+            lambda rows: _embed_text(self.config, self.params, tokens[rows], mask[rows]), len(tokens), _BATCH
+        ).astype(np.float64)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _embed_motion(config, params, features, length):
+    return checkpoints.network_with(config, params).embed_motion(features, length)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _embed_text(config, params, tokens, mask):
+    return checkpoints.network_with(config, params).embed_text(tokens, mask)
+
+
+def judged_features(data: TextMotions) -> tuple[np.ndarray, AxisNormaliser]:
+    """Return what a judge sees of a data set in its network's units, [N, C], and the normaliser.
+
+    Deviations are those of the training split, averaged over turn, velocity, height and positions.
+    """
+    features = data.essential_features()
+    training = np.isin(np.repeat(np.arange(data.num_clips), data.lengths), data.members("train"))
+    normaliser = AxisNormaliser.of(features[training])
+    grouped = normaliser.deviation.copy()
+    for part in (slice(0, 1), slice(1, 3), slice(3, 4), slice(4, None)):
+        grouped[part] = grouped[part].mean()
+    normaliser = AxisNormaliser(normaliser.mean, grouped)
+    return normaliser.normalise(features), normaliser
+
+
+def judge_task(
+    data: TextMotions, encoder: TextEncoder, training: EvaluatorTraining, **sizes
+) -> tuple[EvaluatorTask, AxisNormaliser]:
+    """Return the training of a judge on a data set's training split, and its features' normaliser.
+
+    Args:
+      data: motions with captions.
+      encoder: of the captions.
+      training: how long, and from which seed.
+      **sizes: fields of `TextMotionConfig` to change.
+    """
+    training_split = data.select(data.members("train"))
+    features, normaliser = judged_features(training_split)
+    table, captions = text_motions.clip_table(training_split, features)
+    pairs = [pair for pair, said in zip(training_split.pairs, training_split.captions, strict=True) for _ in said]
+    network = TextMotionConfig(features=features.shape[-1], token_width=encoder.width, **sizes)
+    told = embedded_captions(embed_captions(captions, encoder), pairs)
+    about = {"text_encoder": encoder.identity, "dataset_fingerprint": data.fingerprint}
+    return EvaluatorTask(network, training, table, told, **about), normaliser
+
+
+def train_judge(
+    data: TextMotions, encoder: TextEncoder, training: EvaluatorTraining | None = None, *,
+    checkpoint: Path | None = None, progress: bool = True, stop_at: float | None = None, **sizes,
+) -> TextJudge | None:  # fmt: skip
+    """Train a judge; with a checkpoint a killed training goes on where it was.
+
+    Args:
+      data, encoder, training, **sizes: as in `judge_task`.
+      checkpoint: file of the training state.
+      progress: show a progress bar.
+      stop_at: as for `optimise`; where it comes first, the answer is None.
+    """
+    training = training or EvaluatorTraining()
+    task, normaliser = judge_task(data, encoder, training, **sizes)
+    state, history = optimise(task, checkpoint=checkpoint, checkpoint_every=200, stop_at=stop_at, progress=progress)
+    if int(state.step) < training.num_steps:
+        return None
+    identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}
+    record = run_record(profile="none", dataset=data, seed=training.seed, **identity, history=history)
+    return TextJudge(task.model_config, state.params, normaliser, data.skeleton, encoder.identity, record)
+
+
+def save_judge(path: Path, judge: TextJudge) -> None:
+    """Write a judge; `load_judge` gives back the same."""
+    offsets = np.asarray(judge.skeleton.offsets, np.float32)
+    tree = {"params": judge.params, "normaliser": judge.normaliser._asdict(), "offsets": offsets}
+    about = {"network": dataclasses.asdict(judge.config), "text_encoder": judge.text_encoder, "record": judge.record}
+    skeleton = checkpoints.describe_skeleton(judge.skeleton)
+    checkpoints.save_tree(path, tree, {"kind": "text-to-motion judge", **about, **skeleton})
+
+
+def load_judge(path: Path) -> TextJudge:
+    """Read a judge written by `save_judge`; ValueError names a file that is missing, damaged or of another kind."""
+
+    def template(metadata: dict) -> dict:
+        checkpoints.check_kind(metadata, "text-to-motion judge")
+        config = TextMotionConfig(**metadata["network"])
+        numbers = jax.ShapeDtypeStruct((config.features,), jnp.float32)
+        offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)
+        normaliser = {"mean": numbers, "deviation": numbers}
+        return {"params": checkpoints.weights_shapes(config), "normaliser": normaliser, "offsets": offsets}
+
+    with checkpoints.errors_name(path):
+        tree, metadata = checkpoints.load_tree(path, template)
+        normaliser = AxisNormaliser(**jax.tree.map(np.asarray, tree["normaliser"]))
+        skeleton = checkpoints.described_skeleton(metadata, tree["offsets"])
+        about = (metadata[name] for name in ("text_encoder", "record"))
+        return TextJudge(TextMotionConfig(**metadata["network"]), tree["params"], normaliser, skeleton, *about)
+
+
+# ------------------------------------------------------------------------------------------ verdicts
+
+
+def judged_clips(data: TextMotions, split: str = "test") -> TextMotions:
+    """Return the clips of a split that can be judged: those of pairs with enough clips."""
+    classes = set(text_motions.evaluation_classes(data))
+    chosen = [clip for clip in data.members(split) if data.pairs[clip] in classes]
+    if not chosen:
+        raise ValueError(f"data set {data.name!r} has no pair of content and style with enough clips to judge by")
+    return data.select(chosen)
+
+
+def text_figures(
+    text, motion, reference, pairs, generator: np.random.Generator, group: int = text_metrics.GROUP
+) -> dict[str, float]:
+    """Return the figures of one repeat, by names of the registry.
+
+    Args:
+      text, motion: embeddings of captions and of their motions, [N, D].
+      reference: of real motions, [M, D].
+      pairs: what each caption tells, [N].
+      generator: what draws groups and pairs.
+      group: texts that are ranked together.
+    """
+    groups = text_metrics.groups_of_unlike_pairs(pairs, generator, group)
+    first, second, third = text_metrics.r_precision(text[groups], motion[groups])
+    return {
+        "text_FID": frechet_distance(motion, reference),
+        "R_precision_1": first,
+        "R_precision_2": second,
+        "R_precision_3": third,
+        "matching_distance": text_metrics.matching_distance(text[groups], motion[groups]),
+        "embedding_diversity": text_metrics.embedding_diversity(motion, generator),
+        "CLIP_score": text_metrics.clip_score(text, motion),
+    }
+
+
+def judge_motions(
+    judge: TextJudge, encoder: TextEncoder, real: TextMotions,
+    systems: dict[str, Callable[[int], tuple[Sequence[np.ndarray], Sequence[str]]]],
+    *, repeats: int, bar: float, seed: int = 0, group: int = text_metrics.GROUP,
+) -> pd.DataFrame:  # fmt: skip
+    """Measure systems beside real motion, with intervals over repeats.
+
+    Args:
+      judge, encoder: what looks, and what embeds captions.
+      real: the clips to be compared with, from `judged_clips`.
+      systems: name -> function of the repeat that gives (motions [L, J, 3], captions), one for each
+        clip of `real`, in their order.
+      repeats: how often; in each the captions, the groups and the motions are drawn anew.
+      seed: of the draws.
+      group: texts that are ranked together.
+      bar: least R-precision at 3 of real motion.
+
+    Returns:
+      Columns system, metric, unit, better, value, low, high, repeats; "real" first.
+
+    Raises:
+      ValueError: if the judge reads another encoder's vectors, does not find real motion (`bar`), or
+        a system gives another number of motions.
+    """
+    if encoder.identity != judge.text_encoder:
+        raise ValueError(f"the judge reads captions of {judge.text_encoder}, got {encoder.identity}")
+    clips = [real.clip(number) for number in range(real.num_clips)]
+    embedded = judge.embed_motions(clips)
+    rows = []
+    for repeat in range(repeats):
+        generator = np.random.default_rng([seed, repeat])
+        captions = [said[generator.integers(len(said))] for said in real.captions]
+        own = judge.embed_texts(embed_captions(captions, encoder))
+        made = {"real": (embedded, own)}
+        for name, system in systems.items():
+            motions, told = system(repeat)
+            if not len(motions) == len(told) == real.num_clips:
+                raise ValueError(f"{name}: {len(motions)} motions, {len(told)} captions for {real.num_clips} clips")
+            made[name] = (judge.embed_motions(motions), judge.embed_texts(embed_captions(list(told), encoder)))
+        for name, (motion, text) in made.items():
+            # The same draw for every system.
+            drawing = np.random.default_rng([seed, repeat, 1])
+            figures = text_figures(text, motion, embedded, real.pairs, drawing, group)
+            rows += [{"system": name, "metric": metric, "value": value} for metric, value in figures.items()]
+    table = intervals_over_repeats(pd.DataFrame(rows), ("system", "metric"))
+    seen = table.loc[(table["system"] == "real") & (table["metric"] == "R_precision_3"), "value"].item()
+    if seen < bar:
+        raise ValueError(
+            f"R-precision at 3 of real clips {seen:.2f}, under {bar}: the judge does not see; train it longer"
+        )
+    for place, what in ((2, "unit"), (3, "better")):
+        table.insert(place, what, [getattr(METRICS[name], what) for name in table["metric"]])
+    return table

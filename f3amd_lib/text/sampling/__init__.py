@@ -1,0 +1,1 @@
+"""From noise and a caption to motion."""

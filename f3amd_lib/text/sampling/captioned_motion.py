@@ -1,0 +1,284 @@
+"""Motion that a caption tells: from a trained model and words to positions in metres, whole, controlled or as a stream.
+
+What a user asks for is checked here, once; `text.sampling.text_to_motion` has the samplers.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.root_paths import read_points_csv
+from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.text.data.redundant import smoothed_yaw
+from f3amd_lib.text.data.text_encoders import check_captions, check_words, embed_captions
+from f3amd_lib.text.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
+from f3amd_lib.text.networks.acmdm import TextCondition
+from f3amd_lib.text.networks.acmdm_control import Control
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.text.sampling import text_to_motion
+from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions
+from f3amd_lib.text.stages.acmdm_training import branch_with
+from f3amd_lib.text.stages.latent_models import LatentModel
+from f3amd_lib.text.stages.text_models import TextModel
+from f3amd_lib.training.checkpoints import network_with
+
+NEAR = 4
+"""Starts of a stream among which the seed chooses: those whose captions are nearest to the first one."""
+
+STREAM_PRESET = "ACMDM-n4-PS22-prefix"
+"""The model of the prefix form that two cores can train."""
+
+
+# ------------------------------------------------------------------------------------------------------- what is asked
+
+
+def told_captions(
+    trained: TextModel | LatentModel, encoder, captions: Sequence[str], *, any_words: bool = False
+) -> np.ndarray:
+    """Return pooled embeddings of captions, [captions, W].
+
+    Args:
+      trained: the model that will be told.
+      encoder: of captions.
+      captions: what the person does.
+      any_words: let words through that the model has never seen.
+
+    Raises:
+      ValueError: for a caption that is empty, too long or has unknown words, or another encoder than the model's.
+    """
+    if encoder.identity != trained.text_encoder:
+        raise ValueError(f"{trained.name} reads captions of {trained.text_encoder}, not of {encoder.identity}")
+    check_captions(captions)
+    if not any_words:
+        for caption in captions:
+            check_words(caption, trained.words)
+    return embed_captions(list(captions), encoder).pooled
+
+
+def told_frames(trained: TextModel | LatentModel, seconds: float) -> int:
+    """Return the frames of a length, a multiple of 4; ValueError if the model makes none of that length."""
+    least, most = (frames / trained.fps for frames in (FEWEST_FRAMES, trained.most_frames // UNIT * UNIT))
+    if not least <= seconds <= most:  # also catches NaN
+        raise ValueError(f"--seconds must be between {least:g} and {most:g} for {trained.name}, got {seconds:g}")
+    return max(FEWEST_FRAMES, round(seconds * trained.fps / UNIT) * UNIT)
+
+
+def told_windows(trained: TextModel, seconds: float) -> int:
+    """Return the windows of a stream that a caption is told for; ValueError unless for up to 600 seconds."""
+    if not 0 < seconds <= 600:  # also catches NaN
+        raise ValueError(f"--seconds of a stream must be over 0 and at most 600 a caption, got {seconds:g}")
+    return max(1, round(seconds * trained.fps / window_frames(trained)))
+
+
+def window_frames(trained: TextModel) -> int:
+    """Return the frames of motion that one window of a stream adds; ValueError if the model is for no stream."""
+    if not trained.starts:
+        how = f"--model {STREAM_PRESET}, after f3amd train --preset {STREAM_PRESET} --data bandai"
+        raise ValueError(f"{trained.name} makes whole motions, a stream needs the prefix form: {how}")
+    given = len(next(iter(trained.starts.values())))
+    return (trained.config.window - given) * trained.codec.frames_per_state
+
+
+def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read where a joint should be, from a CSV file with the header frame,x,y,z: frames from 0, metres.
+
+    Args:
+      path: the file.
+      num_frames: of the clip.
+
+    Returns:
+      (frames [K], points [K, 3]).
+
+    Raises:
+      ValueError: naming file and line, as `read_points_csv`, or for a frame that is outside the clip or comes twice,
+        or no row at all.
+    """
+    points: dict[int, list[float]] = {}
+    for where, row in read_points_csv(path, "frame,x,y,z"):
+        frame = row["frame"]
+        if frame != int(frame) or not 0 <= frame < num_frames:
+            raise ValueError(f"{where} frame {frame:g} is not one of the clip's, 0 to {num_frames - 1}; see --seconds")
+        if frame in points:
+            raise ValueError(f"{where} frame {frame:g} comes twice; keep one of its points")
+        points[int(frame)] = [row[axis] for axis in "xyz"]
+    if not points:
+        raise ValueError(f"{path}: needs at least one row below its header")
+    return np.array(list(points)), np.array(list(points.values()))
+
+
+def find_joint(trained: TextModel, name: str) -> int:
+    """Return a joint that the control branch was trained for, by its role or its own name; ValueError lists them."""
+    known = trained.controlled
+    own = {trained.skeleton.names[joint]: joint for joint in known.values()}
+    if name not in known | own:
+        raise ValueError(f"unknown joint {name!r}{nearest_hint(name, known)}")
+    return (known | own)[name]
+
+
+def check_solver(num_steps: int | None, guidance: float | None) -> None:
+    """Raise ValueError for a number of steps or a guidance that makes no sense."""
+    if num_steps is not None and not 1 <= num_steps <= 1000:
+        raise ValueError(f"--steps must be between 1 and 1000, got {num_steps}")
+    if guidance is not None and not 0 <= guidance <= 20:  # also catches NaN
+        raise ValueError(f"--guidance must be between 0 and 20, got {guidance}")
+
+
+# ------------------------------------------------------------------------------------------------------- what is made
+
+
+def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) -> dict:
+    """Return what the samplers are told: a guidance, asked for or the model's own, and Euler's steps where given."""
+    guidance = trained.record.get("guidance") if guidance is None else guidance
+    told = {} if guidance is None else {"guidance": guidance}
+    if num_steps is None:
+        return told
+    return told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
+
+
+def motion_drawer(
+    trained: TextModel, *, guidance: float | None = None, num_steps: int | None = None, controlled: bool = False,
+    mesh: bool = False,
+) -> Callable:  # fmt: skip
+    """Return `draw(pooled, mask, key, control)`, compiled once for a shape: normalised positions [B, L, J, 3].
+
+    Args:
+      trained: a model of whole motions.
+      guidance, num_steps, mesh: as for `draw_motions`.
+      controlled: whether a control is given to it, or None.
+
+    Raises:
+      ValueError: for a control and no branch.
+    """
+    config, schedule = trained.config, trained.schedule
+    asked = _asked(trained, guidance, num_steps)
+    weights = {"network": trained.params}
+    if controlled:
+        trained.control_branch()  # says how to train one if there is none
+        weights["branch"] = trained.branch
+        asked = {{"guidance": "text_scale"}.get(name, name): value for name, value in asked.items()}
+
+    @jax.jit
+    def compiled(weights, codec, pooled, mask, noise, key, control):
+        network, condition = network_with(config, weights["network"]), TextCondition(pooled, codec.state_mask(mask))
+        if controlled:
+            given = branch_with(config, codec, weights["branch"]), schedule, condition, control, noise
+            state = text_to_motion.sample_control(network, *given, key=key, **asked)
+        elif isinstance(config, MaskedACMDMConfig):
+            state = text_to_motion.sample_masked(network, schedule, condition, key, **asked)
+        else:
+            sample = text_to_motion.sample_blocks if config.block_frames else text_to_motion.sample_text
+            state = sample(network, schedule, condition, noise, key=key, **asked)
+        return codec.decode_vertices(state) if mesh else codec.decode(state, mask)
+
+    def draw(pooled, mask, key, control=None):
+        key_noise, key_solver = jax.random.split(key)
+        frames = trained.codec.state_mask(mask).shape
+        noise = jax.random.normal(key_noise, (*frames, config.num_joints, config.channels))
+        return compiled(weights, trained.codec, jnp.asarray(pooled), mask, noise, key_solver, control)
+
+    return draw
+
+
+def draw_motions(
+    trained: TextModel | LatentModel, pooled, num_frames, key, *,
+    guidance: float | None = None, num_steps: int | None = None, control: Control | None = None, mesh: bool = False,
+    draw: Callable | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Draw a motion for each caption, whole at once, or block by block or masked, as the model is made for.
+
+    Args:
+      trained: the model; one of the prefix form goes on from frames and is for `stream_motions`. Of MotionPCM
+        a teacher or a student.
+      pooled: captions, [B, W].
+      num_frames: of each motion, [B] or one for all; multiples of 4.
+      key: JAX random key.
+      guidance: w; by default what the model's record says (`guidance`), else the form's own.
+      num_steps: of Euler's method; by default the model's own sampler. Of MotionPCM as `motionpcm_sampling.steps_of`.
+      control: where joints should be, normalised, [B, L, J, 3].
+      mesh: return the vertices of a model of meshes, [B, L, V, 3], whose `codec.mesh` has joints and faces of them.
+      draw: a `motion_drawer` (of MotionPCM a `latent_sampler`) that is compiled already, told guidance and steps.
+
+    Returns:
+      Positions, [B, L, J, 3], metres, starting near the origin facing +Z; L the longest; 0 in the padding.
+
+    Raises:
+      ValueError: for a model of the prefix form, a control and no branch, or a mesh of a model that makes joints.
+    """
+    if mesh and (isinstance(trained, LatentModel) or trained.codec.mesh is None):
+        raise ValueError(f"{trained.name} makes joints, no mesh; a model that makes one: ACMDM-S-PS28-n2")
+    if isinstance(trained, LatentModel):
+        if control is not None:
+            raise ValueError(f"{trained.name} has no control branch: leave --control out, or name a model of ACMDM")
+        return latent_motions(trained, pooled, num_frames, key, draw=draw, num_steps=num_steps, guidance=guidance)
+    if trained.starts:
+        raise ValueError(f"{trained.name} goes on from earlier frames: stream it (--then), or name another --model")
+    how = {"guidance": guidance, "num_steps": num_steps, "controlled": control is not None, "mesh": mesh}
+    draw = draw or motion_drawer(trained, **how)
+    lengths = np.broadcast_to(num_frames, len(pooled))
+    mask = frame_mask(lengths, int(lengths.max()))
+    made = np.asarray(draw(pooled, mask, key, control))
+    return trained.codec.axes.restore(made) * np.asarray(mask)[..., None, None]
+
+
+def control_of(trained: TextModel, joint: int, frames, points, num_frames: int) -> Control:
+    """Return the control of one motion: a joint at points [K, 3], metres, in frames [K]."""
+    positions = np.zeros((1, num_frames, trained.config.num_joints, 3), np.float32)
+    positions[0, frames, joint] = trained.codec.axes.normalise(points)
+    asked = np.zeros(positions.shape[:-1], np.float32)
+    asked[0, frames, joint] = 1.0
+    return Control.of(jnp.asarray(positions), asked)
+
+
+def stream_motions(
+    trained: TextModel, pooled, windows: Sequence[int], key, *,
+    guidance: float | None = None, num_steps: int | None = None, starts=None,
+) -> np.ndarray:  # fmt: skip
+    """Go on from frames of a clip, window after window, under captions that change on the way (ACMDM App. G, prefix).
+
+    Before each window the last frames are moved to the origin and turned to +Z, as clips begin, and what comes is
+    moved back: a stream may go anywhere and last for ever.
+
+    Args:
+      trained: a model of the prefix form.
+      pooled: captions in their order, [captions, W].
+      windows: how many windows each is told for.
+      key: JAX random key; it also chooses the start.
+      guidance, num_steps: as for `draw_motions`.
+      starts: captions of `trained.starts` embedded, [starts, W], to begin near the first caption; by default anyhow.
+
+    Returns:
+      Positions, [frames, J, 3], metres: the start and all windows.
+
+    Raises:
+      ValueError: for a model that is not of the prefix form.
+    """
+    window_frames(trained)  # refuses a model that is for no stream
+    codec, asked = trained.codec, _asked(trained, guidance, num_steps)
+    states = np.stack(list(trained.starts.values()))
+    near = np.arange(len(states))
+    if starts is not None:
+        near = np.argsort(-(starts @ pooled[0]) / np.linalg.norm(starts, axis=-1))[:NEAR]
+    chosen = states[int(jax.random.choice(jax.random.fold_in(key, 0), near))][None]
+    given = chosen.shape[1] * codec.frames_per_state
+
+    @jax.jit
+    def go_on(before, caption, key):
+        prefix = codec.encode(before, jnp.ones((1, given), bool))
+        (made,) = text_to_motion.continue_prefix(trained.network(), trained.schedule, prefix, [caption], key, **asked)
+        state = jnp.concatenate([prefix, made], axis=1)
+        return codec.decode(state, jnp.ones((1, state.shape[1] * codec.frames_per_state), bool))[:, given:]
+
+    metres = lambda normalised: codec.axes.restore(np.asarray(normalised, np.float64)[0])
+    parts = [metres(codec.decode(jnp.asarray(chosen), jnp.ones((1, given), bool)))]
+    told = [caption for caption, count in zip(pooled, windows, strict=True) for _ in range(count)]
+    for number, caption in enumerate(told, 1):
+        before = np.concatenate(parts)[-given:]
+        place = before[0, 0] * [1.0, 0.0, 1.0]
+        turned = matrix_from_yaw(smoothed_yaw(trained.skeleton, before[:1], 0.0)[0])
+        here = codec.axes.normalise((before - place) @ turned).astype(np.float32)
+        after = go_on(here[None], caption[None], jax.random.fold_in(key, number))
+        parts.append(metres(after) @ turned.T + place)
+    return np.concatenate(parts)

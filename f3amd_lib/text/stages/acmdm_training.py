@@ -1,0 +1,370 @@
+"""What ACMDM trains: the autoencoder, the denoiser of text and motion in all its forms, the control branch.
+
+Each is a task of `training.optimise`; its data are arrays on the device. The paper's settings and ours stand in
+`papers/acmdm/recipes.toml`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from f3amd_lib.diffusion.flow import network_time
+from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
+from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.networks.config import LayerKeys
+from f3amd_lib.text.data.text_motions import ClipTable, draw_clips
+from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
+from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
+from f3amd_lib.text.networks.motion_autoencoder import smooth_l1, variational_loss
+from f3amd_lib.text.stages.motion_codec import MotionCodec
+from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
+from f3amd_lib.training.settings import check_settings
+
+
+@dataclass(frozen=True)
+class TextMotionTraining:
+    """How a part of ACMDM is trained (ACMDM section 4.1, App. B; defaults of the released code for the denoiser).
+
+    Attributes:
+      num_steps: optimiser steps in all.
+      batch_size: motions a step.
+      learning_rate: after the warm-up.
+      schedule: "steps" multiplies the rate by `drop_factor` at each of `drops`; "warmup_cosine" (ours) lets it fall to
+        a hundredth at the end, for short runs.
+      warmup_steps: of a linear rise from 0.
+      drops, drop_factor: of "steps".
+      weight_decay: of AdamW, whose betas are 0.9 and 0.99.
+      gradient_clip: largest global gradient norm; 0 clips nothing (released code: 1 for the variational autoencoder).
+      ema_decay: moving average of the weights; None keeps none.
+      text_dropout: share of samples whose caption is the zero vector.
+      control_dropout: share of samples whose control is dropped.
+      control_weight: of the distance from the control points, m^2, in the control branch's loss.
+      prefix_frames: frames of the state that are given clean (prefix autoregression); 0: none.
+      unit: lengths are multiples of so many frames of the state: 1 of the latent, 4 of motion (released code).
+      window: frames of a training window of the autoencoder; 1 for meshes.
+      seed: of initial weights and batches.
+
+    Raises:
+      ValueError: for a number out of its range or an unknown schedule.
+    """
+
+    paper: ClassVar[str] = "acmdm"
+
+    num_steps: int
+    batch_size: int = 64
+    learning_rate: float = 2e-4
+    schedule: str = "steps"
+    warmup_steps: int = 2000
+    drops: tuple[int, ...] = (50_000,)
+    drop_factor: float = 0.1
+    weight_decay: float = 1e-5
+    gradient_clip: float = 0.0
+    ema_decay: float | None = 0.9999
+    text_dropout: float = 0.1
+    control_dropout: float = 0.1
+    control_weight: float = 1.0
+    prefix_frames: int = 0
+    unit: int = 1
+    window: int = 64
+    seed: int = 3407
+
+    def __post_init__(self):
+        if not isinstance(self.drops, (tuple, list)):
+            raise ValueError(f"drops must be steps, got {self.drops!r}")
+        object.__setattr__(self, "drops", tuple(self.drops))
+        check_settings(self)
+
+    def rate(self, step):
+        """Return the learning rate of a step."""
+        warm = jnp.minimum(1.0, (step + 1) / self.warmup_steps)
+        if self.schedule == "warmup_cosine":
+            share = jnp.clip((step - self.warmup_steps) / max(1, self.num_steps - self.warmup_steps), 0.0, 1.0)
+            return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1.0 + jnp.cos(jnp.pi * share)))
+        passed = sum(step >= drop for drop in self.drops)
+        return self.learning_rate * warm * self.drop_factor**passed
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """Return AdamW, after clipping where it asks for it."""
+        adam = optax.adamw(self.rate, b1=0.9, b2=0.99, weight_decay=self.weight_decay)
+        return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam) if self.gradient_clip else adam
+
+
+# --------------------------------------------------------------------------------------------------------- autoencoder
+
+
+@frozen_tree("clips")
+class AutoencoderTask(ClipsTask):
+    """A motion autoencoder to train on windows of clips that are long enough; clips are normalised positions."""
+
+    name = part = "autoencoder"
+
+    def draw(self, state: TrainingState, key):
+        """Draw windows [B, window, J, 3] from clips of at least that length."""
+        key_clip, key_start, key_loss = jax.random.split(key, 3)
+        size, window, clips = (self.config.batch_size,), self.config.window, self.clips
+        clip = jax.random.categorical(key_clip, jnp.where(clips.length >= window, 0.0, -jnp.inf), shape=size)
+        first = clips.start[clip] + jax.random.randint(key_start, size, 0, clips.length[clip] - window + 1)
+        return clips.frames[first[:, None] + jnp.arange(window)], key_loss
+
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return smooth L1, and as the loss it or the variational loss (ACMDM App. B).
+
+        Args:
+          params: weights.
+          batch: what `draw` drew; out of training, without dropout, whole clips: (positions, mask).
+          key: of dropout and latent.
+          training: whether this is a step of training.
+        """
+        model = network_with(self.model_config, params)
+        if not training:
+            positions, mask = batch
+            latent_mask = mask[:, :: self.model_config.frames_per_latent]
+            loss = smooth_l1(model.decode(model.latent_of(positions, mask), latent_mask), positions, mask)
+            return {"loss": loss, "smooth_l1": loss}
+        latent = model.encode(batch, key=jax.random.fold_in(key, 2))
+        if self.model_config.variational:
+            mean, log_variance = model.moments(latent)
+            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
+        positions_hat = model.decode(latent, key=jax.random.fold_in(key, 3))
+        loss = error = smooth_l1(positions_hat, batch)
+        if self.model_config.variational:
+            loss = variational_loss(positions_hat, batch, mean, log_variance)
+        return {"loss": loss, "smooth_l1": error}
+
+
+@frozen_tree("clips", "codec")
+class MeshAutoencoderTask(AutoencoderTask):
+    """A mesh autoencoder to train on frames, one of each clip that is drawn.
+
+    Attributes:
+      codec: of positions, with the mesh whose vertices they move.
+    """
+
+    name = "mesh autoencoder"
+
+    codec: MotionCodec
+
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return L1, summed over a frame, mean over frames (ACMDM's released code); arguments as above."""
+        clips = batch if training else batch[0]
+        model, lists = network_with(self.model_config, params), self.codec.mesh.lists
+        vertices = self.codec.vertices_of(clips[:, 0])
+        distance = jnp.abs(model.decode(model.encode(vertices, lists), lists) - vertices)
+        return {"loss": jnp.sum(distance) / len(clips)}
+
+
+# ------------------------------------------------------------------------------------------------------------ denoiser
+
+
+def frame_error(prediction, target, counted):
+    """Return the squared error, mean over joints and channels, then over all frames of the batch that count.
+
+    Args:
+      prediction, target: [B, l, J, C].
+      counted: [B, l].
+    """
+    error = jnp.mean((prediction - target) ** 2, axis=(2, 3))
+    return jnp.sum(error * counted) / jnp.maximum(1, counted.sum())
+
+
+def noisy_state(key, schedule: NoiseSchedule, x0, noise, block_frames: int = 0):
+    """Return (alpha x0 + sigma noise, t, alpha, sigma) at random times (ACMDM Eqs 1 and 2).
+
+    Args:
+      key: JAX random key.
+      schedule: what the times are of.
+      x0, noise: [B, l, J, C].
+      block_frames: frames of a block with a time of its own; 0: a sample has one time.
+
+    Returns:
+      The state; t [B], or [B, l] for blocks; alpha and sigma, which broadcast against the state.
+    """
+    batch, frames = x0.shape[:2]
+    if block_frames:
+        t = schedule.draw_times(key, (batch, -(-frames // block_frames)))
+        t = jnp.repeat(t, block_frames, axis=1)[:, :frames]
+    else:
+        t = schedule.draw_times(key, (batch,))
+    spread = t.reshape(*t.shape, *[1] * (x0.ndim - t.ndim))
+    return schedule.perturb(x0, noise, spread), t, schedule.alpha(spread), schedule.sigma(spread)
+
+
+def denoising_loss(network, schedule: NoiseSchedule, x0, condition: TextCondition, key, *, prefix_frames: int = 0):
+    """Return the loss of a denoiser of any form (ACMDM section 3.1 and App. G).
+
+    Args:
+      network: its config says what it predicts. With `block_frames` every block has a time of its own; a masked
+        network denoises the frames that are hidden from it.
+      schedule: noise schedule.
+      x0: clean states, [B, l, J, C].
+      condition: captions and which frames are motion.
+      key: of times, noise and masks.
+      prefix_frames: frames that are given clean in front, and count for nothing.
+    """
+    config, mask = network.config, condition.mask
+    key_time, key_noise, key_hidden, key_spoil = jax.random.split(key, 4)
+    noise = jax.random.normal(key_noise, x0.shape)
+    state, t, *_ = noisy_state(key_time, schedule, x0, noise, config.block_frames)
+    context, counted = network.encode(condition), mask
+    if prefix_frames:
+        given = jnp.arange(x0.shape[1]) < prefix_frames
+        state, counted = jnp.where(given[:, None, None], x0, state), mask & ~given
+    if isinstance(network, MaskedACMDM):
+        counted = draw_hidden(key_hidden, mask)
+        context = network.look(*spoil(key_spoil, x0, counted), context)
+    prediction = network(state, network_time(schedule, t), context)
+    return frame_error(prediction, prediction_target(config.objective, x0, noise), counted)
+
+
+def draw_captioned(key, clips: ClipTable, pooled, config: TextMotionTraining, window: int):
+    """Draw (clips, condition): a caption is one of the clip's own, or none for a share of the samples.
+
+    Args:
+      key: JAX random key.
+      clips: motions as states, with the rows of their captions.
+      pooled: embeddings of all captions, [C, W].
+      config: how many are drawn, and how often without a caption.
+      window: most frames of a state.
+    """
+    key_clip, key_told = jax.random.split(key)
+    batch = draw_clips(key_clip, clips, config.batch_size, window, config.unit)
+    told = jax.random.bernoulli(key_told, 1.0 - config.text_dropout, batch.length.shape)
+    return batch, TextCondition(jnp.where(told[:, None], pooled[batch.caption], 0.0), batch.mask)
+
+
+@frozen_tree("clips", "pooled")
+class TextMotionTask(ClipsTask):
+    """A denoiser of text and motion to train, an `ACMDM` or a `MaskedACMDM`.
+
+    Clips are positions or latents, [N, J, C] in network units.
+
+    Attributes:
+      schedule: the noise schedule of its preset.
+      pooled: embeddings of the clips' captions, [C, W].
+    """
+
+    name, part = "text and motion", "denoiser"
+
+    schedule: NoiseSchedule
+    pooled: Any
+
+    def draw(self, state: TrainingState, key):
+        """Draw (states, condition) and the key of the loss."""
+        key_draw, key_loss = jax.random.split(key)
+        batch, condition = draw_captioned(key_draw, self.clips, self.pooled, self.config, self.model_config.window)
+        return (batch.motion, condition), key_loss
+
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the loss on a batch as `draw` makes it."""
+        network = network_with(self.model_config, params)
+        return {"loss": denoising_loss(network, self.schedule, *batch, key, prefix_frames=self.config.prefix_frames)}
+
+
+# ------------------------------------------------------------------------------------------------------ control branch
+
+
+def draw_control(key, positions, mask, joints) -> Control:
+    """Draw what is controlled in training: one joint a sample, in 1 to L - 1 of its L frames (ACMDM section 3.2).
+
+    Args:
+      key: JAX random key.
+      positions, mask: normalised motion [B, L, J, 3] and its frames [B, L].
+      joints: numbers of the joints that may be controlled.
+    """
+    key_joint, key_count, key_order = jax.random.split(key, 3)
+    batch, _, num_joints, _ = positions.shape
+    joint = jax.random.choice(key_joint, jnp.asarray(joints), (batch,))
+    count = jax.random.randint(key_count, (batch,), 1, jnp.maximum(2, mask.sum(axis=1)))
+    order = jnp.where(mask, jax.random.uniform(key_order, mask.shape), 2.0)
+    chosen = mask & (jnp.argsort(jnp.argsort(order, axis=1), axis=1) < count[:, None])
+    return Control.of(positions, chosen[..., None] & (jnp.arange(num_joints) == joint[:, None, None]))
+
+
+def control_loss(
+    base, branch: ControlBranch, schedule: NoiseSchedule, codec: MotionCodec, x0, positions, condition, control, key
+):
+    """Return {"denoising", "control"}: the base's own loss, and how far the answer is from the control points, m^2.
+
+    The answer is decoded and compared in metres, mean over controlled coordinates. For a velocity it is noise +
+    velocity, with the true noise (released code); for x0 and eps the clean estimate.
+
+    Args:
+      base, branch, schedule: networks and noise schedule.
+      codec: between states and motion.
+      x0, positions: clean states and normalised motion, whose mask is the condition's.
+      condition, control: captions and frames; where joints should be.
+      key: of time and noise.
+    """
+    key_time, key_noise = jax.random.split(key)
+    noise, objective = jax.random.normal(key_noise, x0.shape), base.config.objective
+    state, t, alpha, sigma = noisy_state(key_time, schedule, x0, noise)
+    prediction = controlled(base, branch, condition, control)(state, network_time(schedule, t))
+    denoising = frame_error(prediction, prediction_target(objective, x0, noise), condition.mask)
+    x0_hat = noise + prediction if objective == "v" else clean_estimate(objective, prediction, state, alpha, sigma)
+    motion_mask = jnp.repeat(condition.mask, codec.frames_per_state, axis=1)
+    distance = codec.axes.restore(codec.decode(x0_hat, motion_mask)) - codec.axes.restore(positions)
+    square = jnp.sum(distance**2 * control.asked[..., None])
+    return {"denoising": denoising, "control": square / jnp.maximum(1.0, 3.0 * control.asked.sum())}
+
+
+@frozen_tree("clips", "pooled", "base", "codec")
+class ControlTask(TextMotionTask):
+    """A control branch to train beside a frozen denoiser, whose config and schedule it has.
+
+    Clips are states as the denoiser was trained on, [N, J, C], and the normalised positions that each row stands for,
+    [N, frames of a state, J, 3].
+
+    Attributes:
+      base: the denoiser's weights; no gradient reaches them.
+      codec: between states and motion, frozen as well.
+      joints: numbers of the joints that may be controlled.
+    """
+
+    name = "control branch"
+
+    base: Any
+    codec: MotionCodec
+    joints: tuple[int, ...]
+
+    def identity(self) -> dict:
+        """Return all that decides the weights, as JSON has it."""
+        identity = super().identity()
+        return identity | {"model": identity["model"] | {"joints": {"of": self.joints}}}
+
+    def init(self, key):
+        """Return a branch whose blocks are the base's."""
+        base = network_with(self.model_config, self.base)
+        return nnx.state(control_branch(base, self.codec.frames_per_state, key)), None
+
+    def draw(self, state: TrainingState, key):
+        """Draw (states, positions, condition, control) and the key of the loss."""
+        key_draw, key_control, key_drop, key_loss = jax.random.split(key, 4)
+        batch, condition = draw_captioned(key_draw, self.clips, self.pooled, self.config, self.model_config.window)
+        states, positions = batch.motion
+        mask = jnp.repeat(condition.mask, self.codec.frames_per_state, axis=1)
+        positions = positions.reshape(*mask.shape, *positions.shape[-2:])
+        control = draw_control(key_control, positions, mask, self.joints)
+        kept = jax.random.bernoulli(key_drop, 1.0 - self.config.control_dropout, batch.length.shape)
+        return (states, positions, condition, control._replace(kept=kept.astype(states.dtype))), key_loss
+
+    def terms(self, params, batch, key, training=True) -> dict:
+        """Return the loss terms on a batch as `draw` makes it."""
+        terms = control_loss(
+            network_with(self.model_config, self.base), branch_with(self.model_config, self.codec, params),
+            self.schedule, self.codec, *batch, key,
+        )  # fmt: skip
+        return {"loss": terms["denoising"] + self.config.control_weight * terms["control"], **terms}
+
+
+def branch_with(config: ACMDMConfig, codec: MotionCodec, params) -> ControlBranch:
+    """Return a control branch with the given weights."""
+    blank = nnx.eval_shape(lambda: ControlBranch(config, codec.frames_per_state, rngs=LayerKeys(jax.random.key(0))))
+    return nnx.merge(nnx.graphdef(blank), jax.tree.map(lambda leaf: leaf, params))
