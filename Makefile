@@ -60,16 +60,13 @@ bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=option
 
 # Optional: benchmarks and tests that need one of these say so and go on without.
 bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more; docs/commands.md)
-	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-	  -q -r requirements-bench.txt
+	@bash scripts/extra.sh bench
 
 onnx-tools: $(INSTALLED) ## Add jax2onnx and ONNX Runtime to .venv (about 150 MB more)
-	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-	  -q -r requirements-onnx.txt
+	@bash scripts/extra.sh onnx
 
 sweep-tools: $(INSTALLED) ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
-	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-	  -q --require-hashes --no-deps -r requirements-sweep.txt
+	@bash scripts/extra.sh sweep
 
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
 	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
@@ -99,15 +96,13 @@ coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, th
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
 web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if it is missing
 	@bash scripts/browser.sh
-	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-	  -q --require-hashes --no-deps -r requirements-web.txt
+	@bash scripts/extra.sh web
 
 test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
 	$(PYTEST) $(NO_NOTEBOOKS) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
 
 site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
-	$(PYTHON) -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-	  -q --require-hashes --no-deps -r requirements-site.txt
+	@bash scripts/extra.sh site
 
 # From nothing each time, so that no page outlives its source. A warning is an error.
 site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html

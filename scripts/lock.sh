@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Write requirements.lock anew from pyproject.toml: exact versions with hashes, one file for every
-# platform and for Python 3.11 and newer. For maintainers; it needs the network and changes nothing
-# but the lock. Look at the difference, run `make test`, and note a moved figure in CHANGELOG.md.
+# platform and for Python 3.11 and newer; behind the plain install what each extra adds. For maintainers; it needs the
+# network and changes nothing but the lock. Pins of bench and onnx stay: raise them by hand. Look at the difference, run `make test`, and note a moved figure in CHANGELOG.md.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -14,8 +14,19 @@ echo "Installing uv into a folder that is removed afterwards ..."
 "$tools/bin/python" -m pip install --quiet uv
 
 # No header and no index addresses: the file names packages and hashes, never where they came from.
-"$tools/bin/uv" pip compile pyproject.toml --quiet --no-config \
-  --extra notebooks --extra tests --extra text --group build --universal --python-version 3.11 \
-  --generate-hashes --no-header --no-emit-index-url --no-emit-find-links \
-  "$@" --output-file requirements.lock
+compile() {
+  "$tools/bin/uv" pip compile pyproject.toml --quiet --no-config --universal --python-version 3.11 \
+    --generate-hashes --no-header --no-emit-index-url --no-emit-find-links "$@"
+}
+
+# What is pinned stays where it fits, unless an option says otherwise (--upgrade): uv reads the file that it writes.
+sed '/^# Extras/,$d' requirements.lock >"$tools/plain"
+sed -n '/^# Extras/,$p' requirements.lock >"$tools/extras"
+compile --extra notebooks --extra tests --extra text --group build "$@" --output-file "$tools/plain"
+for extra in site sweep web; do
+  grep -v '^#' "$tools/extras" >"$tools/$extra" || true
+  compile --extra "$extra" --constraints "$tools/plain" --no-annotate "$@" --output-file "$tools/$extra"
+done
+cat "$tools/plain" "$tools/extras" >requirements.lock
+"$python" scripts/lock_extras.py site="$tools/site" sweep="$tools/sweep" web="$tools/web"
 echo "requirements.lock is written. Next: git diff requirements.lock, then make test."

@@ -17,10 +17,7 @@ import nbformat
 import pytest
 import yaml
 from builders import refused
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 from PIL import Image
-from test_environment import LOCK, read_hashed
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -65,13 +62,6 @@ def test_notebooks_open_elsewhere_where_an_address_is_known_and_nowhere_else(mon
     assert buttons["colab_url"] == "https://colab.research.google.com" and "binderhub_url" in buttons
     assert "colab_url" not in launching(monkeypatch, "https://github.com.example.org/owner/name")["launch_buttons"]
     refused("F3AMD_REPOSITORY must be an address", launching, monkeypatch, "owner/name")
-
-
-def test_binder_installs_the_library_as_the_environment_says():
-    command = "pip install --no-deps --no-build-isolation -e ."
-    assert command in (ROOT / "environment.yml").read_text(encoding="utf-8")
-    assert command in (ROOT / "postBuild").read_text(encoding="utf-8").splitlines()
-    assert "F3AMD_REPOSITORY" in WORKFLOW.read_text(encoding="utf-8")
 
 
 def toctree_entries(path: Path) -> list[str]:
@@ -454,33 +444,3 @@ def test_actions_are_pinned_to_commits():
     assert len(lines) == 4
     for line in lines:
         assert re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40} # v\d+(\.\d+)*", line), line
-
-
-def test_continuous_integration_builds_the_site_before_a_browser_looks_at_it():
-    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    order = [script.index(f"make {name}") for name in ("test\n", "site-tools", "site\n", "test-web")]
-    assert order == sorted(order)
-
-
-def test_the_built_site_is_ignored_by_git():
-    assert "/docs/_build/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
-
-
-def test_the_sites_packages_are_hashed_within_their_ranges_and_agree_with_the_lock():
-    entries = read_hashed("site")
-    assert all(hashes for _, hashes, _ in entries)
-    pins = {}
-    for entry, _, _ in entries:
-        (pin,) = entry.specifier
-        assert pin.operator == "=="
-        pins.setdefault(canonicalize_name(entry.name), set()).add(pin.version)
-    wanted = re.findall(r"^[^#\s][^#\n]*", (DOCS / "requirements.in").read_text(), re.M)
-    for requirement in map(Requirement, wanted):
-        versions = pins[canonicalize_name(requirement.name)]
-        assert all(version in requirement.specifier for version in versions), requirement
-    locked = {}
-    for entry, _, _ in LOCK:
-        (pin,) = entry.specifier
-        locked.setdefault(canonicalize_name(entry.name), set()).add(pin.version)
-    for name in pins.keys() & locked.keys():
-        assert pins[name] == locked[name], name
