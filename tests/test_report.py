@@ -18,7 +18,7 @@ from PIL import Image
 
 from f3amd_lib.drawing import pictures, stick_figures
 from f3amd_lib.drawing import style as figures
-from f3amd_lib.ground import papers, records, tables
+from f3amd_lib.ground import papers, records, stored, tables
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_euler, matrix_from_yaw
@@ -300,11 +300,11 @@ def test_numbers_show_four_digits(value, text):
 
 
 def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "repository_root", lambda: tmp_path)
-    assert "No stored `02_any` of `laptop` on `synthetic` yet" in tables.stored_result("synthetic", "02_any")
+    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
+    assert "No stored `02_any` of `laptop` on `synthetic` yet" in stored.stored_result("synthetic", "02_any")
     told, path = record(), tmp_path / "paper_figures/synthetic/laptop/tables/02_any.csv"
     records.write_table(path, pd.DataFrame({"model": ["a"], "value": [1.23456]}), told)
-    shown = tables.stored_result("synthetic", "02_any")
+    shown = stored.stored_result("synthetic", "02_any")
     assert f"data {told['dataset']}, {counted_cores(told)}" in shown and told["date_utc"][:10] in shown
     assert "| a     |  1.23 |" in shown
 

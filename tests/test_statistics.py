@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from f3amd_lib.data.statistics import clip_statistics, lowest_toe_height
+from f3amd_lib.data.features import clip_statistics, lowest_toe_height
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 

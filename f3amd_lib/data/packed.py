@@ -17,8 +17,8 @@ import numpy as np
 import pooch
 from tqdm import tqdm
 
+from f3amd_lib.data.features import lowest_toe_height
 from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset
-from f3amd_lib.data.statistics import lowest_toe_height
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton

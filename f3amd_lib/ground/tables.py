@@ -12,10 +12,6 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from f3amd_lib.ground.names import counted_cores
-from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import read_table
-
 ARROWS = {"down": " ↓", "up": " ↑"}
 
 
@@ -93,26 +89,3 @@ def _cell(value, digits: int) -> str:
 
 def _escape(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
-
-
-def stored_result(dataset: str, name: str, *, profile: str = "laptop", digits: int = 2) -> str:
-    """Render a table that `make figures` left, with what it was measured on.
-
-    Args:
-      dataset: a name of `profiles.DATASETS`.
-      name: of the table, without ending.
-      profile: whose results.
-      digits: decimals.
-
-    Returns:
-      Markdown: the table and a line on its origin, or a sentence that there is none yet.
-    """
-    path = repository_root() / "paper_figures" / dataset / profile / "tables" / f"{name}.csv"
-    if not path.exists():
-        return f"No stored `{name}` of `{profile}` on `{dataset}` yet: `make figures` makes it."
-    frame, record = read_table(path)
-    origin = (
-        f"Stored result: `{name}`, profile {record['profile']}, data {record['dataset']}, "
-        f"{counted_cores(record)} ({record['device_platform']}), {record['date_utc'][:10]}."
-    )
-    return f"{origin}\n\n{markdown_table(frame, digits=digits)}"
