@@ -129,14 +129,6 @@ def ratio(numerator: Figure, denominator: Figure) -> Figure:
     return Figure(value, min(low, value), max(high, value))
 
 
-def difference(first: Figure, second: Figure) -> Figure:
-    """Return first - second with its interval, both being independent (as `ratio`)."""
-    value = first.value - second.value
-    down = np.hypot(first.value - first.low, second.high - second.value)
-    up = np.hypot(first.high - first.value, second.value - second.low)
-    return Figure(value, float(value - down), float(value + up))
-
-
 def mean_figure(figures: Sequence[Figure]) -> Figure:
     """Return the geometric mean of positive figures with its interval."""
     return _combine_logs(figures, np.full(len(figures), 1.0 / len(figures)))
@@ -217,13 +209,12 @@ class Evidence:
       told: of text to motion, model -> (what was trained in its place, motions it saw), since then.
     """
 
-    def __init__(self, framework: str, load: Callable):
+    def __init__(self, load: Callable, framework: str = "jax"):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
         self.framework = framework
         self._load = functools.cache(load)
-        # A ledger asks for thousands of figures, by few devices and values.
-        self._of_device = functools.cache(self._of_device)
-        self._holding = functools.cache(self._holding)
+        # A ledger asks for thousands of figures, by few values of a column.
+        self._holding = functools.cache(lambda name, column, value: (load(name)[0][column] == value).to_numpy())
         self.forget()
 
     def forget(self) -> None:
@@ -241,38 +232,26 @@ class Evidence:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
         return "the paper prints" if self.printed else f"{name}.csv has"
 
-    def table(self, name: str, device: str | None = None) -> pd.DataFrame:
-        """Return a table of `SCHEMAS`, checked, and note it among the sources.
+    def rows(self, name: str, **row) -> pd.DataFrame:
+        """Return those rows of a table that have these values in these columns, maybe none; note its source.
 
         Args:
           name: a key of `SCHEMAS`.
-          device: keep the rows of "CPU" or "GPU".
+          row: columns and what stands in them.
 
         Raises:
-          NotMeasured: if there is no such table, or none with rows of that device.
+          NotMeasured: if there is no such table, or none with rows of the device that is asked for.
           ValueError: if the table is broken or not what its folder says.
         """
-        _, record, path = self._load(name)
-        table = self._of_device(name, device)
-        if device is not None and table.empty:
+        table, record, path = self._load(name)
+        device = row.get("device")
+        if device and not self._holding(name, "device", device).any():
             raise NotMeasured(f"{self.called(name)} no rows of a {device}")
         self.sources.append(Source(path, record.get("table", {}).get("sha256", "")[:12], _hardware(record, device)))
-        return table
-
-    def _of_device(self, name: str, device: str | None) -> pd.DataFrame:
-        table, _, _ = self._load(name)
-        return table if device is None else table[table["device"] == device]
-
-    def _holding(self, name: str, device: str | None, column: str, value) -> np.ndarray:
-        return (self._of_device(name, device)[column] == value).to_numpy()
-
-    def rows(self, name: str, device: str | None = None, **row) -> pd.DataFrame:
-        """Return those rows of a table that have these values in these columns; maybe none."""
-        table = self.table(name, device)
         # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
-        wanted = [(column, value) for column, value in row.items() if column != "dataset" or self.printed]
+        wanted = [self._holding(name, *each) for each in row.items() if each[0] != "dataset" or self.printed]
         if wanted:
-            which = np.logical_and.reduce([self._holding(name, device, *each) for each in wanted])
+            which = np.logical_and.reduce(wanted)
             table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
         if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
             self.trained.append((asked_network(row["model"]), row.get("window_frames", 32)))
@@ -280,27 +259,23 @@ class Evidence:
             self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
         return table
 
-    def figure(self, name: str, device: str | None = None, value: str = "value", **row) -> Figure:
+    def figure(self, name: str, value: str = "value", **row) -> Figure:
         """Return one figure of a table.
 
         Args:
           name: a key of `SCHEMAS`.
-          device: "CPU" or "GPU", for times.
           value: the column; any but the usual one comes without interval.
           row: columns of the schema and what stands in them.
 
         Raises:
           NotMeasured: if there is no such row; the message says which.
         """
-        found = self.rows(name, device, **row)
-        if value in found and found[value].isna().any():
-            found = found[found[value].notna()]
-        if len(found) and value in found:
+        found = self.rows(name, **row)
+        if value in found and len(found := found[found[value].notna()]):
             bounds = ["value", "low", "high"] if value == "value" else [value]
-            return Figure.of(*(found[bound].iat[0] for bound in bounds))
+            return Figure.of(*found[bounds].iloc[0])
         what = "" if value == "value" else f"{value} of "
-        where = f", {device}" if device else ""
-        raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}{where}")
+        raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}")
 
     def quality(self, setting: Setting, metric: str) -> Figure:
         """Return a metric of a model; the published one has a window and a number of steps of its own."""
@@ -311,13 +286,13 @@ class Evidence:
 
     def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
         """Return the time of a round in ms; by default in the framework of this evidence."""
-        row = setting.columns | {"framework": framework or self.framework, "characters": characters}
-        return self.figure("synthesis_time", device, **row)
+        row = {"framework": framework or self.framework, "characters": characters, "device": device}
+        return self.figure("synthesis_time", **setting.columns, **row)
 
     def counts(self, setting: Setting, device: str, framework: str | None = None) -> set[int]:
         """Return the numbers of characters that a model was timed with; maybe none."""
-        rows = self.rows("synthesis_time", device, **setting.columns, framework=framework or self.framework)
-        return {int(count) for count in rows["characters"]}
+        row = {"framework": framework or self.framework, "device": device}
+        return {int(count) for count in self.rows("synthesis_time", **setting.columns, **row)["characters"]}
 
     def speedup(self, slow: Setting, fast: Setting, device: str, characters: int) -> Figure:
         """Return how many times as fast `fast` is."""
@@ -340,16 +315,9 @@ def _row_text(row: Mapping) -> str:
 def _hardware(record: Mapping, device: str | None) -> str:
     if "paper_setting" in record:
         return record["paper_setting"]
-    if device == "CPU" or (device is None and record.get("device_platform") == "cpu"):
+    if (device or record.get("device_platform", "").upper()) == "CPU":
         return f"CPU, {counted_cores(record)}" if "cores" in record else "CPU"
-    kind = str(record.get("device_kind"))
-    return kind if kind != "cpu" else "GPU"
-
-
-@functools.cache
-def _others() -> frozenset[str]:
-    """Return the models of other authors that any paper's tables name."""
-    return frozenset(name for paper in paper_folders() for name in load_paper_file("paper", paper).get("others", ()))
+    return record["device_kind"] if record.get("device_kind") != "cpu" else "GPU"
 
 
 def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
@@ -384,8 +352,8 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
         if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
             raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
-        others = _others() if name in OF_TEXT else ()
-        table = checked_table(name, table, str(path), others)
+        others = [one for paper in paper_folders() for one in load_paper_file("paper", paper).get("others", ())]
+        table = checked_table(name, table, str(path), others if name in OF_TEXT else ())
         if "device" in table and record.get("device_platform") == "cpu":
             # PyTorch finds its own device; the record tells that of JAX.
             own = table.get("framework", pd.Series("jax", index=table.index)) != "torch"
@@ -393,7 +361,18 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
                 raise ValueError(f"{path}: has rows of a GPU, but its record knows only a CPU")
         return table, record, path.relative_to(root).as_posix()
 
-    return Evidence("jax", load)
+    return Evidence(load)
+
+
+def _evidence_of(tables: Mapping[str, pd.DataFrame], record: Mapping, where: str, gap: str, **framework) -> Evidence:
+    """Return evidence of tables in memory; `gap` says that one is not there."""
+
+    def load(name: str):
+        if name not in tables:
+            raise NoTable(gap.format(name=name))
+        return tables[name], record, where
+
+    return Evidence(load, **framework)
 
 
 def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
@@ -412,45 +391,30 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         return []
     table, record = read_table(path)
     table = table[table["recipe"] == "paper"].fillna({"unit": ""})
-    every, table = table, table[table["steps"] > 0]
-    place = path.relative_to(root).as_posix()
+    place, gap = path.relative_to(root).as_posix(), "no {name}.csv of them"
 
-    def evidence(windows: int, rows: pd.DataFrame) -> Evidence:
-        networks = rows[["model", "window_frames"]].drop_duplicates()
-        tables = {
-            "quality": lambda: intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]),
-            "trained": lambda: networks.assign(metric="windows", value=windows),
-        }
-        trainings = rows.groupby(["model", "window_frames"])["seed"].nunique()
+    found = []
+    for windows, rows in reversed([*table[table["steps"] > 0].groupby("windows")]):
+        trainings = rows.groupby(["model", "window_frames"])["seed"].nunique().rename("value")
         most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
         where = f"{place} at {windows:,} windows, {most} a network"
-
-        def load(name: str):
-            if name not in tables:
-                raise NoTable(f"no {name}.csv of them")
-            return checked_table(name, tables[name](), where), record, where
-
-        return Evidence("jax", load)
-
-    by_length = [evidence(windows, rows) for windows, rows in table.groupby("windows")]
-    return [*reversed(by_length), _snapshot_curves(every, record, place)]
+        seen = trainings.reset_index().assign(metric="windows", value=windows)
+        tables = {"quality": intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]), "trained": seen}
+        tables = {name: checked_table(name, one, where) for name, one in tables.items()}
+        found.append(_evidence_of(tables, record, where, gap))
+    curves = _snapshot_curves(table)
+    tables = {} if curves.empty else {"quality_by_epoch": checked_table("quality_by_epoch", curves, place)}
+    return [*found, _evidence_of(tables, record, place, gap)]
 
 
-def _snapshot_curves(rows: pd.DataFrame, record: dict, where: str) -> Evidence:
+def _snapshot_curves(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the learning curves among rows of the long queue."""
     rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
     rows = rows[rows["steps"].isin([0, 8])]  # the loss has no steps
     lengths = rows.groupby(["model", "run"])["windows"].nunique()
     longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
     curves = rows[rows["run"].isin(longest)].rename(columns={"epochs": "epoch"})
-    curves = curves[[*SCHEMAS["quality_by_epoch"], "value"]]
-
-    def load(name: str):
-        if name != "quality_by_epoch" or curves.empty:
-            raise NoTable(f"no {name}.csv of them")
-        return checked_table(name, curves, where), record, where
-
-    return Evidence("jax", load)
+    return curves[[*SCHEMAS["quality_by_epoch"], "value"]]
 
 
 @functools.cache
@@ -460,11 +424,6 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
     Raises:
       ValueError: if two tables print different figures of one row, or one is of no known form.
     """
-    tables, about = printed_tables(paper), load_paper_file("paper", paper)
-
-    def load(name: str):
-        if name not in tables:
-            raise NoTable("the paper has no table of it")
-        return tables[name], {"paper_setting": about["setting"]}, "the paper's tables"
-
-    return Evidence("iree", load)
+    record = {"paper_setting": load_paper_file("paper", paper)["setting"]}
+    where, gap = "the paper's tables", "the paper has no table of it"
+    return _evidence_of(printed_tables(paper), record, where, gap, framework="iree")

@@ -21,6 +21,7 @@ was known, and nothing else.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,17 +31,7 @@ from itertools import combinations, pairwise, product
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.ledger.evidence import (
-    Evidence,
-    Figure,
-    NotMeasured,
-    Setting,
-    difference,
-    known,
-    mean_figure,
-    power_law,
-    ratio,
-)
+from f3amd_companion.ledger.evidence import Evidence, Figure, NotMeasured, Setting, known, mean_figure, power_law, ratio
 from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import NINE_METRICS
@@ -136,16 +127,10 @@ def majority(verdicts: Iterable[str]) -> str:
     return FAILS if share(FAILS, LARGER) > 0.5 else OPEN
 
 
-def every(verdicts: Iterable[str]) -> str:
-    """Return the verdict on "each of them": one that fails is enough."""
+def every(verdicts: Iterable[str], order: Sequence[str] = (FAILS, LARGER, OPEN, HOLDS)) -> str:
+    """Return the verdict on "each of them", the first of an order that is among them: one that fails is enough."""
     found = set(verdicts)
-    return next(verdict for verdict in (FAILS, LARGER, OPEN, HOLDS) if verdict in found)
-
-
-def any_of(verdicts: Iterable[str]) -> str:
-    """Return the verdict on "one of them": one that holds is enough."""
-    found = set(verdicts)
-    return next(verdict for verdict in (HOLDS, OPEN, FAILS) if verdict in found)
+    return next(verdict for verdict in order if verdict in found)
 
 
 def within(figure: Figure, bounds: tuple[float, float], *, gain: bool = False) -> str:
@@ -258,7 +243,7 @@ def _in_percent(figure: Figure) -> Figure:
     return figure.map(lambda bound: 100.0 * (bound - 1.0))
 
 
-# ------------------------------------------------------------------------------- any single figure
+# ------------------------------------------------------- six kinds that most statements are judged by
 
 
 def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None, unit="", text="{}") -> Finding:
@@ -269,16 +254,9 @@ def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None
     return _compared(found, bounds), text.format(figure_text(found, unit))
 
 
-# ---------------------------------------------------------------------------------- rows of a table
-
-
 def _times_worse(metric: str, figure: Figure, against: Figure) -> Figure:
     """Return how many times worse a figure of a metric is than another; above 1 where it is the worse one."""
     return ratio(against, figure) if METRICS[metric].better == "up" else ratio(figure, against)
-
-
-def _row_figures(evidence: Evidence, table: str, metric: str, rows, among) -> list[Figure]:
-    return [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
 
 
 def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
@@ -286,24 +264,25 @@ def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Fin
 
     Args:
       evidence: of one paper or data set.
-      table: a table of `evidence.SCHEMAS`.
+      table: a table of `SCHEMAS`.
       metric: of `measures/metrics.toml`, which says what is better.
       rows: columns of each row.
       among: columns that all rows share.
     """
-    figures = _row_figures(evidence, table, metric, rows, among)
+    figures = [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
     verdict = majority(ordered(_times_worse(metric, second, first)) for first, second in pairwise(figures))
     return verdict, _values_text(figures)
 
 
 def leads(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
     """Judge whether the first row is better than every other; arguments as of `ranked`."""
-    first, *others = _row_figures(evidence, table, metric, rows, among)
+    first, *others = (evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows)
     verdict = every(ordered(_times_worse(metric, other, first)) for other in others)
     return verdict, f"{number_text(first.value)} against {_values_text(others)}"
 
 
-# ------------------------------------------------------------------------------------------- times
+def _saving(gain: Figure) -> Figure:
+    return gain.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
 
 
 def _timed(evidence: Evidence, fast: Setting | Family, device: str, characters) -> list[Setting]:
@@ -315,11 +294,44 @@ def _timed(evidence: Evidence, fast: Setting | Family, device: str, characters) 
 def speedup(
     evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}"
 ) -> Finding:
-    """Judge how many times as fast one model, or each of a family, is at some numbers of characters."""
+    """Judge how many times as fast one model, or each of a family, is at some numbers of characters.
+
+    With the unit " %" it is the time saved.
+    """
     models = _timed(evidence, fast, device, characters)
     figures = [evidence.speedup(slow, model, device, count) for model in models for count in characters]
-    verdict, found = _ranged(figures, bounds, unit, gain=gain)
+    verdict, found = _ranged([_saving(one) for one in figures] if unit == " %" else figures, bounds, unit, gain=gain)
     return verdict, text.format(found)
+
+
+def training_ratio(
+    evidence: Evidence, over, under, bounds=None, column="value", text="{figure}x at batch {batch}"
+) -> Finding:
+    """Judge the training time (or another column) of one model over another's, at the largest shared batch."""
+    rows = evidence.rows("training_time", window_frames=over.window, device="GPU")
+    sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
+    if not (shared := set.intersection(*sizes)):
+        gap = f"no batch size of both {over.model} and {under.model}, GPU"
+        raise NotMeasured(f"{evidence.called('training_time')} {gap}")
+    row = {"window_frames": over.window, "batch_size": int(max(shared)), "device": "GPU"}
+    found = ratio(*(evidence.figure("training_time", column, model=one.model, **row) for one in (over, under)))
+    return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=row["batch_size"])
+
+
+def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
+    """Return how many times worse a metric is; above 1 where `model` is the worse one."""
+    return _times_worse(metric, evidence.quality(model, metric), evidence.quality(against, metric))
+
+
+def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
+    """Judge whether a model is worse than another in one metric, or by a factor in a range."""
+    figures = [evidence.quality(setting, metric) for setting in (model, against)]
+    harm = _times_worse(metric, *figures)
+    text = f"{' against '.join(map(figure_text, figures))} {METRICS[metric].unit}".rstrip()
+    return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
+
+
+# ------------------------------------------------------------ functions for a question or two: of times
 
 
 def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds) -> Finding:
@@ -334,10 +346,9 @@ def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds)
 
 def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Finding:
     """Judge whether the gain of a family is larger with the second number of characters."""
-    few, many = characters
-    gain = lambda model, count: evidence.speedup(slow, model, device, count)
     models = _timed(evidence, fast, device, characters)
-    growth = [ratio(gain(model, many), gain(model, few)) for model in models]
+    gains = [[evidence.speedup(slow, model, device, count) for count in characters] for model in models]
+    growth = [ratio(many, few) for few, many in gains]
     return majority(map(ordered, growth)), f"{range_text(growth)} times the gain"
 
 
@@ -354,34 +365,21 @@ def speedup_above(evidence: Evidence, slow, fast, device, factor) -> Finding:
     return REMARK, f"above {factor:g} at {_list_text(counts)}" if counts else f"nowhere above {factor:g}"
 
 
-def _saving(gain: Figure) -> Figure:
-    return gain.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
-
-
-def saving(evidence: Evidence, slow, fast, device, characters, bounds) -> Finding:
-    """Judge the time saved, %, at every number of characters."""
-    figures = [_saving(evidence.speedup(slow, fast, device, count)) for count in characters]
-    return _ranged(figures, bounds, " %")
-
-
 def mean_saving(evidence: Evidence, slow, fast, device, characters, bounds) -> Finding:
     """Judge the time saved, %, on average over the numbers of characters that were timed."""
     shared = sorted(evidence.counts(slow, device) & evidence.counts(fast, device) & set(characters))
     # Without any, the reason is that of the first.
-    mean = mean_figure([evidence.speedup(slow, fast, device, count) for count in shared or characters[:1]])
-    found = _saving(mean)
+    found = _saving(mean_figure([evidence.speedup(slow, fast, device, count) for count in shared or characters[:1]]))
     return within(found, bounds, gain=True), f"{figure_text(found)} % at {_list_text(shared)}"
 
 
-def _jax_over_torch(
-    evidence: Evidence, model: Setting, released: Setting, device, characters, compiler=None
-) -> dict[int, Figure]:
+def _jax_over_torch(evidence: Evidence, model, released, device, characters, compiler=None) -> dict[int, Figure]:
     """Return time in JAX over time in PyTorch, which has the same network or the released one."""
     peer = model if evidence.counts(model, device, "torch") else released
-    known = evidence.counts(model, device, compiler) & evidence.counts(peer, device, "torch")
+    shared = evidence.counts(model, device, compiler) & evidence.counts(peer, device, "torch") & set(characters)
     return {
         count: ratio(evidence.time(model, device, count, compiler), evidence.time(peer, device, count, "torch"))
-        for count in sorted(known & set(characters)) or characters[:1]
+        for count in sorted(shared) or characters[:1]
     }
 
 
@@ -404,52 +402,31 @@ def speedup_over_torch(evidence: Evidence, slow, released, fast, device, charact
     return REMARK, f"{range_text(list(gains.values()))}x" + (f", slower at {_list_text(slower)}" if slower else "")
 
 
-def _exponent(evidence: Evidence, model: str, device: str, count: int) -> Figure:
+def _exponent(evidence: Evidence, model: Setting, device: str, count: int) -> Figure:
     """Return p of time ~ steps^p."""
     steps = (8, 4, 2, 1)
-    return power_law(steps, [evidence.time(Setting(model, n), device, count) for n in steps])
+    return power_law(steps, [evidence.time(Setting(model.model, n), device, count) for n in steps])
 
 
 def step_exponent(evidence: Evidence, model, device, characters, bounds) -> Finding:
     """Judge the exponent of time against the number of steps."""
-    found = _exponent(evidence, model.model, device, characters)
+    found = _exponent(evidence, model, device, characters)
     return within(found, bounds), f"exponent {figure_text(found)}"
 
 
 def step_exponent_growth(evidence: Evidence, model, device, characters) -> Finding:
     """Judge whether that exponent is larger with the second number of characters."""
-    few, many = characters
-    low, high = (_exponent(evidence, model.model, device, count) for count in characters)
-    rise = difference(high, low)
-    verdict = HOLDS if rise.low > 0 else FAILS if rise.high < 0 else OPEN
-    return verdict, f"exponent {figure_text(low)} at {few}, {figure_text(high)} at {many:,}"
-
-
-def training_ratio(
-    evidence: Evidence, over, under, bounds=None, column="value", text="{figure}x at batch {batch}"
-) -> Finding:
-    """Judge the training time (or another column) of one model over another's, at the largest shared batch."""
-    rows = evidence.rows("training_time", "GPU", window_frames=over.window)
-    sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
-    if not (shared := set.intersection(*sizes)):
-        gap = f"no batch size of both {over.model} and {under.model}, GPU"
-        raise NotMeasured(f"{evidence.called('training_time')} {gap}")
-    row = {"window_frames": over.window, "batch_size": int(max(shared))}
-    times = [evidence.figure("training_time", "GPU", column, model=one.model, **row) for one in (over, under)]
-    found = ratio(*times)
-    return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=row["batch_size"])
+    low, high = (_exponent(evidence, model, device, count) for count in characters)
+    text = f"exponent {figure_text(low)} at {characters[0]}, {figure_text(high)} at {characters[1]:,}"
+    return ordered(ratio(high.map(np.exp), low.map(np.exp))), text
 
 
 def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
     """Return the first epoch that comes close to the best one; NotMeasured if it may yet fall."""
     curve = curve[curve["metric"] == metric].sort_values("epoch")
-    values = curve["value"].to_numpy(np.float64)
-    if NINE_METRICS.get(metric, ("", "down"))[1] == "up":
-        close = values >= values.max() * (1.0 - CONVERGED)
-    else:
-        close = values <= values.min() * (1.0 + CONVERGED)
-    reached = float(curve["epoch"].iloc[int(np.argmax(close))])
-    last = float(curve["epoch"].iloc[-1])
+    values, up = curve["value"], NINE_METRICS.get(metric, ("", "down"))[1] == "up"
+    close = values >= values.max() * (1.0 - CONVERGED) if up else values <= values.min() * (1.0 + CONVERGED)
+    reached, last = float(curve.loc[close, "epoch"].iloc[0]), float(curve["epoch"].iloc[-1])
     if reached > STILL_BETTER * last:
         raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:.3g}")
     return reached
@@ -458,39 +435,26 @@ def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
 def convergence(evidence: Evidence, model, against) -> Finding:
     """Judge, metric by metric, whether a model converges in no more epochs than another."""
     curves = {setting.model: evidence.rows("quality_by_epoch", model=setting.model) for setting in (model, against)}
-    for name, curve in curves.items():
-        if curve.empty:
-            raise NotMeasured(f"quality_by_epoch.csv has no {name}")
-    ours, theirs = ([*curve["metric"].unique()] for curve in curves.values())
-    verdicts, texts = [], []
-    for metric in (name for name in ours if name in theirs):
-        epoch, other = (_converged_epoch(curve, metric, name) for name, curve in curves.items())
-        verdicts.append(HOLDS if epoch <= (1.0 + TOLERANCE) * other else FAILS)
-        texts.append(f"{metric} {epoch:g} against {other:g}")
-    if not verdicts:
-        raise NotMeasured("quality_by_epoch.csv has no metric of both models")
-    return majority(verdicts), ", ".join(texts)
+    shared = functools.reduce(pd.Index.intersection, (pd.Index(curve["metric"].unique()) for curve in curves.values()))
+    if shared.empty:
+        gap = next((name for name, curve in curves.items() if curve.empty), "metric of both models")
+        raise NotMeasured(f"quality_by_epoch.csv has no {gap}")
+    epochs = {name: [_converged_epoch(curves[one], name, one) for one in curves] for name in shared}
+    verdict = majority(HOLDS if own <= (1.0 + TOLERANCE) * other else FAILS for own, other in epochs.values())
+    return verdict, ", ".join(f"{name} {own:g} against {other:g}" for name, (own, other) in epochs.items())
 
 
-# ----------------------------------------------------------------------------------------- quality
+# ------------------------------------------------------------------------------------- of quality
 
 
-def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
-    """Return how many times worse a metric is; above 1 where `model` is the worse one."""
-    return _times_worse(metric, evidence.quality(model, metric), evidence.quality(against, metric))
-
-
-def _has(evidence: Evidence, settings: Iterable[Setting], metric: str) -> bool:
-    return all(known(evidence.quality, setting, metric) for setting in settings)
-
-
-def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> list[str]:
-    """Return those of the nine metrics that all settings have."""
-    kept = [metric for metric in NINE_METRICS if _has(evidence, settings, metric)]
-    if len(kept) < LEAST_METRICS:
+def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> dict[str, list[Figure]]:
+    """Return figures of all settings, by those of the nine metrics that all of them have."""
+    figures = {metric: [known(evidence.quality, one, metric) for one in settings] for metric in NINE_METRICS}
+    shared = {metric: found for metric, found in figures.items() if None not in found}
+    if len(shared) < LEAST_METRICS:
         for asked in product(settings, NINE_METRICS):  # the reason is that of the first gap
             evidence.quality(*asked)
-    return kept
+    return shared
 
 
 def _by_metric(verdicts: Mapping[str, str], text: str, heading: str, notes: Sequence[str]) -> Finding:
@@ -499,61 +463,56 @@ def _by_metric(verdicts: Mapping[str, str], text: str, heading: str, notes: Sequ
     return majority(verdicts.values()), text.format(held) + (heading + ", ".join(notes) if notes else "")
 
 
-def _spread(evidence: Evidence, settings: Sequence[Setting], metric: str) -> tuple[Figure, Setting, Setting]:
+def _spread(settings: Sequence[Setting], figures: Sequence[Figure]) -> tuple[Figure, str, str]:
     """Return largest over least value of a metric, and whose they are."""
-    value = lambda setting: evidence.quality(setting, metric).value
-    largest, least = max(settings, key=value), min(settings, key=value)
-    return ratio(evidence.quality(largest, metric), evidence.quality(least, metric)), largest, least
-
-
-def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
-    """Judge whether a model is worse than another in one metric, or by a factor in a range."""
-    harm = _harm(evidence, model, against, metric)
-    values = " against ".join(figure_text(evidence.quality(setting, metric)) for setting in (model, against))
-    text = f"{values} {METRICS[metric].unit}".rstrip()
-    return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
+    value = lambda pair: pair[1].value
+    (largest, most), (least, fewest) = (pick(zip(settings, figures, strict=True), key=value) for pick in (max, min))
+    return ratio(most, fewest), largest.model, least.model
 
 
 def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) -> Finding:
     """Judge whether each, or any, of some metrics is worse by a factor in a range."""
     harms = {metric: _harm(evidence, model, against, metric) for metric in metrics}
-    verdict = {"each": every, "any": any_of}[quantifier](within(harm, bounds) for harm in harms.values())
+    order = {"each": (FAILS, OPEN, HOLDS), "any": (HOLDS, OPEN, FAILS)}[quantifier]
+    verdict = every((within(harm, bounds) for harm in harms.values()), order)
     texts = (f"{metric} {_harm_text(harm)}" for metric, harm in harms.items())
     return verdict, ", ".join(texts)
 
 
 def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
     """Judge, metric by metric, whether a model is worse than another."""
-    metrics = _shared_metrics(evidence, [model, against])
-    verdicts = {metric: ordered(_harm(evidence, model, against, metric)) for metric in metrics}
+    shared = _shared_metrics(evidence, [model, against])
+    verdicts = {metric: ordered(_times_worse(metric, *figures)) for metric, figures in shared.items()}
     better = [metric for metric, verdict in verdicts.items() if verdict == FAILS]
     return _by_metric(verdicts, "worse in {}", ", better in ", better)
 
 
 def worst_in(evidence: Evidence, model, models) -> Finding:
     """Write in which metrics a model is the last of several (a remark)."""
-    metrics = _shared_metrics(evidence, [model, *models])
-    last = [one for one in metrics if all(_harm(evidence, model, other, one).value > 1.0 for other in models)]
-    return REMARK, _list_text(last) if last else "in no metric"
+    shared = _shared_metrics(evidence, [model, *models])
+    worst = lambda metric, own, *others: all(_times_worse(metric, own, other).value > 1.0 for other in others)
+    return REMARK, _list_text(one for one, figures in shared.items() if worst(one, *figures)) or "in no metric"
 
 
 def alike(evidence: Evidence, models, bounds) -> Finding:
     """Judge, metric by metric, whether the largest value of several models over the least lies in a range."""
-    verdicts, apart = {}, []
-    for metric in _shared_metrics(evidence, models):
-        spread, largest, least = _spread(evidence, models, metric)
-        verdicts[metric] = within(spread, bounds)
-        if verdicts[metric] != HOLDS:
-            apart.append(f"{metric} {number_text(spread.value)}x ({largest.model} over {least.model})")
+    spreads = {metric: _spread(models, figures) for metric, figures in _shared_metrics(evidence, models).items()}
+    verdicts = {metric: within(spread, bounds) for metric, (spread, *_) in spreads.items()}
+    apart = [
+        f"{metric} {number_text(spread.value)}x ({largest} over {least})"
+        for metric, (spread, largest, least) in spreads.items()
+        if verdicts[metric] != HOLDS
+    ]
     return _by_metric(verdicts, "alike in {}", "; apart: ", apart)
 
 
 def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
     """Judge the largest value of one metric over the least, of a family."""
     models = models.measured(lambda setting: evidence.quality(setting, metric))
-    spread, largest, least = _spread(evidence, models, metric)
-    text = f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least.model} to {largest.model})"
-    return within(spread, bounds), text
+    spread, largest, least = _spread(models, [evidence.quality(setting, metric) for setting in models])
+    return within(
+        spread, bounds
+    ), f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least} to {largest})"
 
 
 def best_of(evidence: Evidence, model, models, metric) -> Finding:
@@ -567,15 +526,11 @@ def best_of(evidence: Evidence, model, models, metric) -> Finding:
 
 def better_at_each_width(evidence: Evidence, better, worse, widths, metric, window=32) -> Finding:
     """Judge, width by width (the one that must be there first), whether one kind of network beats another."""
-    verdicts = {}
-    for width in sorted(widths):
-        pair = [Setting(f"{kind}-{width}", window=window) for kind in (worse, better)]
-        if _has(evidence, pair, metric):
-            verdicts[width] = ordered(_harm(evidence, *pair, metric))
+    pair = lambda width, *kinds: [Setting(f"{kind}-{width}", window=window) for kind in kinds]
+    harms = {width: known(_harm, evidence, *pair(width, worse, better), metric) for width in sorted(widths)}
+    verdicts = {width: ordered(harm) for width, harm in harms.items() if harm}
     if not verdicts:
-        for kind in (better, worse):
-            evidence.quality(Setting(f"{kind}-{widths[0]}", window=window), metric)
-        raise NotMeasured(f"{evidence.called('quality')} no width of both families with {metric}")
+        _harm(evidence, *pair(widths[0], better, worse), metric)  # the reason is that of the first
     words = {HOLDS: "yes", FAILS: "no", OPEN: "open"}
     by_verdict = {word: [width for width in verdicts if verdicts[width] == verdict] for verdict, word in words.items()}
     texts = (f"{word} at D = {_list_text(widths)}" for word, widths in by_verdict.items() if widths)
@@ -585,20 +540,19 @@ def better_at_each_width(evidence: Evidence, better, worse, widths, metric, wind
 def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple[Setting, Setting]]:
     """Return (longer window, usual window) of every model that has both."""
     pair = lambda setting: (Setting(setting.model, window=window), setting)
-    known = models.measured(lambda setting: [evidence.quality(one, "FID") for one in pair(setting)])
-    return [pair(setting) for setting in known]
+    return [pair(one) for one in models.measured(lambda one: [evidence.quality(each, "FID") for each in pair(one)])]
 
 
 def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
     """Judge, metric by metric, whether no model of a family is much worse with longer windows."""
     pairs = _window_pairs(evidence, models, window)
     verdicts, worst = {}, []
-    for metric in _shared_metrics(evidence, [setting for pair in pairs for setting in pair]):
-        harms = {longer.model: _harm(evidence, longer, usual, metric) for longer, usual in pairs}
-        verdicts[metric] = every(within(harm, bounds) for harm in harms.values())
+    for metric, figures in _shared_metrics(evidence, [setting for pair in pairs for setting in pair]).items():
+        harms = [_times_worse(metric, *both) for both in zip(figures[::2], figures[1::2], strict=True)]
+        verdicts[metric] = every(within(harm, bounds) for harm in harms)
         if verdicts[metric] != HOLDS:
-            model, harm = max(harms.items(), key=lambda each: each[1].value)
-            worst.append(f"{metric} {_change_text(harm)} ({model})")
+            harm, (longer, _) = max(zip(harms, pairs, strict=True), key=lambda each: each[0].value)
+            worst.append(f"{metric} {_change_text(harm)} ({longer.model})")
     return _by_metric(verdicts, "{} metrics", "; worse: ", worst)
 
 
@@ -615,16 +569,15 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=
     A network that gives one motion whatever its noise does so for a dull reason: where samples of
     one condition differ by less than `least_diversity` cm, nothing was kept.
     """
-    fewer = [Setting(model.model, count) for count in steps]
-    metrics = _shared_metrics(evidence, [model, *fewer])
-    value = evidence.quality
-    changes = {(name, one): ratio(value(one, name), value(model, name)) for name in metrics for one in fewer}
-    verdicts = {name: every(within(changes[name, one], bounds) for one in fewer) for name in metrics}
-    (metric, setting), change = max(changes.items(), key=lambda each: abs(np.log(each[1].value)))
-    at = f"{setting.steps} step{'s' if setting.steps > 1 else ''}"
-    largest = f"{metric} {figure_text(_in_percent(change))} % at {at}"
+    settings = [model, *(Setting(model.model, count) for count in steps)]
+    shared = _shared_metrics(evidence, settings)
+    changes = {name: [ratio(figure, own) for figure in fewer] for name, (own, *fewer) in shared.items()}
+    verdicts = {name: every(within(change, bounds) for change in some) for name, some in changes.items()}
+    every_change = [(name, *each) for name, some in changes.items() for each in zip(steps, some, strict=True)]
+    metric, count, change = max(every_change, key=lambda each: abs(np.log(each[2].value)))
+    largest = f"{metric} {figure_text(_in_percent(change))} % at {count} step{'s' if count > 1 else ''}"
     verdict, text = _by_metric(verdicts, "{} metrics", "; largest change: ", [largest])
-    spread = max((value(one, "diversity") for one in (model, *fewer)), key=lambda figure: figure.value)
+    spread = max((evidence.quality(one, "diversity") for one in settings), key=lambda figure: figure.value)
     if spread.high < least_diversity:
         return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
     return verdict, text
@@ -632,12 +585,11 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=
 
 def change_between_steps(evidence: Evidence, model, steps) -> Finding:
     """Write the largest change of a metric from each number of steps to the next (a remark)."""
-    settings = [Setting(model.model, count) for count in steps]
-    metrics = _shared_metrics(evidence, settings)
-    value = lambda setting, metric: evidence.quality(setting, metric).value
-    change = lambda one, other: max(abs(value(other, metric) / value(one, metric) - 1.0) for metric in metrics)
-    pairs = pairwise(settings)
-    return REMARK, ", ".join(f"{one.steps} to {other.steps} {100.0 * change(one, other):.2g} %" for one, other in pairs)
+    shared = _shared_metrics(evidence, [Setting(model.model, count) for count in steps])
+    values = np.array([[figure.value for figure in figures] for figures in shared.values()])
+    changes = 100.0 * np.abs(values[:, 1:] / values[:, :-1] - 1.0).max(axis=0)
+    texts = (f"{one} to {other} {change:.2g} %" for (one, other), change in zip(pairwise(steps), changes, strict=True))
+    return REMARK, ", ".join(texts)
 
 
 def moved_by_inputs(evidence: Evidence, model) -> Finding:
@@ -656,60 +608,61 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
     Looked at are `metrics` and those of the nine that are better low. Rounds follow one another, so
     that these intervals are narrower than those of free repeats.
     """
-    verdicts, texts = {}, []
     low_ones = {*metrics, *(metric for metric, (_, better) in NINE_METRICS.items() if better == "down")}
+    growth = {}
     for metric, rows in evidence.rows("quality_by_round", **model.columns).groupby("metric", sort=False):
         values = rows.sort_values("round")["value"].to_numpy(np.float64)
-        quarter = len(values) // 4
-        if quarter < 2 or metric not in low_ones:
-            continue
-        late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
-        growth = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
-        verdicts[metric] = within(growth, bounds)
-        texts.append(f"{metric} {_change_text(growth)}")
-    if not verdicts:
+        if (quarter := len(values) // 4) >= 2 and metric in low_ones:
+            late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
+            growth[metric] = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
+    if not growth:
         raise NotMeasured(f"{evidence.called('quality_by_round')} no {model} over 8 rounds or more")
-    return _by_metric(verdicts, "{}", ": ", texts)
+    verdicts = {metric: within(found, bounds) for metric, found in growth.items()}
+    return _by_metric(verdicts, "{}", ": ", [f"{metric} {_change_text(found)}" for metric, found in growth.items()])
 
 
 def _order_score(rows: pd.DataFrame) -> float:
     """Return the share of pairs of strengths that a metric puts in order, less that reversed."""
-    rows = rows.sort_values("strength")
-    figures = [Figure.of(*row) for row in rows[["value", "low", "high"]].to_numpy()]
+    figures = [Figure.of(*row) for row in rows.sort_values("strength")[["value", "low", "high"]].to_numpy()]
     found = [ordered(ratio(stronger, weaker)) for weaker, stronger in combinations(figures, 2)]
-    return float(np.mean([{HOLDS: 1, FAILS: -1, OPEN: 0}[verdict] for verdict in found]))
+    return (found.count(HOLDS) - found.count(FAILS)) / len(found)
 
 
 def better_graded(evidence: Evidence, metric, than) -> Finding:
     """Judge whether one metric puts graded corruptions into their order more often than another."""
-    scores: dict[str, list[float]] = {metric: [], than: []}
-    for name, rows in evidence.table("corruptions").groupby("corruption", sort=False):
-        for which, found in scores.items():
-            chosen = rows[rows["metric"] == which]
-            if len(chosen) < 3:
-                raise NotMeasured(f"corruptions.csv has no three strengths of {name} with {which}")
-            found.append(_order_score(chosen))
-    first, second = (float(np.mean(found)) for found in scores.values())
+    table = evidence.rows("corruptions")
+    found = [
+        [_order_score(rows) for _, rows in table[table["metric"] == one].groupby("corruption") if len(rows) >= 3]
+        for one in (metric, than)
+    ]
+    if min(map(len, found)) < table["corruption"].nunique():
+        raise NotMeasured(f"corruptions.csv has not three strengths of each with {metric} and {than}")
+    first, second = map(np.mean, found)
     verdict = HOLDS if first - second > GRADED else FAILS if second - first > GRADED else OPEN
     return verdict, f"ordered pairs: {metric} {100 * first:.0f} %, {than} {100 * second:.0f} %"
 
 
-# ----------------------------------------------------------------------------------------- theory
+# ------------------------------------------------------------------------------- of levels of noise
 
 
-def _excess_errors(evidence: Evidence, model: str) -> pd.Series:
+def _over_noise(evidence: Evidence, table: str, model: Setting) -> pd.Series:
+    """Return the figures of a model by noise level, low ones first; NotMeasured where there are not three."""
+    figures = evidence.rows(table, model=model.model).set_index("sigma")["value"].astype(np.float64).sort_index()
+    if len(figures) < 3:
+        raise NotMeasured(f"{table}.csv has no three noise levels of {model.model}")
+    return figures
+
+
+def _excess_errors(evidence: Evidence, model: Setting) -> pd.Series:
     """Return the x0 error of a model over that of linear shrinkage, by noise level.
 
     Where x0 has the deviation s, the estimate x s² / (s² + sigma²) is off by s sigma / sqrt(s² + sigma²):
     exact for independent normal numbers, and more than an exact denoiser's error for all others. s is the
     error at the highest level, where nothing is left to see, and at most 1, the deviation of all data.
     """
-    curve = evidence.rows("x0_by_sigma", model=model).sort_values("sigma")
-    if len(curve) < 3:
-        raise NotMeasured(f"x0_by_sigma.csv has no three noise levels of {model}")
-    error, sigma = (curve[column].to_numpy(np.float64) for column in ("value", "sigma"))
-    spread = min(error[-1], 1.0)
-    return pd.Series(error * np.hypot(spread, sigma) / (spread * sigma), sigma)
+    error = _over_noise(evidence, "x0_by_sigma", model)
+    spread = min(error.iloc[-1], 1.0)
+    return error * np.hypot(spread, error.index) / (spread * error.index)
 
 
 def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
@@ -718,7 +671,7 @@ def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
     An exact denoiser of Gaussian data reads 1. One that ignores its input has one error for all
     levels, and at a low level many times what is due.
     """
-    excess = _excess_errors(evidence, model.model)
+    excess = _excess_errors(evidence, model)
     worst = Figure.of(excess.max())
     text = f"x0 error at most {number_text(worst.value)}x that of linear shrinkage, at sigma {excess.idxmax():.2g}"
     return within(worst, bounds), text
@@ -726,15 +679,12 @@ def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
 
 def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
     """Judge how many times larger that figure is of another model, over the noise levels that both know."""
-    curves = {setting.model: _excess_errors(evidence, setting.model) for setting in (model, against)}
-    low = max(curve.index.min() for curve in curves.values())
-    high = min(curve.index.max() for curve in curves.values())
-    worst = []
-    for name, curve in curves.items():
-        shared = curve.loc[low:high]
-        if len(shared) < 3:
-            raise NotMeasured(f"x0_by_sigma.csv has no three levels of {name} that both models know")
-        worst.append(shared.max())
+    curves = [_excess_errors(evidence, setting) for setting in (model, against)]
+    low, high = max(curve.index.min() for curve in curves), min(curve.index.max() for curve in curves)
+    shared = [curve.loc[low:high] for curve in curves]
+    if min(map(len, shared)) < 3:
+        raise NotMeasured(f"x0_by_sigma.csv has no three levels that {model.model} and {against.model} both know")
+    worst = [curve.max() for curve in shared]
     return within(Figure.of(worst[1] / worst[0]), bounds), " against ".join(f"{number_text(one)}x" for one in worst)
 
 
@@ -743,13 +693,9 @@ def gradient_growth(evidence: Evidence, model, bounds) -> Finding:
 
     A network that hardly looks at its noise has one gradient for all levels: it has to pass the gate.
     """
-    table = evidence.rows("gradient_norm", model=model.model).sort_values("sigma")
-    third = len(table) // 3
-    if third < 1:
-        raise NotMeasured(f"gradient_norm.csv has no three noise levels of {model.model}")
-    norms = table["value"].to_numpy(np.float64)
-    low, high = (float(np.exp(np.log(some).mean())) for some in (norms[:third], norms[-third:]))
-    gain = Figure.of(high / low)
+    norms = np.log(_over_noise(evidence, "gradient_norm", model))
+    third = len(norms) // 3
+    gain = Figure.of(np.exp(norms.iloc[-third:].mean()) / np.exp(norms.iloc[:third].mean()))
     return within(gain, bounds), f"{number_text(gain.value)}x from the lowest to the highest third of sigma"
 
 
