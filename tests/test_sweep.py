@@ -85,7 +85,7 @@ def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
         (["wolking"], [A], "walking"),
         (["recipes"], [A], "not measured by preset: f3amd measure recipes"),
         (["walking"], ["F3AMD-FNO-33"], "F3AMD-FNO-32"),
-        (["campaign"], ["CAMDM"], "unknown model of the queue 'CAMDM'"),
+        (["campaign"], ["CAMDM"], "unknown name in the queue 'CAMDM'"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(names, models, told):
@@ -197,15 +197,13 @@ def test_legs_of_other_settings_are_not_mixed(work):
     refused(f"walking-{B}: measured with other settings", gather, work, plan(["walking"], [A, B], PROFILE, QUEUE))
 
 
-def test_a_leg_that_another_process_still_does_is_waited_for(work, monkeypatch, caplog):
+def test_a_leg_that_another_process_still_does_is_waited_for(work):
     """A worker that the scheduler has lost may well be alive."""
     leg, told = Leg("walking", A), []
-    monkeypatch.setattr(sweep, "_WAIT_S", 0.01)
-    monkeypatch.setattr(sweep, "_results_at", lambda place: locked(place / "none", "nothing"))  # threads share it
-    with caplog.at_level(logging.INFO, "f3amd"), locked(work.place(leg) / ".lock", "doing it"):
+    with locked(work.place(leg) / ".lock", "doing it"):
         second = threading.Thread(target=lambda: told.append(run_leg(work, leg)))
         second.start()
-        until(lambda: "another process is doing walking" in caplog.text)
+        second.join(0.5)
         assert second.is_alive() and not told
     second.join()
     assert told[0]["state"] == "done"

@@ -1,9 +1,10 @@
 """Presets x measurements on several processes or machines, by Dask distributed: `f3amd sweep`.
 
 A leg is the most that a dead worker costs: one snapshot of the campaign's queue, the training of a
-preset, one measurement of a preset. Legs write into folders of their own, so that no two write one
-table. What finished legs left is gathered into the tables that one process would have written, row
-by row in the order of the plan. All machines see one folder and run one checkout.
+preset, one measurement of a preset. A leg calls what one process would call, with results in a folder
+of its own, so that no two write one table. What finished legs left is gathered into the tables that
+one process would have written, row by row in the order of the plan. All machines see one folder and
+run one checkout.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import itertools
 import json
 import logging
 import os
@@ -22,13 +22,14 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import jax
 import pandas as pd
 
-from f3amd_companion.measuring.campaign import Run, run_campaign
+from f3amd_companion.measuring.campaign import Run, chosen, run_campaign
 from f3amd_companion.measuring.measure import MEASUREMENTS, models_with_weights, protocol_of
-from f3amd_lib.ground.files import locked, whole_file
+from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
 from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
@@ -50,8 +51,6 @@ CONNECT_S = 10
 """Seconds after which a scheduler counts as not reached."""
 
 _TRAIN_THEMSELVES = ("learning", "quality_by_epoch")
-
-_WAIT_S = 1.0
 
 _ALONE = threading.Lock()  # a process has one results folder: its legs run one after the other
 
@@ -126,39 +125,24 @@ def plan(
     Raises:
       ValueError: for an unknown name or preset, a measurement that is not by preset, or nothing to do.
     """
-    swept = [name for name in MEASUREMENTS if name not in NOT_BY_PRESET]
+    swept = [CAMPAIGN, *(name for name in MEASUREMENTS if name not in NOT_BY_PRESET)]
     if not names:
-        raise ValueError(f"name what to sweep: {CAMPAIGN}, {', '.join(swept)}")
+        raise ValueError(f"name what to sweep: {', '.join(swept)}")
     for name in names:
         if name in NOT_BY_PRESET:
             raise ValueError(f"{name} is not measured by preset: f3amd measure {name}")
-        check_known(name, [CAMPAIGN, *swept], "measurement")
+        check_known(name, swept, "measurement")
     asked = list(dict.fromkeys(presets.find_preset(model).name for model in models))
-    # Of two measurements of a preset that train it, the training is one leg.
-    legs: dict[str, Leg] = {}
+    legs, last = [], {}
     for name in dict.fromkeys(names):
-        if name == CAMPAIGN:
-            wanted = list(_of_queue(asked, snapshots))
-        else:
-            wanted = []
-            for model in asked or models_with_weights(profile, "--preset"):
-                training = Leg(TRAIN, model)
-                alone = name in _TRAIN_THEMSELVES
-                wanted += [Leg(name, model)] if alone else [training, Leg(name, model, after=training.name)]
-        legs |= {leg.name: leg for leg in wanted}
-    return list(legs.values())
-
-
-def _of_queue(asked: Sequence[str], snapshots: Sequence[tuple[Run, int]]) -> Iterator[Leg]:
-    """Yield the legs of the queue: each snapshot goes on from the one before of its run."""
-    for model in asked:
-        check_known(model, {run.preset for run, _ in snapshots}, "model of the queue")
-    last: dict[str, str] = {}
-    for run, windows in snapshots:
-        if not asked or run.preset in asked:
-            leg = Leg(CAMPAIGN, run.preset, run, windows, last.get(run.name))
-            last[run.name] = leg.name
-            yield leg
+        # Each snapshot goes on from the one before of its run.
+        for run, windows in chosen(snapshots, asked) if name == CAMPAIGN else ():
+            legs.append(Leg(CAMPAIGN, run.preset, run, windows, last.get(run)))
+            last[run] = legs[-1].name
+        for model in (asked or models_with_weights(profile, "--preset")) if name != CAMPAIGN else ():
+            training = None if name in _TRAIN_THEMSELVES else Leg(TRAIN, model)
+            legs += [Leg(name, model)] if training is None else [training, Leg(name, model, after=training.name)]
+    return list(dict.fromkeys(legs))  # of two measurements of a preset the training is one leg
 
 
 @functools.lru_cache(maxsize=1)
@@ -172,85 +156,52 @@ def run_leg(work: Work, leg: Leg, before: dict | None = None) -> dict:
 
     Args:
       work, leg: what.
-      before: what the leg returned that had to be over first.
+      before: what the leg returned that had to be over first; only waited for.
 
     Returns:
-      state ("done" or "done before"), seconds, device, state_bytes (of the training state, 0 without one) and weights
-      (their digest, of a training).
-
+      state ("done" or "done before"), seconds, device and state_bytes (of the training state, 0 without one).
     """
-    place = work.place(leg)
+    place, kept = work.place(leg), Path()
     log.setLevel(logging.INFO)  # what it says is forwarded to whoever started the sweep
-    with _ALONE, _locked(place / ".lock", leg.name), _results_at(place):
+    # A worker that the scheduler has lost, or a stopped sweep's, may still do the leg: it is waited for.
+    alone = locked(place / ".lock", f"doing {leg.name}", wait=True)
+    with _ALONE, alone, mock.patch.dict(os.environ, {RESULTS_DIR_VARIABLE: str(place)}):
         log.info("begun: %s", leg.name)
         prepared, started = _opened(work.profile, work.source), time.perf_counter()
-        weights, kept = (before or {}).get("weights", ""), None
         if leg.measurement == TRAIN:
-            trained, _, origin = obtain_model(prepared, work.profile, preset=leg.preset, progress=False)
-            state = "done" if origin == "trained now" else "done before"
-            weights, kept = weights_digest(trained.params), model_files(work.profile, leg.preset).state
+            *_, origin = obtain_model(prepared, work.profile, preset=leg.preset, progress=False)
+            state, kept = origin.replace("trained now", "done"), model_files(work.profile, leg.preset).state
         elif leg.run is not None:
-            state = _snapshot(work, leg, prepared)
-            kept = work.folder / CAMPAIGN / leg.run.name / f"{leg.preset}.state.safetensors"
+            classifier, protocol, _ = protocol_of(prepared, work.profile, CAMPAIGN)
+            folder, snapshots = work.folder / CAMPAIGN, [(leg.run, leg.windows)]
+            # What `f3amd campaign` has measured counts: a training that is further on is not begun anew.
+            ((*_, state),) = run_campaign(
+                prepared, work.profile, classifier, protocol, folder=folder, batch_size=work.batch_size,
+                snapshots=snapshots, known=work.records(work.results), progress=False,
+            )  # fmt: skip
+            kept = folder / leg.run.name / f"{leg.preset}.state.safetensors"
         else:
-            state = _measured(work, leg, prepared, weights)
+            state = _measured(work, leg, prepared)
         return {
-            "state": state, "seconds": round(time.perf_counter() - started, 1), "device": jax.devices()[0].device_kind,
-            "state_bytes": kept.stat().st_size if kept and kept.exists() else 0, "weights": weights,
+            "state": "done" if state in ("done", "measured") else "done before",
+            "seconds": round(time.perf_counter() - started, 1), "device": jax.devices()[0].device_kind,
+            "state_bytes": kept.stat().st_size if kept.is_file() else 0,
         }  # fmt: skip
 
 
-@contextlib.contextmanager
-def _locked(path: Path, name: str) -> Iterator[None]:
-    """Hold a leg's lock; wait while a worker that the scheduler has lost, or a stopped sweep's, still does the leg."""
-    with contextlib.ExitStack() as held:
-        for tried in itertools.count():
-            try:
-                held.enter_context(locked(path, f"doing {name}"))
-                break
-            except ValueError as error:
-                if not tried:
-                    log.info("waits: %s", error)
-                time.sleep(_WAIT_S)
-        yield
-
-
-@contextlib.contextmanager
-def _results_at(place: Path) -> Iterator[None]:
-    """Send results of this process to a folder."""
-    earlier = os.environ.get(RESULTS_DIR_VARIABLE)
-    os.environ[RESULTS_DIR_VARIABLE] = str(place)
-    try:
-        yield
-    finally:
-        del os.environ[RESULTS_DIR_VARIABLE]
-        if earlier is not None:
-            os.environ[RESULTS_DIR_VARIABLE] = earlier
-
-
-def _snapshot(work: Work, leg: Leg, prepared: PreparedData) -> str:
-    """Train the queue's run up to a snapshot and measure it, unless somebody has."""
-    classifier, protocol, _ = protocol_of(prepared, work.profile, CAMPAIGN)
-    ((*_, state),) = run_campaign(
-        prepared, work.profile, classifier, protocol, folder=work.folder / CAMPAIGN, batch_size=work.batch_size,
-        # What `f3amd campaign` has measured counts: a training that is further on is not begun anew.
-        snapshots=[(leg.run, leg.windows)], known=work.records(work.results), progress=False,
-    )  # fmt: skip
-    return "done before" if state == "measured before" else "done"
-
-
-def _measured(work: Work, leg: Leg, prepared: PreparedData, weights: str) -> str:
+def _measured(work: Work, leg: Leg, prepared: PreparedData) -> str:
     """Measure a preset, unless it was with the same weights, data and profile."""
-    place, finished = work.place(leg), work.place(leg) / "finished.json"
+    finished, weights = work.place(leg) / "finished.json", ""
+    if leg.after is not None:
+        weights = weights_digest(obtain_model(prepared, work.profile, preset=leg.preset)[0].params)
     asked = {"profile": dataclasses.asdict(work.profile), "data": prepared.packed.fingerprint, "weights": weights}
     asked = json.dumps(asked, indent=1) + "\n"
     if finished.exists() and finished.read_text(encoding="utf-8") == asked:
         return "done before"
     finished.unlink(missing_ok=True)
-    shutil.rmtree(work.records(place), ignore_errors=True)  # of a leg that was killed, or of other weights
+    shutil.rmtree(work.records(work.place(leg)), ignore_errors=True)  # of a leg that was killed, or of other weights
     MEASUREMENTS[leg.measurement](prepared, work.profile, [leg.preset])
-    with whole_file(finished) as file:
-        file.write_text(asked, encoding="utf-8")
+    write_whole(finished, asked)
     return "done"
 
 
@@ -272,22 +223,20 @@ def gather(work: Work, legs: Iterable[Leg]) -> list[Path]:
                 left.setdefault(path.name, []).append((leg, *read_table(path)))
     written = []
     for name, parts in left.items():
-        record, target = parts[0][2], work.records(work.results) / name
+        record, target, tables, digests = parts[0][2], work.records(work.results) / name, [], {}
         for leg, _, its in parts:
             if record_hash(its) != record_hash(record):
                 raise ValueError(f"{work.place(leg)}: measured with other settings; remove it and sweep again")
-        tables, digests = [], {}
         if (earlier := kept_rows(target, record)) is not None:
-            for leg, *_ in parts:
-                earlier = earlier[~leg.own(earlier)]
-            tables, digests = [earlier], read_table(target)[1].get("weights_digests") or {}
+            tables = [earlier[~pd.concat([leg.own(earlier) for leg, *_ in parts], axis=1).any(axis=1)]]
+            digests = read_table(target)[1].get("weights_digests") or {}
         for leg, table, its in parts:
             mine = leg.own(table)
             if leg.run is None:  # every leg measures real motion, alike: the first one's rows are kept
-                mine |= ~table["model"].isin({model for known in tables for model in known["model"]})
+                mine |= ~table["model"].isin({model for each in tables for model in each["model"]})
             tables.append(table[mine])
             for key, found in (its.get("weights_digests") or {}).items():
-                digests[key] = found if leg.run is None else list(dict.fromkeys([*digests.get(key, ()), *found]))
+                digests[key] = list(dict.fromkeys([*(digests.get(key, ()) if leg.run else ()), *found]))
         told = {"weights_digests": digests} if "weights_digests" in record else {}
         written.append(write_table(target, pd.concat([each for each in tables if len(each)]), record | told))
     return written
@@ -306,7 +255,8 @@ def run_sweep(
       scheduler: address of a cluster that is there already, such as tcp://host:8786, instead.
 
     Yields:
-      (leg, what `run_leg` returned) as legs are over; of one that failed, state is "failed" and why.
+      (leg, what `run_leg` returned) as legs are over; of one that failed, or stands on one that did, state is "failed"
+      and why.
 
     Raises:
       ImportError: without Dask distributed.
@@ -314,33 +264,13 @@ def run_sweep(
     """
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
-    with _client(workers, scheduler) as client:
-        from distributed import as_completed
-
-        futures, names = {}, {}
-        for leg in legs:
-            key = f"{leg.name}-{uuid.uuid4().hex}"  # a cluster may still hold an earlier sweep's
-            names[key] = leg
-            futures[leg.name] = client.submit(run_leg, work, leg, futures.get(leg.after), key=key, pure=False)
-        failed = set()
-        for future in as_completed(futures.values()):
-            leg = names[future.key]
-            try:
-                yield leg, future.result()
-            except Exception as error:  # a failed leg is no reason to stop the others
-                failed.add(leg.name)
-                why = f"{leg.after} failed" if leg.after in failed else f"{error or type(error).__name__}"
-                yield leg, {"state": f"failed, {why}"}
-
-
-@contextlib.contextmanager
-def _client(workers: int, scheduler: str | None):
-    """Yield a client of a scheduler, by default of one of its own with so many worker processes."""
     try:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, as_completed
     except ImportError:
-        raise ImportError(f"f3amd sweep needs Dask distributed: {INSTALL}") from None
+        raise ImportError(
+            'f3amd sweep needs Dask distributed: make sweep-tools, or pip install "f3amd_lib[sweep]"'
+        ) from None
     # What concerns the user comes back as a leg's state.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as held:
@@ -359,6 +289,15 @@ def _client(workers: int, scheduler: str | None):
         except (OSError, ValueError) as error:
             raise ValueError(f"--scheduler {scheduler}: not reached ({error}); `dask scheduler` starts one") from None
         client.forward_logging(log.name)
-        found = len(client.nthreads())
-        log.info("workers      %d%s", found, "" if found else ", so far: legs wait for the first")
-        yield client
+        log.info("workers      %d now; legs wait for a free one", len(client.nthreads()))
+        futures, of_key = {}, {}
+        for leg in legs:
+            key = f"{leg.name}-{uuid.uuid4().hex}"  # a cluster may still hold an earlier sweep's
+            futures[leg.name] = client.submit(run_leg, work, leg, futures.get(leg.after), key=key, pure=False)
+            of_key[key] = leg
+        for future in as_completed(futures.values()):
+            try:
+                told = future.result()
+            except Exception as error:  # a failed leg is no reason to stop the others
+                told = {"state": f"failed, {error or type(error).__name__}"}
+            yield of_key[future.key], told

@@ -127,7 +127,7 @@ def _clear_leftovers(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(path, doing: str) -> Iterator[None]:
+def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a lock file while the block runs, so that no second process does the same work there.
 
     The operating system frees the lock of a process that was killed. Where a file system (or Windows)
@@ -136,9 +136,10 @@ def locked(path, doing: str) -> Iterator[None]:
     Args:
       path: of the lock file; missing folders are made.
       doing: what the block does, for the message, such as "training F3AMD-FNO-96".
+      wait: until whoever holds the lock has finished.
 
     Raises:
-      ValueError: if another process holds the lock.
+      ValueError: if another process holds the lock, unless it is waited for.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +147,7 @@ def locked(path, doing: str) -> Iterator[None]:
         file = path.open("a")
         try:
             if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
         except BlockingIOError:
