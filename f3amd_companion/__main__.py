@@ -243,30 +243,22 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     """Train models of text to motion, or their judge; what is finished is left as it is."""
     from f3amd_lib.text.data.text_encoders import load_text_encoder
     from f3amd_lib.text.judge import evaluator_task, text_judge
-    from f3amd_lib.text.stages import latent_models, text_models
+    from f3amd_lib.text.stages import text_models, train_stage
 
-    preset_of = lambda name: text_models.preset_and_branch(name)[0]
-    is_latent = lambda name: name != text_models.JUDGE and latent_models.is_latent_preset(preset_of(name))
     for name in names:
-        if name != text_models.JUDGE and not (is_latent(name) or text_models.is_text_preset(name)):
-            raise ValueError(f"{name} needs no captions: train it by a call of its own")
+        if name != text_models.JUDGE:
+            train_stage.stage_of(name)  # refuses those that need no captions
     profile = motion.numbers(train_steps=steps, batch_size=batch_size, seed=seed)
     data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
     stop_at = _stop_at(minutes)
-    how = {"batch_size": batch_size, "folder": out, "stop_at": stop_at}
+    how = {"window": motion.window, "batch_size": batch_size, "folder": out, "teacher": teacher, "stop_at": stop_at}
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
-        if is_latent(name):
-            done = latent_models.train_latent_model(data, encoder, profile, name, teacher=teacher, **how)
-        elif name != text_models.JUDGE:
-            done = text_models.train_text_model(data, encoder, profile, name, window=motion.window, **how)
-        elif files.model.exists():
-            done = text_judge.load_judge(files.model)
-        else:
+        if name == text_models.JUDGE:
             training = evaluator_task.EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
-            done = text_judge.train_judge(data, encoder, training, checkpoint=files.state, stop_at=stop_at)
-            if done is not None:
-                text_judge.save_judge(files.model, done)
+            done = text_judge.train_judge(data, encoder, training, files=files, stop_at=stop_at)
+        else:
+            done = train_stage.train_stage(data, encoder, profile, name, **how)
         log.info("%-12s %s", name, files.state if done is None else files.model)
         if done is None:
             return UNFINISHED
@@ -377,7 +369,7 @@ def text(
     from f3amd_lib.motion import inverse_kinematics, skeleton
     from f3amd_lib.text.data import text_encoders
     from f3amd_lib.text.sampling import captioned_motion
-    from f3amd_lib.text.stages import latent_models, text_models
+    from f3amd_lib.text.stages import text_models
     from f3amd_lib.training import checkpoints
 
     captions = [caption, *then]
@@ -385,9 +377,9 @@ def text(
     seed = checked_seed(seed)
     captioned_motion.check_solver(steps, guidance)
     if weights is None:
-        latent = model is not None and (model.lower() == "motionpcm" or latent_models.is_latent_preset(model))
+        latent = model is not None and (model.lower() == "motionpcm" or text_models.is_latent_preset(model))
     else:
-        latent = checkpoints.file_kind(weights) == latent_models.KIND  # the file itself says whose it is
+        latent = checkpoints.file_kind(weights) == text_models.LatentModel.kind  # the file itself says whose it is
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
     if latent and (then or control):
@@ -396,12 +388,8 @@ def text(
     targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
     Model(overwrite=overwrite).check_free(*targets)
     preset = model or (captioned_motion.STREAM_PRESET if then else None)
-    if latent:
-        found = weights or latent_models.find_latent_model(data, model, steps)
-        trained = latent_models.load_latent_model(found)
-    else:
-        found = weights or text_models.find_text_model(data, preset, control=control is not None)
-        trained = text_models.load_text_model(found)
+    found = weights or text_models.find_text_model(data, preset, control=control is not None, num_steps=steps)
+    trained = text_models.load_text_model(found)
     log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
     log.info("terms        %s", trained.record.get("dataset_licence"))
     encoder = text_encoders.load_text_encoder(trained.text_encoder.split("-")[0], text_weights)

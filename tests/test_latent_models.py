@@ -32,17 +32,16 @@ from f3amd_lib.text.sampling.motionpcm_sampling import (
     sample_teacher,
     steps_of,
 )
-from f3amd_lib.text.stages import captioned_models, latent_models, text_models
-from f3amd_lib.text.stages.latent_models import (
-    is_latent_preset,
-    load_latent_model,
-    named_model,
-    stage_of,
-    stands_on,
-    train_latent_model,
-)
+from f3amd_lib.text.stages import text_models, train_stage
 from f3amd_lib.text.stages.motionpcm_training import frame_statistics
-from f3amd_lib.text.stages.text_models import text_model_files
+from f3amd_lib.text.stages.text_models import (
+    find_text_model,
+    is_latent_preset,
+    load_text_model,
+    named_model,
+    text_model_files,
+)
+from f3amd_lib.text.stages.train_stage import stage_of, stands_on
 from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -67,10 +66,9 @@ QUIET = {"progress": False, "batch_size": 2}
 def test_a_preset_knows_what_it_stands_on():
     chain = {}
     for name in ("MotionPCM-VAE", "MotionPCM-teacher-small", "MotionPCM-M4", "MotionLCM-V2-small"):
-        preset = presets.find_preset(name)
-        chain[name] = stage_of(preset), stands_on(preset)
+        chain[name] = stage_of(name), stands_on(name)
     assert chain == {
-        "MotionPCM-VAE": ("autoencoder", ""),
+        "MotionPCM-VAE": ("latent autoencoder", ""),
         "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small-spans"),
         "MotionPCM-M4": ("student", "MotionPCM-teacher"),
         "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
@@ -82,12 +80,12 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     (tmp_path / "text").mkdir()
     for name in ("ACMDM-S-PS22-raw-n3", "MotionPCM-M1-small", "MotionPCM-VAE-small"):  # the newest comes last
         (tmp_path / "text" / f"{name}.safetensors").touch()
-    assert text_models.find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
+    assert find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
     for asked in ("motionpcm", "MotionPCM-M1-small"):
-        assert latent_models.find_latent_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
+        assert find_text_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
     with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
-        latent_models.find_latent_model("bandai", "MotionPCM-M4-small")
+        find_text_model("bandai", "MotionPCM-M4-small")
     # A student is trained for one number of steps: the steps that are asked for choose it.
     for steps, wanted in ((None, "M1"), (1, "M1"), (2, "M2"), (4, "M4")):
         name = named_model("MotionPCM", steps)
@@ -95,10 +93,10 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
         assert presets.find_preset(name).training.get("num_phases", 1) == (steps or 1)
     assert named_model("MotionPCM-M1-small", 4) == "MotionPCM-M1-small"
     with pytest.raises(ValueError, match="no trained MotionPCM-M2-small"):
-        latent_models.find_latent_model("bandai", "motionpcm", 2)
+        find_text_model("bandai", "motionpcm", num_steps=2)
     for steps in (3, 50):
         with pytest.raises(ValueError, match=f"for 1, 2 or 4 steps, none for {steps}; .* MotionPCM-teacher-small"):
-            latent_models.find_latent_model("bandai", "motionpcm", steps)
+            find_text_model("bandai", "motionpcm", num_steps=steps)
     assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
 
 
@@ -125,7 +123,7 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     assert command_line.main([*words, "--model", "motionpcm", "--steps", "1"]) == 0
     ((name, motion),), ((shape, times),) = made, asked
     assert (name, shape, times) == ("MotionPCM-M1-small", (1, 16, 32), [999, 0])
-    student = load_latent_model(SHIPPED / "MotionPCM-M1-small.safetensors")
+    student = load_text_model(SHIPPED / "MotionPCM-M1-small.safetensors")
     pooled = embed_captions(["a person raises the left hand"], load_text_encoder()).pooled
     wanted = latent_motions(student, pooled, 24, jax.random.key(3), guidance=14.0)[0]
     other = latent_motions(student, pooled, 24, jax.random.key(3), guidance=5.0)[0]
@@ -163,9 +161,7 @@ def test_steps_that_no_student_takes_are_refused(steps, model, told, tmp_path, m
 
 
 def test_a_student_is_told_no_guidance_that_it_has_never_heard():
-    student, teacher = (
-        load_latent_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher")
-    )
+    student, teacher = (load_text_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher"))
     assert [guidance_of(student, 1, w) for w in (None, 5.0, 15.0)] == [14.0, 5.0, 15.0]
     assert [guidance_of(teacher, 50, w) for w in (None, 0.0, 20.0)] == [6.5, 0.0, 20.0]
     told = {**student.record["identity"]["training"], "consistency": "latent"}
@@ -194,17 +190,17 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
     """A loop that trains nothing: weights of ones, whose moving average is twos."""
     tasks = {}
 
-    def loop(task, files, record, **leg):
+    def loop(task, files, record, *, held_out, **leg):
         tasks[task.name] = task
+        watched.append(held_out)
         params = jax.tree.map(jnp.ones_like, jax.eval_shape(lambda: task.init(jax.random.key(0))[0]))
         average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
-    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
+    monkeypatch.setattr(train_stage, "train_in_legs", loop)
     watched = []
-    monkeypatch.setattr(latent_models, "held_out_clips", lambda clips, config: watched.append(clips.count.tolist()))
-    student = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
-    teacher = load_latent_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
+    student = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    teacher = load_text_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
     ones, twos = (lambda tree, value=value: all((leaf == value).all() for leaf in jax.tree.leaves(tree))
                   for value in (1.0, 2.0))  # fmt: skip
     # The student's moving average is its target and no more; of the others the average is what is used.
@@ -216,20 +212,28 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         wanted = OneVectorAWord()(["a person walks 0", "a person walks 2"]).pooled
         np.testing.assert_allclose(tasks[name].clips.pooled, wanted, atol=1e-6)
     # Losses are watched on the one validation clip; recipes' shares of the 20 steps arrive.
-    assert watched == [[1]] * 3
+    statistics = frame_statistics(data)
+    (frames, mask), *others = watched
+    assert mask.sum() == 40 * len(mask)
+    (validation,) = data.members("validation")
+    clip = statistics.normalise(data.select([validation]).redundant_vectors())
+    for motion in frames:
+        np.testing.assert_allclose(motion[:40], clip, atol=1e-4)
+    wanted = OneVectorAWord()(data.captions[validation]).pooled
+    for _, captions in others:
+        np.testing.assert_allclose(captions, np.broadcast_to(wanted, captions.shape), atol=1e-6)
     assert [tasks[name].config.num_steps for name in ("latent autoencoder", "latent teacher", "student")] == [5, 20, 3]
     assert student.words == ("a", "person", "walks")
-    statistics = frame_statistics(data)
     for kept in (student.statistics, teacher.statistics):
         np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeypatch):
-    made = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     files = {name: text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
-    teacher, student = (load_latent_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
-    assert load_latent_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
+    teacher, student = (load_text_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
+    assert load_text_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
     for model in (teacher, student):
         for found, wanted in zip(
             *map(jax.tree.leaves, (model.autoencoder_params, made.autoencoder_params)), strict=True
@@ -243,7 +247,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
         assert np.isfinite(history[f"held_out_{term}"].dropna()).all() and history[f"held_out_{term}"].notna().any()
     # The same student from the teacher's file alone, where nothing else lies; other files are refused.
     elsewhere = tmp_path / "elsewhere"
-    from_file = partial(train_latent_model, data, OneVectorAWord(), PROFILE, folder=elsewhere, **QUIET)
+    from_file = partial(train_stage.train_stage, data, OneVectorAWord(), PROFILE, folder=elsewhere, **QUIET)
     alone = from_file("tiny-M2", teacher=files["tiny-teacher"])
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
@@ -255,7 +259,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
             from_file(name, teacher=files[file])
     others = data.select(np.arange(len(data.captions) - 1))
     with pytest.raises(ValueError, match="trained on other clips"):
-        train_latent_model(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
+        train_stage.train_stage(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
     # What is kept of one caption: the latent that each model makes in its own steps, from the noise of the seed.
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
     asked = {"models": ["tiny-M2", "tiny-teacher"], "folder": tmp_path}
@@ -277,10 +281,12 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     digests = {weights_digest(model.params) for model in (student, teacher)}
     assert told["caption"] == ONE_CAPTION and set(kept["weights"]) == digests
     # Finished models are read, and other settings are refused by name.
-    again = train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
+    again = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))
     with pytest.raises(ValueError, match="other training settings \\(batch_size\\) lies there"):
-        train_latent_model(data, OneVectorAWord(), PROFILE, "tiny-VAE", folder=tmp_path, progress=False, batch_size=1)
+        train_stage.train_stage(
+            data, OneVectorAWord(), PROFILE, "tiny-VAE", folder=tmp_path, progress=False, batch_size=1
+        )
     # From noise to vectors of a frame, all numbers.
     network, coder = network_with(made.config, made.params), network_with(made.autoencoder, made.autoencoder_params)
     noise, text = jax.random.normal(jax.random.key(0), (2, 2, 3)), np.zeros((2, 8), np.float32)
@@ -297,7 +303,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
         draw(made, num_steps=1)
     with pytest.raises(ValueError, match="an autoencoder alone"):
-        draw(load_latent_model(files["tiny-VAE"]))
+        draw(load_text_model(files["tiny-VAE"]))
     with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
         latent_motions(made, text, 44, key)
     # What a mean latent gives back is a motion of the same place and size, and not another clip's.

@@ -18,7 +18,8 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.sampling.motionpcm_sampling import TEACHER_GUIDANCE
-from f3amd_lib.text.stages.latent_models import is_latent_preset, stage_of
+from f3amd_lib.text.stages.text_models import is_latent_preset
+from f3amd_lib.text.stages.train_stage import stage_of
 
 PROFILE = load_profile("smoke", "bandai", train_steps=20)
 TEACHER, STUDENT = (
@@ -108,4 +109,4 @@ def test_the_files_rows_name_presets_columns_and_commands():
                 continue
             model, trained = presets.find_preset(row["model"]), presets.find_preset(row["trained"])
             assert model.name == row["model"] and is_latent_preset(trained.name)
-            assert stage_of(model) == stage_of(trained) and model.training == trained.training
+            assert stage_of(model.name) == stage_of(trained.name) and model.training == trained.training

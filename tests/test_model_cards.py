@@ -18,7 +18,7 @@ from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data import text_encoders
-from f3amd_lib.text.stages import text_models
+from f3amd_lib.text.stages import text_models, train_stage
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -52,10 +52,10 @@ class Asked(Exception):
 
 
 def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(monkeypatch):
-    def begin(data, split, encoder, preset, config, codec, window=None):
-        raise Asked(preset, config, window)
+    def begin(asked, split):
+        raise Asked(asked.preset.name, asked.config, asked.window)
 
-    monkeypatch.setattr(text_models, "denoiser_task", begin)
+    monkeypatch.setitem(train_stage.STAGES, "denoiser", train_stage.STAGES["denoiser"]._replace(task=begin))
     walks = captioned_walks(synthetic.STYLES[:1], ("train",), num_frames=40)
     monkeypatch.setattr(text_models, "open_text_motions", lambda *asked: walks)
     monkeypatch.setattr(text_encoders, "load_text_encoder", lambda: None)

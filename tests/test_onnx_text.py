@@ -28,9 +28,8 @@ from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
 from f3amd_lib.text.sampling.motionpcm_sampling import sample_student, sample_teacher
 from f3amd_lib.text.sampling.text_to_motion import text_prediction
-from f3amd_lib.text.stages.latent_models import LatentModel, save_latent_model
 from f3amd_lib.text.stages.motion_codec import MotionCodec
-from f3amd_lib.text.stages.text_models import TextModel, save_text_model
+from f3amd_lib.text.stages.text_models import LatentModel, TextModel, save_text_model
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
 
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
@@ -90,8 +89,7 @@ MODELS = {
 def exported(request, tmp_path_factory):
     """A model, and the folder that its file was exported to by the command."""
     trained, folder = MODELS[request.param](), tmp_path_factory.mktemp("told")
-    save = save_text_model if isinstance(trained, TextModel) else save_latent_model
-    save(folder / "tiny.safetensors", trained, jnp.float32)
+    save_text_model(folder / "tiny.safetensors", trained, jnp.float32)
     words = ["export", "--target", "onnx", "--weights", str(folder / "tiny.safetensors"), "--steps", "4"]
     assert main([*words, "--out", str(folder / "out")]) == 0
     assert main([*words, "--out", str(folder / "out")]) == 2  # nothing is replaced unasked

@@ -12,6 +12,7 @@ from f3amd_lib.text.data.text_encoders import TextEmbeddings
 from f3amd_lib.text.data.text_motions import text_motions
 from f3amd_lib.text.judge import text_judge
 from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
+from f3amd_lib.text.stages import text_models
 
 STYLES = synthetic.STYLES[:4]
 SIZES = {"movement_width": 16, "motion_hidden": 16, "text_hidden": 16, "embedding_width": 8}
@@ -76,7 +77,7 @@ def test_a_motion_is_embedded_alike_wherever_it_stands_and_in_any_batch(data, ju
 
 
 def test_a_judge_comes_back_from_its_file(judge, data, tmp_path):
-    text_judge.save_judge(tmp_path / "judge.safetensors", judge)
+    text_models.save_text_model(tmp_path / "judge.safetensors", judge, np.float32)
     again = text_judge.load_judge(tmp_path / "judge.safetensors")
     assert np.array_equal(again.embed_motions([data.clip(0)]), judge.embed_motions([data.clip(0)]))
     assert again.text_encoder == judge.text_encoder and again.skeleton == judge.skeleton

@@ -19,14 +19,8 @@ from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.sampling import captioned_motion
-from f3amd_lib.text.stages import captioned_models, text_models
-from f3amd_lib.text.stages.text_models import (
-    controlled_joints,
-    find_text_model,
-    load_text_model,
-    save_text_model,
-    train_text_model,
-)
+from f3amd_lib.text.stages import text_models, train_stage
+from f3amd_lib.text.stages.text_models import controlled_joints, find_text_model, load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import describe
 
 pytestmark = pytest.mark.slow
@@ -72,7 +66,7 @@ def folder(data, tmp_path_factory):
         for name, preset in TINY.items():
             patch.setitem(presets.PRESETS, name, preset)
         for name in ("tiny+control", "tiny+control-pelvis", "tiny-redundant", "tiny-mesh", "tiny-prefix"):
-            assert train_text_model(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
+            assert train_stage.train_stage(data, ENCODER, PROFILE, name, folder=folder / "models", **QUIET) is not None
         yield folder / "models"
 
 
@@ -130,12 +124,12 @@ def test_a_branch_stands_beside_the_network_that_ships_where_that_knows_the_moti
     marked = dataclasses.replace(shipped, record=shipped.record | {"guidance": 1.5})
     save_text_model(place / "tiny.safetensors", marked, jnp.float32)
     monkeypatch.setattr(text_models, "PRETRAINED_DIR", tmp_path / "pretrained")
-    made = train_text_model(data, encoder, PROFILE, "tiny+control", folder=tmp_path / "own", **QUIET)
+    made = train_stage.train_stage(data, encoder, PROFILE, "tiny+control", folder=tmp_path / "own", **QUIET)
     assert not (tmp_path / "own" / "tiny.safetensors").exists() and made.record["guidance"] == 1.5
     for one, other in zip(jax.tree.leaves(made.params), jax.tree.leaves(shipped.params), strict=True):
         np.testing.assert_allclose(one, other, rtol=0.01)  # written in 16 bits
     # Of other motions it knows nothing: the base is trained first.
-    train_text_model(data.cut(32), encoder, PROFILE, "tiny+control", folder=tmp_path / "other", **QUIET)
+    train_stage.train_stage(data.cut(32), encoder, PROFILE, "tiny+control", folder=tmp_path / "other", **QUIET)
     assert (tmp_path / "other" / "tiny.safetensors").exists()
 
 
@@ -179,9 +173,9 @@ def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_pa
         average = jax.tree.map(lambda leaf: 2.0 * leaf, params)
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
-    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
+    monkeypatch.setattr(train_stage, "train_in_legs", loop)
     monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
-    made = train_text_model(data, ENCODER, PROFILE, "tiny+control", folder=tmp_path, **QUIET)
+    made = train_stage.train_stage(data, ENCODER, PROFILE, "tiny+control", folder=tmp_path, **QUIET)
     for weights in (made.params, made.branch, given["control branch"][0].base):
         assert all((leaf == 2.0).all() for leaf in jax.tree.leaves(weights))
     axes, clips = data.normaliser(), {name: data.members(name) for name in ("train", "validation")}
@@ -205,11 +199,11 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
         given.update(task=task, record=record)
         return types.SimpleNamespace(step=0), []
 
-    monkeypatch.setattr(captioned_models, "train_in_legs", loop)
+    monkeypatch.setattr(train_stage, "train_in_legs", loop)
     monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
-    assert train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, window=32, **QUIET) is None
+    assert train_stage.train_stage(data, ENCODER, PROFILE, "tiny", folder=tmp_path, window=32, **QUIET) is None
     with pytest.raises(ValueError, match="no train clip has 64 frames, the longest has 32; tiny-AE needs longer ones"):
-        train_text_model(data, ENCODER, PROFILE, "tiny-AE", folder=tmp_path, window=32, **QUIET)
+        train_stage.train_stage(data, ENCODER, PROFILE, "tiny-AE", folder=tmp_path, window=32, **QUIET)
     cut, task = data.cut(32), given["task"]
     assert task.model_config.window == 32 and np.asarray(task.clips.length).tolist() == [32] * 8
     first = cut.normaliser().normalise(data.clip(data.members("train")[0])[:32])
@@ -218,7 +212,7 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
 
 
 def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(folder, data, tmp_path):
-    train = lambda **leg: train_text_model(data, ENCODER, PROFILE, "tiny", folder=tmp_path, **QUIET, **leg)
+    train = lambda **leg: train_stage.train_stage(data, ENCODER, PROFILE, "tiny", folder=tmp_path, **QUIET, **leg)
     assert train(stop_at=0.0) is None
     assert describe(tmp_path / "tiny.state.safetensors")["part"] == "text and motion"
     assert same(train().params, load(folder, "tiny").params)
@@ -226,7 +220,7 @@ def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(fol
 
 def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(folder, data):
     before = (folder / "tiny.safetensors").read_bytes()
-    train = lambda profile: train_text_model(data, ENCODER, profile, "tiny", folder=folder, **QUIET)
+    train = lambda profile: train_stage.train_stage(data, ENCODER, profile, "tiny", folder=folder, **QUIET)
     assert same(train(PROFILE).params, load(folder, "tiny").params)
     with pytest.raises(ValueError, match=r"training settings \(seed\) lies there.*--out"):
         train(dataclasses.replace(PROFILE, seed=5))
@@ -235,7 +229,7 @@ def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(fo
 
 def test_a_branch_stands_beside_a_finished_model_of_any_settings_but_of_the_same_data(folder, data, tmp_path):
     (tmp_path / "tiny.safetensors").write_bytes((folder / "tiny.safetensors").read_bytes())
-    train = lambda data: train_text_model(
+    train = lambda data: train_stage.train_stage(
         data, ENCODER, dataclasses.replace(PROFILE, seed=5), "tiny+control", folder=tmp_path, stop_at=0.0, **QUIET
     )
     assert train(data) is None  # begun, and not refused
@@ -247,13 +241,13 @@ def test_positions_do_not_train_a_preset_of_other_channels(folder, data, monkeyp
     wrong = dataclasses.replace(TINY["tiny"], name="wrong", network=SIZES | {"channels": 12})
     monkeypatch.setitem(presets.PRESETS, "wrong", wrong)
     with pytest.raises(ValueError, match="wrong models 12 numbers a joint; positions have 3"):
-        train_text_model(data, ENCODER, PROFILE, "wrong", folder=folder, **QUIET)
+        train_stage.train_stage(data, ENCODER, PROFILE, "wrong", folder=folder, **QUIET)
 
 
 def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, data):
     plain, trained = load(folder, "tiny"), load(folder, "tiny-redundant")
-    states = text_models.encoded_clips(trained.codec, data)
-    np.testing.assert_array_equal(states[..., :3], text_models.encoded_clips(plain.codec, data))
+    states = train_stage.encoded_clips(trained.codec, data)
+    np.testing.assert_array_equal(states[..., :3], train_stage.encoded_clips(plain.codec, data))
     part = np.repeat([split == "train" for split in data.splits], data.lengths)
     np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)
     np.testing.assert_allclose(states[part, :, 3:].std(axis=(0, 1)), 1.0, atol=1e-3)
@@ -280,7 +274,7 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
     clip = codec.axes.normalise(data.clip(0)[None])
     vertices = codec.axes.restore(codec.vertices_of(clip[0]))
     np.testing.assert_allclose(mesh.joints(vertices), data.clip(0), atol=2e-3)
-    states = text_models.encoded_clips(codec, data)
+    states = train_stage.encoded_clips(codec, data)
     assert states.shape == (len(data.positions), 12, 5)
     one = np.asarray(codec.encode(clip, np.ones(clip.shape[:2], bool)))[0]
     np.testing.assert_allclose(one, states[: len(one)], atol=1e-4)
@@ -297,7 +291,7 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
     with pytest.raises(ValueError, match="tiny makes joints, no mesh"):
         captioned_motion.draw_motions(load(folder, "tiny"), np.zeros((1, 8)), 24, jax.random.key(0), mesh=True)
     with pytest.raises(ValueError, match="tiny-mesh has no control branch"):
-        train_text_model(data, ENCODER, PROFILE, "tiny-mesh+control", folder=folder, **QUIET)
+        train_stage.train_stage(data, ENCODER, PROFILE, "tiny-mesh+control", folder=folder, **QUIET)
 
 
 def test_a_model_of_another_body_is_refused(folder, tmp_path, monkeypatch):
@@ -313,7 +307,7 @@ def test_a_model_of_another_body_is_refused(folder, tmp_path, monkeypatch):
 
 def test_a_network_for_a_larger_mesh_is_refused(data, tmp_path):
     with pytest.raises(ValueError, match=r"levels must have fewer and fewer vertices, got .\d+, 1925"):
-        train_text_model(data, ENCODER, PROFILE, "ACMDM-S-PS28", folder=tmp_path, **QUIET)
+        train_stage.train_stage(data, ENCODER, PROFILE, "ACMDM-S-PS28", folder=tmp_path, **QUIET)
 
 
 def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):

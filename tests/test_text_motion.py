@@ -14,7 +14,7 @@ from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable
 from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch
+from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, branch_with
 from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
 from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.text.sampling.text_to_motion import sample_control
@@ -23,7 +23,6 @@ from f3amd_lib.text.stages.acmdm_training import (
     ControlTask,
     TextMotionTask,
     TextMotionTraining,
-    branch_with,
     control_loss,
     denoising_loss,
     draw_captioned,
@@ -380,7 +379,7 @@ def test_a_trained_branch_takes_a_joint_where_it_is_asked_to_be():
     wanted, noise = jnp.asarray(still[:64]), jax.random.normal(jax.random.key(5), (64, frames, joints, 3))
     asked = np.zeros((64, frames, joints), np.float32)
     asked[:, 3, 0] = 1.0
-    network, branch = network_with(config, base), branch_with(config, codec, state.averaged)
+    network, branch = network_with(config, base), branch_with(config, codec.frames_per_state, state.averaged)
     control, how = Control.of(wanted, asked), {"sampler": straight().sampler, "num_steps": 20}
 
     def apart(control):
@@ -403,7 +402,7 @@ def test_the_control_loss_is_in_metres_at_the_asked_points():
         def __call__(self, state, time, context, residuals=None):
             return NORMALISED.at[..., 2].add(0.5)
 
-    branch = branch_with(config, CODEC, nnx.state(control_branch_of(config)))
+    branch = branch_with(config, CODEC.frames_per_state, nnx.state(control_branch_of(config)))
     loss = jax.jit(
         lambda key: control_loss(
             Base(config, None), branch, straight(), CODEC, NORMALISED, NORMALISED, told, control, key

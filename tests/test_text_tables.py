@@ -27,7 +27,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.judge.text_metrics import control_errors
-from f3amd_lib.text.stages import text_models
+from f3amd_lib.text.stages import train_stage
 from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -156,7 +156,7 @@ def test_states_are_as_long_as_the_clips_but_for_prefixes_and_blocks(preset, win
     bench = types.SimpleNamespace(settings=settings, record=lambda *arguments: {"settings": settings})
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
-    monkeypatch.setattr(text_tables, "train_text_model", lambda *named, window, **how: asked.append((named[3], window)))
+    monkeypatch.setattr(text_tables, "train_stage", lambda *named, window, **how: asked.append((named[3], window)))
     rows = [{"model": "ACMDM-S-PS22-raw", "trained": preset}]
     assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
     assert asked == [(preset, window)]
@@ -175,7 +175,7 @@ def test_steps_and_motions_a_step_of_a_table_arrive_where_networks_are_trained(d
 
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
-    monkeypatch.setattr(text_tables, "train_text_model", train)
+    monkeypatch.setattr(text_tables, "train_stage", train)
     rows = [{"model": "ACMDM-S-PS22", "trained": "ACMDM-S-PS22-n2"}]
     assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, folder=tmp_path, **QUIET) is None
     # The autoencoder by its own recipe's batch, before the denoiser that stands on it.
@@ -237,7 +237,7 @@ def test_the_files_rows_name_presets_columns_and_commands():
         # What the paper says of its four sizes of meshes ("competitive") is no question to one row of ours.
         assert (f"f3amd measure {name} " in typed) == (name != "text_table4")
         for row in about[name]["rows"]:
-            assert text_models.is_text_preset(row["trained"]) and presets.find_preset(row["model"])
+            assert train_stage.stage_of(row["trained"]) == "denoiser" and presets.find_preset(row["model"])
             assert {*row} - {"trained", "first"} == set(SCHEMAS[name]) - {"metric", "joint"}
     # One autoencoder size and one number of blocks within a table, but where blocks are what is compared.
     depths = {presets.find_preset(row["trained"]).network["depth"] for row in about["text_table1"]["rows"]}

@@ -30,8 +30,7 @@ from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.text.judge.text_judge import load_judge
-from f3amd_lib.text.stages.latent_models import is_latent_preset, load_latent_model
-from f3amd_lib.text.stages.text_models import JUDGE, load_text_model
+from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
 from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -185,7 +184,7 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    trained = load_latent_model(path)
+    trained = load_text_model(path)
     training, phases = _text_training(path, trained, trained.training, "motionpcm"), trained.training["num_phases"]
     shown = [*_OF_JUDGE, "sampling_seconds"]
     rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)

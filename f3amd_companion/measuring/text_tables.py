@@ -1,8 +1,7 @@
 """Tables of text to motion: `f3amd measure text_table1`, rows from `papers/PAPER/experiments.toml`.
 
-Each row's model is trained first, if it is not, by `text.stages.text_models` or, for MotionPCM's, by
-`text.stages.latent_models`; then it makes a motion for each held-out clip's caption, and the judge looks. A row is kept
-as soon as it is measured; a leg that is out of time goes on there.
+Each row's model is trained first, if it is not, by `text.stages.train_stage`; then it makes a motion for each held-out
+clip's caption, and the judge looks. A row is kept as soon as it is measured; a leg that is out of time goes on there.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
 from f3amd_lib.text.data.text_motions import TextMotions, frame_mask, pad_motions
 from f3amd_lib.text.judge import text_metrics
 from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
-from f3amd_lib.text.judge.text_judge import TextJudge, judge_motions, judged_clips, load_judge, save_judge, train_judge
+from f3amd_lib.text.judge.text_judge import TextJudge, judge_motions, judged_clips, train_judge
 from f3amd_lib.text.networks.acmdm import TextCondition
 from f3amd_lib.text.networks.acmdm_control import Control
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
@@ -37,8 +36,8 @@ from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions, latent_sa
 from f3amd_lib.text.sampling.noise_optimisation import control_distance, optimise_noise
 from f3amd_lib.text.sampling.text_to_motion import continue_prefix, sample_control, sample_text
 from f3amd_lib.text.stages import text_models
-from f3amd_lib.text.stages.latent_models import LatentModel, is_latent_preset, train_latent_model
-from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, TextModel, train_text_model
+from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel, is_latent_preset
+from f3amd_lib.text.stages.train_stage import train_stage
 from f3amd_lib.training.checkpoints import weights_digest
 
 PAPERS = {
@@ -423,16 +422,11 @@ def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, f
     The one that ships must know these very motions and this encoder. None where `stop_at` comes first.
     """
     files = text_models.text_model_files(profile, text_models.JUDGE, folder=folder)
-    if files.model.exists():
-        return load_judge(files.model)
-    if shipped := text_models.shipped_for(files.model.stem, data, encoder, load_judge):
+    if not files.model.exists() and (shipped := text_models.shipped_for(files.model.stem, data, encoder, TextJudge)):
         return shipped
     # A check of the way needs no judge that sees.
     training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
-    judge = train_judge(data, encoder, training, checkpoint=files.state, **leg)
-    if judge is not None:
-        save_judge(files.model, judge)
-    return judge
+    return train_judge(data, encoder, training, files=files, **leg)
 
 
 REAL = "Real"
@@ -501,16 +495,16 @@ def measure_text_table(
     def trained(preset: str) -> TextModel | LatentModel | None:
         base = text_models.preset_and_branch(preset)[0]
         if is_latent_preset(base):  # these see clips of a length of their own
-            return train_latent_model(data, encoder, profile, preset, folder=folder, **leg)
+            return train_stage(data, encoder, profile, preset, folder=folder, **leg)
         form = presets.find_preset(base)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
         own = "prefix_frames" in form.training or "block_frames" in form.network
         where = {"window": None if own else most_frames, "folder": apart, **leg}
         if form.latent and "autoencoder_steps" in settings:
             steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
-            if train_text_model(cut, encoder, steps, form.latent, **where) is None:
+            if train_stage(cut, encoder, steps, form.latent, **where) is None:
                 return None
-        return train_text_model(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
+        return train_stage(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
 
     for row in rows:
         if asked and row["model"] not in asked:

@@ -21,17 +21,13 @@ from f3amd_companion.serving.onnx_export import ABOUT, card_head, skeleton_card,
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.text.networks.acmdm import ACMDMConfig
 from f3amd_lib.text.phases import cut_phases, ddim_times, shares
-from f3amd_lib.text.stages.latent_models import LatentModel, load_latent_model
-from f3amd_lib.text.stages.text_models import TextModel, load_text_model
+from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model
 from f3amd_lib.training.checkpoints import file_kind, network_with
-
-_LOADERS = {"text-to-motion model": load_text_model, "latent motion model": load_latent_model}
 
 
 def load_text_or_latent(path) -> TextModel | LatentModel | None:
     """Read a model of text to motion; None for a weights file of another kind, ValueError for one that is damaged."""
-    load = _LOADERS.get(file_kind(path))
-    return load and load(path)
+    return load_text_model(path) if file_kind(path) in (TextModel.kind, LatentModel.kind) else None
 
 
 def asked_at(trained: TextModel | LatentModel, num_steps: int) -> dict[str, list[float]]:

@@ -6,6 +6,7 @@ the name, so that a crash leaves the old file whole. Reading checks names, shape
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import hashlib
@@ -100,13 +101,15 @@ def describe(path: Path) -> dict:
     return _read(path)[1]
 
 
-def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
+def load_tree(path: Path, template: Any, *, rest: bool = False) -> tuple[Any, dict]:
     """Read a tree written by `save_tree`; the file is read and its checksum taken once.
 
     Args:
       path: the file.
       template: tree of arrays or shapes that says what must be there, or a function that makes one
         from the file's description, which it may refuse with a ValueError.
+      rest: the tree is a dict, and the template has some of its parts; the others come as the file has them, as dicts
+        of arrays in dicts.
 
     Returns:
       (tree, metadata).
@@ -118,6 +121,8 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
     if callable(template):
         with errors_name(path):
             template = template(metadata)
+    if rest:
+        template = _by_names(arrays) | template
     wanted = _named_leaves(template)
     if wanted.keys() != arrays.keys():
         odd = sorted(wanted.keys() ^ arrays.keys())
@@ -127,6 +132,20 @@ def load_tree(path: Path, template: Any) -> tuple[Any, dict]:
             raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {leaf.shape}")
     leaves = [jax.device_put(arrays[name].astype(leaf.dtype)) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
+
+
+def _by_names(arrays: dict) -> dict:
+    """Return arrays as dicts in dicts, of names such as "['axes']['mean']"."""
+    tree = {}
+    for name, array in arrays.items():
+        place, keys, node = tree, [], ast.parse(f"_{name}", mode="eval").body
+        while not isinstance(node, ast.Name):
+            keys.append(node.attr if isinstance(node, ast.Attribute) else node.slice.value)
+            node = node.value
+        for key in keys[:0:-1]:
+            place = place.setdefault(key, {})
+        place[keys[0]] = array
+    return tree
 
 
 def file_kind(path) -> str | None:

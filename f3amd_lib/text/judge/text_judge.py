@@ -6,12 +6,11 @@ It says what it sees before it judges: R-precision is refused where real held-ou
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,6 @@ from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.measures.distributions import frechet_distance, intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.text.data import text_motions
 from f3amd_lib.text.data.redundant import canonical_start, essential_features
 from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions
@@ -30,31 +28,34 @@ from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, pad_mo
 from f3amd_lib.text.judge import text_metrics
 from f3amd_lib.text.judge.evaluator_task import EvaluatorTask, EvaluatorTraining, embedded_captions
 from f3amd_lib.text.judge.judge_network import TextMotionConfig
+from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, load_text_model, save_text_model
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.optimise import optimise
+from f3amd_lib.training.pipeline import ModelFiles
 
 _BATCH = 64
 
 
-@dataclass(frozen=True, eq=False)
-class TextJudge:
-    """A trained judge.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TextJudge(CaptionedModel):
+    """A trained judge; motions on another skeleton than its own are not accepted.
 
     Attributes:
-      config: of its network.
-      params: weights.
       normaliser: of its motion features; deviations averaged over each part.
-      skeleton: of the motion it was trained on; no other is accepted.
-      text_encoder: identity of the encoder whose token vectors it reads.
-      record: how it was trained, on what.
     """
 
-    config: TextMotionConfig
-    params: Any
+    kind: ClassVar[str] = TextMotionConfig.family
+
     normaliser: AxisNormaliser
-    skeleton: Skeleton
-    text_encoder: str
-    record: dict
+
+    def parts(self) -> tuple[dict, dict, None, dict]:
+        """Return what its file has besides, as `TextModel.parts`."""
+        return {}, {"normaliser": self.normaliser._asdict()}, None, {}
+
+    @classmethod
+    def of(cls, tree: dict, autoencoder, said: dict, about: dict) -> TextJudge:
+        """Return the judge of a file, as `TextModel.of`."""
+        return cls(normaliser=AxisNormaliser(**jax.tree.map(np.asarray, tree["normaliser"])), **about)
 
     def embed_motions(self, motions: Sequence[np.ndarray]) -> np.ndarray:
         """Return motions as vectors, [N, D].
@@ -132,52 +133,37 @@ def judge_task(
 
 def train_judge(
     data: TextMotions, encoder: TextEncoder, training: EvaluatorTraining | None = None, *,
-    checkpoint: Path | None = None, progress: bool = True, stop_at: float | None = None, **sizes,
+    files: ModelFiles | None = None, progress: bool = True, stop_at: float | None = None, **sizes,
 ) -> TextJudge | None:  # fmt: skip
-    """Train a judge; with a checkpoint a killed training goes on where it was.
+    """Train a judge; with files a killed training goes on where it was, and a finished judge is only read.
 
     Args:
       data, encoder, training, **sizes: as in `judge_task`.
-      checkpoint: file of the training state.
+      files: where it is kept; by default nowhere.
       progress: show a progress bar.
       stop_at: as for `optimise`; where it comes first, the answer is None.
     """
-    training = training or EvaluatorTraining()
+    if files and files.model.exists():
+        return load_judge(files.model)
+    training, checkpoint = training or EvaluatorTraining(), files and files.state
     task, normaliser = judge_task(data, encoder, training, **sizes)
     state, history = optimise(task, checkpoint=checkpoint, checkpoint_every=200, stop_at=stop_at, progress=progress)
     if int(state.step) < training.num_steps:
         return None
     identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}
     record = run_record(profile="none", dataset=data, seed=training.seed, **identity, history=history)
-    return TextJudge(task.model_config, state.params, normaliser, data.skeleton, encoder.identity, record)
-
-
-def save_judge(path: Path, judge: TextJudge) -> None:
-    """Write a judge; `load_judge` gives back the same."""
-    offsets = np.asarray(judge.skeleton.offsets, np.float32)
-    tree = {"params": judge.params, "normaliser": judge.normaliser._asdict(), "offsets": offsets}
-    about = {"network": dataclasses.asdict(judge.config), "text_encoder": judge.text_encoder, "record": judge.record}
-    skeleton = checkpoints.describe_skeleton(judge.skeleton)
-    checkpoints.save_tree(path, tree, {"kind": "text-to-motion judge", **about, **skeleton})
+    judge = TextJudge(
+        name=JUDGE, config=task.model_config, params=state.params, normaliser=normaliser, skeleton=data.skeleton,
+        fps=data.fps, text_encoder=encoder.identity, record=record,
+    )  # fmt: skip
+    if files:
+        save_text_model(files.model, judge, jnp.float32)
+    return judge
 
 
 def load_judge(path: Path) -> TextJudge:
-    """Read a judge written by `save_judge`; ValueError names a file that is missing, damaged or of another kind."""
-
-    def template(metadata: dict) -> dict:
-        checkpoints.check_kind(metadata, "text-to-motion judge")
-        config = TextMotionConfig(**metadata["network"])
-        numbers = jax.ShapeDtypeStruct((config.features,), jnp.float32)
-        offsets = jax.ShapeDtypeStruct((len(metadata["joints"]), 3), jnp.float32)
-        normaliser = {"mean": numbers, "deviation": numbers}
-        return {"params": checkpoints.weights_shapes(config), "normaliser": normaliser, "offsets": offsets}
-
-    with checkpoints.errors_name(path):
-        tree, metadata = checkpoints.load_tree(path, template)
-        normaliser = AxisNormaliser(**jax.tree.map(np.asarray, tree["normaliser"]))
-        skeleton = checkpoints.described_skeleton(metadata, tree["offsets"])
-        about = (metadata[name] for name in ("text_encoder", "record"))
-        return TextJudge(TextMotionConfig(**metadata["network"]), tree["params"], normaliser, skeleton, *about)
+    """Read a judge from its file; ValueError names one that is missing, damaged or of another kind."""
+    return load_text_model(path, TextJudge)
 
 
 # ------------------------------------------------------------------------------------------ verdicts

@@ -7,8 +7,10 @@ therefore changes nothing.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 
@@ -99,6 +101,18 @@ def control_branch(base: ACMDM, frames_per_state: int, key) -> ControlBranch:
     branch = ControlBranch(base.config, frames_per_state, rngs=LayerKeys(key))
     nnx.update(branch.blocks, nnx.state(base.blocks))
     return branch
+
+
+@functools.lru_cache(maxsize=8)
+def blank_branch(config: ACMDMConfig, frames_per_state: int) -> tuple:
+    """Return a branch's structure and the shapes of its weights, without building arrays."""
+    blank = lambda: ControlBranch(config, frames_per_state, rngs=LayerKeys(jax.random.key(0)))
+    return nnx.split(nnx.eval_shape(blank))
+
+
+def branch_with(config: ACMDMConfig, frames_per_state: int, params) -> ControlBranch:
+    """Return a control branch with the given weights."""
+    return nnx.merge(blank_branch(config, frames_per_state)[0], jax.tree.map(lambda leaf: leaf, params))
 
 
 def controlled(base: ACMDM, branch: ControlBranch, condition: TextCondition, control: Control):

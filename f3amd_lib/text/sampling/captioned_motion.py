@@ -16,13 +16,11 @@ from f3amd_lib.text.data.redundant import smoothed_yaw
 from f3amd_lib.text.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.text.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
 from f3amd_lib.text.networks.acmdm import TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control
+from f3amd_lib.text.networks.acmdm_control import Control, branch_with
 from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
 from f3amd_lib.text.sampling import text_to_motion
 from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions
-from f3amd_lib.text.stages.acmdm_training import branch_with
-from f3amd_lib.text.stages.latent_models import LatentModel
-from f3amd_lib.text.stages.text_models import TextModel
+from f3amd_lib.text.stages.text_models import LatentModel, TextModel
 from f3amd_lib.training.checkpoints import network_with
 
 NEAR = 4
@@ -164,7 +162,8 @@ def motion_drawer(
     def compiled(weights, codec, pooled, mask, noise, key, control):
         network, condition = network_with(config, weights["network"]), TextCondition(pooled, codec.state_mask(mask))
         if controlled:
-            given = branch_with(config, codec, weights["branch"]), schedule, condition, control, noise
+            branch = branch_with(config, codec.frames_per_state, weights["branch"])
+            given = branch, schedule, condition, control, noise
             state = text_to_motion.sample_control(network, *given, key=key, **asked)
         elif isinstance(config, MaskedACMDMConfig):
             state = text_to_motion.sample_masked(network, schedule, condition, key, **asked)

@@ -15,7 +15,7 @@ from f3amd_lib.text import phases
 from f3amd_lib.text.data.redundant import positions_from_redundant
 from f3amd_lib.text.data.text_motions import frame_mask
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoder, LatentDenoiser
-from f3amd_lib.text.stages.latent_models import LatentModel
+from f3amd_lib.text.stages.text_models import LatentModel
 from f3amd_lib.training.checkpoints import network_with
 
 Predict = Callable[[jax.Array, jax.Array], jax.Array]

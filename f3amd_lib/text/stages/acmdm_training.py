@@ -17,10 +17,9 @@ from flax import nnx
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.networks.config import LayerKeys
 from f3amd_lib.text.data.text_motions import ClipTable, draw_clips
-from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, control_branch, controlled
+from f3amd_lib.text.networks.acmdm import TextCondition
+from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, branch_with, control_branch, controlled
 from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
 from f3amd_lib.text.networks.motion_autoencoder import smooth_l1, variational_loss
 from f3amd_lib.text.stages.motion_codec import MotionCodec
@@ -113,6 +112,11 @@ class AutoencoderTask(ClipsTask):
         clip = jax.random.categorical(key_clip, jnp.where(clips.length >= window, 0.0, -jnp.inf), shape=size)
         first = clips.start[clip] + jax.random.randint(key_start, size, 0, clips.length[clip] - window + 1)
         return clips.frames[first[:, None] + jnp.arange(window)], key_loss
+
+    def held_out(self):
+        """Return windows and their mask, to watch the losses on."""
+        windows, _ = self.draw(None, jax.random.key(0))
+        return windows, jnp.ones(windows.shape[:2], bool)
 
     def terms(self, params, batch, key, training=True) -> dict:
         """Return smooth L1, and as the loss it or the variational loss (ACMDM App. B).
@@ -262,6 +266,10 @@ class TextMotionTask(ClipsTask):
         batch, condition = draw_captioned(key_draw, self.clips, self.pooled, self.config, self.model_config.window)
         return (batch.motion, condition), key_loss
 
+    def held_out(self):
+        """Return a batch to watch the losses on."""
+        return self.draw(None, jax.random.key(0))[0]
+
     def terms(self, params, batch, key, training=True) -> dict:
         """Return the loss on a batch as `draw` makes it."""
         network = network_with(self.model_config, params)
@@ -357,14 +365,7 @@ class ControlTask(TextMotionTask):
 
     def terms(self, params, batch, key, training=True) -> dict:
         """Return the loss terms on a batch as `draw` makes it."""
-        terms = control_loss(
-            network_with(self.model_config, self.base), branch_with(self.model_config, self.codec, params),
-            self.schedule, self.codec, *batch, key,
-        )  # fmt: skip
+        branch = branch_with(self.model_config, self.codec.frames_per_state, params)
+        base = network_with(self.model_config, self.base)
+        terms = control_loss(base, branch, self.schedule, self.codec, *batch, key)
         return {"loss": terms["denoising"] + self.config.control_weight * terms["control"], **terms}
-
-
-def branch_with(config: ACMDMConfig, codec: MotionCodec, params) -> ControlBranch:
-    """Return a control branch with the given weights."""
-    blank = nnx.eval_shape(lambda: ControlBranch(config, codec.frames_per_state, rngs=LayerKeys(jax.random.key(0))))
-    return nnx.merge(nnx.graphdef(blank), jax.tree.map(lambda leaf: leaf, params))

@@ -160,6 +160,11 @@ class LatentAutoencoderTask(ClipsTask):
         batch = draw_clips(key_draw, self.clips, self.config.batch_size, self.config.num_frames)
         return (batch.motion, batch.mask), key_loss
 
+    def held_out(self):
+        """Return (features, mask) to watch the losses on."""
+        batch = draw_clips(jax.random.key(0), self.clips, self.config.batch_size, self.config.num_frames)
+        return batch.motion, batch.mask
+
     def terms(self, params, batch, key, training=True) -> dict:
         """Return smooth L1 of features and of joints, and the divergence; out of training of the latent's mean."""
         keys = jax.random.split(key, 3) if training else (None, None, None)
@@ -244,6 +249,10 @@ class TeacherTask(ClipsTask):
         latent, text = self.clips.draw(key_draw, self.config.batch_size)
         told = jax.random.bernoulli(key_told, 1.0 - self.config.text_dropout, (len(text), 1))
         return (latent, jnp.where(told, text, self.clips.empty)), key_loss
+
+    def held_out(self):
+        """Return (latents, captions) to watch the losses on."""
+        return self.clips.draw(jax.random.key(0), self.config.batch_size)
 
     def terms(self, params, batch, key, training=True) -> dict:
         """Return the squared error of the noise; out of training without dropout."""

@@ -1,61 +1,41 @@
-"""Trained models of text to motion as files, and the road to them from a preset's name.
+"""Trained models of captioned motion as files, and where they are found.
 
-    captioned clips -> normalised positions -> (autoencoder -> latent) -> denoiser -> (control branch)
-
-Each stage leaves one file that is whole in itself, with the weights of the stages before it. A preset's name with
-"+control" behind it stands for the branch beside the finished model of that name, with "+control-pelvis" for one that
-knows the pelvis alone.
+All kinds have one form of file: weights of one network or several, arrays, and a description that says the networks'
+configs. A preset's name with "+control" behind it stands for the branch beside the finished model of that name, with
+"+control-pelvis" for one that knows the pelvis alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 
 from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
+from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
-from f3amd_lib.motion.body import make_body
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.networks import presets
-from f3amd_lib.text.data.body_mesh import BodyMesh, standing
+from f3amd_lib.networks.config import CheckedConfig
+from f3amd_lib.text.data.body_mesh import BodyMesh
 from f3amd_lib.text.data.humanml3d import read_humanml3d
-from f3amd_lib.text.data.redundant import NUM_JOINT_FEATURES
-from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions, words_of
-from f3amd_lib.text.data.text_motions import (
-    UNIT,
-    AxisNormaliser,
-    TextMotions,
-    bandai_text_motions,
-    clip_table,
-    pad_motions,
-)
-from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig
-from f3amd_lib.text.networks.acmdm_control import ControlBranch
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig
-from f3amd_lib.text.networks.mesh_autoencoder import MeshAutoencoderConfig
-from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
-from f3amd_lib.text.stages import acmdm_training
-from f3amd_lib.text.stages.captioned_models import (
-    CaptionedModel,
-    load_captioned_model,
-    save_captioned_model,
-    train_part,
-)
-from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
-from f3amd_lib.training.checkpoints import errors_name, network_with, weights_digest
-from f3amd_lib.training.optimise import Task, differences
+from f3amd_lib.text.data.text_encoders import TextEncoder
+from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, bandai_text_motions
+from f3amd_lib.text.networks.acmdm import ACMDMConfig
+from f3amd_lib.text.networks.acmdm_control import ControlBranch, blank_branch, branch_with
+from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
+from f3amd_lib.text.stages.motion_codec import MotionCodec
+from f3amd_lib.training import checkpoints
+from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
-from f3amd_lib.training.settings import profile_part_recipe
 
 CONTROL = "+control"
 """Behind a preset's name: the model with its control branch."""
@@ -69,13 +49,59 @@ CONTROLLED = {"left_foot": "left_toe", "right_foot": "right_toe"} | {
 """Joints that a branch learns to control besides the pelvis (ACMDM section 3.2): their names on the command line, and
 their roles in a skeleton."""
 
-_KIND = "text-to-motion model"
-_ENCODED_AT_ONCE = 64
+DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"
+"""The preset that two cores can train, and that is named where none is."""
+
+JUDGE = "judge"
+"""Name on the command line, and of the file, of the judge of text to motion."""
+
+STUDENTS = {phases: f"MotionPCM-M{phases}-small" for phases in (1, 2, 4)}
+"""The models that `f3amd text --model motionpcm` means, by --steps: a student is trained for one number of them."""
+
+DENOISERS = (ACMDMConfig.family, MaskedACMDMConfig.family)
+"""Families of ACMDM's networks that turn text into motion."""
+
+LATENT_FAMILIES = (LatentAutoencoderConfig.family, LatentDenoiserConfig.family)
+"""MotionPCM's families."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptionedModel:
+    """What all models of captioned motion have; autoencoders alone have no network of their own.
+
+    A subclass says what else a file holds (`parts`) and makes a model of it (`of`).
+
+    Attributes:
+      name: preset, perhaps with what stands beside it.
+      skeleton, fps: of the motion it was trained on.
+      record: how it was trained, on what, under what terms.
+      config, params: of the network that is told captions; None for an autoencoder alone.
+      schedule: the noise schedule it was trained with, None without noise.
+      text_encoder: identity of the encoder whose vectors it reads.
+      words: of all captions that it was trained with.
+    """
+
+    kind: ClassVar[str]
+    """What a file says that it holds."""
+
+    name: str
+    skeleton: Skeleton
+    fps: float
+    record: dict
+    config: CheckedConfig | None = None
+    params: Any = None
+    schedule: NoiseSchedule | None = None
+    text_encoder: str = ""
+    words: tuple[str, ...] = ()
+
+    def network(self):
+        """Return the network with its weights."""
+        return network_with(self.config, self.params)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TextModel(CaptionedModel):
-    """A trained model of text to motion, or a motion autoencoder alone.
+    """A trained model of ACMDM, or its motion autoencoder alone.
 
     Its name has "+control" or "+control-pelvis" at its end where there is a branch; weights are the moving average.
 
@@ -85,19 +111,17 @@ class TextModel(CaptionedModel):
       branch: weights of the control branch, None without one.
     """
 
+    kind: ClassVar[str] = "text-to-motion model"
+
     codec: MotionCodec
     starts: dict = field(default_factory=dict)
     branch: Any = None
-
-    def network(self) -> ACMDM | MaskedACMDM:
-        """Return the denoiser with its weights."""
-        return network_with(self.config, self.params)
 
     def control_branch(self) -> ControlBranch:
         """Return the control branch with its weights; ValueError says how to train one if there is none."""
         if self.branch is None:
             raise ValueError(f"{self.name} has no control branch; train one: f3amd train --preset {self.name}{CONTROL}")
-        return acmdm_training.branch_with(self.config, self.codec, self.branch)
+        return branch_with(self.config, self.codec.frames_per_state, self.branch)
 
     @property
     def controlled(self) -> dict[str, int]:
@@ -109,6 +133,74 @@ class TextModel(CaptionedModel):
     def most_frames(self) -> int:
         """Frames of motion in the longest state."""
         return self.config.window * self.codec.frames_per_state
+
+    def parts(self) -> tuple[dict, dict, CheckedConfig | None, dict]:
+        """Return what its file has besides: (weights, arrays, config of the autoencoder, what the description says)."""
+        codec, said = self.codec, {"controlled": self.branch is not None}
+        normalisers = {"axes": codec.axes, "latent": codec.latent, "redundancy": codec.redundancy}
+        arrays = {what: normaliser._asdict() for what, normaliser in normalisers.items() if normaliser is not None}
+        arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in self.starts.items()}
+        if codec.mesh is not None:
+            arrays["rest"] = jnp.asarray(codec.mesh.skeleton.offsets, jnp.float32)
+            said["neighbours"] = weights_digest(codec.mesh.lists)
+        return {"autoencoder": codec.params, "branch": self.branch}, arrays, codec.autoencoder, said
+
+    @classmethod
+    def of(cls, tree: dict, autoencoder: CheckedConfig | None, said: dict, about: dict) -> TextModel:
+        """Return the model of a file's tree and description; `about` is what all kinds have."""
+        axes, latent, redundancy = (_normaliser(tree.get(what)) for what in ("axes", "latent", "redundancy"))
+        mesh = None
+        if "rest" in tree:
+            rest = dataclasses.replace(about["skeleton"], offsets=np.asarray(tree["rest"]))
+            mesh = BodyMesh.of(rest, autoencoder.levels, **autoencoder.neighbours)
+            if weights_digest(mesh.lists) != said["neighbours"]:
+                raise ValueError("was trained on a body with other neighbours than this version's; train it anew")
+        codec = MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy, mesh)
+        starts = {caption: np.asarray(state) for caption, state in tree.get("starts", {}).items()}
+        return cls(codec=codec, starts=starts, branch=tree.get("branch"), **about)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LatentModel(CaptionedModel):
+    """A trained model of MotionPCM: an autoencoder, with a teacher or a student or alone.
+
+    Its weights are a teacher's moving average, or a student's own. For the text encoder zeros stand for no caption. The
+    identity of its task, in the record, says M and k of a student.
+
+    Attributes:
+      autoencoder, autoencoder_params: config and weights.
+      statistics: of its features.
+    """
+
+    kind: ClassVar[str] = "latent motion model"
+
+    autoencoder: LatentAutoencoderConfig
+    autoencoder_params: Any
+    statistics: AxisNormaliser
+
+    @property
+    def training(self) -> dict:
+        """How it was trained: the settings of `LatentMotionTraining`."""
+        return self.record["identity"]["training"]
+
+    @property
+    def most_frames(self) -> int:
+        """Frames of the longest clip that it was trained on."""
+        return self.training["num_frames"]
+
+    def parts(self) -> tuple[dict, dict, CheckedConfig, dict]:
+        """Return what its file has besides, as `TextModel.parts`."""
+        return {"autoencoder": self.autoencoder_params}, self.statistics._asdict(), self.autoencoder, {}
+
+    @classmethod
+    def of(cls, tree: dict, autoencoder: CheckedConfig, said: dict, about: dict) -> LatentModel:
+        """Return the model of a file, as `TextModel.of`."""
+        statistics = AxisNormaliser(tree["mean"], tree["deviation"])
+        return cls(autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **about)
+
+
+def _normaliser(arrays: dict | None) -> AxisNormaliser | None:
+    return None if arrays is None else AxisNormaliser(**jax.tree.map(np.asarray, arrays))
 
 
 def controlled_joints(skeleton: Skeleton) -> dict[str, int]:
@@ -127,74 +219,65 @@ def preset_and_branch(name: str) -> tuple[str, str]:
 # --------------------------------------------------------------------------------------------------------------- files
 
 
-def save_text_model(path: Path, trained: TextModel, dtype=jnp.bfloat16) -> None:
-    """Write a model; `load_text_model` gives it back, weights in the precision of the file.
+def save_text_model(path: Path, trained: CaptionedModel, dtype=jnp.bfloat16) -> None:
+    """Write a model of any kind; `load_text_model` gives it back, weights in the precision of the file.
 
     Args:
       path: file to write.
       trained: the model.
       dtype: of the weights, as for `checkpoints.save_model`.
     """
-    codec = trained.codec
-    normalisers = {"axes": codec.axes, "latent": codec.latent, "redundancy": codec.redundancy}
-    arrays = {what: normaliser._asdict() for what, normaliser in normalisers.items() if normaliser is not None}
-    if codec.mesh is not None:
-        arrays["rest"] = jnp.asarray(codec.mesh.skeleton.offsets, jnp.float32)
-    arrays["starts"] = {caption: jnp.asarray(state, jnp.float32) for caption, state in trained.starts.items()}
-    extra = {
-        "controlled": trained.branch is not None,
-        "start_shapes": {caption: list(np.shape(state)) for caption, state in trained.starts.items()},
-        "neighbours": None if codec.mesh is None else weights_digest(codec.mesh.lists),
-    }
-    weights = {"autoencoder": codec.params, "branch": trained.branch}
-    save_captioned_model(
-        path, _KIND, trained, autoencoder=codec.autoencoder, weights=weights, arrays=arrays, extra=extra, dtype=dtype
-    )
+    weights, arrays, autoencoder, said = trained.parts()
+    weights = {"params": trained.params} | weights
+    tree = {name: checkpoints.packed_weights(params, dtype) for name, params in weights.items() if params is not None}
+    described = {"model": trained.config, "autoencoder": autoencoder, "diffusion": trained.schedule}
+    metadata = {
+        "kind": trained.kind, "name": trained.name,
+        **{name: None if value is None else value.to_dict() for name, value in described.items()},
+        "weights": jnp.dtype(dtype).name, "fps": trained.fps, "text_encoder": trained.text_encoder,
+        "words": list(trained.words), **said, **checkpoints.describe_skeleton(trained.skeleton),
+        "record": trained.record,
+    }  # fmt: skip
+    offsets = jnp.asarray(trained.skeleton.offsets, jnp.float32)
+    checkpoints.save_tree(path, tree | arrays | {"offsets": offsets}, metadata)
 
 
-def load_text_model(path: Path) -> TextModel:
+def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | LatentModel:
     """Read a model written by `save_text_model`.
+
+    Args:
+      path: the file.
+      *kinds: classes of models that it may hold; by default `TextModel` and `LatentModel`.
 
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    with errors_name(path):
-        common, autoencoder, tree, metadata = load_captioned_model(path, _KIND, _shapes)
-        axes, latent, redundancy = (AxisNormaliser(**jax.tree.map(np.asarray, tree[what])) if what in tree else None
-                                    for what in ("axes", "latent", "redundancy"))  # fmt: skip
-        mesh = None
-        if "rest" in tree:
-            rest = dataclasses.replace(common["skeleton"], offsets=np.asarray(tree["rest"]))
-            mesh = BodyMesh.of(rest, autoencoder.levels, **autoencoder.neighbours)
-            if weights_digest(mesh.lists) != metadata["neighbours"]:
-                raise ValueError("was trained on a body with other neighbours than this version's; train it anew")
-        return TextModel(
-            codec=MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy, mesh),
-            starts={caption: np.asarray(state) for caption, state in tree["starts"].items()},
-            branch=tree.get("branch"),
-            **common,
-        )
+    known = {model.kind: model for model in kinds or (TextModel, LatentModel)}
+    configs = {}
 
+    def networks(said: dict) -> dict:
+        if said.get("kind") not in known:
+            raise ValueError(f"holds a {said.get('kind')}, not a {' or a '.join(known)}")
+        if "network" in said:  # a judge's file of an earlier form
+            said.update(model={"family": said["kind"], **said["network"]}, weights="float32", name=JUDGE, fps=0.0)
+        stated = {"params": said["model"], "autoencoder": said.get("autoencoder")}
+        configs.update((part, presets.config_from_dict(config)) for part, config in stated.items() if config)
+        shapes = {part: checkpoints.weights_shapes(config) for part, config in configs.items()}
+        if said.get("controlled"):
+            frames = configs["autoencoder"].frames_per_latent if "autoencoder" in configs else 1
+            shapes["branch"] = blank_branch(configs["params"], frames)[1]
+        return {part: checkpoints.packed_shapes(shape, said["weights"]) for part, shape in shapes.items()}
 
-def _shapes(metadata: dict, config: ACMDMConfig | None, autoencoder: AutoencoderConfig | None) -> tuple[dict, dict]:
-    """Return the shapes of the branch's weights, and of normalisers and first frames."""
-    single = jax.ShapeDtypeStruct
-    numbers = lambda width: {what: single((width,), jnp.float32) for what in AxisNormaliser._fields}
-    weights, arrays = {}, {"axes": numbers(3)}
-    if isinstance(autoencoder, MeshAutoencoderConfig):
-        arrays["rest"] = single((len(metadata["joints"]), 3), jnp.float32)
-    if autoencoder is not None:
-        arrays["latent"] = numbers(autoencoder.latent_channels)
-    elif config.channels > 3:
-        arrays["redundancy"] = numbers(NUM_JOINT_FEATURES)
-    if metadata["controlled"]:
-        frames = 1 if autoencoder is None else autoencoder.frames_per_latent
-        weights["branch"] = nnx.state(nnx.eval_shape(lambda: ControlBranch(config, frames, rngs=nnx.Rngs(0))))
-    arrays["starts"] = {name: single(tuple(shape), jnp.float32) for name, shape in metadata["start_shapes"].items()}
-    return weights, arrays
-
-
-# ---------------------------------------------------------------------------------------------------------------- data
+    with checkpoints.errors_name(path):
+        tree, said = checkpoints.load_tree(path, networks, rest=True)
+        tree |= {part: checkpoints.unpacked_weights(tree[part]) for part in ("params", "autoencoder", "branch")
+                 if part in tree}  # fmt: skip
+        about = {name: said[name] for name in ("name", "fps", "text_encoder", "record")} | {
+            "config": configs.get("params"), "params": tree.get("params"), "words": tuple(said.get("words", ())),
+            "schedule": schedule_from_dict(said["diffusion"]) if said.get("diffusion") else None,
+            "skeleton": checkpoints.described_skeleton(said, tree["offsets"]),
+        }  # fmt: skip
+        return known[said["kind"]].of(tree, configs.get("autoencoder"), said, about)
 
 
 def open_text_motions(name: str, source=None, *, held_out_wording: bool = False) -> TextMotions:
@@ -218,111 +301,12 @@ def open_text_motions(name: str, source=None, *, held_out_wording: bool = False)
     return read_humanml3d(source)
 
 
-def _whole_states(codec: MotionCodec, data: TextMotions) -> list[np.ndarray]:
-    """Return the normalised positions of each clip, as many as make whole frames of the state."""
-    frames = codec.frames_per_state
-    clips = (data.clip(number) for number in range(data.num_clips))
-    return [codec.axes.normalise(clip[: len(clip) // frames * frames]) for clip in clips]
+# ------------------------------------------------------------------------------------------------------------- finding
 
 
-def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
-    """Return all clips as states, one after the other, [N / frames of a state, J, C]."""
-    frames, clips = codec.frames_per_state, _whole_states(codec, data)
-    if codec.redundancy is not None:
-        return np.concatenate([np.concatenate(clips), codec.redundancy.normalise(data.joint_features())], axis=-1)
-    if codec.autoencoder is None:
-        return np.concatenate(clips)
-    encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
-    if codec.mesh is not None:  # frames do not see each other: nothing is padded
-        whole = np.concatenate(clips)[None]
-        return np.asarray(encode(codec, whole, np.ones(whole.shape[:2], bool)))[0]
-    for first in range(0, len(clips), _ENCODED_AT_ONCE):
-        part = clips[first : first + _ENCODED_AT_ONCE]
-        padded = pad_motions([*part, *[part[0]] * (_ENCODED_AT_ONCE - len(part))], longest)
-        states = np.asarray(encode(codec, padded.motion, padded.mask))
-        parts += [state[: len(clip) // frames] for state, clip in zip(states, part, strict=False)]
-    return np.concatenate(parts)
-
-
-def _captioned_states(codec: MotionCodec, data: TextMotions, encoder: TextEncoder):
-    """Return (clips as states, pooled embeddings of their captions)."""
-    table, captions = clip_table(data, encoded_clips(codec, data), codec.frames_per_state)
-    return table, pooled_captions(captions, encoder)
-
-
-def pooled_captions(captions: Sequence[str], encoder: TextEncoder) -> jax.Array:
-    """Return the pooled embedding of each caption, [N, W]; those that are said twice are embedded once."""
-    unlike, place = np.unique(captions, return_inverse=True)
-    return jnp.asarray(embed_captions(unlike.tolist(), encoder).pooled[place])
-
-
-# ---------------------------------------------------------------------------------------------------------------- tasks
-
-
-def autoencoder_task(
-    data: TextMotions, split: str, preset: str, config: acmdm_training.TextMotionTraining
-) -> acmdm_training.AutoencoderTask | acmdm_training.MeshAutoencoderTask:
-    """Return the training of a preset's autoencoder on the clips of a split."""
-    axes, part = data.normaliser(), data.select(data.members(split))
-    table, _ = clip_table(part, axes.normalise(part.positions))
-    if presets.find_preset(preset).family != MeshAutoencoderConfig.family:
-        if len(part.lengths) and part.lengths.max() < config.window:
-            lengths = f"no {split} clip has {config.window} frames, the longest has {part.lengths.max()}"
-            raise ValueError(f"data set {data.name!r}: {lengths}; {preset} needs longer ones, or a larger --window")
-        model = presets.build_config(preset)
-        return acmdm_training.AutoencoderTask(model, config, table, dataset_fingerprint=data.fingerprint)
-    # The body stands as people do when clips begin: those of training, whatever the split.
-    rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
-    model = presets.build_config(preset, num_vertices=len(make_body(rest).vertices))
-    codec = MotionCodec(axes, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
-    return acmdm_training.MeshAutoencoderTask(model, config, table, codec, dataset_fingerprint=data.fingerprint)
-
-
-def denoiser_task(
-    data: TextMotions, split: str, encoder: TextEncoder, preset: str, config: acmdm_training.TextMotionTraining,
-    codec: MotionCodec, window: int | None = None,
-) -> acmdm_training.TextMotionTask:  # fmt: skip
-    """Return the training of a preset's denoiser on the clips of a split.
-
-    Args:
-      data, split: captioned clips.
-      encoder: of the captions.
-      preset, config: the model and its training.
-      codec: of its states, which must have the preset's channels.
-      window: most frames of motion in a state, instead of the preset's.
-    """
-    table, pooled = _captioned_states(codec, data.select(data.members(split)), encoder)
-    sizes = {"num_joints": table.frames.shape[1], "text_width": pooled.shape[-1]}
-    if window:
-        sizes["window"] = window // codec.frames_per_state
-    model = presets.build_config(preset, **sizes)
-    if model.channels != table.frames.shape[-1]:
-        raise ValueError(f"{preset} models {model.channels} numbers a joint; positions have {table.frames.shape[-1]}")
-    fingerprint = data.fingerprint
-    if codec.autoencoder is not None:
-        fingerprint += f" in the latent of {weights_digest(codec.params)}"
-    schedule = presets.find_preset(preset).diffusion
-    return acmdm_training.TextMotionTask(model, config, table, schedule, pooled, dataset_fingerprint=fingerprint)
-
-
-def control_task(
-    data: TextMotions, split: str, encoder: TextEncoder, base: TextModel, config: acmdm_training.TextMotionTraining,
-    joints,
-) -> acmdm_training.ControlTask:  # fmt: skip
-    """Return the training of a branch that controls `joints` beside a finished model, on the clips of a split."""
-    part, codec, frames = data.select(data.members(split)), base.codec, base.codec.frames_per_state
-    table, pooled = _captioned_states(codec, part, encoder)
-    positions = jnp.asarray(np.concatenate(_whole_states(codec, part)), jnp.float32)
-    positions = positions.reshape(len(table.frames), frames, *positions.shape[1:])
-    table = table._replace(frames=(table.frames, positions))
-    fingerprint = f"{data.fingerprint} beside {weights_digest(base.params)}"
-    return acmdm_training.ControlTask(
-        base.config, config, table, base.schedule, pooled, base.params, codec, tuple(joints),
-        dataset_fingerprint=fingerprint,
-    )  # fmt: skip
-
-
-# ------------------------------------------------------------------------------------------------------------- training
+def is_latent_preset(name: str) -> bool:
+    """Say whether a preset is one of MotionPCM's."""
+    return presets.find_preset(preset_and_branch(name)[0]).family in LATENT_FAMILIES
 
 
 def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
@@ -330,153 +314,12 @@ def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
     return ModelFiles.of(folder or runs_dir(profile.dataset, profile.name) / "text", name)
 
 
-def of_this_training(found, task: Task, files: ModelFiles):
-    """Return a finished model that was read from `files`; ValueError if it came from another training than `task`."""
-    if unlike := differences(task.identity(), found.record["identity"]):
-        lies = f"a model with other {'; '.join(unlike)} lies there"
-        raise ValueError(f"{files.model}: {lies}; move it away or name another folder (--out)")
-    return found
-
-
-_DENOISERS = (ACMDMConfig.family, MaskedACMDMConfig.family)
-_AUTOENCODERS = {AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.family: "mesh-autoencoder"}
-"""Recipe of each family of autoencoders."""
-
-
-def is_text_preset(name: str) -> bool:
-    """Say whether a preset, with or without a branch, is one that this file trains."""
-    return presets.find_preset(preset_and_branch(name)[0]).family in (*_DENOISERS, *_AUTOENCODERS)
-
-
-def train_text_model(
-    data: TextMotions, encoder: TextEncoder, profile: Profile, name: str, *,
-    window: int | None = None, batch_size: int | None = None, folder=None, **leg,
-) -> TextModel | None:  # fmt: skip
-    """Train a preset, and first what it stands on, unless that is finished already, with whatever settings.
-
-    A branch may stand beside the network that ships, where that knows these motions. A killed training goes on where it
-    was; a finished model is only read.
-
-    Args:
-      data: captioned clips.
-      encoder: of the captions.
-      profile: how long; "gpu" by the paper's recipe, else by the short ones.
-      name: of a preset of ACMDM, or with "+control" or "+control-pelvis" behind it.
-      window: most frames of motion in a state, instead of the preset's; longer clips are cut to their first frames, so
-        that all begin where a caption's motion will: at the origin.
-      batch_size: instead of the recipe's.
-      folder: where files go instead of `runs/`.
-      **leg: stop_at and progress, as for `optimise`.
-
-    Returns:
-      The model as its file has it; None where `stop_at` came first.
-
-    Raises:
-      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data.
-      TrainingDiverged: if the loss stops being a number.
-    """
-    base, branch = preset_and_branch(name)
-    preset = presets.find_preset(base)
-    if branch and preset.latent and presets.find_preset(preset.latent).family == MeshAutoencoderConfig.family:
-        raise ValueError(f"{preset.name} has no control branch: its states are of vertices, not of joints")
-    name = preset.name + branch
-    data = data.cut(window) if window and window < data.lengths.max() else data
-    earlier = preset.name if branch else preset.latent
-    before = None
-    if earlier:
-        lies = text_model_files(profile, earlier, folder=folder).model
-        asked = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
-        before = load_text_model(lies) if lies.exists() else None
-        if before is None and branch:
-            before = shipped_for(earlier, data, encoder)
-        before = before or train_text_model(data, encoder, profile, earlier, **asked)
-        if before is None:
-            return None
-        if before.record["dataset_fingerprint"] != data.fingerprint:
-            raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
-    part = "control" if branch else _AUTOENCODERS.get(preset.family, "denoiser")
-    codec = _codec_of_positions(data, preset) if before is None else before.codec
-    settings = {"unit": max(1, UNIT // codec.frames_per_state), "batch_size": batch_size}
-    own = None if branch else preset.name
-    config = profile_part_recipe(acmdm_training.TextMotionTraining, part, profile, own, **settings)
-    if part == "denoiser":
-        task_of = lambda split: denoiser_task(data, split, encoder, preset.name, config, codec, window)
-    elif part == "control":
-        joints = [0] if branch == PELVIS else controlled_joints(data.skeleton).values()
-        task_of = lambda split: control_task(data, split, encoder, before, config, joints)
-    else:
-        task_of = lambda split: autoencoder_task(data, split, preset.name, config)
-    files, task = text_model_files(profile, name, folder=folder), task_of("train")
-    if files.model.exists():
-        return of_this_training(load_text_model(files.model), task, files)
-    held_out = task_of("validation").draw(None, jax.random.key(0))[0]
-    if preset.family in _AUTOENCODERS:
-        held_out = (held_out, jnp.ones(held_out.shape[:2], bool))
-    state, about = train_part(task, files, data, profile, name, held_out, **leg)
-    if state is None:
-        return None
-    if preset.family in _AUTOENCODERS:
-        made = TextModel(codec=_codec_of(task, codec, state.averaged, data), **about)
-    elif part == "control":
-        kept = {key: before.record[key] for key in ("guidance",) if key in before.record}
-        made = dataclasses.replace(before, branch=state.averaged, name=name, record=about["record"] | kept)
-    else:
-        trained_on = data.select(data.members("train"))
-        made = TextModel(
-            codec=codec, config=task.model_config, params=state.averaged, schedule=task.schedule,
-            text_encoder=encoder.identity, words=words_of([said for lines in trained_on.captions for said in lines]),
-            starts=first_frames(codec, trained_on, config.prefix_frames), **about,
-        )  # fmt: skip
-    save_text_model(files.model, made)
-    return load_text_model(files.model)
-
-
-def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, load=load_text_model):
+def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, *kinds: type[CaptionedModel]):
     """Return the model of this name that ships, if it was trained on these very motions with this encoder."""
     path = PRETRAINED_DIR / data.name / "text" / f"{name}.safetensors"
-    found = load(path) if path.exists() else None
+    found = load_text_model(path, *kinds) if path.exists() else None
     known = found and (found.record["dataset_fingerprint"], found.text_encoder) == (data.fingerprint, encoder.identity)
     return found if known else None
-
-
-def _codec_of_positions(data: TextMotions, preset: presets.Preset) -> MotionCodec:
-    """Return the codec of positions, and of redundant features beside them where a preset has channels for those."""
-    redundancy = None
-    if preset.network.get("channels") == 3 + NUM_JOINT_FEATURES:
-        redundancy = AxisNormaliser.of(data.select(data.members("train")).joint_features())
-    return MotionCodec(data.normaliser(), redundancy=redundancy)
-
-
-def _codec_of(task: acmdm_training.AutoencoderTask, codec: MotionCodec, params, data: TextMotions) -> MotionCodec:
-    """Return the codec of a trained autoencoder, its latent normalised over up to 512 training clips."""
-    part = data.members("train")
-    part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]
-    frames = task.model_config.frames_per_latent
-    codec = getattr(task, "codec", codec)
-    clips = [codec.axes.normalise(data.clip(number)) for number in part]
-    padded = pad_motions(clips, max(map(len, clips)) // frames * frames)
-    return with_latent(codec, task.model_config, params, padded.motion, padded.mask)
-
-
-def first_frames(codec: MotionCodec, data: TextMotions, count: int) -> dict[str, np.ndarray]:
-    """Return the first frames of one clip of each pair of content and style, by its first caption, as states.
-
-    Args:
-      codec: of the states.
-      data: captioned clips.
-      count: frames of the state, P; 0 returns nothing.
-
-    Returns:
-      [P, J, C] each.
-    """
-    if not count:
-        return {}
-    frames = count * codec.frames_per_state
-    long_enough = [number for number in range(data.num_clips) if data.lengths[number] >= frames]
-    shown = {data.pairs[number]: number for number in reversed(long_enough)}.values()
-    clips = jnp.asarray(np.stack([codec.axes.normalise(data.clip(number)[:frames]) for number in shown]))
-    states = np.asarray(codec.encode(clips, jnp.ones(clips.shape[:2], bool)))
-    return {data.captions[number][0]: state for number, state in zip(shown, states, strict=True)}
 
 
 def text_model_folders(dataset: str) -> list[Path]:
@@ -485,46 +328,51 @@ def text_model_folders(dataset: str) -> list[Path]:
     return [*own, PRETRAINED_DIR / dataset / "text"]
 
 
-def newest_weights(dataset: str, choices: list[list[str]], told: str) -> Path:
-    """Return the weights file of a data set that comes first: by folder, then by choice, of one choice the newest.
+def named_model(name: str, num_steps: int | None = None) -> str:
+    """Return the name that a user means, with its branch.
 
     Args:
-      dataset: that models were trained on.
-      choices: names of models, each list as good as the one after it or better.
-      told: the name to train, where there is none of them.
+      name: of a preset, perhaps with a branch, or of the paper, "motionpcm".
+      num_steps: asked for; of the paper's students it chooses one, by default that of one step.
 
     Raises:
-      ValueError: if there is none, saying how to train it.
+      ValueError: for an unknown name, or a number of steps that no student takes.
     """
-    for folder in text_model_folders(dataset):
-        for names in choices:
-            if found := [path for name in names if (path := folder / f"{name}.safetensors").is_file()]:
-                return max(found, key=lambda path: path.stat().st_mtime)
-    how = f"f3amd train --preset {told} --data {dataset}"
-    raise ValueError(f"no trained {told} for data set {dataset!r}; train it: {how}")
+    if name.lower() != "motionpcm":
+        base, branch = preset_and_branch(name)
+        return presets.find_preset(base).name + branch
+    if (steps := num_steps or 1) not in STUDENTS:
+        *some, last = STUDENTS
+        raise ValueError(
+            f"students of MotionPCM are trained for {', '.join(map(str, some))} or {last} steps, none for {steps}; "
+            "their teacher takes any number: --model MotionPCM-teacher-small"
+        )
+    return STUDENTS[steps]
 
 
-def find_text_model(dataset: str, preset: str | None = None, *, control: bool = False) -> Path:
+def find_text_model(
+    dataset: str, preset: str | None = None, *, control: bool = False, num_steps: int | None = None
+) -> Path:
     """Return the weights file of a data set: the user's own gpu or laptop run, else shipped.
 
     Args:
       dataset: that it was trained on.
-      preset: by default the newest that turns text into motion.
+      preset: as for `named_model`; by default the newest of ACMDM's that turn text into motion.
       control: it must have a control branch.
+      num_steps: as for `named_model`.
 
     Raises:
-      ValueError: if there is none, saying how to train it.
+      ValueError: as `named_model`, or if there is none, saying how to train it.
     """
-    wanted, branch = preset_and_branch(preset or DEFAULT_PRESET)
-    wanted = presets.find_preset(wanted).name
+    wanted, branch = preset_and_branch(named_model(preset or DEFAULT_PRESET, num_steps))
     branches = (branch,) if branch else (CONTROL, PELVIS) if control else ("",)
-    denoisers = [name for name, known in presets.PRESETS.items() if known.family in _DENOISERS]
+    denoisers = [name for name, known in presets.PRESETS.items() if known.family in DENOISERS]
     names = [wanted] if preset else [name + form for name in denoisers for form in ("", *presets.FORMS)]
-    return newest_weights(dataset, [[name + branch for name in names] for branch in branches], wanted + branches[0])
-
-
-DEFAULT_PRESET = "ACMDM-S-PS22-raw-n3"
-"""The preset that two cores can train, and that is named where none is."""
-
-JUDGE = "judge"
-"""Name on the command line, and of the file, of the judge of text to motion."""
+    for folder in text_model_folders(dataset):
+        for branch in branches:
+            files = (folder / f"{name}{branch}.safetensors" for name in names)
+            if found := [path for path in files if path.is_file()]:
+                return max(found, key=lambda path: path.stat().st_mtime)
+    told = wanted + branches[0]
+    how = f"f3amd train --preset {told} --data {dataset}"
+    raise ValueError(f"no trained {told} for data set {dataset!r}; train it: {how}")
