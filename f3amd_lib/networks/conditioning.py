@@ -15,7 +15,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.networks.attention import MultiHeadAttention, attend, check_num_heads, position_code
+from f3amd_lib.networks.attention import MultiHeadAttention, attend, position_code
 from f3amd_lib.networks.config import NetworkConfig
 
 PATH_CHANNELS = 8
@@ -46,6 +46,8 @@ class ConditionedConfig(NetworkConfig):
     """
 
     from_data: ClassVar[tuple[str, ...]] = ("channels", "num_styles")
+    frames_before: ClassVar[int] = 0
+    """Frames of history that a network's blocks see before the window; `variants` has some."""
 
     num_styles: int
     num_history: int = 10
@@ -103,17 +105,12 @@ class ConditionEncoder(nnx.Module):
     Args:
       config: sizes; its latent width is that of tokens and c.
       num_heads: must divide that width.
-      frames_before: frames before the window that have a c of their own.
-
-    Raises:
-      ValueError: if the number of heads does not divide the width.
     """
 
-    def __init__(self, config: ConditionedConfig, num_heads: int = 1, frames_before: int = 0, *, rngs: nnx.Rngs):
+    def __init__(self, config: ConditionedConfig, num_heads: int = 1, *, rngs: nnx.Rngs):
         width = config.latent_width
-        check_num_heads(width, num_heads)
         self.width, self.window, self.num_history = width, config.window, config.num_history
-        self.frames_before, self.num_heads = frames_before, num_heads
+        self.frames_before, self.num_heads = config.frames_before, num_heads
         self.history = nnx.Linear(config.channels, width, rngs=rngs)
         self.path = nnx.Linear(PATH_CHANNELS, width, rngs=rngs)
         self.style = nnx.Linear(config.num_styles, width, rngs=rngs)
@@ -148,26 +145,13 @@ class ConditionEncoder(nnx.Module):
         return asked + self.output(attend(query, context.keys, context.values, self.num_heads))
 
 
-def _linear(width_in: int, width_out: int, zero: bool, rngs: nnx.Rngs) -> nnx.Linear:
-    """Return a linear layer, whose answers are zero at the start if `zero`."""
-    initial = {"kernel_init": nnx.initializers.zeros_init()} if zero else {}
-    return nnx.Linear(width_in, width_out, rngs=rngs, **initial)
-
-
-def _output_layer(width: int, zero_output: bool, rngs: nnx.Rngs) -> nnx.Linear:
-    """Return the linear layer of Eq. 7 (a convolution of kernel 1 is a linear layer per frame)."""
-    # Zero at the start makes a residual block the identity, so that depth costs nothing.
-    return _linear(width, width, zero_output, rngs)
-
-
 class FiLM(nnx.Module):
     """Feature-wise linear modulation with a bounded gate (Eqs 5-7)."""
 
-    def __init__(
-        self, width: int, condition_width: int, *, identity: bool = False, zero_output: bool = False, rngs: nnx.Rngs
-    ):
-        self.modulation = _linear(condition_width, 2 * width, identity, rngs)
-        self.output = _output_layer(width, zero_output, rngs)
+    def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):
+        self.modulation = nnx.Linear(condition_width, 2 * width, rngs=rngs)
+        # Conv_1x1 of Eq. 7, here and below: a linear layer per frame.
+        self.output = nnx.Linear(width, width, rngs=rngs)
 
     def modulate(self, z_base, c):
         """Modulate [B, T, D] by c [B, T, C_cond] (Eqs 5-7)."""
@@ -188,8 +172,8 @@ class Concatenation(nnx.Module):
     The base block brings both together, so that only the output layer of Eq. 7 is left here.
     """
 
-    def __init__(self, width: int, condition_width=None, *, zero_output: bool = False, rngs: nnx.Rngs):
-        self.output = _output_layer(width, zero_output, rngs)
+    def __init__(self, width: int, condition_width=None, *, rngs: nnx.Rngs):
+        self.output = nnx.Linear(width, width, rngs=rngs)
 
     def __call__(self, base, z, c):
         """Run the base block on z [B, 2 T, D], whose first T frames came from c; c is not read."""
@@ -204,8 +188,9 @@ class AdaLNZero(nnx.Module):
     as c enters by a linear layer alone in FiLM too (Eq. 5).
     """
 
-    def __init__(self, width: int, condition_width: int, *, zero_output: bool = True, rngs: nnx.Rngs):
-        self.modulation = _linear(condition_width, 3 * width, True, rngs)
+    def __init__(self, width: int, condition_width: int, *, rngs: nnx.Rngs):
+        zero = nnx.initializers.zeros_init()
+        self.modulation = nnx.Linear(condition_width, 3 * width, kernel_init=zero, rngs=rngs)
 
     def __call__(self, base, z, c):
         """Add to z [B, T, D] what the base block makes of it under c [B, T, C_cond]."""
@@ -221,11 +206,9 @@ class CrossAttention(nnx.Module):
     not prefer its own part of c.
     """
 
-    def __init__(
-        self, width: int, condition_width: int, num_heads: int = 1, *, zero_output: bool = False, rngs: nnx.Rngs
-    ):
+    def __init__(self, width: int, condition_width: int, num_heads: int = 1, *, rngs: nnx.Rngs):
         self.attention = MultiHeadAttention(width, num_heads, condition_width, rngs=rngs)
-        self.output = _output_layer(width, zero_output, rngs)
+        self.output = nnx.Linear(width, width, rngs=rngs)
 
     def __call__(self, base, z, c):
         """Run the base block on z [B, T, D], and let the result ask c [B, T, C_cond]."""
@@ -241,10 +224,7 @@ CONDITIONINGS = {
 """The ways of Table 11 for c to enter a backbone block."""
 
 
-def conditioning_layer(
-    name: str, width: int, condition_width: int, *, num_heads: int = 1, identity: bool = False,
-    zero_output: bool = False, rngs: nnx.Rngs,
-):  # fmt: skip
+def conditioning_layer(name: str, width: int, condition_width: int, *, num_heads: int = 1, rngs: nnx.Rngs):
     """Return a layer that brings c into a backbone block, called as layer(base, z, c).
 
     There `base` is the base block (a callable z -> z_base), z is [B, T, D] and c [B, T, C_cond].
@@ -255,13 +235,10 @@ def conditioning_layer(
       width: D.
       condition_width: C_cond; for "concatenation", D as well.
       num_heads: of "cross_attention".
-      identity: let "film" begin with nothing to modulate, z_tilde = z_base in Eq. 6.
-      zero_output: start as zero, for a block whose input is added to its output ("adaln_zero" adds
-        its input itself, and starts with nothing to add anyway).
 
     Raises:
       ValueError: for an unknown name, with the nearest.
     """
     check_known(name, CONDITIONINGS, "conditioning")
-    own = {"cross_attention": {"num_heads": num_heads}, "film": {"identity": identity}}.get(name, {})
-    return CONDITIONINGS[name](width, condition_width, **own, zero_output=zero_output, rngs=rngs)
+    own = {"num_heads": num_heads} if name == "cross_attention" else {}
+    return CONDITIONINGS[name](width, condition_width, **own, rngs=rngs)

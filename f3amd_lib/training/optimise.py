@@ -251,8 +251,8 @@ def differences(identity: dict, description: dict) -> list[str]:
 
     Args:
       identity: of the task.
-      description: of the file; what it tells beside the task's identity does not matter, nor does a setting that it
-        does not know, as one younger than the file, if that is off (false, 0 or empty).
+      description: of the file; what it tells beside the task's identity does not matter, nor does a setting that one
+        of the two does not know, as one younger than the file, if that is off (false, 0 or empty).
     """
     # Files have lists where settings have tuples.
     wanted, stored = (
@@ -261,10 +261,10 @@ def differences(identity: dict, description: dict) -> list[str]:
     unlike = []
     for part in (part for part in wanted if wanted[part] != stored[part]):
         if isinstance(wanted[part], dict) and isinstance(stored[part], dict):
-            off = {name: value for name, value in wanted[part].items() if not value}
-            known = off | stored[part]
-            names = sorted(wanted[part].keys() | known.keys())
-            changed = [name for name in names if wanted[part].get(name) != known.get(name)]
+            both = wanted[part], stored[part]
+            off = {name: value for settings in both for name, value in settings.items() if not value}
+            ours, theirs = (off | settings for settings in both)
+            changed = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
             unlike += [f"{part} settings ({', '.join(changed)})"] if changed else []
         else:
             unlike.append(part.replace("_", " "))
