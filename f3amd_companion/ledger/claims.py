@@ -19,8 +19,10 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import tyro
 
@@ -138,41 +140,36 @@ def _read_models(value, families: Mapping, where: str) -> Setting | judging.Fami
     if isinstance(value, list):
         return [_read_models(item, families, where) for item in value]
     value = {"model": value} if isinstance(value, str) else value
-    if "family" in value:
-        check_entry(value, where, ("family",), ("window",))
-        family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
-        chosen = {key: [{"model": model, "window": window} for model in family[key]] for key in ("models", "required")}
-        return judging.Family(**{key: tuple(_read_models(models, {}, where)) for key, models in chosen.items()})
-    check_entry(value, where, ("model",), ("steps", "window"))
-    check_model(value["model"], where)
-    return Setting(**value)
+    if "family" not in value:
+        check_entry(value, where, ("model",), ("steps", "window"))
+        check_model(value["model"], where)
+        return Setting(**value)
+    check_entry(value, where, ("family",), ("window",))
+    family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
+    named = lambda key: _read_models([{"model": model, "window": window} for model in family[key]], {}, where)
+    return judging.Family(named("models"), named("required"))
 
 
 def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     where = f"{where}, {entry.get('says')!r}"
     check_entry(entry, where, ("says", "kind"), entry)
-    parameters, thresholds = dict(entry), about.get("thresholds", {})
-    says = parameters.pop("says")
-    kind = find_entry(_KINDS, parameters.pop("kind"), "kind of judgement", where)
-    optional, remark = (parameters.pop(key, False) for key in ("optional", "remark"))
+    parameters = {"optional": False, "remark": False} | entry
+    says, kind, optional, remark = (parameters.pop(key) for key in ("says", "kind", "optional", "remark"))
+    kind = find_entry(_KINDS, kind, "kind of judgement", where)
     for key in set(_MODELS) & set(parameters):
         parameters[key] = _read_models(parameters[key], about.get("families", {}), where)
     for key, known in (("metric", METRICS), ("table", SCHEMAS)):
         if key in parameters:
             find_entry(known, parameters[key], key, where)
-    ranges = [key for key in judging.RANGES if key in parameters]
+    ranges = {key: parameters.pop(key) for key in judging.RANGES if key in parameters}
     if len(ranges) > 1:
         raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
+    thresholds = about.get("thresholds", {})
     number = lambda bound: find_entry(thresholds, bound, "threshold", where) if isinstance(bound, str) else bound
-    for key in ranges:
-        value = parameters.pop(key)
-        numbers = map(number, value if isinstance(value, list) else [value])
-        try:
-            bound = inspect.signature(judging.RANGES[key]).bind(*numbers)
-        except TypeError:
-            raise ValueError(f"{where}: {key}: {value!r} is another number of numbers than it takes") from None
-        parameters["bounds"] = judging.RANGES[key](*bound.args)
     try:
+        for key, value in ranges.items():
+            numbers = value if isinstance(value, list) else [value]
+            parameters["bounds"] = judging.RANGES[key](*map(number, numbers))
         inspect.signature(kind).bind(None, **parameters)
     except TypeError as error:
         raise ValueError(f"{where}: {error}; {kind.__name__} takes {inspect.signature(kind)}") from None
@@ -271,25 +268,6 @@ def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...
     return tuple(max(statements, key=lambda statement: statement.known) for statements in judged)
 
 
-def _is_of_times(statement: Statement) -> bool:
-    """Say whether a judged statement rests on times alone, which hang on the device and hardly on the data."""
-    return bool(statement.sources) and all(source.name in TIMES for source in statement.sources)
-
-
-def _filled(
-    ours: Sequence[Statement], others: Mapping[str, Sequence[Statement]]
-) -> tuple[tuple[Statement, ...], tuple[str, ...]]:
-    """Put times of other data sets where there are none, the first that has some; return whose, too."""
-    filled, of = [], {}
-    for place, statement in enumerate(ours):
-        theirs = {data: some[place] for data, some in others.items() if _is_of_times(some[place])}
-        if statement.verdict == judging.UNMEASURED and theirs:
-            data, statement = next(iter(theirs.items()))
-            of[data] = None
-        filled.append(statement)
-    return tuple(filled), tuple(of)
-
-
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
     """Judge a claim.
 
@@ -306,10 +284,15 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
         return Judgement(claim, paper, (), "computed")
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
     dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
-    ours, times_of = _filled(tried[dataset], {data: some for data, some in tried.items() if data != dataset})
-    ours = _seen(ours)
-    nothing = judging.combine(statement.verdict for statement in ours) == judging.UNMEASURED
-    return Judgement(claim, ours, paper, "" if nothing else dataset, times_of)
+    ours, times_of = list(tried.pop(dataset)), {}
+    # Times hang on the device and hardly on the data: those of other data sets fill gaps, the first that has some.
+    for place, data in product(range(len(ours)), tried):
+        sources = tried[data][place].sources
+        if ours[place].verdict == judging.UNMEASURED and sources and all(one.name in TIMES for one in sources):
+            ours[place] = tried[data][place]
+            times_of[data] = None
+    nothing = judging.combine(statement.verdict for statement in _seen(ours)) == judging.UNMEASURED
+    return Judgement(claim, _seen(ours), paper, "" if nothing else dataset, tuple(times_of))
 
 
 def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
@@ -341,31 +324,30 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
 
 def _figures(statements: Sequence[Statement]) -> str:
     """Return all figures in one line, each with a mark for its verdict; or why there are none, or no verdict."""
-    measured = [
-        f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict not in (judging.UNMEASURED, judging.REMARK)
-    ]
     gaps = [s.figure for s in statements if s.verdict == judging.UNMEASURED]
-    if measured:
-        if gaps:
-            measured.append(f"{len(gaps)} of {len(gaps) + len(measured)} not measured")
-        return "; ".join([*dict.fromkeys(reason for s in statements for reason in s.reasons), *measured])
-    first, *others = dict.fromkeys(gaps) or [""]
-    return first + (f"; and {len(others)} more" if others else "")
+    measured = [f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict and s.verdict != judging.UNMEASURED]
+    if not measured:
+        first, *others = dict.fromkeys(gaps) or [""]
+        return first + (f"; and {len(others)} more" if others else "")
+    missing = [f"{len(gaps)} of {len(gaps) + len(measured)} not measured"] if gaps else []
+    return "; ".join([*dict.fromkeys(reason for s in statements for reason in s.reasons), *measured, *missing])
 
 
 def _row(judgement: Judgement) -> dict:
     claim = judgement.claim
     # Without a data set a remark may have looked into a table, and decided nothing.
     sources = [source for statement in judgement.ours for source in statement.sources if judgement.dataset]
-    said = {"id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where}
-    said["decided_by"] = claim.decided_by
-    judged = {"verdict": judgement.verdict, "ours": _figures(judgement.ours), "paper_says": claim.paper_says}
-    judged |= {"paper_verdict": judgement.paper_verdict, "paper_figure": _figures(judgement.paper)}
-    names = [name for name in (judgement.dataset, *judgement.times_of) if name]
-    dataset = "; ".join(name + " (procedural, no real motion)" * (name == "synthetic") for name in names)
-    hardware = "float64" if claim.computed else "; ".join(dict.fromkeys(source.hardware for source in sources))
-    record = "; ".join(dict.fromkeys(map(str, sources)))
-    return said | judged | {"dataset": dataset, "hardware": hardware, "record": record}
+    joined = lambda words: "; ".join(dict.fromkeys(filter(None, words)))
+    label = lambda name: name + " (procedural, no real motion)" * (name == "synthetic")
+    return {
+        "id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where,
+        "decided_by": claim.decided_by, "verdict": judgement.verdict, "ours": _figures(judgement.ours),
+        "paper_says": claim.paper_says, "paper_verdict": judgement.paper_verdict,
+        "paper_figure": _figures(judgement.paper),
+        "dataset": joined(map(label, (judgement.dataset, *judgement.times_of))),
+        "hardware": "float64" if claim.computed else joined(source.hardware for source in sources),
+        "record": joined(map(str, sources)),
+    }  # fmt: skip
 
 
 def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
@@ -395,13 +377,9 @@ def _found(statement: Statement) -> str:
 def statement_table(judgement: Judgement) -> pd.DataFrame:
     """Return the statements behind a judgement: statement, ours, the paper's tables."""
     sides = {"ours": judgement.ours, "the paper's tables": judgement.paper}
-    found = {column: {one.says: _found(one) for one in statements} for column, statements in sides.items()}
-    rows = []
-    for statement in judgement.claim.statements:
-        texts = {column: known.get(statement.says, "") for column, known in found.items()}
-        if any(texts.values()):
-            rows.append({"statement": f"({statement.says})" if statement.remark else statement.says} | texts)
-    return pd.DataFrame(rows)
+    found = pd.DataFrame({side: {one.says: _found(one) for one in some} for side, some in sides.items()}, dtype=str)
+    says = {one.says: f"({one.says})" if one.remark else one.says for one in judgement.claim.statements}
+    return found.reindex(list(says)).dropna(how="all").fillna("").rename(says).rename_axis("statement").reset_index()
 
 
 _TEXTS = read_toml(Path(__file__).with_name("claims_page.toml"))
@@ -419,11 +397,11 @@ def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
     marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
     about, words = load_paper_file("paper", paper), _TEXTS["page"] | load_paper_file("claims", paper).get("page", {})
-    gpu, training = load_profile("gpu", "100style"), about.get("training", {})
-    seen, whole = gpu.train_steps * gpu.batch_size, training.get("windows", {}).get("32")
-    fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "least": 100.0 * LEAST_SHARE}
-    fields["share"] = f", {100.0 * seen / whole:.0f} % of the paper's length" if whole else ""
-    fields["windows"] = training.get("says", "their number is not known")
+    gpu, training = load_profile("gpu", "100style"), about["training"]
+    seen = gpu.train_steps * gpu.batch_size
+    share = 100.0 * seen / training["windows"].get("32", np.nan)
+    fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}
+    fields |= {"least": 100.0 * LEAST_SHARE, "windows": training["says"]}
     head = _TEXTS["head"].format(
         count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks,
         **{key: text.strip().format(**fields) for key, text in words.items()},
@@ -465,6 +443,12 @@ def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
+def _verdicts(frame: pd.DataFrame) -> dict[str, dict[str, str]]:
+    """Return what is accepted of a ledger, in the form of `accepted_verdicts`."""
+    columns = ["verdict", "ours", "paper_verdict", "paper_figure"]
+    return frame.set_index("id")[columns].rename(columns={"ours": "figure"}).to_dict("index")
+
+
 def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, str]]) -> list[str]:
     """List the verdicts that are not the accepted ones, one sentence each.
 
@@ -472,16 +456,14 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
       frame: from `ledger`.
       accepted: from `accepted_verdicts`.
     """
-    sides = (("verdict", "our records", "ours"), ("paper_verdict", "the paper's tables", "paper_figure"))
-    changes = []
-    for row in frame.to_dict("records"):
-        before = accepted.get(row["id"], {})
-        for key, whose, figure in sides:
-            if before.get(key) != row[key]:
-                was = f"{before[key]!r}" if key in before else "not accepted yet"
-                changes.append(f"{row['id']} by {whose}: was {was}, is {row[key]!r} ({row[figure]})")
-    known = set(frame["id"])
-    return changes + [f"{name}: is no claim any more" for name in accepted if name not in known]
+    changes, verdicts = [], _verdicts(frame)
+    for name, now in verdicts.items():
+        for whose, side in (("our records", ""), ("the paper's tables", "paper_")):
+            was, verdict = accepted.get(name, {}).get(f"{side}verdict"), now[f"{side}verdict"]
+            if was != verdict:
+                before = repr(was) if was else "not accepted yet"
+                changes.append(f"{name} by {whose}: was {before}, is {verdict!r} ({now[f'{side}figure']})")
+    return changes + [f"{name}: is no claim any more" for name in accepted if name not in verdicts]
 
 
 def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
@@ -500,13 +482,10 @@ def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False)
     """
     path, frame = named_file(path, ".md", "ledgers"), ledger(judgements)
     changes = changed_verdicts(frame, accepted_verdicts(path))
-    if changes and not accept:
-        return changes
-    columns = ["verdict", "ours", "paper_verdict", "paper_figure"]
-    verdicts = frame.set_index("id")[columns].rename(columns={"ours": "figure"}).to_dict("index")
-    page, kept = ledger_markdown(judgements), json.dumps(verdicts, indent=2, ensure_ascii=False)
-    write_whole(path, page)
-    write_whole(path.with_suffix(".json"), f"{kept}\n")
+    if accept or not changes:
+        write_whole(path, ledger_markdown(judgements))
+        kept = json.dumps(_verdicts(frame), indent=2, ensure_ascii=False)
+        write_whole(path.with_suffix(".json"), f"{kept}\n")
     return changes
 
 
@@ -521,25 +500,23 @@ def main(accept: bool = False, paper: str | None = None) -> int:
       Exit status: 0 if the ledger was written, 1 if a verdict changed and was not accepted, 2 for
       records, or a paper's file, that are broken.
     """
-    papers = [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]
-    return max(_written(name, accept) for name in papers)
-
-
-def _written(paper: str, accept: bool) -> int:
-    """Write a paper's ledger; return the exit status of `main`."""
-    path = ledger_path(paper)
-    try:
-        changes = write_ledger(path, judge_claims(paper=paper), accept=accept)
-    except ValueError as error:
-        log.error("Stopped: %s", error)
-        return 2
-    for change in changes:
-        log.info("%s", change)
-    if changes and not accept:
-        log.error("Nothing was written. If these are right: --accept")
-        return 1
-    log.info("%s is up to date", path.relative_to(repository_root()))
-    return 0
+    status = 0
+    for name in [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]:
+        path = ledger_path(name)
+        try:
+            changes = write_ledger(path, judge_claims(paper=name), accept=accept)
+        except ValueError as error:
+            log.error("Stopped: %s", error)
+            status = 2
+            continue
+        for change in changes:
+            log.info("%s", change)
+        if changes and not accept:
+            log.error("Nothing was written. If these are right: --accept")
+            status = max(status, 1)
+        else:
+            log.info("%s is up to date", path.relative_to(repository_root()))
+    return status
 
 
 if __name__ == "__main__":

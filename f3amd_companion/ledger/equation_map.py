@@ -16,7 +16,7 @@ import ast
 import functools
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import compact_table
 
 _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
-_KINDS = ("functions", "tests", "notebooks", "cells", "figures")
+_KINDS = ["functions", "tests", "notebooks", "cells", "figures"]
 
 # A mark without a number may stand in LaTeX, where \bar\alpha_t holds alpha_t too and does not mean it.
 _MENTION = r"(?:\b({papers})\s+)?(?:\bEqs?\.?\s+((?:\d+(?:\s*(?:-|,|and|to)\s*)?)+)|(?<!\\bar\\)(?<!\w)({marks})(?!\w))"
@@ -36,47 +36,45 @@ _TEST_NAME = r"test_(?:({papers})_)?(?:eq(\d\d)(?:_(?:to_eq)?(\d\d))?|({marks}))
 _DISPLAYED = re.compile(r"\\qquad\s*\(([\d, .]+)\)\s*\$\$")
 _OTHERS = re.compile(r"et al\.|\b(?:19|20)\d\d\b")  # a citation, whose equations are not ours to find
 
+Mentions = set[tuple[str, str]]
+"""(paper, label) of equations; a label is "Eq. 9", or a mark of the paper's own such as "Appendix F"."""
+
 
 def equation_labels(paper: str = _DEFAULT) -> list[str]:
-    """Return the labels of a paper's equations: "Eq. 9", or a mark of its own such as "Appendix F"."""
+    """Return the labels of a paper's equations."""
     return [entry["label"] for entry in load_paper_file("paper", paper).get("equation", ())]
 
 
 @functools.cache
-def _patterns(paper: str) -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]:
+def _patterns() -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]:
     """Return the patterns of mentions and test names, papers by name, and marks by how a test spells them."""
     names = {load_paper_file("paper", folder)["name"]: folder for folder in paper_folders()}
-    marks = {label.lower().replace(" ", "_"): label for label in equation_labels(paper) if "Eq." not in label}
-    either = lambda words: "|".join(map(re.escape, words)) or "(?!)"
+    marks = {label.lower().replace(" ", "_"): label for label in equation_labels() if "Eq." not in label}
+    either = lambda words: "|".join(map(re.escape, words))
     mention = re.compile(_MENTION.format(papers=either(names), marks=either(marks.values())))
-    test_name = re.compile(_TEST_NAME.format(papers=either(names.values()), marks=either(marks)))
-    return mention, test_name, names, marks
+    return mention, re.compile(_TEST_NAME.format(papers=either(names.values()), marks=either(marks))), names, marks
 
 
-def mentioned_equations(text: str, paper: str = _DEFAULT) -> set[str]:
-    """Return the labels of a paper's equations that a text mentions.
+def clauses(text: str) -> list[str]:
+    """Split a text where a citation ends to be about what follows."""
+    return re.split(r"[;()]|\.\s*\n", text)
+
+
+def mentioned_equations(text: str) -> Mentions:
+    """Return the equations that a text mentions, whether or not the paper has such equations.
 
     "Eqs 2-4" stands for three, of the paper named before it ("F3AMD Eqs 2-4") or of F3AMD. An
     equation of a paper that has no folder here is left out: it follows "et al." or a year in the same
     clause ("Zhou et al. 2019, Eq. 15").
     """
-    return _mentions(text, paper) & set(equation_labels(paper))
-
-
-def _clauses(text: str) -> list[str]:
-    return re.split(r"[;()]|\.\s*\n", text)
-
-
-def _mentions(text: str, paper: str) -> set[str]:
-    """Return labels as a text has them, whether or not the paper has such equations."""
-    pattern, _, names, _ = _patterns(paper)
+    pattern, _, names, _ = _patterns()
     found = set()
-    for clause in _clauses(text):
+    for clause in clauses(text):
         for match in pattern.finditer(clause):
             name, numbers, mark = match.groups()
-            if _OTHERS.search(clause[: match.start()]) or names.get(name, _DEFAULT) != paper:
-                continue
-            found |= {mark} if mark else {f"Eq. {number}" for number in _numbers(numbers)}
+            if not _OTHERS.search(clause[: match.start()]):
+                labels = {mark} if mark else {f"Eq. {number}" for number in _numbers(numbers)}
+                found |= {(names.get(name, _DEFAULT), label) for label in labels}
     return found
 
 
@@ -84,6 +82,16 @@ def _numbers(text: str) -> set[int]:
     """Read "2-4" or "10, 12 and 13"."""
     parts = [[int(number) for number in re.findall(r"\d+", part)] for part in re.split(r",|and", text)]
     return {number for ends in parts if ends for number in range(ends[0], ends[-1] + 1)}
+
+
+def tested_equations(name: str) -> Mentions:
+    """Return the equations that the name of a test carries: "test_eq03_to_eq04_sum", "test_acmdm_eq01_path"."""
+    _, pattern, _, marks = _patterns()
+    if not (named := pattern.match(name)):
+        return set()
+    paper, first, last, mark = named.groups()
+    labels = [marks[mark]] if mark else [f"Eq. {number}" for number in range(int(first), int(last or first) + 1)]
+    return {(paper or _DEFAULT, label) for label in labels}
 
 
 def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> pd.DataFrame:
@@ -101,44 +109,42 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
       02, "C4.1" in the course's 04), figures (files that these sections draw). The last five hold
       names joined by ", ", "" where there are none.
     """
-    root = Path(root) if root is not None else repository_root()
-    places = _places(root, paper, course)
+    return _rows_of(paper, _places(Path(root or repository_root()), course))
+
+
+def _rows_of(paper: str, places: pd.DataFrame) -> pd.DataFrame:
     rows = pd.DataFrame(load_paper_file("paper", paper).get("equation", ()), columns=["label", "section", "what"])
-    joined = {kind: [", ".join(found[kind]) for found in places.values()] for kind in _KINDS}
-    return rows.rename(columns={"label": "equation"}).assign(**joined)
+    own = places[places["paper"] == paper].groupby(["label", "kind"])["place"].agg(", ".join).unstack()
+    return rows.join(own.reindex(columns=_KINDS), on="label").fillna("").rename(columns={"label": "equation"})
 
 
-def _places(root: Path, paper: str, course: bool) -> dict[str, dict[str, list[str]]]:
-    """Return for each equation of a paper where it lives, by `_KINDS`."""
-    places = {label: {kind: [] for kind in _KINDS} for label in equation_labels(paper)}
-    packages = [root / "f3amd_lib", root / "f3amd_companion"]
-    for path in (path for package in packages for path in sorted(package.rglob("*.py"))):
-        module = path.relative_to(root).with_suffix("").as_posix().partition("/")[2]
-        if module.startswith("ledger/"):  # what draws and lists implements nothing
-            continue
-        for name, text in _documented(path.read_text(encoding="utf-8")):
-            for label in mentioned_equations(text, paper):
-                places[label]["functions"].append(f"{module}: {name}")
+def _places(root: Path, course: bool) -> pd.DataFrame:
+    """Return where equations live: kind (of `_KINDS`), place, paper, label."""
+    found: list[tuple] = []
+    note = lambda kind, place, mentions: found.extend((kind, place, *each) for each in mentions)
+    for package in ("f3amd_lib", "f3amd_companion"):
+        for path in sorted((root / package).rglob("*.py")):
+            module = path.relative_to(root / package).with_suffix("").as_posix()
+            if not module.startswith("ledger/"):  # what draws and lists implements nothing
+                for name, text in _documented(path.read_text(encoding="utf-8")):
+                    note("functions", f"{module}: {name}", mentioned_equations(text))
     for path in sorted((root / "tests").glob("test_*.py")):
-        for name, labels in _tests(path.read_text(encoding="utf-8"), paper):
-            for label in labels:
-                places[label]["tests"].append(f"{path.stem}: {name}")
+        for name, text in _documented(path.read_text(encoding="utf-8")):
+            if name.startswith("test_") and "." not in name:
+                note("tests", f"{path.stem}: {name}", mentioned_equations(text) | tested_equations(name))
     folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
     for path in (path for folder in folders for path in sorted(folder.glob("[0-9][0-9]_*.ipynb"))):
         # The reading guide shows this very map and explains none of it; solutions only repeat.
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
         markdown = ("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "markdown")
-        for label in _told("\n\n".join(markdown), paper):
-            places[label]["notebooks"].append(path.stem)
-        for section in notebook_sections(path, paper):
-            for label in section.equations if section.number else ():
-                places[label]["cells"].append(section.number)
-                places[label]["figures"] += section.figures
-    return places
+        note("notebooks", path.stem, Section("", "\n\n".join(markdown), []).equations)
+        for section in notebook_sections(path):
+            for kind, place in [("cells", section.number), *(("figures", figure) for figure in section.figures)]:
+                note(kind, place, section.equations if section.number else ())
+    return pd.DataFrame(found, columns=["kind", "place", "paper", "label"])
 
 
-# Papers have sources in common: a file is parsed once for all of them.
 @functools.cache
 def _documented(source: str) -> list[tuple[str, str]]:
     """Return (qualified name, docstring) of the classes, functions and methods of a file."""
@@ -154,33 +160,19 @@ def _documented(source: str) -> list[tuple[str, str]]:
     return list(visit(ast.parse(source).body, ""))
 
 
-def _tests(source: str, paper: str):
-    """Yield (name, labels) of tests that carry an equation in their name or docstring."""
-    _, pattern, _, marks = _patterns(paper)
-    for name, text in _documented(source):
-        if name.startswith("test_") and "." not in name:
-            labels = mentioned_equations(text, paper)
-            named = pattern.match(name)
-            if named and (named[1] or _DEFAULT) == paper:
-                first, last = named[2], named[3] or named[2]
-                numbers = range(int(first), int(last) + 1) if first else ()
-                labels |= {marks[named[4]]} if named[4] else {f"Eq. {number}" for number in numbers}
-            yield name, labels & set(equation_labels(paper))
-
-
-@dataclass(frozen=True)
+@dataclass
 class Section:
     """What stands under one heading of a notebook.
 
     Attributes:
       heading: its line, without the marks: "2.3 One line, three labels (Eq. 9)".
-      equations: labels of the paper's equations that its text, or its code, mentions.
+      text: all of it, code and heading included.
       figures: names of the figures that its code draws and keeps, "02_schedule".
     """
 
     heading: str
-    equations: frozenset[str]
-    figures: tuple[str, ...]
+    text: str
+    figures: list[str]
 
     @property
     def number(self) -> str:
@@ -188,43 +180,31 @@ class Section:
         found = re.match(r"C?\d+\.\d+(?= )", self.heading)
         return found[0] if found else ""
 
+    @property
+    def equations(self) -> Mentions:
+        """Equations that it mentions or, F3AMD's, displays with the number: "\\qquad (11)$$"."""
+        numbers = [one.strip() for one in ",".join(_DISPLAYED.findall(self.text)).split(",")]
+        return mentioned_equations(self.text) | {(_DEFAULT, f"Eq. {one}") for one in numbers if one.isdigit()}
 
-def notebook_sections(path, paper: str = _DEFAULT) -> list[Section]:
-    """Read the sections of a notebook in their order.
 
-    Args:
-      path: of the notebook. What stands before its first heading of the second level is its title
-        page and in no section; deeper headings stay in the section they stand in.
-      paper: whose equations are looked for.
+def notebook_sections(path) -> list[Section]:
+    """Read the sections of a notebook in their order, one for each heading of the second level ("## ...").
 
-    Returns:
-      One entry per heading of the second level ("## ...").
+    What stands before the first of them is the title page and in no section; deeper headings stay in the section
+    they stand in.
     """
-    texts: list[tuple[str, list[str], list[str]]] = []
+    sections: list[Section] = []
     for cell in _cells(path):
-        source = "".join(cell["source"])
-        if cell["cell_type"] == "code":
-            if texts:
-                texts[-1][1].append(source)
-                texts[-1][2].extend(_kept_figures(source))
-            continue
-        before, *parts = re.split(r"^## (.*)$", source, flags=re.M)
-        if texts:
-            texts[-1][1].append(before)
+        source, code = "".join(cell["source"]), cell["cell_type"] == "code"
+        before, *parts = [source] if code else re.split(r"^## (.*)$", source, flags=re.M)
+        if sections:
+            sections[-1].text += f"\n\n{before}"
+            sections[-1].figures += _kept_figures(source) if code else []
         for heading, text in zip(parts[::2], parts[1::2], strict=True):
-            texts.append((heading.strip(), [heading, text], []))
-    return [
-        Section(heading, frozenset(_told("\n\n".join(text), paper)), tuple(figures)) for heading, text, figures in texts
-    ]
+            sections.append(Section(heading.strip(), f"{heading}\n\n{text}", []))
+    return sections
 
 
-def _told(text: str, paper: str) -> set[str]:
-    """Return the labels that a notebook's text mentions or, F3AMD's, displays with the number: "\\qquad (11)$$"."""
-    numbers = ",".join(_DISPLAYED.findall(text)).split(",") if paper == _DEFAULT else ()
-    return mentioned_equations(text, paper) | {f"Eq. {one.strip()}" for one in numbers} & set(equation_labels(paper))
-
-
-@functools.cache
 def _kept_figures(source: str) -> list[str]:
     """Return the names under which a code cell keeps figures: `keep_figure(..., "02_paths")`."""
     names = []
@@ -251,32 +231,33 @@ def equations_markdown(*, root=None) -> str:
 
     An equation that no function computes has the reason in its place, `cited_only` in `paper.toml`.
     """
-    root = Path(root) if root is not None else repository_root()
-    papers = [paper for paper in paper_folders() if load_paper_file("paper", paper).get("equation")]
-    papers.sort(key=lambda paper: paper != _DEFAULT)
-    preface = Path(__file__).with_suffix(".template").read_text(encoding="utf-8")
-    return preface + "".join(f"\n{_paper_markdown(root, paper)}" for paper in papers)
+    root = Path(root or repository_root())
+    places = _places(root, course=True)
+    parts = [Path(__file__).with_suffix(".template").read_text(encoding="utf-8")]
+    for paper in sorted(filter(equation_labels, paper_folders()), key=lambda paper: paper != _DEFAULT):
+        about, rows = load_paper_file("paper", paper), _rows_of(paper, places)
+        functions = rows["functions"].str.replace(": ", ".").map(lambda names: _joined(names, "`{}`".format))
+        reasons = [f"*cited only:* {one['cited_only']}" if "cited_only" in one else "" for one in about["equation"]]
+        page = rows[["equation", "section"]].assign(**{"what it says": rows["what"]})
+        page["functions"] = functions.where(functions != "", reasons)
+        page["tests"] = rows["tests"].map(_first_tests)
+        page["notebooks"] = rows["cells"].map(lambda cells: _joined(cells, lambda cell: _section_link(root, cell)))
+        parts.append(f"\n## {about['name']}\n\n{compact_table(page)}")
+    return "".join(parts)
 
 
-def _paper_markdown(root: Path, paper: str) -> str:
-    about, rows = load_paper_file("paper", paper), []
-    for entry, found in zip(about["equation"], _places(root, paper, course=True).values(), strict=True):
-        functions = ", ".join(f"`{name.replace(': ', '.')}`" for name in found["functions"])
-        reason = f"*cited only:* {entry['cited_only']}" if "cited_only" in entry else ""
-        row = {"equation": entry["label"], "section": entry["section"], "what it says": entry["what"]}
-        row |= {"functions": functions or reason, "tests": _first_tests(found["tests"])}
-        rows.append(row | {"notebooks": ", ".join(_section_link(root, cell) for cell in found["cells"])})
-    return f"## {about['name']}\n\n{compact_table(pd.DataFrame(rows))}"
+def _joined(names: str, written: Callable[[str], str]) -> str:
+    return ", ".join(map(written, filter(None, names.split(", "))))
 
 
-def _first_tests(names: Iterable[str]) -> str:
+def _first_tests(names: str) -> str:
     """Return the first test of each file, and how many more it has."""
     files: dict[str, list[str]] = {}
-    for name in names:
+    for name in filter(None, names.split(", ")):
         file, test = name.split(": ")
-        files.setdefault(f"`tests/{file}.py`", []).append(f"`{test}`")
-    texts = (f"{file}: {first}" + (f" and {len(more)} more" if more else "") for file, (first, *more) in files.items())
-    return "; ".join(texts)
+        files.setdefault(file, []).append(test)
+    more = lambda tests: f" and {len(tests) - 1} more" if len(tests) > 1 else ""
+    return "; ".join(f"`tests/{file}.py`: `{tests[0]}`{more(tests)}" for file, tests in files.items())
 
 
 def _section_link(root: Path, cell: str) -> str:
@@ -301,7 +282,7 @@ def running_times(*, root=None) -> pd.DataFrame:
     Raises:
       ValueError: if a summary is not the one its record describes.
     """
-    root = Path(root) if root is not None else repository_root()
+    root = Path(root or repository_root())
     columns = {}
     for path in sorted((root / "paper_figures").glob("*/*/tables/run_summary.csv")):
         summary, record = read_table(path)
