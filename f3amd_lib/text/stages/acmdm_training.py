@@ -6,26 +6,34 @@ Each is a task of `training.optimise`; its data are arrays on the device. The pa
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.text.data.text_motions import ClipTable, draw_clips
+from f3amd_lib.motion.body import make_body
+from f3amd_lib.networks import presets
+from f3amd_lib.text.data.body_mesh import BodyMesh, standing
+from f3amd_lib.text.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.text.networks.acmdm import TextCondition
 from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, branch_with, control_branch, controlled
 from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
 from f3amd_lib.text.networks.motion_autoencoder import smooth_l1, variational_loss
-from f3amd_lib.text.stages.motion_codec import MotionCodec
-from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
+from f3amd_lib.text.stages.text_models import PELVIS, Asked, TextModel, controlled_joints
+from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
+
+_ENCODED_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,63 @@ class TextMotionTraining:
         return optax.chain(optax.clip_by_global_norm(self.gradient_clip), adam) if self.gradient_clip else adam
 
 
+# -------------------------------------------------------------------------------------------------------------- states
+
+
+def _whole_states(codec: MotionCodec, data: TextMotions) -> list[np.ndarray]:
+    """Return the normalised positions of each clip, as many as make whole frames of the state."""
+    frames = codec.frames_per_state
+    clips = (data.clip(number) for number in range(data.num_clips))
+    return [codec.axes.normalise(clip[: len(clip) // frames * frames]) for clip in clips]
+
+
+def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
+    """Return all clips as states, one after the other, [N / frames of a state, J, C]."""
+    frames, clips = codec.frames_per_state, _whole_states(codec, data)
+    if codec.redundancy is not None:
+        return np.concatenate([np.concatenate(clips), codec.redundancy.normalise(data.joint_features())], axis=-1)
+    if codec.autoencoder is None:
+        return np.concatenate(clips)
+    encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
+    if codec.mesh is not None:  # frames do not see each other: nothing is padded
+        whole = np.concatenate(clips)[None]
+        return np.asarray(encode(codec, whole, np.ones(whole.shape[:2], bool)))[0]
+    for first in range(0, len(clips), _ENCODED_AT_ONCE):
+        part = clips[first : first + _ENCODED_AT_ONCE]
+        padded = pad_motions([*part, *[part[0]] * (_ENCODED_AT_ONCE - len(part))], longest)
+        states = np.asarray(encode(codec, padded.motion, padded.mask))
+        parts += [state[: len(clip) // frames] for state, clip in zip(states, part, strict=False)]
+    return np.concatenate(parts)
+
+
+def _captioned_states(asked: Asked, split: str | None):
+    """Return (clips of a split as states, pooled embeddings of their captions)."""
+    codec, part = asked.codec, asked.part(split)
+    table, captions = clip_table(part, encoded_clips(codec, part), codec.frames_per_state)
+    return table, asked.pooled(captions)
+
+
+def first_frames(codec: MotionCodec, data: TextMotions, count: int) -> dict[str, np.ndarray]:
+    """Return the first frames of one clip of each pair of content and style, by its first caption, as states.
+
+    Args:
+      codec: of the states.
+      data: captioned clips.
+      count: frames of the state, P; 0 returns nothing.
+
+    Returns:
+      [P, J, C] each.
+    """
+    if not count:
+        return {}
+    frames = count * codec.frames_per_state
+    long_enough = [number for number in range(data.num_clips) if data.lengths[number] >= frames]
+    shown = {data.pairs[number]: number for number in reversed(long_enough)}.values()
+    clips = jnp.asarray(np.stack([codec.axes.normalise(data.clip(number)[:frames]) for number in shown]))
+    states = np.asarray(codec.encode(clips, jnp.ones(clips.shape[:2], bool)))
+    return {data.captions[number][0]: state for number, state in zip(shown, states, strict=True)}
+
+
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
@@ -103,7 +168,34 @@ class TextMotionTraining:
 class AutoencoderTask(ClipsTask):
     """A motion autoencoder to train on windows of clips that are long enough; clips are normalised positions."""
 
-    name = part = "autoencoder"
+    name = part = recipe = "autoencoder"
+    settings = TextMotionTraining
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> AutoencoderTask:
+        """Return the training on the clips of a split; ValueError for clips that are too short."""
+        longest, config = asked.part(split).lengths.max(), asked.config
+        if longest < config.window:
+            lengths = f"no {split or 'train'} clip has {config.window} frames, the longest has {longest}"
+            needs = f"{asked.preset.name} needs longer ones, or a larger --window"
+            raise ValueError(f"data set {asked.data.name!r}: {lengths}; {needs}")
+        return cls(presets.build_config(asked.preset.name), config, **cls._clips(asked, split))
+
+    @staticmethod
+    def _clips(asked: Asked, split: str | None) -> dict:
+        part = asked.part(split)
+        table, _ = clip_table(part, asked.codec.axes.normalise(part.positions))
+        return {"clips": table, "dataset_fingerprint": asked.data.fingerprint}
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> TextModel:
+        """Return the trained autoencoder, its latent normalised over up to 512 training clips."""
+        part = asked.data.members("train")
+        part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]
+        frames, codec = self.model_config.frames_per_latent, getattr(self, "codec", asked.codec)
+        clips = [codec.axes.normalise(asked.data.clip(number)) for number in part]
+        padded = pad_motions(clips, max(map(len, clips)) // frames * frames)
+        codec = with_latent(codec, self.model_config, state.averaged, padded.motion, padded.mask)
+        return TextModel(codec=codec, **about)
 
     def draw(self, state: TrainingState, key):
         """Draw windows [B, window, J, 3] from clips of at least that length."""
@@ -152,9 +244,19 @@ class MeshAutoencoderTask(AutoencoderTask):
       codec: of positions, with the mesh whose vertices they move.
     """
 
-    name = "mesh autoencoder"
+    name, recipe = "mesh autoencoder", "mesh-autoencoder"
 
     codec: MotionCodec
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> MeshAutoencoderTask:
+        """Return the training on the clips of a split."""
+        # The body stands as people do when clips begin: those of training, whatever the split.
+        data = asked.data
+        rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
+        model = presets.build_config(asked.preset.name, num_vertices=len(make_body(rest).vertices))
+        codec = dataclasses.replace(asked.codec, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
+        return cls(model, asked.config, codec=codec, **cls._clips(asked, split))
 
     def terms(self, params, batch, key, training=True) -> dict:
         """Return L1, summed over a frame, mean over frames (ACMDM's released code); arguments as above."""
@@ -255,10 +357,32 @@ class TextMotionTask(ClipsTask):
       pooled: embeddings of the clips' captions, [C, W].
     """
 
-    name, part = "text and motion", "denoiser"
+    name, part, recipe = "text and motion", "denoiser", "denoiser"
+    settings = TextMotionTraining
 
     schedule: NoiseSchedule
     pooled: Any
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> TextMotionTask:
+        """Return the training on the clips of a split; ValueError for states of other channels than the preset's."""
+        (table, pooled), codec, preset = _captioned_states(asked, split), asked.codec, asked.preset
+        sizes = {"num_joints": table.frames.shape[1], "text_width": pooled.shape[-1]}
+        if asked.window:
+            sizes["window"] = asked.window // codec.frames_per_state
+        model = presets.build_config(preset.name, **sizes)
+        if (channels := table.frames.shape[-1]) != model.channels:
+            raise ValueError(f"{preset.name} models {model.channels} numbers a joint; positions have {channels}")
+        fingerprint = asked.data.fingerprint
+        if codec.autoencoder is not None:
+            fingerprint += f" in the latent of {weights_digest(codec.params)}"
+        return cls(model, asked.config, table, preset.diffusion, pooled, dataset_fingerprint=fingerprint)
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> TextModel:
+        """Return the trained denoiser: its moving average."""
+        starts = first_frames(asked.codec, asked.part("train"), self.config.prefix_frames)
+        made = {"config": self.model_config, "params": state.averaged, "schedule": self.schedule}
+        return TextModel(codec=asked.codec, starts=starts, **made, **asked.told(), **about)
 
     def draw(self, state: TrainingState, key):
         """Draw (states, condition) and the key of the loss."""
@@ -336,11 +460,31 @@ class ControlTask(TextMotionTask):
       joints: numbers of the joints that may be controlled.
     """
 
-    name = "control branch"
+    name, recipe = "control branch", "control"
 
     base: Any
     codec: MotionCodec
     joints: tuple[int, ...]
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> ControlTask:
+        """Return the training beside a finished denoiser, on the clips of a split."""
+        base, codec, frames = asked.before, asked.codec, asked.codec.frames_per_state
+        table, pooled = _captioned_states(asked, split)
+        positions = jnp.asarray(np.concatenate(_whole_states(codec, asked.part(split))), jnp.float32)
+        positions = positions.reshape(len(table.frames), frames, *positions.shape[1:])
+        joints = (0,) if asked.branch == PELVIS else tuple(controlled_joints(asked.data.skeleton).values())
+        return cls(
+            base.config, asked.config, table._replace(frames=(table.frames, positions)), base.schedule, pooled,
+            base.params, codec, joints,
+            dataset_fingerprint=f"{asked.data.fingerprint} beside {weights_digest(base.params)}",
+        )  # fmt: skip
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> TextModel:
+        """Return the denoiser with its trained branch, told the guidance that it was told before."""
+        kept = {key: asked.before.record[key] for key in ("guidance",) if key in asked.before.record}
+        record = about["record"] | kept
+        return dataclasses.replace(asked.before, branch=state.averaged, name=about["name"], record=record)
 
     def identity(self) -> dict:
         """Return all that decides the weights, as JSON has it."""

@@ -5,6 +5,8 @@ Each is a task of `training.optimise`. Settings of the paper and ours stand in `
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,12 +16,13 @@ import optax
 from flax import nnx
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.networks.presets import build_from_config
+from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.text import phases
 from f3amd_lib.text.data.redundant import grouped_statistics, positions_from_redundant
-from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, draw_clips, pad_motions
+from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.text.networks import motionpcm
-from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.text.stages.text_models import Asked, LatentModel
+from f3amd_lib.training.checkpoints import network_with, weights_digest
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 
@@ -99,6 +102,7 @@ class LatentMotionTraining:
 # --------------------------------------------------------------------------------------------------------- autoencoder
 
 
+@functools.lru_cache(maxsize=1)
 def frame_statistics(data: TextMotions) -> AxisNormaliser:
     """Return mean and deviation of the training clips' redundant vectors, as HumanML3D has them, [features]."""
     mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
@@ -150,9 +154,25 @@ class LatentAutoencoderTask(ClipsTask):
       statistics: of these vectors.
     """
 
-    name, part = "latent autoencoder", "autoencoder"
+    name, part, recipe = "latent autoencoder", "autoencoder", "autoencoder"
+    settings = LatentMotionTraining
 
     statistics: AxisNormaliser
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> LatentAutoencoderTask:
+        """Return the training on the clips of a split, without any where it is None."""
+        data, part, clips, statistics = asked.data, asked.part(split), None, None
+        if split is not None:
+            statistics = frame_statistics(data)
+            clips, _ = clip_table(part, statistics.normalise(part.redundant_vectors()))
+        model = build_config(asked.preset.name, features=12 * data.skeleton.num_joints - 1)
+        return cls(model, asked.config, clips, statistics, dataset_fingerprint=data.fingerprint)
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> LatentModel:
+        """Return the trained autoencoder."""
+        weights = {"autoencoder": self.model_config, "autoencoder_params": state.averaged}
+        return LatentModel(statistics=self.statistics, **weights, **about)
 
     def draw(self, state: TrainingState, key):
         """Draw (features, mask) and the key of the loss."""
@@ -231,6 +251,16 @@ def latent_table(
     return LatentTable(mean, log_variance, first, count, jnp.asarray(pooled), jnp.asarray(empty))
 
 
+def _latents(asked: Asked, split: str | None) -> LatentTable | None:
+    """Return the latents and captions of a split's clips; None where nothing is trained, since that takes minutes."""
+    if split is None:
+        return None
+    before, part = asked.before, asked.part(split)
+    pooled = asked.pooled([caption for several in part.captions for caption in several])
+    model, nothing = network_with(before.autoencoder, before.autoencoder_params), jnp.zeros_like(pooled[0])
+    return latent_table(model, before.statistics, part, pooled, nothing, asked.config.num_frames)
+
+
 @frozen_tree("clips")
 class TeacherTask(ClipsTask):
     """A teacher to train: the noise of latents under a caption, or none. Clips are a `LatentTable`.
@@ -239,9 +269,23 @@ class TeacherTask(ClipsTask):
       schedule: the noise schedule of its preset.
     """
 
-    name, part = "latent teacher", "teacher"
+    name, part, recipe = "latent teacher", "teacher", "teacher"
+    settings = LatentMotionTraining
 
     schedule: NoiseSchedule
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> TeacherTask:
+        """Return the training on the latents of a split's clips, without any where it is None."""
+        model = build_config(asked.preset.name, text_width=asked.pooled(["a person walks"]).shape[-1])
+        fingerprint = f"{asked.data.fingerprint} on {weights_digest(asked.before.autoencoder_params)}"
+        given = model, asked.config, _latents(asked, split), asked.preset.diffusion
+        return cls(*given, dataset_fingerprint=fingerprint)
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> LatentModel:
+        """Return the trained teacher: its moving average."""
+        made = {"schedule": self.schedule, "config": self.model_config, "params": state.averaged}
+        return dataclasses.replace(asked.before, **made, **asked.told(), **about)
 
     def draw(self, state: TrainingState, key):
         """Draw (latents, captions) and the key of the loss; a share of the captions is the empty one."""
@@ -306,13 +350,25 @@ class DistillationTask(TeacherTask):
       teacher: its frozen weights; the config of the network and the schedule are the teacher's as well.
     """
 
-    name = "student"
+    name = recipe = "student"
 
     teacher: Any
 
     def __post_init__(self):
         if self.config.ema_decay is None:
             raise ValueError("a student's target is its moving average: set ema_decay, 0 for the student itself")
+
+    @classmethod
+    def of(cls, asked: Asked, split: str | None) -> DistillationTask:
+        """Return the distillation from a finished teacher, on the latents of a split's clips."""
+        teacher, fingerprint = asked.before, f"{asked.data.fingerprint} on {weights_digest(asked.before.params)}"
+        given = teacher.config, asked.config, _latents(asked, split), teacher.schedule, teacher.params
+        return cls(*given, dataset_fingerprint=fingerprint)
+
+    def kept(self, asked: Asked, state: TrainingState, about: dict) -> LatentModel:
+        """Return the trained student itself: its moving average was its target."""
+        made = {"config": self.student_config, "params": state.params["student"]}
+        return dataclasses.replace(asked.before, **made, **asked.told(), **about)
 
     @property
     def student_config(self) -> motionpcm.LatentDenoiserConfig:

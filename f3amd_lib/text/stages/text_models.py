@@ -8,6 +8,7 @@ configs. A preset's name with "+control" behind it stands for the branch beside 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,7 +27,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import CheckedConfig
 from f3amd_lib.text.data.body_mesh import BodyMesh
 from f3amd_lib.text.data.humanml3d import read_humanml3d
-from f3amd_lib.text.data.text_encoders import TextEncoder
+from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions, words_of
 from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, bandai_text_motions
 from f3amd_lib.text.networks.acmdm import ACMDMConfig
 from f3amd_lib.text.networks.acmdm_control import ControlBranch, blank_branch, branch_with
@@ -376,3 +377,43 @@ def find_text_model(
     told = wanted + branches[0]
     how = f"f3amd train --preset {told} --data {dataset}"
     raise ValueError(f"no trained {told} for data set {dataset!r}; train it: {how}")
+
+
+# ------------------------------------------------------------------------------------------------------------ training
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be trained, and on what: tasks are made of it, and finished models.
+
+    Attributes:
+      data, encoder: captioned clips, and what embeds captions.
+      preset, branch: the model, and what follows its name (`preset_and_branch`).
+      config: how it is trained.
+      before: the finished model that it stands on, None for none.
+      codec: between motion and the states of ACMDM, as far as it is known before this stage; None for MotionPCM.
+      window: most frames of motion in a state of ACMDM, instead of the preset's.
+    """
+
+    data: TextMotions
+    encoder: TextEncoder
+    preset: presets.Preset
+    branch: str
+    config: Any
+    before: TextModel | LatentModel | None
+    codec: MotionCodec | None
+    window: int | None
+
+    def part(self, split: str | None) -> TextMotions:
+        """Return the clips of a split; None is for a task that is only compared, which takes those of training."""
+        return self.data.select(self.data.members(split or "train"))
+
+    def pooled(self, captions: Sequence[str]) -> jax.Array:
+        """Return the pooled embedding of each caption, [N, W]; those that are said twice are embedded once."""
+        unlike, place = np.unique(captions, return_inverse=True)
+        return jnp.asarray(embed_captions(unlike.tolist(), self.encoder).pooled[place])
+
+    def told(self) -> dict:
+        """Return what a model that reads captions says of them."""
+        said = [caption for several in self.part("train").captions for caption in several]
+        return {"text_encoder": self.encoder.identity, "words": words_of(said)}
