@@ -242,7 +242,7 @@ def train(
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
     """Train models of text to motion, or their judge; what is finished is left as it is."""
     from f3amd_lib.text.data.text_encoders import load_text_encoder
-    from f3amd_lib.text.judge import evaluator_task, text_judge
+    from f3amd_lib.text.judge import text_judge
     from f3amd_lib.text.stages import text_models, train_stage
 
     for name in names:
@@ -255,7 +255,7 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
         if name == text_models.JUDGE:
-            training = evaluator_task.EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
+            training = text_judge.EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
             done = text_judge.train_judge(data, encoder, training, files=files, stop_at=stop_at)
         else:
             done = train_stage.train_stage(data, encoder, profile, name, **how)

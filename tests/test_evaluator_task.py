@@ -9,8 +9,8 @@ from flax import nnx
 
 from f3amd_lib.text.data.text_encoders import TextEmbeddings
 from f3amd_lib.text.data.text_motions import ClipTable, draw_clips
-from f3amd_lib.text.judge.evaluator_task import EvaluatorTask, EvaluatorTraining, contrastive_loss, embedded_captions
 from f3amd_lib.text.judge.judge_network import HalvingConvolution, TextMotionConfig, TextMotionNetwork
+from f3amd_lib.text.judge.text_judge import EvaluatorTask, EvaluatorTraining, contrastive_loss, embedded_captions
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import optimise
 

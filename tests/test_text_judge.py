@@ -11,7 +11,7 @@ from f3amd_lib.motion.skeleton import resample, turn
 from f3amd_lib.text.data.text_encoders import TextEmbeddings
 from f3amd_lib.text.data.text_motions import text_motions
 from f3amd_lib.text.judge import text_judge
-from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
+from f3amd_lib.text.judge.text_judge import EvaluatorTraining
 from f3amd_lib.text.stages import text_models
 
 STYLES = synthetic.STYLES[:4]

@@ -27,8 +27,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
 from f3amd_lib.text.data.text_motions import TextMotions, frame_mask, pad_motions
 from f3amd_lib.text.judge import text_metrics
-from f3amd_lib.text.judge.evaluator_task import EvaluatorTraining
-from f3amd_lib.text.judge.text_judge import TextJudge, judge_motions, judged_clips, train_judge
+from f3amd_lib.text.judge.text_judge import EvaluatorTraining, TextJudge, judge_motions, judged_clips, train_judge
 from f3amd_lib.text.networks.acmdm import TextCondition
 from f3amd_lib.text.networks.acmdm_control import Control
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
