@@ -195,7 +195,7 @@ class TextJudge(CaptionedModel):
         canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
         features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
         return in_batches(
-            lambda rows: _embed_motion(self.config, self.params, *pad_motions([features[row] for row in rows])[:2]),
+            lambda rows: _embed("motion", self.config, self.params, *pad_motions([features[row] for row in rows])[:2]),
             len(features), _BATCH,
         ).astype(np.float64)  # fmt: skip
 
@@ -203,18 +203,13 @@ class TextJudge(CaptionedModel):
         """Return embedded captions as vectors, [N, D]."""
         tokens, mask = embedded.tokens, embedded.mask
         return in_batches(
-            lambda rows: _embed_text(self.config, self.params, tokens[rows], mask[rows]), len(tokens), _BATCH
+            lambda rows: _embed("text", self.config, self.params, tokens[rows], mask[rows]), len(tokens), _BATCH
         ).astype(np.float64)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _embed_motion(config, params, features, length):
-    return network_with(config, params).embed_motion(features, length)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _embed_text(config, params, tokens, mask):
-    return network_with(config, params).embed_text(tokens, mask)
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _embed(what: str, config: TextMotionConfig, params, *given):
+    return getattr(network_with(config, params), f"embed_{what}")(*given)
 
 
 def judged_features(data: TextMotions) -> tuple[np.ndarray, AxisNormaliser]:
@@ -291,10 +286,10 @@ def load_judge(path: Path) -> TextJudge:
 # ------------------------------------------------------------------------------------------ verdicts
 
 
-def judged_clips(data: TextMotions, split: str = "test") -> TextMotions:
-    """Return the clips of a split that can be judged: those of pairs with enough clips."""
+def judged_clips(data: TextMotions) -> TextMotions:
+    """Return the test clips that can be judged: those of pairs with enough clips."""
     classes = set(text_motions.evaluation_classes(data))
-    chosen = [clip for clip in data.members(split) if data.pairs[clip] in classes]
+    chosen = [clip for clip in data.members("test") if data.pairs[clip] in classes]
     if not chosen:
         raise ValueError(f"data set {data.name!r} has no pair of content and style with enough clips to judge by")
     return data.select(chosen)

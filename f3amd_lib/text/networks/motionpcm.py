@@ -303,9 +303,9 @@ class LatentDenoiser(nnx.Module):
         return [z[:, : self.config.window] for z in outputs]
 
 
-def student_config(teacher: LatentDenoiserConfig, guidance_features: int = 256) -> LatentDenoiserConfig:
+def student_config(teacher: LatentDenoiserConfig) -> LatentDenoiserConfig:
     """Return the config of a teacher's student, which is told the guidance."""
-    return dataclasses.replace(teacher, guidance_features=guidance_features)
+    return dataclasses.replace(teacher, guidance_features=256)
 
 
 def student_of(teacher: LatentDenoiser, key) -> LatentDenoiser:

@@ -18,19 +18,9 @@ from f3amd_lib.text.data.text_motions import UNIT, AxisNormaliser, TextMotions
 from f3amd_lib.text.networks.mesh_autoencoder import MeshAutoencoderConfig
 from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
-from f3amd_lib.text.stages import acmdm_training, motionpcm_training
+from f3amd_lib.text.stages import acmdm_training, motionpcm_training, text_models
 from f3amd_lib.text.stages.motion_codec import MotionCodec
-from f3amd_lib.text.stages.text_models import (
-    DENOISERS,
-    Asked,
-    LatentModel,
-    TextModel,
-    load_text_model,
-    preset_and_branch,
-    save_text_model,
-    shipped_for,
-    text_model_files,
-)
+from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model, preset_and_branch
 from f3amd_lib.training.optimise import differences
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
 from f3amd_lib.training.settings import profile_part_recipe
@@ -52,7 +42,7 @@ STAGES = {
 - `kept(asked, state, about)` of a task, what is kept of its last state.
 """
 
-_STAGE_OF = dict.fromkeys(DENOISERS, "denoiser") | {
+_STAGE_OF = dict.fromkeys(text_models.DENOISERS, "denoiser") | {
     AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.family: "mesh autoencoder",
     LatentAutoencoderConfig.family: "latent autoencoder", LatentDenoiserConfig.family: "teacher",
 }  # fmt: skip
@@ -140,10 +130,10 @@ def train_stage(
     if teacher is not None:
         before = _named_teacher(teacher, preset, data)
     elif earlier:
-        lies = text_model_files(profile, earlier, folder=folder).model
+        lies = text_models.text_model_files(profile, earlier, folder=folder).model
         before = load_text_model(lies) if acmdm and lies.exists() else None
         if before is None and branch:
-            before = shipped_for(earlier, data, encoder)
+            before = text_models.shipped_for(earlier, data, encoder)
         how = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
         before = before or train_stage(data, encoder, profile, earlier, **how)
         if before is None:
@@ -156,8 +146,8 @@ def train_stage(
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
     own = None if branch else preset.name
     config = profile_part_recipe(stage.settings, stage.recipe, profile, own, **settings)
-    asked = Asked(data, encoder, preset, branch, config, before, codec, window)
-    files = text_model_files(profile, name, folder=folder)
+    asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
+    files = text_models.text_model_files(profile, name, folder=folder)
     if files.model.exists():
         found = load_text_model(files.model)
         if unlike := differences(stage.of(asked, None).identity(), found.record["identity"]):
@@ -174,5 +164,5 @@ def train_stage(
     if int(state.step) < config.num_steps:
         return None
     about = {"name": name, "skeleton": data.skeleton, "fps": data.fps, "record": record}
-    save_text_model(files.model, task.kept(asked, state, about))
+    text_models.save_text_model(files.model, task.kept(asked, state, about))
     return load_text_model(files.model)
