@@ -152,12 +152,12 @@ def dataset(
       fps: frames per second to write.
       out: folder to write to; must be empty or not there yet.
     """
+    from f3amd_companion.serving import captioned_folder
     from f3amd_lib.data import sources
-    from f3amd_lib.text.data import humanml3d
 
     opened = sources.open_dataset(data, path=source)
-    written = humanml3d.captioned_motions(opened, humanml3d.read_caption_table(captions), fps=fps)
-    folder = humanml3d.write_humanml3d(out, written)
+    written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
+    folder = captioned_folder.write_humanml3d(out, written)
     for clip, reason in written.skipped:
         log.info("left out     %s: %s", clip, reason)
     joints, counts = written.skeleton.num_joints, [f"{written.splits.count(split)} {split}" for split in sources.SPLITS]

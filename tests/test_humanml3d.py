@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from f3amd_companion.__main__ import main
+from f3amd_companion.serving import captioned_folder
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import write_bvh
@@ -134,7 +135,7 @@ def test_another_number_of_joints_needs_its_skeleton(tmp_path):
 
 
 def test_caption_lines_are_read_as_they_were_written():
-    line = humanml3d.write_caption_line("A man's self-assured walk, twice.")
+    line = captioned_folder.write_caption_line("A man's self-assured walk, twice.")
     assert (
         line
         == "A man's self-assured walk, twice.#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
@@ -208,8 +209,8 @@ def test_a_bad_table_is_refused(bvh_folder, tmp_path, table, words):
     path = tmp_path / "bad.csv"
     path.write_text(table, encoding="utf-8")
     with pytest.raises(ValueError, match=words):
-        humanml3d.captioned_motions(
-            open_dataset("folder", path=bvh_folder), humanml3d.read_caption_table(path), progress=False
+        captioned_folder.captioned_motions(
+            open_dataset("folder", path=bvh_folder), captioned_folder.read_caption_table(path), progress=False
         )
 
 
@@ -220,14 +221,14 @@ def test_another_skeleton_is_refused_by_the_first_ones_name_even_if_that_clip_wa
     write_bvh(tmp_path / "b_long.bvh", other.replace(skeleton=longer))
     captions = {"a_short": ["stands"], "b_long": ["walks"]}
     with pytest.raises(ValueError, match="b_long: its skeleton differs from that of a_short"):
-        humanml3d.captioned_motions(open_dataset("folder", path=tmp_path), captions, progress=False)
+        captioned_folder.captioned_motions(open_dataset("folder", path=tmp_path), captions, progress=False)
 
 
 def test_nothing_is_written_over(bvh_folder, tmp_path):
-    data = humanml3d.captioned_motions(
+    data = captioned_folder.captioned_motions(
         open_dataset("folder", path=bvh_folder), {"take0": ("a walk",), "take1": ("a walk",)}, progress=False
     )
     assert isinstance(data, TextMotions)
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(ValueError, match="is not empty; choose another folder"):
-        humanml3d.write_humanml3d(tmp_path, data)
+        captioned_folder.write_humanml3d(tmp_path, data)
