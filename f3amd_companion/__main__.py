@@ -366,11 +366,11 @@ def text(
     import numpy as np
 
     from f3amd_companion.serving import player
+    from f3amd_lib.ground.trees import file_kind
     from f3amd_lib.motion import inverse_kinematics, skeleton
     from f3amd_lib.text.data import text_encoders
     from f3amd_lib.text.sampling import captioned_motion
     from f3amd_lib.text.stages import text_models
-    from f3amd_lib.training import checkpoints
 
     captions = [caption, *then]
     text_encoders.check_captions(captions)
@@ -379,7 +379,7 @@ def text(
     if weights is None:
         latent = model is not None and (model.lower() == "motionpcm" or text_models.is_latent_preset(model))
     else:
-        latent = checkpoints.file_kind(weights) == text_models.LatentModel.kind  # the file itself says whose it is
+        latent = file_kind(weights) == text_models.LatentModel.kind  # the file itself says whose it is
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
     if latent and (then or control):

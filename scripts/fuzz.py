@@ -111,13 +111,13 @@ def _make_cache(folder: Path) -> None:
     source = folder / "source"
     source.mkdir()
     (source / "calm_a.bvh").write_text(format_bvh(walk()))
-    save_packed(folder / "cache.npz", pack(open_dataset("folder", path=source), progress=False))
+    save_packed(folder / "cache.safetensors", pack(open_dataset("folder", path=source), progress=False))
 
 
 def _make_weights(folder: Path) -> None:
     import jax.numpy as jnp
 
-    from f3amd_lib.training.checkpoints import save_tree
+    from f3amd_lib.ground.trees import save_tree
 
     save_tree(folder / "a.safetensors", {"a": jnp.ones((3, 4)), "b": [jnp.zeros(2)]}, {"kind": "x", "of": {"y": 1}})
 
@@ -125,7 +125,7 @@ def _make_weights(folder: Path) -> None:
 def _read_weights(folder: Path) -> None:
     import jax.numpy as jnp
 
-    from f3amd_lib.training.checkpoints import load_tree
+    from f3amd_lib.ground.trees import load_tree
 
     tree, _ = load_tree(folder / "a.safetensors", {"a": jnp.ones((3, 4)), "b": [jnp.zeros(2)]})
     if not (np.all(tree["a"] == 1) and np.all(tree["b"][0] == 0)):
@@ -140,7 +140,7 @@ def _make_humanml3d(folder: Path) -> None:
 
 def _make_crowd(folder: Path) -> None:
     from f3amd_companion.serving import crowd
-    from f3amd_lib.training.checkpoints import describe_skeleton
+    from f3amd_lib.motion.skeleton import describe_skeleton
 
     out, skeleton = folder / "crowd", walk().skeleton
     out.mkdir()
@@ -212,7 +212,7 @@ READERS = {
         "t.*",
     ),
     "weights": Reader(_make_weights, _read_weights, "*.safetensors"),
-    "cache": Reader(_make_cache, lambda f: load_packed(f / "cache.npz"), "cache.npz"),
+    "cache": Reader(_make_cache, lambda f: load_packed(f / "cache.safetensors"), "cache.safetensors"),
     "archive": Reader(
         _make_zip, lambda f: [clip.load() for clip in open_dataset("folder", path=f / "data.zip").clips], "data.zip"
     ),

@@ -26,10 +26,11 @@ from f3amd_lib.drawing.style import model_style, plot_style
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.real_clips import follow_clip
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.training.checkpoints import load_model, weights_digest
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, prepare
 
 CLIP, STYLE, SEED = "dataset-2_walk-turn-left_normal_007", "2-normal", 0

@@ -17,11 +17,11 @@ from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
 
 from f3amd_companion import __main__ as command_line
 from f3amd_lib.drawing import style
-from f3amd_lib.ground import files
+from f3amd_lib.ground import files, trees
 from f3amd_lib.ground.files import locked, whole_file
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import kept_rows, read_table, write_table
-from f3amd_lib.training import checkpoints, pipeline
+from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, optimise
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -170,7 +170,7 @@ def test_what_a_killed_process_left_unfinished_goes_after_an_hour(tmp_path):
 def test_weights_can_be_read_by_whom_the_umask_says(tmp_path):
     before = os.umask(0o027)
     try:
-        checkpoints.save_tree(tmp_path / "weights.safetensors", {"a": jnp.ones(3)}, {})
+        trees.save_tree(tmp_path / "weights.safetensors", {"a": jnp.ones(3)}, {})
     finally:
         os.umask(before)
     assert (tmp_path / "weights.safetensors").stat().st_mode & 0o777 == 0o640
@@ -178,13 +178,13 @@ def test_weights_can_be_read_by_whom_the_umask_says(tmp_path):
 
 def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
     def full(arrays, path, header):
-        raise checkpoints.SafetensorError("No space left on device (os error 28)")
+        raise trees.SafetensorError("No space left on device (os error 28)")
 
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"the old ones")
-    monkeypatch.setattr(checkpoints, "save_file", full)
+    monkeypatch.setattr(trees, "save_file", full)
     with pytest.raises(OSError, match=r"weights.safetensors: cannot be written .*No space left"):
-        checkpoints.save_tree(path, {"a": jnp.ones(3)}, {})
+        trees.save_tree(path, {"a": jnp.ones(3)}, {})
     assert path.read_bytes() == b"the old ones" and len(list(tmp_path.iterdir())) == 1
 
 

@@ -303,11 +303,18 @@ def minutes(packed, monkeypatch, tmp_path):
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
-    save_packed(tmp_path / "packed.npz", packed)
+    save_packed(tmp_path / "clips.safetensors", packed)
 
     def call(number: float, *words: str):
         done.clear()
-        given = ["--packed", str(tmp_path / "packed.npz"), "--out", str(tmp_path / "out"), "--minutes", str(number)]
+        given = [
+            "--packed",
+            str(tmp_path / "clips.safetensors"),
+            "--out",
+            str(tmp_path / "out"),
+            "--minutes",
+            str(number),
+        ]
         return main(["campaign", "--profile", "smoke", "--times", *given, *words]), done.copy()
 
     call.done = done

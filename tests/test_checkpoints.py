@@ -25,9 +25,11 @@ from builders import (
 from safetensors.numpy import save_file
 
 from f3amd_lib.data.features import frame_positions
+from f3amd_lib.ground import trees
+from f3amd_lib.ground.trees import load_tree, save_tree
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import checkpoints
-from f3amd_lib.training.checkpoints import load_model, load_tree, save_model, save_tree
+from f3amd_lib.training.checkpoints import load_model, save_model
 
 TREE = {
     "a": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
@@ -72,7 +74,7 @@ def test_a_failed_write_leaves_the_old_file_whole(tmp_path, monkeypatch):
         file.write_bytes(b"half")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(checkpoints, "save_file", half_write)
+    monkeypatch.setattr(trees, "save_file", half_write)
     with pytest.raises(OSError, match="no space"):
         save_tree(path, {"other": jnp.ones(3)}, {})
     assert path.read_bytes() == content
@@ -181,14 +183,14 @@ def test_safetensors_of_another_project_are_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("header", "says"), [({}, "not written by this project"), ({"format": checkpoints.FORMAT}, "not a whole")]
+    ("header", "says"), [({}, "not written by this project"), ({"format": trees.FORMAT}, "not a whole")]
 )
 def test_a_type_that_numpy_does_not_know_is_no_bare_error(tmp_path, header, says):
     entry = {"x": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}
     text = json.dumps({"__metadata__": header} | entry).encode()
     path = tmp_path / "theirs.safetensors"
     path.write_bytes(struct.pack("<Q", len(text)) + text + bytes(4))
-    refused(rf"theirs\.safetensors: {says}", checkpoints.describe, path)
+    refused(rf"theirs\.safetensors: {says}", trees.describe, path)
 
 
 def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):
@@ -201,15 +203,11 @@ def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):
 
 def rewritten(saved, path, change):
     """Copy a model file with its description changed."""
-    arrays, metadata = checkpoints._read(saved)
+    arrays, metadata = trees._read(saved)
     change(metadata)
     description = json.dumps(metadata)
-    header = {
-        "format": checkpoints.FORMAT,
-        "description": description,
-        "sha256": checkpoints._checksum(arrays, description),
-    }
-    checkpoints.save_file(arrays, path, header)
+    header = {"format": trees.FORMAT, "description": description, "sha256": trees._checksum(arrays, description)}
+    trees.save_file(arrays, path, header)
     return path
 
 
@@ -256,7 +254,7 @@ def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, mon
     path = tmp_path / "small.safetensors"
     save_model(path, trained, jnp.int8)
     again = load_model(path)
-    assert checkpoints.describe(path)["weights"] == "int8"
+    assert trees.describe(path)["weights"] == "int8"
     kept = 0
     for ours, theirs in zip(jax.tree.leaves(trained.params), jax.tree.leaves(again.params), strict=True):
         before, after = np.asarray(ours, np.float32), np.asarray(theirs, np.float32)
@@ -281,6 +279,6 @@ def test_eight_bits_quarter_the_file(trained, tmp_path, monkeypatch):
     for dtype in (jnp.float32, jnp.int8):
         path = tmp_path / f"{jnp.dtype(dtype).name}.safetensors"
         save_model(path, trained, dtype)
-        arrays, _ = checkpoints._read(path)
+        arrays, _ = trees._read(path)
         sizes[dtype] = sum(a.nbytes for name, a in arrays.items() if name.startswith("['params']"))
     assert sizes[jnp.int8] < 0.45 * sizes[jnp.float32]

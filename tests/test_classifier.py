@@ -12,6 +12,7 @@ from builders import SKELETON, packed_from, refused, same_tree
 from flax import nnx
 
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.trees import save_tree
 from f3amd_lib.measures import classifier as module
 from f3amd_lib.measures.classifier import (
     ACCURACY_BAR,
@@ -36,7 +37,6 @@ from f3amd_lib.measures.classifier_windows import (
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
-from f3amd_lib.training.checkpoints import save_tree
 
 STYLES = ("ArmsOverhead", "Runner", "Zombie")
 WINDOW = 20

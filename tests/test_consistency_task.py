@@ -14,7 +14,7 @@ from f3amd_companion.measuring.consistency_task import ConsistencyTask
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table, run_record
-from f3amd_lib.training.checkpoints import weights_digest
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.training.optimise import advance, initial_state
 from f3amd_lib.training.pipeline import PreparedData
 

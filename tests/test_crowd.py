@@ -15,10 +15,10 @@ from test_rollout import obedient
 from f3amd_companion.serving import crowd as crowds
 from f3amd_companion.serving.crowd import PATHS, crowd_paths, generate_crowd, read_crowd
 from f3amd_lib.data.features import frame_yaw, motion_from_frames, turn_frames
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion.root_paths import NAMES, named_path
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.training.checkpoints import weights_digest
 
 FRAMES = WINDOW + 3
 FILES = ("root.npy", "rotations.npy", "path.npy", "styles.npy", "crowd.json")

@@ -24,12 +24,13 @@ from builders import (
 from flax import nnx
 
 from f3amd_lib.data.features import path_condition, turn_frames
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks.attention import position_code
 from f3amd_lib.networks.conditioning import Condition, Context
 from f3amd_lib.networks.f3amd import F3AMD, F3AMDConfig
 from f3amd_lib.networks.presets import build_from_config, config_from_dict
 from f3amd_lib.networks.variants import Variant, VariantConfig
-from f3amd_lib.training.checkpoints import describe, load_model
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.optimise import differences
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 

@@ -12,10 +12,11 @@ from builders import HISTORY, WINDOW, packed_from, wandering_motion
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.measuring import learning_curves, measure
+from f3amd_lib.ground import trees
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
-from f3amd_lib.training import checkpoints, pipeline
+from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import initial_state
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import profile_recipe
@@ -170,7 +171,7 @@ def test_a_family_is_trained_in_legs(prepared, small, tmp_path, caplog):
         assert leg(prepared, profile, tmp_path, budget_s=1.0) == [("F3AMD-FNO-32", "unfinished")]
     files = learning_curves.model_files(profile, "F3AMD-FNO-32", folder=tmp_path)
     assert files.state.exists() and not files.model.exists()
-    done = int(checkpoints.load_tree(files.state, state_of(prepared, profile))[0].step)
+    done = int(trees.load_tree(files.state, state_of(prepared, profile))[0].step)
     assert done == 4
     # A kill between the writing of the state and that of the history costs the rows, not the run.
     files.history.unlink()

@@ -12,7 +12,8 @@ from builders import refused
 from PIL import Image
 
 from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.training.checkpoints import load_model, weights_digest
+from f3amd_lib.ground.trees import weights_digest
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 ROOT = repository_root()

@@ -27,9 +27,9 @@ from f3amd_companion.serving.web_page import FOLDER
 from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
+from f3amd_lib.motion.skeleton import describe_skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.rollout.blending import blend_seams
-from f3amd_lib.training.checkpoints import describe_skeleton
 
 SIGMAS = variance_exploding().grid(3)
 BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};\n//# sourceMappingURL=x"

@@ -15,7 +15,8 @@ from f3amd_lib.ground.records import (
     stale_reason,
     write_table,
 )
-from f3amd_lib.training.checkpoints import load_model, weights_digest
+from f3amd_lib.ground.trees import weights_digest
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 

@@ -13,6 +13,7 @@ from test_text_judge import OneVectorAWord
 from f3amd_companion.__main__ import main
 from f3amd_lib.diffusion.schedules import straight
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.motion import body, synthetic
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.networks import presets
@@ -21,7 +22,6 @@ from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.sampling import captioned_motion
 from f3amd_lib.text.stages import text_models, train_stage
 from f3amd_lib.text.stages.text_models import controlled_joints, find_text_model, load_text_model, save_text_model
-from f3amd_lib.training.checkpoints import describe
 
 pytestmark = pytest.mark.slow
 

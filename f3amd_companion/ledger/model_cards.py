@@ -26,12 +26,13 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
-from f3amd_lib.training.checkpoints import describe, load_model, weights_digest
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 log = logging.getLogger("f3amd")

@@ -42,13 +42,14 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use, noise_use
 from f3amd_lib.measures.protocol import Protocol, held_out_clips, measure_model
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks import presets
 from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.training.checkpoints import TrainedModel, errors_name, load_model, save_model, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.optimise import compile_steps, held_out_terms
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import TrainingConfig

@@ -19,8 +19,9 @@ import pandas as pd
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.text.phases import consistency_answer
-from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
 from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
 from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep

@@ -43,6 +43,7 @@ from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, set_aside_table, whole_table, write_table
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures import denoising
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
 from f3amd_lib.measures.protocol import (
@@ -63,7 +64,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.rollout.rounds import sample_round
-from f3amd_lib.training.checkpoints import TrainedModel, network_with, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel, network_with
 from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.recipe import profile_recipe

@@ -29,10 +29,11 @@ from f3amd_lib.data.features import frame_positions, frame_yaw
 from f3amd_lib.data.windows import WindowSet, gather_windows, spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.arrays import in_batches
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.denoising import CM, root_mean_square
 from f3amd_lib.measures.distributions import diversity_variance
 from f3amd_lib.motion.skeleton import Skeleton
-from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.pipeline import PreparedData
 

@@ -33,8 +33,8 @@ from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
 from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks import presets
-from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model, prepare
 
 log = logging.getLogger("f3amd")

@@ -21,6 +21,7 @@ from f3amd_companion.measuring.runner import Records
 from f3amd_companion.measuring.text_tables import TABLES, bench_of, measure_text_table
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.text.data.captions import caption_wordings
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
@@ -29,7 +30,7 @@ from f3amd_lib.text.judge.text_metrics import RAISED, raised_hands
 from f3amd_lib.text.sampling.captioned_motion import draw_motions
 from f3amd_lib.text.sampling.motionpcm_sampling import latent_walk, steps_of
 from f3amd_lib.text.stages.text_models import find_text_model, load_text_model
-from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.checkpoints import network_with
 
 TREMBLE = 0.02
 """Deviation of the noise on every coordinate of every joint of trembling motion, metres."""

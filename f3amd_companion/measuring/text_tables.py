@@ -22,6 +22,7 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
@@ -37,7 +38,6 @@ from f3amd_lib.text.sampling.text_to_motion import continue_prefix, sample_contr
 from f3amd_lib.text.stages import text_models
 from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel, is_latent_preset
 from f3amd_lib.text.stages.train_stage import train_stage
-from f3amd_lib.training.checkpoints import weights_digest
 
 PAPERS = {
     "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),

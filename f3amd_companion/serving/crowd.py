@@ -36,10 +36,10 @@ from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, keep_apart
 from f3amd_lib.data.features import center_window, motion_from_frames, split_frames, turn_frames
 from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import checked_seed
+from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
-from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
 from f3amd_lib.rollout.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
-from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton, errors_name, weights_digest
 
 PATHS = tuple(name for name in NAMES if name != "complex")
 """Names that the paths of a crowd are drawn from: those that face where they go."""

@@ -39,10 +39,11 @@ from f3amd_lib.diffusion.samplers import ddpm_step
 from f3amd_lib.ground.files import read_toml, whole_folder
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.rollout.rounds import sample_round
-from f3amd_lib.training.checkpoints import TrainedModel, weights_digest
+from f3amd_lib.training.checkpoints import TrainedModel
 
 _ENTRY = "main"
 """What JAX calls the program's one public function."""

@@ -24,11 +24,11 @@ from flax import nnx
 
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.motion.skeleton import Skeleton, describe_skeleton
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition, ConditionedConfig
 from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.text.networks.motionpcm import LatentDenoiserConfig
-from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel, describe_skeleton
+from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel
 
 PROGRAM = "denoiser.onnx"
 CARD = "card.json"

@@ -19,10 +19,11 @@ import numpy as np
 
 from f3amd_companion.serving.onnx_export import ABOUT, card_head, skeleton_card, write_export
 from f3amd_lib.diffusion.flow import network_time
+from f3amd_lib.ground.trees import file_kind
 from f3amd_lib.text.networks.acmdm import ACMDMConfig
 from f3amd_lib.text.phases import cut_phases, ddim_times, shares
 from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model
-from f3amd_lib.training.checkpoints import file_kind, network_with
+from f3amd_lib.training.checkpoints import network_with
 
 
 def load_text_or_latent(path) -> TextModel | LatentModel | None:

@@ -2,12 +2,10 @@
 
 Parsing text takes seconds to minutes, so it is done once. The packed file holds root positions in
 float32 (float16 steps by 8 mm at 10 m) and rotations as 6D numbers in float16, which moves no joint of
-Bandai's clips by more than 0.5 mm (`tests/test_packed.py`); it is a plain `.npz` without pickled objects,
-and small enough to carry to another machine.
+Bandai's clips by more than 0.5 mm (`tests/test_packed.py`); it is a file of arrays as weights are, and small
+enough to carry to another machine.
 """
 
-import hashlib
-import json
 import os
 import warnings
 from dataclasses import dataclass
@@ -19,27 +17,22 @@ from tqdm import tqdm
 
 from f3amd_lib.data.features import lowest_toe_height
 from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
-from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
 
 CACHE_DIR_VARIABLE = "F3AMD_CACHE_DIR"
 
-_FORMAT = 1
+_FORMAT = 2
 """Raised whenever the file's layout or what is put into it changes, so that old caches retire."""
 
-_ARRAYS = {
-    "root_position": np.float32,
-    "rotation_6d": np.float16,
-    "clip_start": np.int32,
-    "clip_style": np.int32,
-    "clip_split": np.uint8,
-    "floor_shift": np.float32,
-}
+_KIND = f"packed data set of format {_FORMAT}"
+
+_ARRAYS = ("root_position", "rotation_6d", "clip_start", "clip_style", "clip_split", "floor_shift")
 _TEXTS = (
     "styles clip_names clip_contents primary_styles mirror_styles dataset licence credit fingerprint skipped"
 ).split()
-"""What of `PackedMotion` is stored as arrays of which type, and what as JSON."""
+"""What of `PackedMotion` a file has as arrays, and what in its description."""
 
 _SHARED = ("styles", "primary_styles", "mirror_styles", "licence", "credit", "fingerprint")
 """What a packed data set has from its `Dataset`."""
@@ -159,83 +152,29 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     )  # fmt: skip
 
 
-def _checksum(arrays: dict[str, np.ndarray], text: bytes) -> str:
-    """Hash arrays with their names, types and shapes, and the text beside them."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode("ascii"))
-        digest.update(array.data)
-    digest.update(text)
-    return digest.hexdigest()
-
-
-def save_packed(path, packed: PackedMotion, *, overwrite: bool = False) -> Path:
-    """Write a packed data set; the file appears whole or not at all.
-
-    Args:
-      path: where to; ".npz" is customary. Missing folders are made.
-      packed: what to write.
-      overwrite: an existing file is replaced only if this is true.
-
-    Returns:
-      The path.
-
-    Raises:
-      ValueError: if the file exists and `overwrite` is false.
-    """
-    skeleton = packed.skeleton
-    tree = {"joint_names": skeleton.names, "joint_parents": skeleton.parents, "end_sites": skeleton.end_sites}
+def save_packed(path, packed: PackedMotion) -> Path:
+    """Write a packed data set by `ground.trees`; return its path, which ends in ".safetensors" by custom."""
     texts = {name: getattr(packed, name) for name in _TEXTS} | {"mirror_styles": sorted(packed.mirror_styles)}
-    text = json.dumps({"format": _FORMAT, **tree, **texts}, ensure_ascii=True).encode("ascii")
-    arrays = {name: np.asarray(getattr(packed, name), dtype) for name, dtype in _ARRAYS.items()}
-    arrays["offsets"] = np.asarray(skeleton.offsets, np.float64)
-    checksum = _checksum(arrays, text)
-    texts = {"text": text, "checksum": checksum.encode("ascii")}
-    texts = {name: np.frombuffer(content, np.uint8) for name, content in texts.items()}
-    with whole_file(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **texts, **arrays)
+    # Bones are text, too: in float64, which JAX's arrays are not.
+    skeleton = describe_skeleton(packed.skeleton) | {"offsets": packed.skeleton.offsets.tolist()}
+    arrays = {name: getattr(packed, name) for name in _ARRAYS}
+    save_tree(path, arrays, {"kind": _KIND, **skeleton, **texts})
     return Path(path)
 
 
 def load_packed(path) -> PackedMotion:
-    """Read a packed data set and check it against the checksum inside.
-
-    Args:
-      path: a file written by `save_packed`.
-
-    Returns:
-      The packed data set.
+    """Read what `save_packed` wrote.
 
     Raises:
       ValueError: naming the file, if it is absent, truncated, altered or of another version.
     """
-    path = Path(path)
-    try:
-        return _read_packed(path)
-    # What numpy, zipfile and Python's own tokenizer raise over damaged bytes is no closed list.
-    except Exception as error:
-        text = f"cannot be read as a packed data set ({type(error).__name__}: {error}); delete it and pack again"
-        raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {text}") from error
-
-
-def _read_packed(path: Path) -> PackedMotion:
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in ("text", "checksum", "offsets", *_ARRAYS)}
-    strange = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
-    if strange:  # numpy hands out other members of a zip as bytes
-        raise ValueError(f"{strange[0]} is not an array")
-    text, checksum = arrays.pop("text").tobytes(), arrays.pop("checksum").tobytes()
-    if _checksum(arrays, text).encode("ascii") != checksum:
-        raise ValueError(f"{path}: checksum differs, the file was altered; delete it, pack again")
-    description = json.loads(text)
-    if description["format"] != _FORMAT:
-        raise ValueError(f"{path}: is of format {description['format']}, this version reads {_FORMAT}; pack again")
-    names, parents, end_sites = (description[name] for name in ("joint_names", "joint_parents", "end_sites"))
-    skeleton = Skeleton(names, parents, arrays.pop("offsets"), end_sites)
-    texts = {name: _tuples(description[name]) for name in _TEXTS}
-    texts["mirror_styles"] = frozenset(texts["mirror_styles"])
-    return PackedMotion(skeleton=skeleton, **arrays, **texts)
+    with errors_name(path):
+        tree, about = load_tree(path, {}, rest=True)
+        check_kind(about, _KIND)
+        texts = {name: _tuples(about[name]) for name in _TEXTS}
+        texts["mirror_styles"] = frozenset(texts["mirror_styles"])
+        arrays = {name: np.asarray(tree[name]) for name in _ARRAYS}
+        return PackedMotion(skeleton=described_skeleton(about, about["offsets"]), **arrays, **texts)
 
 
 def _tuples(value):
@@ -250,7 +189,7 @@ def cache_folder() -> Path:
 
 def cache_path(dataset: Dataset) -> Path:
     """Return where the packed form of a data set is cached."""
-    return cache_folder() / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.npz"
+    return cache_folder() / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.safetensors"
 
 
 def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
@@ -277,5 +216,5 @@ def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
         except ValueError as error:
             warnings.warn(f"{error} (packing anew)", stacklevel=2)
     packed = pack(dataset, progress=progress)
-    save_packed(path, packed, overwrite=True)
+    save_packed(path, packed)
     return packed

@@ -36,12 +36,12 @@ from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.names import check_known, refuse_unknown
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
+from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
 from f3amd_lib.measures.classifier_windows import NUM_CHANNELS, classifier_frames, mirror_channels, side_by_side
-from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.motion.skeleton import Skeleton, describe_skeleton, described_skeleton
 from f3amd_lib.networks.attention import dropout
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.spectral import TemporalConvolution
-from f3amd_lib.training import checkpoints
 from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree, optimise
 
 ACCURACY_BAR = 0.8
@@ -583,12 +583,12 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "kind": "style classifier",
         "classifier": dataclasses.asdict(classifier.config),
         "styles": list(classifier.styles),
-        **checkpoints.describe_skeleton(skeleton),
+        **describe_skeleton(skeleton),
         "held_out_accuracy": classifier.held_out_accuracy,
         "reference_windows": {split: len(reference.features) for split, reference in classifier.references.items()},
         "record": classifier.record,
     }
-    checkpoints.save_tree(path, tree, metadata)
+    save_tree(path, tree, metadata)
 
 
 def load_classifier(path: Path) -> StyleClassifier:
@@ -597,31 +597,23 @@ def load_classifier(path: Path) -> StyleClassifier:
     Raises:
       ValueError: naming the file, if it is missing, truncated, damaged or of another kind.
     """
-    with checkpoints.errors_name(path):
-        tree, metadata = checkpoints.load_tree(path, _template)
-        found = {name: metadata[name] for name in ("held_out_accuracy", "record")}
-        references = jax.tree.map(np.asarray, tree["references"])
+
+    def weights(metadata: dict) -> dict:
+        check_kind(metadata, "style classifier")
+        _, params, statistics = _blank(ClassifierConfig.from_dict(metadata["classifier"]))
+        return {"params": params, "statistics": statistics}
+
+    with errors_name(path):
+        tree, metadata = load_tree(path, weights, rest=True)
+        references = {
+            split: ReferenceFeatures(**jax.tree.map(np.asarray, part))._replace(
+                features=np.asarray(part["features"], np.float32)
+            )
+            for split, part in tree["references"].items()
+        }
         return StyleClassifier(
-            **found, params=tree["params"], statistics=tree["statistics"], styles=tuple(metadata["styles"]),
-            config=ClassifierConfig.from_dict(metadata["classifier"]),
-            skeleton=checkpoints.described_skeleton(metadata, tree["offsets"]),
-            references={split: ReferenceFeatures(**part) for split, part in references.items()},
+            params=tree["params"], statistics=tree["statistics"], styles=tuple(metadata["styles"]),
+            config=ClassifierConfig.from_dict(metadata["classifier"]), references=references,
+            skeleton=described_skeleton(metadata, tree["offsets"]),
+            held_out_accuracy=metadata["held_out_accuracy"], record=metadata["record"],
         )  # fmt: skip
-
-
-def _template(metadata: dict) -> dict:
-    """Return the shapes that a classifier's description speaks of."""
-    checkpoints.check_kind(metadata, "style classifier")
-    config = ClassifierConfig.from_dict(metadata["classifier"])
-    _, params, statistics = _blank(config)
-    shape = jax.ShapeDtypeStruct
-    return {
-        "params": params,
-        "statistics": statistics,
-        "references": {
-            split: {"features": shape((count, config.feature_width), jnp.float32)}
-            | dict.fromkeys(("styles", "clips"), shape((count,), jnp.int32))
-            for split, count in metadata["reference_windows"].items()
-        },
-        "offsets": shape((len(metadata["joints"]), 3), jnp.float32),
-    }

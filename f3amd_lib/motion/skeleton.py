@@ -155,6 +155,21 @@ class Skeleton:
         return frames
 
 
+def describe_skeleton(skeleton: Skeleton) -> dict:
+    """Return a skeleton's names and tree as JSON-ready values; offsets go with the arrays."""
+    return {
+        "joints": list(skeleton.names),
+        "parents": list(skeleton.parents),
+        "end_sites": [[joint, list(offset)] for joint, offset in skeleton.end_sites],
+    }
+
+
+def described_skeleton(metadata: dict, offsets) -> Skeleton:
+    """Return the skeleton that `describe_skeleton` described, with its offsets [J, 3]."""
+    end_sites = tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"])
+    return Skeleton(tuple(metadata["joints"]), tuple(metadata["parents"]), np.asarray(offsets, np.float64), end_sites)
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A skeleton in motion: where all joints are, and how they are turned where that is known.

@@ -26,10 +26,10 @@ from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
+from f3amd_lib.ground.trees import load_tree, save_tree
 from f3amd_lib.networks.config import CheckedConfig, with_fast_gradient
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.training import parallel
-from f3amd_lib.training.checkpoints import load_tree, save_tree
 
 
 class TrainingDiverged(ArithmeticError):

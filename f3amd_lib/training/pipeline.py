@@ -30,10 +30,11 @@ from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, sta
 from f3amd_lib.ground.files import locked, set_aside
 from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.training import parallel
-from f3amd_lib.training.checkpoints import TrainedModel, describe, load_model, save_model
+from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task, weights_identity
 from f3amd_lib.training.optimise import Task, TrainingState, differences, optimise, restore_state
 from f3amd_lib.training.recipe import TrainingConfig, profile_recipe

@@ -20,9 +20,10 @@ import numpy as np
 from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
+from f3amd_lib.ground import trees
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
-from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.motion.skeleton import Skeleton, describe_skeleton, described_skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import CheckedConfig
 from f3amd_lib.text.data.body_mesh import BodyMesh
@@ -236,11 +237,11 @@ def save_text_model(path: Path, trained: CaptionedModel, dtype=jnp.bfloat16) -> 
         "kind": trained.kind, "name": trained.name,
         **{name: None if value is None else value.to_dict() for name, value in described.items()},
         "weights": jnp.dtype(dtype).name, "fps": trained.fps, "text_encoder": trained.text_encoder,
-        "words": list(trained.words), **said, **checkpoints.describe_skeleton(trained.skeleton),
+        "words": list(trained.words), **said, **describe_skeleton(trained.skeleton),
         "record": trained.record,
     }  # fmt: skip
     offsets = jnp.asarray(trained.skeleton.offsets, jnp.float32)
-    checkpoints.save_tree(path, tree | arrays | {"offsets": offsets}, metadata)
+    trees.save_tree(path, tree | arrays | {"offsets": offsets}, metadata)
 
 
 def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | LatentModel:
@@ -269,14 +270,14 @@ def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | Lat
             shapes["branch"] = blank_branch(configs["params"], frames)[1]
         return {part: checkpoints.packed_shapes(shape, said["weights"]) for part, shape in shapes.items()}
 
-    with checkpoints.errors_name(path):
-        tree, said = checkpoints.load_tree(path, networks, rest=True)
+    with trees.errors_name(path):
+        tree, said = trees.load_tree(path, networks, rest=True)
         tree |= {part: checkpoints.unpacked_weights(tree[part]) for part in ("params", "autoencoder", "branch")
                  if part in tree}  # fmt: skip
         about = {name: said[name] for name in ("name", "fps", "text_encoder", "record")} | {
             "config": configs.get("params"), "params": tree.get("params"), "words": tuple(said.get("words", ())),
             "schedule": schedule_from_dict(said["diffusion"]) if said.get("diffusion") else None,
-            "skeleton": checkpoints.described_skeleton(said, tree["offsets"]),
+            "skeleton": described_skeleton(said, tree["offsets"]),
         }  # fmt: skip
         return known[said["kind"]].of(tree, configs.get("autoencoder"), said, about)
 
