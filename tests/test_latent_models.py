@@ -15,6 +15,7 @@ from f3amd_companion.measuring.text_probes import ONE_CAPTION, measure_one_capti
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks import presets
@@ -42,7 +43,7 @@ from f3amd_lib.text.stages.text_models import (
     text_model_files,
 )
 from f3amd_lib.text.stages.train_stage import stage_of, stands_on
-from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 SIZES = {"window": 2, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 16}

@@ -15,12 +15,12 @@ from f3amd_companion.__main__ import main
 from f3amd_companion.ledger import model_cards
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
-from f3amd_lib.ground.trees import describe
+from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.stages import text_models, train_stage
-from f3amd_lib.training.checkpoints import load_model, weights_digest
+from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 SHIPPED = sorted(PRETRAINED_DIR.rglob("*.safetensors"))

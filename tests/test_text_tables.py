@@ -22,13 +22,13 @@ from f3amd_companion.measuring.text_tables import (
 )
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.judge.text_metrics import control_errors
 from f3amd_lib.text.stages import train_stage
-from f3amd_lib.training.checkpoints import weights_digest
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 QUIET = {"progress": False}

@@ -19,6 +19,7 @@ from flax import nnx
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion.body import make_body
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.body_mesh import BodyMesh, standing
@@ -29,7 +30,7 @@ from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
 from f3amd_lib.text.networks.motion_autoencoder import smooth_l1, variational_loss
 from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
 from f3amd_lib.text.stages.text_models import PELVIS, Asked, TextModel, controlled_joints
-from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 

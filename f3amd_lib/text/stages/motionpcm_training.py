@@ -16,13 +16,14 @@ import optax
 from flax import nnx
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.text import phases
 from f3amd_lib.text.data.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.text.networks import motionpcm
 from f3amd_lib.text.stages.text_models import Asked, LatentModel
-from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.settings import check_settings
 

@@ -23,6 +23,7 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground import trees
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import Profile, runs_dir
+from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion.skeleton import Skeleton, describe_skeleton, described_skeleton
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import CheckedConfig
@@ -36,7 +37,7 @@ from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
 from f3amd_lib.text.stages.motion_codec import MotionCodec
 from f3amd_lib.training import checkpoints
-from f3amd_lib.training.checkpoints import network_with, weights_digest
+from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
 
 CONTROL = "+control"
