@@ -11,9 +11,8 @@ import pytest
 from f3amd_companion.ledger import claims, evidence
 from f3amd_companion.ledger.equation_map import (
     _OTHERS,
-    _clauses,
-    _mentions,
     _patterns,
+    clauses,
     equation_labels,
     equation_map,
     equations_markdown,
@@ -50,7 +49,12 @@ from f3amd_lib.training.recipe import short_recipe
     ],
 )
 def test_mentions_are_read(text, expected):
-    assert mentioned_equations(text) == expected
+    assert known_mentions(text) == expected
+
+
+def known_mentions(text, paper="f3amd"):
+    """Labels of a paper's equations that a text mentions."""
+    return {label for folder, label in mentioned_equations(text) if folder == paper} & set(equation_labels(paper))
 
 
 def test_a_small_checkout_is_mapped(tmp_path):
@@ -105,10 +109,10 @@ def test_sections_know_their_equations_and_figures(tmp_path):
     assert [section.heading for section in sections] == ["4.1 Batches", "4.2 Losses",
                                                          "What we learned"]  # fmt: skip
     assert [section.number for section in sections] == ["4.1", "4.2", ""]
-    assert sections[0].equations == set() and sections[0].figures == ()
-    assert sections[1].equations == {f"Eq. {number}" for number in (10, 11, 12, 13, 14)}
-    assert sections[1].figures == ("04_film", "04_terms")
-    assert sections[2].equations == {"Eq. 8"} and sections[2].figures == ()
+    assert sections[0].equations == set() and sections[0].figures == []
+    assert sections[1].equations == {("f3amd", f"Eq. {number}") for number in (10, 11, 12, 13, 14)}
+    assert sections[1].figures == ["04_film", "04_terms"]
+    assert sections[2].equations == {("f3amd", "Eq. 8")} and sections[2].figures == []
 
 
 def test_the_map_points_to_sections_and_their_figures(tmp_path):
@@ -191,14 +195,12 @@ def unknown_equations(text: str) -> list[str]:
 
     Citations are left out, as in `mentioned_equations`.
     """
-    unknown = set()
-    for paper in papers.paper_folders():
-        name = papers.load_paper_file("paper", paper)["name"]
-        unknown |= {f"{name} {label}" for label in _mentions(text, paper) - set(equation_labels(paper))}
-    names = {papers.load_paper_file("paper", paper)["name"] for paper in papers.paper_folders()}
-    for clause in _clauses(text):
+    names = {paper: papers.load_paper_file("paper", paper)["name"] for paper in papers.paper_folders()}
+    found = mentioned_equations(text)
+    unknown = {f"{names[paper]} {label}" for paper, label in found if label not in equation_labels(paper)}
+    for clause in clauses(text):
         for match in re.finditer(r"\b([A-Z][\w-]*)\s+Eqs?\.?\s+\d", clause):
-            if match[1] not in names and not _OTHERS.search(clause[: match.start()]):
+            if match[1] not in names.values() and not _OTHERS.search(clause[: match.start()]):
                 unknown.add(match[0])
     return sorted(unknown)
 
@@ -376,9 +378,9 @@ def second_paper(tmp_path, monkeypatch):
 
 def test_a_mention_belongs_to_the_paper_that_it_names(second_paper):
     text = "Eq. 2 and OTHER-2 Eq. 2, see F3AMD Eqs 3, 4; OTHER-2 Box 1, OTHER-2 Eq. 9"
-    assert mentioned_equations(text) == {"Eq. 2", "Eq. 3", "Eq. 4"}
-    assert mentioned_equations(text, second_paper) == {"Eq. 2", "Box 1"}
-    assert mentioned_equations("Eq. 2", second_paper) == set()
+    assert known_mentions(text) == {"Eq. 2", "Eq. 3", "Eq. 4"}
+    assert known_mentions(text, second_paper) == {"Eq. 2", "Box 1"}
+    assert known_mentions("Eq. 2", second_paper) == set()
 
 
 def test_a_second_paper_has_its_own_map_and_claims(second_paper, tmp_path):

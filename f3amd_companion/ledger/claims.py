@@ -397,7 +397,8 @@ def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
     marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
     about, words = load_paper_file("paper", paper), _TEXTS["page"] | load_paper_file("claims", paper).get("page", {})
-    gpu, training = load_profile("gpu", "100style"), about["training"]
+    gpu = load_profile("gpu", "100style")
+    training = {"windows": {}, "says": "their number is not known"} | about.get("training", {})
     seen = gpu.train_steps * gpu.batch_size
     share = 100.0 * seen / training["windows"].get("32", np.nan)
     fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}

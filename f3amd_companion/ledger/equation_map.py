@@ -49,7 +49,8 @@ def equation_labels(paper: str = _DEFAULT) -> list[str]:
 def _patterns() -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]:
     """Return the patterns of mentions and test names, papers by name, and marks by how a test spells them."""
     names = {load_paper_file("paper", folder)["name"]: folder for folder in paper_folders()}
-    marks = {label.lower().replace(" ", "_"): label for label in equation_labels() if "Eq." not in label}
+    labels = [label for folder in names.values() for label in equation_labels(folder)]
+    marks = {label.lower().replace(" ", "_"): label for label in labels if "Eq." not in label}
     either = lambda words: "|".join(map(re.escape, words))
     mention = re.compile(_MENTION.format(papers=either(names), marks=either(marks.values())))
     return mention, re.compile(_TEST_NAME.format(papers=either(names.values()), marks=either(marks))), names, marks
@@ -73,8 +74,11 @@ def mentioned_equations(text: str) -> Mentions:
         for match in pattern.finditer(clause):
             name, numbers, mark = match.groups()
             if not _OTHERS.search(clause[: match.start()]):
-                labels = {mark} if mark else {f"Eq. {number}" for number in _numbers(numbers)}
-                found |= {(names.get(name, _DEFAULT), label) for label in labels}
+                paper = names.get(name, _DEFAULT)
+                # A mark means an equation in the paper that calls one so, and any text elsewhere.
+                marked = {mark} & set(equation_labels(paper))
+                labels = marked if mark else {f"Eq. {number}" for number in _numbers(numbers)}
+                found |= {(paper, label) for label in labels}
     return found
 
 
@@ -114,8 +118,9 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
 
 def _rows_of(paper: str, places: pd.DataFrame) -> pd.DataFrame:
     rows = pd.DataFrame(load_paper_file("paper", paper).get("equation", ()), columns=["label", "section", "what"])
-    own = places[places["paper"] == paper].groupby(["label", "kind"])["place"].agg(", ".join).unstack()
-    return rows.join(own.reindex(columns=_KINDS), on="label").fillna("").rename(columns={"label": "equation"})
+    own = places[places["paper"] == paper].groupby(["label", "kind"])["place"].agg(", ".join).unstack(fill_value="")
+    own = own.reindex(index=rows["label"], columns=_KINDS, fill_value="")
+    return rows.join(own, on="label").rename(columns={"label": "equation"})
 
 
 def _places(root: Path, course: bool) -> pd.DataFrame:
