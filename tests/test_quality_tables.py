@@ -27,21 +27,12 @@ UNITS = {"style_coverage": "%", "trajectory_error": "m", "direction_error": "deg
 
 def figures(model="F3AMD-FNO-96", steps=8, window_frames=32, value=10.0, half=1.0, metrics=None):
     """Rows of one system, as `protocol.summarise` makes them."""
+    shared = {"model": model, "window_frames": window_frames, "steps": steps, "better": "near real", "repeats": 5}
     rows = [
-        {
-            "model": model,
-            "window_frames": window_frames,
-            "steps": steps,
-            "metric": metric,
-            "unit": UNITS.get(metric, ""),
-            "better": "near real",
-            "value": value + number,
-            "low": value + number - half,
-            "high": value + number + half,
-            "repeats": 5,
-        }
+        shared | {"metric": metric, "unit": UNITS.get(metric, "")}
+        | {"value": value + number, "low": value + number - half, "high": value + number + half}
         for number, metric in enumerate(metrics or FIGURES)
-    ]
+    ]  # fmt: skip
     return pd.DataFrame(rows)
 
 
@@ -166,13 +157,9 @@ def test_bad_input_is_refused():
 
 
 def test_the_papers_numbers_stand_in_columns_of_their_own():
-    ours = pd.DataFrame(
-        [
-            {"label": "real", "metric": "IRD", "unit": "cm", "better": "near real", "value": 4.1},
-            {"label": "mine", "metric": "IRD", "unit": "cm", "better": "near real", "value": 4.0},
-            {"label": "mine", "metric": "drift", "unit": "", "better": "down", "value": 0.1},
-        ]
-    )
+    rows = [("real", "IRD", "cm", "near real", 4.1), ("mine", "IRD", "cm", "near real", 4.0)]
+    rows.append(("mine", "drift", "", "down", 0.1))
+    ours = pd.DataFrame(rows, columns=["label", "metric", "unit", "better", "value"])
     table = side_by_side(ours, paper_rows())
     paper = ["paper, F3AMD-FNO-96, 8 steps", "paper, CAMDM, 8 steps"]
     assert table.columns.tolist() == ["metric", "real", "mine", *paper]

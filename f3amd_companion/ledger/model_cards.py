@@ -30,6 +30,7 @@ from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
 from f3amd_lib.training.checkpoints import load_model
@@ -65,9 +66,9 @@ def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     return limits
 
 
-def _filled(name: str, path: Path, trained, params, **fields) -> str:
+def _filled(name: str, path: Path, trained, params, measured: pd.DataFrame | None, **fields) -> str:
     """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
-    record = trained.record
+    record, says = trained.record, _CARDS["measured" if measured is not None else "unmeasured"][name]
     non_commercial = "NC" in re.split(r"[\s-]+", record["dataset_licence"])
     return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
@@ -76,31 +77,32 @@ def _filled(name: str, path: Path, trained, params, **fields) -> str:
         terms=": **non-commercial use only**" if non_commercial else "",
         commit=(record["git_commit"] or "unknown")[:10],
         tree=" from a work tree with uncommitted changes" if record["git_dirty"] else "",
+        measured=says if measured is None else says.format(table=markdown_table(measured), **fields),
         cores=counted_cores(record), **fields,
     )  # fmt: skip
 
 
-def _training(path: Path, record: Mapping, recipe: Mapping, examples: str, data: str) -> dict:
+def _training(path: Path, trained, recipe: Mapping, paper: str = "") -> dict:
     """Return what a card says of a training: how many examples it saw, in how many steps, and its last held-out loss.
 
     Args:
       path: the weights, with the history beside them.
-      record, recipe: of the run.
-      examples, data: keys of the record: examples seen, and examples in the data.
+      trained: the model.
+      recipe: of its run.
+      paper: of a model of text to motion, beside whose training its own is told.
     """
+    record = trained.record
+    examples, data = ("motions_seen", "num_train_clips") if paper else ("windows_seen", "num_train_windows")
     # A model may be trained in several legs, of which the recipe is the last's.
     seen, legs = record.get(examples, recipe["num_steps"] * recipe["batch_size"]), record.get("schedule_note")
     loss = read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
-    shares = {"steps": seen // recipe["batch_size"], "passes": seen / record[data]}
-    return {"recipe": recipe, "loss": loss, "seen": seen, "legs": f" ({legs})" if legs else "", **shares}
-
-
-def _text_training(path: Path, trained, recipe: Mapping, paper: str) -> dict:
-    """Return what a card of a model of text to motion says of its training, beside the paper's."""
-    about = load_paper_file("paper", paper)["training"]
-    fields = _training(path, trained.record, recipe, "motions_seen", "num_train_clips")
-    fields |= {"paper": about["says"], "share": 100 * fields["seen"] / about["windows"]["text"]}
-    return fields | {"seconds": trained.most_frames / trained.fps, "words": len(trained.words)}
+    fields = {"recipe": recipe, "loss": loss, "seen": seen, "legs": f" ({legs})" if legs else ""}
+    fields |= {"steps": seen // recipe["batch_size"], "passes": seen / record[data]}
+    if paper:
+        about = load_paper_file("paper", paper)["training"]
+        fields |= {"paper": about["says"], "share": 100 * seen / about["windows"]["text"]}
+        fields |= {"seconds": trained.most_frames / trained.fps, "words": len(trained.words)}
+    return fields
 
 
 def model_card(path: Path, quality: pd.DataFrame | None) -> str:
@@ -117,23 +119,19 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
       ValueError: if the file is broken.
     """
     trained = load_model(path)
-    training = _training(path, trained.record, trained.record["training"], "windows_seen", "num_train_windows")
-    figures, limits = "Not measured by the protocol yet.", []
+    training, figures, limits = _training(path, trained, trained.record["training"]), None, []
     if quality is not None:
-        weights = weights_digest(trained.params)
-        measured = quality[(quality["model"] == trained.name) & (quality["weights"] == weights)]
+        own = (quality["model"] == trained.name) & (quality["weights"] == weights_digest(trained.params))
         real = quality[quality["model"] == "real"]
-        if len(measured):
-            figures = _CARDS["measured"]["model"].format(table=markdown_table(_figures(measured, real)))
-            limits = _limits(measured, real)
+        if own.any():
+            figures, limits = _figures(quality[own], real), _limits(quality[own], real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     whole = load_paper_file("paper")["training"]["windows"].get(str(trained.config.window))
     if whole and training["seen"] < LEAST_SHARE * whole:
         limits.append(f"It saw {100 * training['seen'] / whole:.2g} % of the windows that the paper's models saw.")
-    return _filled(
-        "model_card", path, trained, trained.params, **training,
-        styles=", ".join(trained.styles), measured=figures, limits="\n".join(f"- {limit}" for limit in limits),
-    )  # fmt: skip
+    limits = "\n".join(f"- {limit}" for limit in limits)
+    styles = ", ".join(trained.styles)
+    return _filled("model_card", path, trained, trained.params, figures, **training, styles=styles, limits=limits)
 
 
 def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
@@ -150,26 +148,20 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
       ValueError: if the file is broken.
     """
     trained = load_text_model(path)
-    record, recipe = trained.record, trained.record["identity"]["training"]
-    training, codec = _text_training(path, trained, recipe, "acmdm"), trained.codec
-    measured = "Not measured yet."
-    if hands is not None:
-        own = hands[(hands["weights"] == weights_digest(trained.params)) | hands["model"].isin(["real clips"])]
-        if own["weights"].notna().any():
-            columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
-            counts = own.fillna({"wording": "clips"}).groupby(["model", "wording"], sort=False)[columns].sum()
-            counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
-            measured = _CARDS["measured"]["text"].format(table=markdown_table(counts))
+    record, codec, counts = trained.record, trained.codec, None
+    if hands is not None and (own := hands["weights"] == weights_digest(trained.params)).any():
+        columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
+        shown = hands[own | (hands["model"] == "real clips")].fillna({"wording": "clips"})
+        counts = shown.groupby(["model", "wording"], sort=False)[columns].sum()
+        counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
     state = "positions of joints" + (" and redundant features" if codec.redundancy else "")
     if codec.frames_per_state > 1:
         state = f"latent of {codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
     elif codec.mesh:
         state = f"latent of a body's mesh, {trained.config.num_joints} vertices of {trained.config.channels} numbers"
-    guidance = f"{record['guidance']:g}" if "guidance" in record else "the paper's 3"
-    return _filled(
-        "text_model_card", path, trained, (trained.params, codec.params), **training,
-        state=state, guidance=guidance, measured=measured,
-    )  # fmt: skip
+    fields = _training(path, trained, record["identity"]["training"], "acmdm") | {"state": state}
+    fields["guidance"] = f"{record['guidance']:g}" if "guidance" in record else "the paper's 3"
+    return _filled("text_model_card", path, trained, (trained.params, codec.params), counts, **fields)
 
 
 def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
@@ -185,30 +177,26 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    trained = load_text_model(path)
-    training, phases = _text_training(path, trained, trained.training, "motionpcm"), trained.training["num_phases"]
-    shown = [*_OF_JUDGE, "sampling_seconds"]
-    rows = [table[(table["trained"] == trained.name) & table["metric"].isin(shown)].assign(table=name)
-            for name, table in tables.items() if "steps" in table]  # fmt: skip
-    measured = "Not measured yet."
-    if rows and len(own := pd.concat(rows)):
-        own = own.assign(text=own["value"].map("{:.3g}".format))
-        wide = own.drop_duplicates(["steps", "metric"]).pivot(index="steps", columns="metric", values="text")
-        wide = wide[[metric for metric in shown if metric in wide]].fillna("–")
-        wide = wide.rename(columns=lambda metric: METRICS[metric].title)
-        measured = _CARDS["measured"]["latent"].format(table=markdown_table(wide.reset_index()))
+    trained, wide = load_text_model(path), None
+    rows = [table[table["trained"] == trained.name] for table in tables.values() if "steps" in table]
+    if any(map(len, rows)):
+        own = pd.concat(rows).drop_duplicates(["steps", "metric"])
+        wide = own.assign(value=own["value"].map("{:.3g}".format)).pivot(
+            index="steps", columns="metric", values="value"
+        )
+        titles = {name: METRICS[name].title for name in [*_OF_JUDGE, "sampling_seconds"] if name in wide}
+        wide = wide[list(titles)].fillna("–").rename(columns=titles).reset_index()
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
-    if (table := tables.get("text_pcm3")) is not None:
-        values = table.set_index(["trained", "metric"])["value"]
-        if (kept := values.get((find_preset(trained.name).latent, "kept_movement"))) is not None:
-            movement = f"Its autoencoder keeps {100 * kept:.1f} % of the movement of real clips (variance over frames)"
-    is_student = bool(trained.config.guidance_features)
+    if "text_pcm3" in tables:
+        kept = tables["text_pcm3"].set_index(["trained", "metric"])["value"]
+        if (share := kept.get((find_preset(trained.name).latent, "kept_movement"))) is not None:
+            movement = f"Its autoencoder keeps {100 * share:.1f} % of the movement of real clips (variance over frames)"
+    phases, is_student = trained.training["num_phases"], bool(trained.config.guidance_features)
     what = f"student of {phases} step{'s' * (phases > 1)}" if is_student else "teacher, sampled by DDIM"
-    return _filled(
-        "latent_model_card", path, trained, (trained.params, trained.autoencoder_params), **training,
-        what=what, measured=measured, latent=f"{trained.autoencoder.window} x {trained.autoencoder.channels}",
-        movement=movement,
-    )  # fmt: skip
+    latent = f"{trained.autoencoder.window} x {trained.autoencoder.channels}"
+    fields = _training(path, trained, trained.training, "motionpcm") | {"what": what, "latent": latent}
+    params = (trained.params, trained.autoencoder_params)
+    return _filled("latent_model_card", path, trained, params, wide, **fields, movement=movement)
 
 
 def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
@@ -224,14 +212,15 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     Raises:
       ValueError: if the file is broken.
     """
-    judge = load_judge(path)
-    digest, measured = weights_digest(judge.params), "Not measured yet."
+    judge, wide, fields = load_judge(path), None, {}
+    digest = weights_digest(judge.params)
     if seen is not None and seen[1]["judge_weights"] == digest:
-        table, titles = seen[0], {name: METRICS[name].title for name in _OF_JUDGE}
-        wide = table.pivot(index="system", columns="metric", values="value").loc[table["system"].unique(), _OF_JUDGE]
-        as_text = markdown_table(wide.rename(columns=titles).reset_index())
-        measured = _CARDS["measured"]["judge"].format(repeats=seen[1]["settings"]["repeats"], table=as_text)
-    return _filled("judge_card", path, judge, judge.params, digest=digest, measured=measured)
+        wide = (
+            seen[0].pivot(index="system", columns="metric", values="value").loc[seen[0]["system"].unique(), _OF_JUDGE]
+        )
+        wide = wide.rename(columns={name: METRICS[name].title for name in _OF_JUDGE}).reset_index()
+        fields["repeats"] = seen[1]["settings"]["repeats"]
+    return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
 
 
 def checksums(folder: Path) -> str:
@@ -274,10 +263,8 @@ def card_of(path: Path) -> str:
     if path.stem == JUDGE:
         return judge_card(path, committed_table(dataset, "text_judge"))
     if is_latent_preset(path.stem):
-        records = repository_root() / "paper_figures" / dataset / "laptop" / "records"
-        return latent_model_card(
-            path, {file.stem: read_table(file)[0] for file in sorted(records.glob("text_pcm*.csv"))}
-        )
+        found = {name: committed_table(dataset, name) for name in SCHEMAS if name.startswith("text_pcm")}
+        return latent_model_card(path, {name: one[0] for name, one in found.items() if one})
     hands, _ = committed_table(dataset, "hands") or (None, None)
     return text_model_card(path, hands)
 

@@ -240,11 +240,10 @@ def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.Data
     for (model, steps), figures in {("real", 0): real, **measured}.items():
         label = row_label(model, steps) if steps else "real"
         for metric in SHOWN["first"]:
-            values = figures[metric.key].dropna().to_numpy()
+            values = figures[metric.key].dropna()
             row = {"label": label, "model": model, "steps": steps, "metric": metric.name, "unit": metric.unit}
-            row |= {"better": metric.better, "value": values.mean() if len(values) else np.nan}
-            spread = values.std(ddof=1) if len(values) > 1 else np.nan
-            rows.append(row | {"spread": spread, "characters": len(values)})
+            row |= {"better": metric.better, "value": values.mean(), "spread": values.std()}
+            rows.append(row | {"characters": len(values)})
     return pd.DataFrame(rows)
 
 
@@ -256,8 +255,7 @@ def paper_rows() -> pd.DataFrame:
     """
     printed = load_paper_table(3)
     kept = printed[printed["model"].isin(["F3AMD-FNO-96", "CAMDM"]) & (printed["window_frames"] == 32)]
-    labels = [f"paper, {m}, {s} steps" for m, s in zip(kept["model"], kept["steps"], strict=True)]
-    return kept.assign(label=labels)
+    return kept.assign(label=[f"paper, {row_label(*one)}" for one in zip(kept["model"], kept["steps"], strict=True)])
 
 
 def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.DataFrame:
