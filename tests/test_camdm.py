@@ -164,7 +164,7 @@ def test_config_survives_json():
         ({"noise_levels": (0.0, 0.5)}, "noise_levels must be positive"),
         ({"noise_levels": 3.0}, "noise_levels must be positive"),
         ({"noise_levels": (1.0, float("inf"))}, "noise_levels must be positive"),
-        ({"split_path": 1}, "split_path must be of type bool"),
+        ({"split_path": 1}, "split_path must be true or false"),
     ],
 )
 def test_impossible_configs_are_refused(changes, message):

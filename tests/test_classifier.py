@@ -294,7 +294,7 @@ def test_dropout_keeps_the_mean_of_what_it_passes_on():
 
 def test_sizes_that_make_no_network_are_refused():
     assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
-    refused("hidden_width must be positive", ClassifierConfig, num_styles=3, hidden_width=0)
+    refused("hidden_width must be above 0", ClassifierConfig, num_styles=3, hidden_width=0)
     refused("widths must be whole numbers above 0, got .8, 0.", ClassifierConfig, num_styles=3, widths=(8, 0))
     refused("dropout", ClassifierConfig, num_styles=3, dropout=1.0)
     refused("'hiden_width'.*'hidden_width'", ClassifierConfig.from_dict, {"num_styles": 3, "hiden_width": 5})

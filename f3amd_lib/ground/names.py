@@ -1,17 +1,18 @@
-"""Names that people type: refuse an unknown one, and say which known one is nearest."""
+"""Names and settings that people type: refuse an unknown one and say which is nearest; one check of their values."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import numbers
 from collections.abc import Iterable, Mapping
 
 
-def nearest_names(name, known: Iterable[str], count: int = 3) -> list[str]:
-    """Return up to `count` known names that look like `name`, the likest first; case is ignored."""
+def nearest_names(name, known: Iterable[str]) -> list[str]:
+    """Return up to three known names that look like `name`, the likest first; case is ignored."""
     by_lower = {item.lower(): item for item in known}
-    near = difflib.get_close_matches(str(name).lower(), by_lower, n=count, cutoff=0.5)
+    near = difflib.get_close_matches(str(name).lower(), by_lower, n=3, cutoff=0.5)
     return [by_lower[item] for item in near]
 
 
@@ -56,6 +57,57 @@ def checked_seed(seed) -> int:
     if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
         raise ValueError(f"seed must be a whole number from 0 to {2**32 - 1}, got {str(seed)[:40]}")
     return int(seed)
+
+
+_are = lambda values, fits: isinstance(values, (list, tuple)) and all(map(fits, values))
+_is_whole = lambda value: isinstance(value, numbers.Integral) and not isinstance(value, bool)
+_is_name = lambda value: isinstance(value, str) and value != ""
+_KINDS = {
+    "int": (_is_whole, "a whole number", int),
+    "float": (lambda value: isinstance(value, numbers.Real) and math.isfinite(value), "a finite number", float),
+    "bool": (lambda value: isinstance(value, bool), "true or false", bool),
+    "str": (_is_name, "a name", str),
+    "tuple[str, ...]": (lambda values: _are(values, _is_name), "a list of names", tuple),
+    "tuple[int, ...]": (
+        lambda values: _are(values, lambda value: _is_whole(value) and value > 0), "whole numbers above 0", tuple
+    ),
+}  # fmt: skip
+"""Type of a field -> what its values are, what they are called, and what makes them of that type."""
+
+_LIMITS = {
+    "above 0": lambda value: value > 0,
+    "0 or more": lambda value: value >= 0,
+    "from 0 to 1": lambda value: 0 <= value <= 1,
+    "from 0 to below 1": lambda value: 0 <= value < 1,
+}
+
+
+def checked_value(name: str, value, annotation: str, rule: str | Iterable[str] = "above 0"):
+    """Return a setting's value as its field's type; one of a type that is not known here comes back as it is.
+
+    Args:
+      name: what messages call it; a "seed" is checked as such.
+      value: what was given.
+      annotation: type of its field, as source text has it (`from __future__ import annotations`).
+      rule: of a number, a name of `_LIMITS`; of a name, those that are known.
+
+    Raises:
+      ValueError: for a value of another type (True is no number, 8.0 no count), out of range or unknown.
+    """
+    kind, *rest = annotation.split(" | ")
+    if kind not in _KINDS or (value is None and rest):
+        return value
+    if name == "seed":
+        return checked_seed(value)
+    if not isinstance(rule, str):
+        check_known(value, rule, name)
+    fits, called, convert = _KINDS[kind]
+    if (isinstance(value, bool) and kind != "bool") or not fits(value):
+        what = f"{called} or None" if rest else called
+        raise ValueError(f"{name} must be {what}, got {value!r} ({type(value).__name__})")
+    if kind in ("int", "float") and not _LIMITS[rule](value):
+        raise ValueError(f"{name} must be {rule}, got {value!r}")
+    return convert(value)
 
 
 def row_label(model: str, steps: int) -> str:

@@ -8,13 +8,11 @@ unknown names and wrong types are refused here.
 from __future__ import annotations
 
 import dataclasses
-import math
-import numbers
 import os
 from pathlib import Path
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.ground.names import check_known, checked_value
 
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
@@ -75,17 +73,6 @@ class Profile:
         return 32 * self.rollout_rounds
 
 
-_is_name = lambda value: isinstance(value, str)
-_are_names = lambda value: isinstance(value, (list, tuple)) and all(map(_is_name, value))
-# Type of a field -> what its values are, what they are called, and what makes them of that type.
-_KINDS = {
-    "int": (lambda value: isinstance(value, numbers.Integral), "a whole number", int),
-    "float": (lambda value: isinstance(value, numbers.Real) and math.isfinite(value), "a finite number", float),
-    "str": (_is_name, "a name", str),
-    "tuple[str, ...]": (_are_names, "a list of names", tuple),
-}
-
-
 def load_profile(name: str, dataset: str, **overrides) -> Profile:
     """Return the numbers of a profile on a data set, with some of them replaced.
 
@@ -107,24 +94,8 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
     for key in overrides:
         check_known(key, types, "profile field")
     values = _NUMBERS["common"] | _NUMBERS[name] | _NUMBERS["on"].get(dataset, {}).get(name, {}) | overrides
-    return Profile(name=name, dataset=dataset, **{key: _checked(key, values.get(key), types[key]) for key in types})
-
-
-def _checked(key: str, value, annotation: str):
-    """Return a value as its field's type, or say why not."""
-    # `from __future__ import annotations` leaves types as their source text.
-    kind, *rest = annotation.split(" | ")
-    if value is None and rest:
-        return None
-    fits, called, convert = _KINDS[kind]
-    if isinstance(value, bool) or not fits(value) or value == "":
-        called += " or None" if rest else ""
-        raise ValueError(f"{key} must be {called}, got {value!r} ({type(value).__name__})")
-    if key == "seed":
-        return checked_seed(value)
-    if kind in ("int", "float") and value <= 0:
-        raise ValueError(f"{key} must be above 0, got {value!r}")
-    return convert(value)
+    checked = {key: checked_value(key, values.get(key), annotation) for key, annotation in types.items()}
+    return Profile(name=name, dataset=dataset, **checked)
 
 
 def _check_names(dataset: str, profile: str) -> None:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import jax
 from flax import nnx
 
-from f3amd_lib.ground.names import check_known, refuse_unknown
-
-_TYPES = {"int": int, "float": float, "bool": bool, "str": str}
+from f3amd_lib.ground.names import checked_value, refuse_unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,20 +31,8 @@ class CheckedConfig:
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            name, value, wanted = field.name, getattr(self, field.name), _TYPES.get(field.type)
-            if field.type == "tuple[int, ...]":
-                value = tuple(value)
-                if any(type(size) is not int or size < 1 for size in value):
-                    raise ValueError(f"{name} must be whole numbers above 0, got {value}")
-            if wanted is float and type(value) is int:
-                value = float(value)
-            if wanted and type(value) is not wanted:
-                raise ValueError(f"{name} must be of type {wanted.__name__}, got {value!r}")
-            if name in self.choices:
-                check_known(value, self.choices[name], name)
-            if wanted in (int, float) and not (0 < value < math.inf or (value == 0 and name in self.may_be_zero)):
-                raise ValueError(f"{name} must be positive and finite, got {value!r}")
-            object.__setattr__(self, name, value)
+            rule = self.choices.get(field.name, "0 or more" if field.name in self.may_be_zero else "above 0")
+            object.__setattr__(self, field.name, checked_value(field.name, getattr(self, field.name), field.type, rule))
         if getattr(self, "dropout", 0.0) >= 1.0:
             raise ValueError(f"dropout must be below 1, got {self.dropout}")
 

@@ -2,51 +2,28 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from pathlib import Path
 
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known, checked_seed, refuse_unknown
+from f3amd_lib.ground.names import check_known, checked_value, refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 
 _SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
 
-_RANGES = {
-    "true or false": lambda x: type(x) is bool,
-    "positive and whole": lambda x: type(x) is int and x >= 1,
-    "0 or more and whole": lambda x: type(x) is int and x >= 0,
-    "positive and finite": lambda x: 0 < x < math.inf,
-    "0 or more and finite": lambda x: 0 <= x < math.inf,
-    "in [0, 1]": lambda x: 0 <= x <= 1,
-    "in [0, 1)": lambda x: 0 <= x < 1,
-    "in [0, 1), or None": lambda x: x is None or 0 <= x < 1,
-}
-
-
-def _in_range(value, wanted: str) -> bool:
-    try:
-        return _RANGES[wanted](value)
-    except TypeError:  # no number at all
-        return False
-
 
 def check_settings(settings, kind: str = "") -> None:
-    """Raise ValueError for a field that is not what `settings.toml` says of its class, or a seed that is none.
+    """Raise ValueError for a field that is not of its type, or not what `settings.toml` says of it.
 
     Args:
-      settings: of a class that the file has.
-      kind: what its numbers are, before their names in a message, such as "loss weight ".
+      settings: of any dataclass; its numbers are above 0 where the file says nothing else.
+      kind: what its fields are, before their names in a message, such as "loss weight ".
     """
-    for name, wanted in _SETTINGS[type(settings).__name__].items():
-        value = getattr(settings, name)
-        if isinstance(wanted, list):
-            check_known(value, wanted, name)
-        elif not _in_range(value, wanted):
-            raise ValueError(f"{kind}{name} must be {wanted}, got {value!r}")
-    if hasattr(settings, "seed"):
-        checked_seed(settings.seed)
+    rules = _SETTINGS.get(type(settings).__name__, {})
+    for field in dataclasses.fields(settings):
+        checked_value(kind + field.name, getattr(settings, field.name), field.type, rules.get(field.name, "above 0"))
 
 
 def part_recipe(training: type, part: str, num_steps: int, preset: str | None = None, **settings):
