@@ -4,15 +4,15 @@ import pandas as pd
 import pytest
 
 from f3amd_lib.ground import stored
-from f3amd_lib.papers import printed_beside
-from f3amd_lib.papers.printed_beside import beside_printed, judge_note
+from f3amd_lib.papers import printed
+from f3amd_lib.papers.printed import beside_printed, judge_note
 
 
 @pytest.fixture
 def committed(monkeypatch):
     """Tables that are committed, by name: (table, record); a test puts in what it wants."""
     tables = {}
-    for module in (stored, printed_beside):
+    for module in (stored, printed):
         monkeypatch.setattr(module, "committed_table", lambda dataset, name: tables.get(name))
     return tables
 
@@ -49,7 +49,7 @@ def test_without_a_record_the_papers_figures_stand_alone(committed):
 
 def test_another_judge_is_told_and_the_same_one_is_not(committed):
     committed |= {"text_table1": of_judge("one"), "text_tableA5": of_judge("one")}
-    assert judge_note("bandai", "text_tableA5") == ""
+    assert judge_note("text_tableA5") == ""
     committed |= {"text_table4": of_judge("two"), "text_judge": of_judge("one")}
-    assert "`text_judge`, `text_table1`, `text_tableA5`" in judge_note("bandai", "text_table4")
-    assert "`text_table4`" in judge_note("bandai", "text_table1").split("than that of")[1]
+    assert "`text_judge`, `text_table1`, `text_tableA5`" in judge_note("text_table4")
+    assert "`text_table4`" in judge_note("text_table1").split("than that of")[1]
