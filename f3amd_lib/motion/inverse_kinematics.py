@@ -54,8 +54,17 @@ def _aimed(offsets: np.ndarray, wanted):
         direction = wanted[:, 0]
         nowhere = xp.linalg.norm(direction, axis=-1, keepdims=True) < _NO_LENGTH
         return shortest_turn(offsets, xp.where(nowhere, offsets, direction))
-    spread = xp.sum(wanted[..., :, None] * offsets[:, None, :], axis=1)
-    left, _, right = xp.linalg.svd(spread + _PULL * np.eye(3, dtype=offsets.dtype))
+    return best_turns(offsets, wanted, _PULL)
+
+
+def best_turns(was: np.ndarray, shall, pull: float = 0.0):
+    """Return the rotations [T, 3, 3] that bring vectors [K, 3] nearest to others, [T, K, 3] (Kabsch 1976).
+
+    With a `pull` (m^2) no rotation at all is preferred where the vectors leave one open.
+    """
+    xp = array_module(shall)
+    spread = xp.sum(shall[..., :, None] * was[:, None, :], axis=1)
+    left, _, right = xp.linalg.svd(spread + pull * np.eye(3, dtype=was.dtype))
     sign = xp.linalg.det(left) * xp.linalg.det(right)
     left = left * xp.stack([xp.ones_like(sign), xp.ones_like(sign), sign], axis=-1)[:, None]
     return compose(left, right)

@@ -6,7 +6,7 @@ chest, from which several bones go, by the rotation that fits them best. What bo
 hands, stays as in the reference. The root's path is scaled by the length of the legs, and the lowest toe put where
 the reference has it.
 
-Source: ours; the fit is that of W. Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
+Source: ours.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ import numpy as np
 
 from f3amd_lib.motion.anatomy import joint_roles, leg_length
 from f3amd_lib.motion.curves import unit
+from f3amd_lib.motion.inverse_kinematics import best_turns
 from f3amd_lib.motion.rotations import shortest_turn
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations, local_rotations
 
@@ -72,7 +73,7 @@ def retarget(motion: Motion, reference: Motion) -> Retargeted:
         was = unit(skeleton.offsets[children] @ rest[joint].T)
         shall = unit(np.stack([wanted[child] - wanted[joint] for child in children], axis=1))
         if len(children) > 1:
-            turned[:, joint] = _best_turn(was, shall)
+            turned[:, joint] = best_turns(was, shall)
         else:
             turned[:, joint] = shortest_turn(before @ was[0], shall[:, 0]) @ before
     local = local_rotations(skeleton, turned @ rest)
@@ -108,11 +109,3 @@ def _wanted_points(motion: Motion, theirs, skeleton: Skeleton, ours) -> dict[int
             shoulder = place[role.replace("collar", "shoulder")]
             points[joint] = (2.0 * place["neck"] + shoulder) / 3.0
     return points
-
-
-def _best_turn(was: np.ndarray, shall: np.ndarray) -> np.ndarray:
-    """Return the rotations [T, 3, 3] that bring directions [K, 3] nearest to others, [T, K, 3]."""
-    left, _, right = np.linalg.svd(np.einsum("tka,kb->tab", shall, was))
-    side = np.linalg.det(left @ right)
-    left[..., 2] *= side[:, None]
-    return left @ right
