@@ -20,6 +20,7 @@ from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
 from f3amd_lib.networks.camdm import CAMDMConfig
@@ -293,3 +294,11 @@ def rows_of_one_step() -> pd.DataFrame:
     folder = repository_root() / "paper_figures/bandai/laptop/records"
     rows = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
     return rows.set_index(["model", "steps", "metric"])
+
+
+def placed(path: RootPath, position, yaw: float = 0.0) -> RootPath:
+    """Move a path so that its first frame lies at `position` (x, z) and faces `yaw`."""
+    angle = float(yaw) - path.yaw[0]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turned = (path.position - path.position[0]) @ turn
+    return RootPath(turned + np.asarray(position, np.float64), path.yaw + angle, path.fps)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, refused, tiny_trained
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, placed, refused, tiny_trained
 from scipy.spatial import cKDTree
 from test_rollout import obedient
 
@@ -195,7 +195,7 @@ def test_a_crowd_on_circles_walks_the_named_circle_left_and_right(monkeypatch):
     position, yaw = crowd_paths(range(30), np.full(30, 1.2), 90, 0)
     sides = []
     for place, facing in zip(position, yaw, strict=True):
-        left = named_path("circle", 90).placed(place[0], facing[0])
+        left = placed(named_path("circle", 90), place[0], facing[0])
         side = np.sign(facing[-1] - facing[0])
         sides.append(side)
         if side > 0:

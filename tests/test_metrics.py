@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders import refused
+from builders import placed, refused
 
 from f3amd_lib.measures import metrics, registry
 from f3amd_lib.motion.root_paths import named_path
@@ -314,10 +314,10 @@ def test_camdm_metrics_and_the_place_and_turn_of_the_world():
     positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
     path = named_path("slalom", len(positions))
     before = metrics.camdm_metrics(positions, path, SKELETON)
-    moved = metrics.camdm_metrics(positions + shift, path.placed(shift[[0, 2]], path.yaw[0]), SKELETON)
+    moved = metrics.camdm_metrics(positions + shift, placed(path, shift[[0, 2]], path.yaw[0]), SKELETON)
     assert moved == pytest.approx(before)
     turned = positions @ matrix_from_yaw(np.float64(angle)).T
-    after = metrics.camdm_metrics(turned, path.placed((0, 0), angle), SKELETON)
+    after = metrics.camdm_metrics(turned, placed(path, (0, 0), angle), SKELETON)
     for key in ("camdm_foot_sliding", "coherence"):
         assert after[key] == pytest.approx(before[key])
 
@@ -365,7 +365,7 @@ def test_turning_and_moving_the_world_changes_nothing():
     positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
     path = named_path("slalom", len(positions))
     moved = positions @ matrix_from_yaw(np.float64(angle)).T + shift
-    target = path.placed(shift[[0, 2]], angle)
+    target = placed(path, shift[[0, 2]], angle)
     before = metrics.first_metrics(positions, path, WINDOW, SKELETON)
     after = metrics.first_metrics(moved, target, WINDOW, SKELETON)
     for key, value in before.items():

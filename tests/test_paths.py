@@ -123,12 +123,6 @@ def test_bad_numbers_are_refused(bad):
     refused(next(iter(bad)).split("_")[0], named_path, "circle", **{"num_frames": 10} | bad)
 
 
-def test_placed_moves_and_turns():
-    path = named_path("straight", 31, speed=1.0).placed([2.0, 3.0], np.pi / 2)
-    np.testing.assert_allclose(path.position[[0, -1]], [[2.0, 3.0], [3.0, 3.0]], atol=1e-9)
-    np.testing.assert_allclose(path.yaw, np.pi / 2)
-
-
 def test_root_path_refuses_nonsense():
     refused("position", RootPath, np.zeros((4, 3)), np.zeros(4))
     refused("not finite at frame 2", RootPath, np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))

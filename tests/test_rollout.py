@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, make_condition, refused, tiny_camdm, tiny_trained
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, make_condition, placed, refused, tiny_camdm, tiny_trained
 
 from f3amd_lib.data.features import frame_yaw, split_frames, turn_frames
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
@@ -59,7 +59,7 @@ def test_a_perfect_network_walks_exactly_on_the_path(trained, name):
 
 
 def test_paths_anywhere_facing_anywhere_are_followed(trained):
-    path = named_path("circle", 3 * WINDOW).placed((30.0, -20.0), 2.0)
+    path = placed(named_path("circle", 3 * WINDOW), (30.0, -20.0), 2.0)
     frames = obedient(trained).rollout(path, "calm").frames[0]
     np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=5e-5)
 
@@ -87,7 +87,7 @@ def test_histories_may_be_longer_than_windows():
 
 
 def test_rollouts_start_one_step_before_the_path_and_face_along_it(trained):
-    path = named_path("circle", 2 * WINDOW).placed((3.0, 4.0), -2.0)
+    path = placed(named_path("circle", 2 * WINDOW), (3.0, 4.0), -2.0)
     history = obedient(trained).rollout(path, "proud").history[0]
     start = 2 * path.position[0] - path.position[1]
     np.testing.assert_allclose(history[-1, [0, 2]], start, atol=1e-5)

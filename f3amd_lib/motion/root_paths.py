@@ -77,14 +77,6 @@ class RootPath:
         """Return frames start (included) to stop (excluded)."""
         return dataclasses.replace(self, position=self.position[start:stop], yaw=self.yaw[start:stop])
 
-    def placed(self, position, yaw: float = 0.0) -> RootPath:
-        """Move the path so that its first frame lies at `position` (x, z) and faces `yaw`."""
-        angle = float(yaw) - self.yaw[0]
-        cosine, sine = np.cos(angle), np.sin(angle)
-        x, z = (self.position - self.position[0]).T
-        turned = np.stack([cosine * x + sine * z, cosine * z - sine * x], axis=-1)
-        return dataclasses.replace(self, position=turned + np.asarray(position, dtype=np.float64), yaw=self.yaw + angle)
-
 
 def named_path(name: str, num_frames: int, *, speed: float = 1.2, seed: int = 0, fps: float = 30.0) -> RootPath:
     """Build one of the named paths.
