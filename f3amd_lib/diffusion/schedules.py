@@ -108,9 +108,9 @@ class NoiseSchedule:
         with np.errstate(divide="ignore"):  # the straight path begins at an infinite level
             return np.append(self.level(self.times(num_steps, spacing)), 0.0)
 
-    def scaled_grid(self, num_steps: int, spacing: str = "endpoints") -> tuple[np.ndarray, np.ndarray]:
+    def scaled_grid(self, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Return (alphas, sigmas) at `times`, then (1, 0), each [N + 1]: what a sampler of z_t itself visits."""
-        t = self.times(num_steps, spacing)
+        t = self.times(num_steps)
         return np.append(self.alpha(t), 1.0), np.append(self.sigma(t), 0.0)
 
     def level(self, t):

@@ -317,7 +317,7 @@ def crowd_colors(labels: Sequence[str]) -> list[str]:
 
 
 @plot_style()
-def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, width: float = 12.0):
+def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, width: float = 12.0):
     """Draw crowds in perspective, a panel each, all seen from where the whole of the first one fills its panel.
 
     Bodies have the thickness of a person's, far ones come first and paler. Nearer limbs cover those
@@ -327,7 +327,6 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
     Args:
       crowds: title (further lines stand smaller below it) -> (motions, a colour for each).
       frame: of the motions.
-      columns: panels in a row.
       width: of the figure, inches.
 
     Returns:
@@ -340,7 +339,7 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, columns: int = 2, w
         raise ValueError("a picture of crowds needs at least one crowd, and somebody in each")
     for motion in (motion for motions, _ in crowds.values() for motion in motions):
         _check_frames(motion, frame)
-    columns = min(columns, len(crowds))
+    columns = min(2, len(crowds))
     rows, panel = -(-len(crowds) // columns), width / columns
     roots = np.array([motion.root_position[frame, [0, 2]] for motion in next(iter(crowds.values()))[0]], float)
     x, z = middle = 0.5 * (roots.min(axis=0) + roots.max(axis=0))
@@ -414,7 +413,7 @@ def _ground_lines(camera: Camera, step: float, radius: float, color: str) -> Lin
 
 def write_gif(
     path, motions, *, target_paths=None, titles=None, every: int = 3, size: tuple[int, int] = (256, 256),
-    around_deg: float = 50.0, max_seconds: float | None = None,
+    max_seconds: float | None = None,
 ) -> Path:  # fmt: skip
     """Write a small looping GIF of one motion, or of several in panels side by side.
 
@@ -428,7 +427,6 @@ def write_gif(
       titles: a text, or a list of one a motion; by default the motion's name.
       every: keep every n-th frame; 3 keeps 8 s near 200 kB. At most 30 kept frames a second.
       size: pixels of one panel, width and height.
-      around_deg: camera, 0 in front of the character's first facing, 90 at its right side.
       max_seconds: stop there; None shows everything.
 
     Returns:
@@ -458,7 +456,7 @@ def write_gif(
     canvas, pictures = FigureCanvasAgg(figure), []
     bare = {"left": 0.0, "right": 1.0, "bottom": 0.0, "top": 1.0, "wspace": 0.0}
     axes = figure.subplots(1, len(rows), squeeze=False, gridspec_kw=bare)[0]
-    draws = [_gif_panel(axis, *row, frames, size, np.deg2rad(around_deg)) for axis, row in zip(axes, rows, strict=True)]
+    draws = [_gif_panel(axis, *row, frames, size) for axis, row in zip(axes, rows, strict=True)]
     for place in range(len(frames)):
         for draw in draws:
             draw(place)
@@ -478,7 +476,11 @@ def write_gif(
     return path
 
 
-def _gif_panel(axis, motion: Motion, target, title: str, frames, size, around: float):
+_AROUND = np.deg2rad(50.0)
+"""Where the camera of a GIF stands, from the character's first facing to its right."""
+
+
+def _gif_panel(axis, motion: Motion, target, title: str, frames, size):
     """Prepare a panel of a GIF; return what draws it at a place in `frames`, held at the motion's last."""
     frames = np.minimum(frames, motion.num_frames - 1)
     points, touching, yaw = drawn_points(motion, frames), _toes_down(motion, frames), yaw_of(motion)
@@ -492,7 +494,7 @@ def _gif_panel(axis, motion: Motion, target, title: str, frames, size, around: f
 
     def draw(place: int) -> None:
         x, _, z = follow[place]
-        camera = Camera((0.0 if yaw is None else yaw[0]) - around, np.deg2rad(14.0), (x, 0.88, z), distance=4.6)
+        camera = Camera((0.0 if yaw is None else yaw[0]) - _AROUND, np.deg2rad(14.0), (x, 0.88, z), distance=4.6)
         for old in [*axis.lines, *axis.collections, *axis.patches, *axis.texts]:
             old.remove()
         axis.add_collection(_ground_lines(camera, 1.0, 3.0, "#D9D9D9"))

@@ -111,17 +111,17 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
         return figure, figure.subplots(nrows, ncols, **grid)
 
 
-def label_log_axis(axis, places: Sequence[float] = (1, 3), form: str = "{x:g}") -> None:
+def label_log_axis(axis, places: Sequence[float] = (1, 3)) -> None:
     """Label a logarithmic axis (`axes.xaxis` or `axes.yaxis`) at these places of each decade, and nowhere else.
 
     An axis that shows fewer than two of them is labelled at even steps by matplotlib.
     """
     axis.set_major_locator(LogLocator(subs=places))
-    axis.set_major_formatter(form)
+    axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter("")
 
 
-def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
+def save_figure(figure: Figure, path) -> Path:
     """Write a figure as PNG whose bytes depend on the drawing alone.
 
     No date and no software version is written, so that an unchanged figure is an unchanged file.
@@ -130,7 +130,6 @@ def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
     Args:
       figure: what to write.
       path: ends in .png; folders are made.
-      dpi: dots an inch.
 
     Returns:
       The path.
@@ -139,7 +138,7 @@ def save_figure(figure: Figure, path, *, dpi: int = 150) -> Path:
       ValueError: if the name does not end in .png.
     """
     path = named_file(path, ".png", "figures")
-    return write_whole(path, _png(figure, dpi))
+    return write_whole(path, _png(figure, 150))
 
 
 def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):

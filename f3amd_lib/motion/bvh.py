@@ -43,12 +43,11 @@ class _Broken(Exception):
     """(line, what is wrong and what to do); `parse_bvh` adds the file's name."""
 
 
-def read_bvh(path, scale: float = 0.01) -> Motion:
-    """Read a BVH file.
+def read_bvh(path) -> Motion:
+    """Read a BVH file in centimetres.
 
     Args:
-      path: of the file; its text from elsewhere is for `parse_bvh`.
-      scale: metres per unit of length in the file (centimetres: 0.01).
+      path: of the file; its text from elsewhere, or in other units, is for `parse_bvh`.
 
     Returns:
       A `Motion` at the file's own frame rate, called by its path (see `parse_bvh`).
@@ -60,7 +59,7 @@ def read_bvh(path, scale: float = 0.01) -> Motion:
         content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    return parse_bvh(content, str(path), scale)
+    return parse_bvh(content, str(path))
 
 
 def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:

@@ -26,12 +26,11 @@ def rotation_6d_from_matrix(matrix):
     return xp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 
-def matrix_from_rotation_6d(rotation_6d, eps: float = 1e-8):
+def matrix_from_rotation_6d(rotation_6d):
     """Turn any six numbers into a rotation matrix by Gram-Schmidt.
 
     Args:
       rotation_6d: [..., 6], first column then second column; need not be orthonormal.
-      eps: added under the root, so that gradients stay finite at zero length.
 
     Returns:
       Rotation matrices, [..., 3, 3], determinant +1.
@@ -41,8 +40,8 @@ def matrix_from_rotation_6d(rotation_6d, eps: float = 1e-8):
     xp = array_module(rotation_6d)
     first, second = rotation_6d[..., 0:3], rotation_6d[..., 3:6]
 
-    def unit(vector):
-        return vector / xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True) + eps * eps)
+    def unit(vector):  # with a finite gradient at zero length
+        return vector / xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True) + 1e-8 * 1e-8)
 
     column_x = unit(first)
     column_y = unit(second - xp.sum(column_x * second, axis=-1, keepdims=True) * column_x)

@@ -353,14 +353,13 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     return yaw_from_direction(forward)
 
 
-def contact_labels(skeleton: Skeleton, positions, fps: float = 30.0, speed: float = CONTACT_SPEED):
-    """Mark toes that hardly move: 3D speed under `speed` metres per 1/30 s.
+def contact_labels(skeleton: Skeleton, positions, fps: float = 30.0):
+    """Mark toes that hardly move: 3D speed under `CONTACT_SPEED` metres per 1/30 s.
 
     Args:
       skeleton: the joints.
       positions: global positions, [..., T, J, 3], metres.
       fps: frames per second of `positions`.
-      speed: threshold in metres per frame at 30 fps (CAMDM: 0.01).
 
     Returns:
       Boolean [..., T, 2], left and right. Frame t is judged by the step t -> t + 1, the last frame
@@ -373,7 +372,7 @@ def contact_labels(skeleton: Skeleton, positions, fps: float = 30.0, speed: floa
     step = toes[..., 1:, :, :] - toes[..., :-1, :, :]
     moving = xp.sqrt(xp.sum(step * step, axis=-1)) * (fps / 30.0)
     moving = xp.concatenate([moving, moving[..., -1:, :]], axis=-2)
-    return moving < speed
+    return moving < CONTACT_SPEED
 
 
 def mirror(motion: Motion) -> Motion:

@@ -477,15 +477,16 @@ def _arm(pose: ArmPose, side, swing, gesture, lean_deg, roll_deg, drift):
 # ------------------------------------------------------------------------------------ assembly
 
 
-def walk_along(style: str, position, yaw, seed: int = 0, fps: float = 30.0) -> Motion:
+def walk_along(style: str, position, yaw) -> Motion:
     """Let the walker follow a path that somebody drew: what a generated walk is held against.
 
     Args:
       style: one of `STYLES`.
       position: [T, 2], x and z in metres, T >= 4.
       yaw: facing, [T], radians; the direction of travel is the path's own.
-      seed: as in `synthesize`.
-      fps: frames per second of path and motion.
+
+    Returns:
+      The motion at 30 fps, as the path.
 
     Raises:
       ValueError: for an unknown style, shapes that do not fit, or a number that is not finite.
@@ -494,7 +495,7 @@ def walk_along(style: str, position, yaw, seed: int = 0, fps: float = 30.0) -> M
     yaw = finite_array("path yaw", yaw, (len(position),))
     if len(yaw) < 4:
         raise ValueError(f"a path needs 4 frames or more, got {len(yaw)}")
-    return _walk(style_parameters(style), style, seed, fps, len(yaw), (position, yaw))[0]
+    return _walk(style_parameters(style), style, 0, 30.0, len(yaw), (position, yaw))[0]
 
 
 def synthesize_with_contacts(
