@@ -29,7 +29,7 @@ from f3amd_lib.text.data.text_motions import TextMotions
 from f3amd_lib.text.judge.text_metrics import RAISED, raised_hands
 from f3amd_lib.text.sampling.captioned_motion import draw_motions
 from f3amd_lib.text.sampling.motionpcm_sampling import latent_walk, steps_of
-from f3amd_lib.text.stages.text_models import find_text_model, load_text_model
+from f3amd_lib.text.stages.text_models import LatentModel, find_text_model, load_text_model
 from f3amd_lib.training.checkpoints import network_with
 
 TREMBLE = 0.02
@@ -205,7 +205,7 @@ def measure_one_caption(
     text, rows = jnp.asarray(embed_captions([ONE_CAPTION], encoder).pooled), []
     for name in models or ["MotionLCM-V2-small"]:
         path = find_text_model(profile.dataset, name) if folder is None else Path(folder) / f"{name}.safetensors"
-        trained = load_text_model(path)
+        trained = load_text_model(path, LatentModel)
         network, key = network_with(trained.config, trained.params), jax.random.key(profile.seed)
         noise = jax.random.normal(key, trained.config.state_shape(1))
         latent = latent_walk(trained)(network, text, noise, key)
