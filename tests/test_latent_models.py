@@ -70,7 +70,7 @@ def test_a_preset_knows_what_it_stands_on():
         chain[name] = stage_of(name), stands_on(name)
     assert chain == {
         "MotionPCM-VAE": ("latent autoencoder", ""),
-        "MotionPCM-teacher-small": ("teacher", "MotionPCM-VAE-small-spans"),
+        "MotionPCM-teacher-small": ("latent denoiser", "MotionPCM-VAE-small-spans"),
         "MotionPCM-M4": ("student", "MotionPCM-teacher"),
         "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
     }

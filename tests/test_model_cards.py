@@ -56,7 +56,7 @@ def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(
     def begin(asked, split):
         raise Asked(asked.preset.name, asked.config, asked.window)
 
-    monkeypatch.setitem(train_stage.STAGES, "denoiser", train_stage.STAGES["denoiser"]._replace(task=begin))
+    monkeypatch.setattr(train_stage.STAGES["ACMDM"], "of", begin)
     walks = captioned_walks(synthetic.STYLES[:1], ("train",), num_frames=40)
     monkeypatch.setattr(text_models, "open_text_motions", lambda *asked: walks)
     monkeypatch.setattr(text_encoders, "load_text_encoder", lambda: None)

@@ -28,7 +28,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.judge.text_metrics import control_errors
-from f3amd_lib.text.stages import train_stage
+from f3amd_lib.text.stages import text_models, train_stage
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 QUIET = {"progress": False}
@@ -237,7 +237,7 @@ def test_the_files_rows_name_presets_columns_and_commands():
         # What the paper says of its four sizes of meshes ("competitive") is no question to one row of ours.
         assert (f"f3amd measure {name} " in typed) == (name != "text_table4")
         for row in about[name]["rows"]:
-            assert train_stage.stage_of(row["trained"]) == "denoiser" and presets.find_preset(row["model"])
+            assert train_stage.stage_of(row["trained"]) in text_models.DENOISERS and presets.find_preset(row["model"])
             assert {*row} - {"trained", "first"} == set(SCHEMAS[name]) - {"metric", "joint"}
     # One autoencoder size and one number of blocks within a table, but where blocks are what is compared.
     depths = {presets.find_preset(row["trained"]).network["depth"] for row in about["text_table1"]["rows"]}

@@ -31,10 +31,7 @@ from f3amd_lib.text.data.body_mesh import BodyMesh
 from f3amd_lib.text.data.humanml3d import read_humanml3d
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions, words_of
 from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, bandai_text_motions
-from f3amd_lib.text.networks.acmdm import ACMDMConfig
 from f3amd_lib.text.networks.acmdm_control import ControlBranch, blank_branch, branch_with
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
-from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
 from f3amd_lib.text.stages.motion_codec import MotionCodec
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.checkpoints import network_with
@@ -61,11 +58,8 @@ JUDGE = "judge"
 STUDENTS = {phases: f"MotionPCM-M{phases}-small" for phases in (1, 2, 4)}
 """The models that `f3amd text --model motionpcm` means, by --steps: a student is trained for one number of them."""
 
-DENOISERS = (ACMDMConfig.family, MaskedACMDMConfig.family)
+DENOISERS = ("ACMDM", "masked ACMDM")
 """Families of ACMDM's networks that turn text into motion."""
-
-LATENT_FAMILIES = (LatentAutoencoderConfig.family, LatentDenoiserConfig.family)
-"""MotionPCM's families."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -177,7 +171,7 @@ class LatentModel(CaptionedModel):
 
     kind: ClassVar[str] = "latent motion model"
 
-    autoencoder: LatentAutoencoderConfig
+    autoencoder: CheckedConfig
     autoencoder_params: Any
     statistics: AxisNormaliser
 
@@ -309,7 +303,7 @@ def open_text_motions(name: str, source=None, *, held_out_wording: bool = False)
 
 def is_latent_preset(name: str) -> bool:
     """Say whether a preset is one of MotionPCM's."""
-    return presets.find_preset(preset_and_branch(name)[0]).family in LATENT_FAMILIES
+    return presets.find_preset(preset_and_branch(name)[0]).paper == "motionpcm"
 
 
 def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:

@@ -15,9 +15,6 @@ from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data.redundant import NUM_JOINT_FEATURES
 from f3amd_lib.text.data.text_encoders import TextEncoder
 from f3amd_lib.text.data.text_motions import UNIT, AxisNormaliser, TextMotions
-from f3amd_lib.text.networks.mesh_autoencoder import MeshAutoencoderConfig
-from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
-from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiserConfig
 from f3amd_lib.text.stages import acmdm_training, motionpcm_training, text_models
 from f3amd_lib.text.stages.motion_codec import MotionCodec
 from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model, preset_and_branch
@@ -26,15 +23,16 @@ from f3amd_lib.training.pipeline import alone_with, train_in_legs
 from f3amd_lib.training.settings import profile_part_recipe
 
 STAGES = {
-    "autoencoder": acmdm_training.AutoencoderTask,
+    "motion autoencoder": acmdm_training.AutoencoderTask,
     "mesh autoencoder": acmdm_training.MeshAutoencoderTask,
-    "denoiser": acmdm_training.TextMotionTask,
+    "ACMDM": acmdm_training.TextMotionTask,
+    "masked ACMDM": acmdm_training.TextMotionTask,
     "control branch": acmdm_training.ControlTask,
     "latent autoencoder": motionpcm_training.LatentAutoencoderTask,
-    "teacher": motionpcm_training.TeacherTask,
+    "latent denoiser": motionpcm_training.TeacherTask,
     "student": motionpcm_training.DistillationTask,
 }
-"""What trains each stage: a class of tasks with
+"""What trains each stage, which is called as the family of its network or as what stands on such a one: a class with
 
 - `settings` and `recipe`, the class of its settings and their name in `papers/<paper>/recipes.toml`;
 - `of(asked, split)`, the task on the clips of a split;
@@ -42,21 +40,16 @@ STAGES = {
 - `kept(asked, state, about)` of a task, what is kept of its last state.
 """
 
-_STAGE_OF = dict.fromkeys(text_models.DENOISERS, "denoiser") | {
-    AutoencoderConfig.family: "autoencoder", MeshAutoencoderConfig.family: "mesh autoencoder",
-    LatentAutoencoderConfig.family: "latent autoencoder", LatentDenoiserConfig.family: "teacher",
-}  # fmt: skip
-
 
 def stage_of(name: str) -> str:
     """Return the stage of `STAGES` that trains a preset, with or without a branch; ValueError for others' presets."""
     base, branch = preset_and_branch(name)
     preset = presets.find_preset(base)
-    if preset.family not in _STAGE_OF:
+    if preset.family not in STAGES:
         raise ValueError(f"{name} needs no captions: train it by a call of its own")
     if branch:
         return "control branch"
-    return "student" if preset.network.get("guidance_features") else _STAGE_OF[preset.family]
+    return "student" if preset.network.get("guidance_features") else preset.family
 
 
 def stands_on(name: str) -> str:
@@ -67,7 +60,7 @@ def stands_on(name: str) -> str:
         return preset.name
     if stage_of(name) != "student":
         return preset.latent
-    fits = lambda other: other.latent == preset.latent and stage_of(other.name) == "teacher"
+    fits = lambda other: other.latent == preset.latent and stage_of(other.name) == "latent denoiser"
     return next(name for name, other in presets.PRESETS.items() if fits(other))
 
 
