@@ -24,7 +24,9 @@ from f3amd_lib.measures.protocol import (
     evaluation_paths,
     measure_model,
     measure_real,
+    rollout_figures,
     summarise,
+    walk_protocol,
     windows_that_fit,
 )
 from f3amd_lib.measures.real_clips import sideways_share
@@ -99,9 +101,11 @@ def measured(generator, packed, prepared, classifier):
 TEXT_TABLES = ("text", "control", "reconstruction")
 TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]} | {"sampling_seconds", "LSD"}
 PROTOCOL_METRICS = (
-    set(METRICS) - TEXT_METRICS - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
+    set(METRICS)
+    - TEXT_METRICS
+    - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick", "foot_all_frames"}
 )
-"""All but what `measure walking` measures."""
+"""All but what `measure walking` and the queue of readings measure."""
 
 
 def one(rows: pd.DataFrame, metric: str, seed: int = 0) -> float:
@@ -133,26 +137,22 @@ def test_a_models_rows_are_tidy(measured):
     assert set(rounds["round"]) == {1, 2, 3}
 
 
-def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, generator, classifier, monkeypatch):
+def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, classifier, monkeypatch):
     """Of two styles and two seeds, with stand-ins that write down what they are given."""
     walked, judged, told = {}, [], []
 
     def rollout(paths, styles, *, seed):
         walked.update(paths=paths, styles=list(styles))
         motion = lambda number: types.SimpleNamespace(number=number)
-        return types.SimpleNamespace(window=32, motion=motion)
+        return types.SimpleNamespace(window=32, motion=motion, paths=paths)
 
-    walker = types.SimpleNamespace(trained=generator.trained, num_steps=1, rollout=rollout)
+    walker = types.SimpleNamespace(rollout=rollout)
     monkeypatch.setattr(module.real_clips, "style_floor", lambda packed, style: float(STYLES.index(style)))
-    monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {})
-    monkeypatch.setattr(module, "_style_means", lambda figures, styles: {})
+    monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {"IRD": 0.0})
     monkeypatch.setattr(module, "classify_windows", lambda classifier, motions, styles: told.append((motions, styles)))
     monkeypatch.setattr(module, "distribution_figures", lambda *given: {})
-    monkeypatch.setattr(module, "_diversities", lambda *given: {})
-    monkeypatch.setattr(module, "_rounds", lambda *given: None)
-    keys = {METRICS[name].key: 0.0 for name in ("x0_error_ratio", "seed_spread")}
-    monkeypatch.setattr(module, "noise_use", lambda *given, seed: keys)
-    measure_model(walker, packed, classifier, SMALL, None)
+    seeds = rollout_figures(walk_protocol(walker, packed, SMALL), packed, classifier, SMALL)
+    assert seeds == [{"IRD": 0.0}] * 2
     assert walked["styles"] == [*STYLES, *STYLES]
     assert [motion.number for motion, *_ in judged] == [0, 1, 2, 3]
     for number, (_, path, window, floor) in enumerate(judged):
@@ -170,7 +170,7 @@ def test_real_windows_are_training_windows_and_real_rows_are_not(packed, classif
     assert set(np.asarray(packed.clip_split)[known.clips]) == {0}
     counted = sum(len(features) for features in module.real_features(packed, classifier, STYLES, 32).values())
     assert 0 < counted <= len(known.features)
-    clips, labels = module._held_out_clips(packed, STYLES, 32)
+    clips, labels = module.held_out_clips(packed, STYLES, 32)
     assert set(np.asarray(packed.clip_split)[clips]) == {1, 2}
     assert [packed.styles[packed.clip_style[clip]] for clip in clips] == labels.tolist()
 

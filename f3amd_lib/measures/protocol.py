@@ -269,14 +269,85 @@ def _rows(figures: Mapping[str, float], **columns) -> list[dict]:
     ]
 
 
+def walk_protocol(generator: MotionGenerator, packed: PackedMotion, protocol: Protocol) -> Rollout:
+    """Walk every style with every seed of a protocol in one batch, seed after seed.
+
+    Seeds differ in path, noise and, as far as there are enough stored ones, starting pose.
+    """
+    seeds, styles = range(protocol.num_seeds), list(protocol.styles)
+    walks = [evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed) for seed in seeds]
+    return generator.rollout(sum(walks, []), styles * len(seeds), seed=protocol.path_seed)
+
+
+def rollout_figures(
+    rollout: Rollout, packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol
+) -> list[dict[str, float]]:
+    """Measure the walks of a protocol: a dict a seed, name in records -> mean over styles.
+
+    Args:
+      rollout: from `walk_protocol`.
+      packed, classifier, protocol: as for `measure_model`.
+    """
+    styles = list(protocol.styles)
+    floors = [real_clips.style_floor(packed, style) for style in styles]
+    real = real_features(packed, classifier, styles, rollout.window)
+    seeds = []
+    for seed in range(protocol.num_seeds):
+        places = range(seed * len(styles), (seed + 1) * len(styles))
+        motions = [rollout.motion(place) for place in places]
+        walks = zip(motions, [rollout.paths[place] for place in places], floors, strict=True)
+        figures = [_figures_without_classifier(motion, path, rollout.window, floor) for motion, path, floor in walks]
+        rng, seen = np.random.default_rng([protocol.path_seed, seed]), classify_windows(classifier, motions, styles)
+        scores = distribution_figures(seen, real, protocol.windows_per_style, rng)
+        seeds.append(_style_means(figures, styles) | scores)
+    return seeds
+
+
+def samples_of_one_start(
+    generator: MotionGenerator,
+    paths: Sequence[RootPath],
+    styles: Sequence[str],
+    *,
+    repeats: int,
+    seeds: tuple[int, int],
+) -> np.ndarray:
+    """Walk each style several times from one starting pose, with noise of its own each time.
+
+    Args:
+      generator: the model and its sampler.
+      paths, styles: one a style.
+      repeats: walks of each style.
+      seeds: of the starting poses, and of the noise.
+
+    Returns:
+      Joints, [styles, repeats, T, J, 3], metres.
+    """
+    poses = generator.rollout(paths, styles, seed=seeds[0]).history
+    again = lambda each: [one for one in each for _ in range(repeats)]
+    made = generator.rollout(again(paths), again(styles), seed=seeds[1], history=np.repeat(poses, repeats, axis=0))
+    joints = np.stack([made.motion(place).positions for place in range(len(made.styles))])
+    return joints.reshape(len(styles), repeats, *joints.shape[1:])
+
+
+def sample_figures(samples: np.ndarray, window: int) -> dict[str, float]:
+    """Diversity of Appendix C under one fixed condition a style: first round, and some rounds on.
+
+    `diversity` compares samples of the first round. `rollout_diversity` compares all frames of some rounds, each
+    walked from the sample's own history: it holds differences of phase.
+
+    Args:
+      samples: from `samples_of_one_start`.
+      window: frames of a round.
+    """
+    first, whole = distributions.diversity(samples[:, :, :window]), distributions.diversity(samples)
+    return {"diversity": first, "rollout_diversity": whole}
+
+
 def measure_model(
     generator: MotionGenerator, packed: PackedMotion, classifier: StyleClassifier, protocol: Protocol,
     held_out: WindowSet, *, name: str | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
     """Run the whole protocol for one model and number of steps.
-
-    All styles and seeds are walked in one batch. Seeds differ in path, noise and, as far as there
-    are enough stored ones, starting pose.
 
     Args:
       generator: the model and its sampler.
@@ -294,63 +365,20 @@ def measure_model(
       ValueError: if the classifier cannot tell styles apart, or does not know one of them.
     """
     require_telling_styles(classifier)
-    trained, seeds = generator.trained, range(protocol.num_seeds)
-    columns = {"model": name or trained.name, "window_frames": trained.config.window, "steps": generator.num_steps}
-    styles = list(protocol.styles)
-    real = real_features(packed, classifier, styles, trained.config.window)
-    paths = [evaluation_paths(packed, styles, protocol.num_frames, seed=protocol.path_seed + seed) for seed in seeds]
-    floors = {style: real_clips.style_floor(packed, style) for style in styles}
-    rollout = generator.rollout(
-        [path for walk in paths for path in walk], styles * protocol.num_seeds, seed=protocol.path_seed
-    )
-    rows = []
-    for seed in seeds:
-        motions = [rollout.motion(seed * len(styles) + place) for place in range(len(styles))]
-        walked = zip(motions, paths[seed], styles, strict=True)
-        each = [
-            _figures_without_classifier(motion, path, rollout.window, floors[style]) for motion, path, style in walked
-        ]
-        figures = _style_means(each, styles)
-        rng = np.random.default_rng([protocol.path_seed, seed])
-        seen = classify_windows(classifier, motions, styles)
-        figures |= distribution_figures(seen, real, protocol.windows_per_style, rng)
-        figures |= _diversities(generator, paths[seed], styles, protocol, seed)
+    window, styles, rows = generator.trained.config.window, list(protocol.styles), []
+    columns = {"model": name or generator.trained.name, "window_frames": window, "steps": generator.num_steps}
+    rollout = walk_protocol(generator, packed, protocol)
+    for seed, figures in enumerate(rollout_figures(rollout, packed, classifier, protocol)):
+        walked = rollout.paths[seed * len(styles) : (seed + 1) * len(styles)]
+        paths = [path.slice(0, min(_DIVERSITY_ROUNDS * window, protocol.num_frames)) for path in walked]
+        seeds = protocol.path_seed + seed, protocol.path_seed + seed + protocol.num_seeds
+        samples = samples_of_one_start(generator, paths, styles, repeats=protocol.num_diversity_seeds, seeds=seeds)
         use = noise_use(generator, held_out, seed=seed)
-        figures |= {name: use[METRICS[name].key] for name in ("x0_error_ratio", "seed_spread")}
-        rows += _rows(figures, **columns, varies="seed", seed=seed)
-    return pd.DataFrame(rows), _rounds(rollout, columns)
-
-
-def _diversities(
-    generator: MotionGenerator, paths: Sequence[RootPath], styles: Sequence[str], protocol: Protocol, seed: int
-) -> dict:
-    """Diversity of Appendix C under one fixed condition a style: first round, and some rounds on.
-
-    `diversity` compares samples of the first round. `rollout_diversity` lets them walk on, each
-    from its own history, and compares all frames of some rounds: it holds differences of phase.
-    """
-    window, repeats = generator.trained.config.window, protocol.num_diversity_seeds
-    frames = min(_DIVERSITY_ROUNDS * window, protocol.num_frames)
-    short = [path.slice(0, frames) for path in paths]
-    poses = generator.rollout(short, styles, seed=protocol.path_seed + seed).history
-    made = generator.rollout(
-        [path for path in short for _ in range(repeats)],
-        [style for style in styles for _ in range(repeats)],
-        seed=protocol.path_seed + seed + protocol.num_seeds,
-        history=np.repeat(poses, repeats, axis=0),
-    )
-    samples = np.stack([made.motion(k).positions for k in range(len(made.styles))])
-    samples = samples.reshape(len(styles), repeats, *samples.shape[1:])
-    return {
-        "diversity": distributions.diversity(samples[:, :, :window]),
-        "rollout_diversity": distributions.diversity(samples),
-    }
-
-
-def _rounds(rollout: Rollout, columns: dict) -> pd.DataFrame:
-    """Follow a rollout round by round (claim Q16: long rollouts drift)."""
-    table = by_round(rollout).melt(id_vars="round", var_name="metric")
-    return table.assign(**columns)[[*columns, "metric", "round", "value"]]
+        use = {name: use[METRICS[name].key] for name in ("x0_error_ratio", "seed_spread")}
+        rows += _rows(figures | sample_figures(samples, window) | use, **columns, varies="seed", seed=seed)
+    # Long rollouts drift (claim Q16): the same walks round by round.
+    rounds = by_round(rollout).melt(id_vars="round", var_name="metric").assign(**columns)
+    return pd.DataFrame(rows), rounds[[*columns, "metric", "round", "value"]]
 
 
 def measure_real(
