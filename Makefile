@@ -109,6 +109,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	rm -rf docs/_build
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
+	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_companion steer --overwrite --out docs/_build/html/steer.html
 	$(PYTHON) docs/check_links.py docs/_build/html
 

@@ -365,7 +365,7 @@ def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
     one, two = draw(tmp_path / "a" / "one.png"), draw(tmp_path / "two.png")
     assert one.read_bytes() == two.read_bytes()
     with Image.open(one) as image:
-        assert image.size == (1050, 540)
+        assert image.size == (770, 396)
         assert not {"Software", "Creation Time", "date"} & set(image.info)
     refused(r"written as \.png", draw, tmp_path / "figure.pdf")
 

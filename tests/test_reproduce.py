@@ -269,3 +269,19 @@ def test_the_course_runs_without_parameters_into_copies_of_its_own(checkout):
     assert news[0].startswith("01_first")
     with pytest.raises(reproduce.NotebookFailed, match="02_broken"):
         reproduce.run_course()
+
+
+def test_a_picture_of_one_name_and_bytes_stands_once(tmp_path):
+    ours, theirs = tmp_path / "synthetic/laptop", tmp_path / "bandai/laptop"
+    files = {
+        ours / "figures/02_paths.png": b"theory", theirs / "figures/02_paths.png": b"theory",
+        theirs / "figures/02_other.png": b"theory", ours / "figures/05_feet.png": b"a",
+        theirs / "figures/05_feet.png": b"b", theirs / "media/05_feet.png": b"b",
+        ours / "tables/02_paths.csv": b"theory",
+    }  # fmt: skip
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    gone = reproduce.keep_once([ours, theirs])
+    assert gone == [theirs / "figures/02_paths.png", theirs / "media/05_feet.png"]
+    assert {path for path in files if path.is_file()} == set(files) - set(gone)

@@ -2,8 +2,7 @@
 
 Texts that are made while it is built (`pages`), equations without a network (`copy_mathjax`),
 figures that say in words what they show (`describe_figures`) and open in full size
-(`enlarge_figures`), docstrings that are not meant as reStructuredText (`plain_docstring`), and
-player pages that are kept as they are (`copy_players`).
+(`enlarge_figures`), and docstrings that are not meant as reStructuredText (`plain_docstring`).
 """
 
 from __future__ import annotations
@@ -15,25 +14,13 @@ import shutil
 from pathlib import Path
 
 from docutils import nodes
-from pages import INSERT, ROOT, first_sentence, insert, plain_lines, player_address, players
+from pages import INSERT, ROOT, first_sentence, insert, plain_lines
 from sphinx.errors import ExtensionError
 from sphinx.util.osutil import relative_uri
 
 # The file as MathJax 3.2.2 published it; a package carries it, and any other content is refused.
 MATHJAX_PACKAGE = "sphinx-mathjax-offline"
 MATHJAX_SHA256 = "a4354ff94fd868aea0cc6eaaa79a57fda0588646fc46ee3700a349ee0a11cbe6"
-
-
-# Players ------------------------------------------------------------------------------------------
-
-
-def copy_players(app, exception) -> None:
-    """Put the players into the site as they are: each is a page of its own."""
-    if exception is None and app.builder.format == "html":
-        for path in players():
-            target = Path(app.outdir) / player_address(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
 
 
 # Equations ----------------------------------------------------------------------------------------
@@ -165,6 +152,5 @@ def setup(app):
     app.connect("doctree-resolved", describe_figures)
     app.connect("doctree-resolved", enlarge_figures)
     app.connect("env-updated", forget_sourceless)
-    app.connect("build-finished", copy_players)
     app.connect("build-finished", remove_templates)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -21,6 +21,7 @@ import textwrap
 from pathlib import Path, PurePosixPath
 
 import nbformat
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -158,21 +159,19 @@ def moving_markdown(dataset: str = "", *, with_credit: bool = True) -> str:
     items = []
     for folder in result_folders(dataset or "*"):
         credit = credit_line(folder) if with_credit else label_of(folder)
-        for path in sorted(path for path in (folder / "media").glob("*") if path.suffix in (".gif", ".webp", ".html")):
+        moving = [path for path in (folder / "media").glob("*") if path.suffix in (".gif", ".webp")]
+        moving += [folder / "figures" / f"{name}.png" for where, name in players() if where == folder]
+        for path in sorted(moving, key=lambda path: path.name):
             notebook = notebooks_by_number().get(path.name[:2])
             source = f" From [notebook {path.name[:2]}](/{relative(notebook)})." if notebook else ""
             title = f"{words(path.stem).capitalize()} ({folder.parent.name})"
-            posters = (path.with_suffix(".png"), folder / "figures" / f"{path.stem}.png")
-            if path.suffix != ".html":
+            if path.suffix != ".png":
                 caption = f"**{title}.**{source} {credit}"
                 items.append(picture(path, f"Animation: {title}", caption, classes="moving"))
             else:
-                target = f"../../{player_address(path)}"
+                target = f"../../{player_address(folder, path.stem)}"
                 caption = f'<a class="player" href="{target}">▶ Play: {title}</a>.{source} {credit}'
-                poster = next((file for file in posters if file.is_file()), None)
-                if poster is None:
-                    raise ValueError(f"{relative(path)}: a player needs a picture, {posters[0].name}, beside it")
-                items.append(picture(poster, f"Play: {title}", caption, target=target))
+                items.append(picture(path, f"Play: {title}", caption, target=target))
     return grid(items) if items else ""
 
 
@@ -238,8 +237,8 @@ def read_notebook(text: str):
             if file:
                 content = file.read_bytes()
                 output.data["image/png"] = base64.b64encode(content).decode()
-                inches = int.from_bytes(content[16:20], "big") / 150  # a PNG's width, at the dots an inch of results
-                about["width"] = round(96 * inches)
+                with Image.open(file) as figure:
+                    about["width"] = round(96 * figure.width / figure.info["dpi"][0])
     return notebook
 
 
@@ -293,14 +292,19 @@ def launch_options(address: str) -> dict:
 # Players ------------------------------------------------------------------------------------------
 
 
-def players() -> list[Path]:
-    """Return the self-contained player pages among the results."""
-    return sorted((ROOT / "paper_figures").glob("*/*/media/*.html"))
+PLAYERS = ("14_crowd", "14_walker")
+"""Figures with a player page behind them, which `docs/players.py` writes."""
 
 
-def player_address(path: Path) -> PurePosixPath:
+def players() -> list[tuple[Path, str]]:
+    """Return (folder of results, name) of each player page of the site."""
+    return [(folder, name) for folder in result_folders() for name in PLAYERS
+            if (folder / "figures" / f"{name}.png").is_file()]  # fmt: skip
+
+
+def player_address(folder: Path, name: str) -> PurePosixPath:
     """Return where a player lies in the built site, from its root."""
-    return PurePosixPath("players", *path.relative_to(ROOT / "paper_figures").parts)
+    return PurePosixPath("players", *folder.relative_to(ROOT / "paper_figures").parts, f"{name}.html")
 
 
 # Docstrings ---------------------------------------------------------------------------------------

@@ -1,0 +1,53 @@
+"""Write the player pages of the site: a walker of each data set's crowd, and a crowd by the weights that ship.
+
+    python docs/players.py docs/_build/html
+
+A walker is read from the results (`media/14_walker.bvh`); a crowd is made anew, in about a minute on two cores.
+Pages that the site links to are those of `pages.PLAYERS`.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
+
+import pages  # noqa: E402 (the line above is what finds it)
+
+from f3amd_companion.__main__ import main as command  # noqa: E402
+from f3amd_companion.serving.player import write_player  # noqa: E402
+from f3amd_lib.motion.bvh import read_bvh  # noqa: E402
+
+CROWD = ("--characters", "64", "--seconds", "8", "--plan", "--pictures")
+
+
+def write_walker(folder: Path, page: Path) -> None:
+    """Write the page of the walker that a run of notebook 14 left among its results."""
+    walker = read_bvh(folder / "media" / "14_walker.bvh").replace(name=f"One of the crowd, data {folder.parent.name}")
+    write_player(page, walker, strip=False, credit=pages.credit_line(folder))
+
+
+def write_crowd(folder: Path, page: Path) -> None:
+    """Write the page of a crowd that the shipped weights of the data set make."""
+    with tempfile.TemporaryDirectory() as made:
+        status = command(["crowd", "--data", folder.parent.name, *CROWD, "--out", f"{made}/crowd"])
+        if status:
+            raise SystemExit(f"{page.name}: no crowd could be made (status {status})")
+        page.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(f"{made}/crowd.html", page)
+
+
+WRITERS = {"14_crowd": write_crowd, "14_walker": write_walker}
+
+
+def main(site: Path) -> None:
+    for folder, name in pages.players():
+        WRITERS[name](folder, site / pages.player_address(folder, name))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
