@@ -1,0 +1,57 @@
+"""`scripts/gpu_package.py`: what a GPU elsewhere needs, whole and small enough."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+from builders import refused
+
+from f3amd_lib.ground.profiles import repository_root
+
+ROOT = repository_root()
+
+
+@pytest.fixture
+def gpu_package():
+    spec = importlib.util.spec_from_file_location("gpu_package", ROOT / "scripts" / "gpu_package.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(gpu_package, tmp_path, cache_dir, capsys):
+    folder = tmp_path / "away"
+    words = [str(folder), "--package", "A", "--minutes", "9"]
+    assert gpu_package.main(words) == 2 and "no packed clips of Bandai" in capsys.readouterr().err
+    packed = cache_dir / "bandai-0123456789abcdef-v1.npz"
+    packed.parent.mkdir(parents=True)
+    packed.write_bytes(b"no clips")
+    assert gpu_package.main(words) == 0
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"run.sh", "pyproject.toml", packed.name, "f3amd_lib/papers/f3amd/gpu_plan.toml"} <= names
+    assert not [name for name in names if "pretrained/" in name or "__pycache__" in name]
+    subprocess.run(["bash", "-n", "run.sh"], cwd=folder, check=True)
+    # Another Python is there: the one of the tests, behind the name that the script calls.
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python3").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (tmp_path / "bin" / "python3").chmod(0o755)
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "XLA_FLAGS")}
+    environment["PATH"] = f"{tmp_path / 'bin'}{os.pathsep}{environment['PATH']}"
+    script = (folder / "run.sh").read_text(encoding="utf-8")
+    assert "autotune_level" not in script.split("export", 1)[1]
+    (folder / "run.sh").write_text(script.replace("export XLA_FLAGS", "UNUSED"), encoding="utf-8")  # no GPU here
+    ran = subprocess.run(["bash", "run.sh"], cwd=folder, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 2 and f"{packed.name}: " in ran.stderr, ran.stderr  # all it lacks are clips
+
+
+def test_what_cannot_be_laid_out_is_refused(gpu_package, tmp_path, monkeypatch):
+    packed = tmp_path / "bandai.npz"
+    packed.write_bytes(b"0" * 2_000_000)
+    refused("package 'a'", gpu_package.lay_out, tmp_path / "x", "a", 9.0, packed)
+    refused("is there already", gpu_package.lay_out, tmp_path, "A", 9.0, packed)
+    refused("no such file", gpu_package.lay_out, tmp_path / "x", "A", 9.0, tmp_path / "none.npz")
+    monkeypatch.setattr(gpu_package, "MOST_BYTES", 1_000_000)
+    refused(r"MB, more than 1; the largest: bandai.npz 2.0 MB", gpu_package.lay_out, tmp_path / "x", "A", 9.0, packed)
+    assert not (tmp_path / "x").exists()
