@@ -137,5 +137,5 @@ def test_impossible_asks_are_refused(call, message):
 
 def test_a_crowd_that_finds_no_paths_however_far_it_is_spread_is_refused(monkeypatch):
     position, yaw = two_who_meet()
-    monkeypatch.setattr(crowd_planning, "_untangle", lambda wanted, min_distance, fps: None)
+    monkeypatch.setattr(crowd_planning, "_untangle", lambda wanted, min_distance: None)
     refused("2 characters found no paths .* however far they were spread", keep_apart, position, yaw)

@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import refused
+from steering_oracle import Steering, Target, first_pose, move_target
 
-from f3amd_companion.serving import npm_packages, steer
+from f3amd_companion.serving import steer
 from f3amd_companion.serving.foot_locking import leg_chains
-from f3amd_companion.serving.npm_packages import package_file
 from f3amd_companion.serving.online_feet import lock_frame, start_feet
 from f3amd_companion.serving.onnx_export import model_card
-from f3amd_companion.serving.steer import steer_page, write_steer
-from f3amd_companion.serving.steering import Steering, Target, first_pose, move_target
+from f3amd_companion.serving.steer import package_file, steer_page, write_steer
 from f3amd_companion.serving.web_page import FOLDER
 from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
@@ -132,8 +131,8 @@ def test_rounds_under_way_are_alike_for_the_same_noise(tmp_path, trained):
 
     generator = SimpleNamespace(trained=trained, sample_window=sample_window)
     headings, places = [0.4, -2.0], [(1.0, 0.5), (-1.0, 3.0)]
-    poses = [first_pose(trained, "calm", (0.0, 0.0), 0.0, 1.0) for _ in places]
-    starts = [first_pose(trained, "calm", place, yaw, 1.0) for place, yaw in zip(places, headings, strict=True)]
+    poses = [first_pose(trained, "calm", (0.0, 0.0), 0.0) for _ in places]
+    starts = [first_pose(trained, "calm", place, yaw) for place, yaw in zip(places, headings, strict=True)]
     steering = Steering(generator, np.stack(starts), headings, hop=3, blend_frames=2)
     noise = np.random.default_rng(1).standard_normal((3, 2, builders.WINDOW, builders.CHANNELS)).astype(np.float32)
     speed, direction, style = [1.2, 0.0], [2.0, 0.0], np.array([[0.25, 0.75], [1.0, 0.0]])
@@ -292,11 +291,11 @@ def test_another_bundle_or_sampler_is_refused(trained, monkeypatch):
 
 
 def test_a_package_that_is_not_as_pinned_is_refused_with_its_place(monkeypatch, tmp_path):
-    monkeypatch.setattr(npm_packages.pooch, "os_cache", lambda name: tmp_path)
+    monkeypatch.setattr(steer.pooch, "os_cache", lambda name: tmp_path)
     (tmp_path / "three-0.187.0.tgz").write_bytes(b"something else")
 
     def offline(*_, **__):
         raise OSError("no network")
 
-    monkeypatch.setattr(npm_packages.pooch.core, "stream_download", offline)
+    monkeypatch.setattr(steer.pooch.core, "stream_download", offline)
     refused("put that file at .*three-0.187.0.tgz", package_file, "three", "build/three.module.js")

@@ -4,10 +4,12 @@ import builders
 import jax
 import numpy as np
 import pytest
+from steering_oracle import FPS, MAX_TURN, Steering, Target, first_pose, move_target
 
-from f3amd_companion.serving.steering import FPS, MAX_TURN, Steering, Target, first_pose, move_target, usual_pace
+from f3amd_companion.serving.steer import usual_walk
 from f3amd_lib.rollout.blending import blend_seams
 from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.rollout.start_poses import pose_speed
 
 STILL = Target(np.zeros((1, 2)), np.zeros(1), np.zeros(1), np.zeros(1))
 
@@ -18,7 +20,7 @@ def generator():
 
 
 def start(generator, batch=2, **settings):
-    poses = [first_pose(generator.trained, "calm", (k, 0.5), 0.3, 1.0) for k in range(batch)]
+    poses = [first_pose(generator.trained, "calm", (k, 0.5), 0.3) for k in range(batch)]
     return Steering(generator, np.stack(poses), np.full(batch, 0.3), **settings)
 
 
@@ -89,11 +91,8 @@ def test_characters_of_a_batch_do_not_hear_of_each_other(generator):
     np.testing.assert_allclose(together[:1], alone, atol=1e-5)
 
 
-def test_a_first_pose_lies_and_faces_where_it_shall(generator):
-    trained = generator.trained
-    pose = first_pose(trained, "calm", (2.0, -1.0), 0.0, 1.0)
-    np.testing.assert_allclose(pose[-1, [0, 2]], (2.0, -1.0))
-    turned = first_pose(trained, "calm", (2.0, -1.0), np.pi / 2, 1.0)
-    step, turned_step = pose[-1] - pose[0], turned[-1] - turned[0]
-    np.testing.assert_allclose(turned_step[[0, 2]], [step[2], -step[0]], atol=1e-6)
-    assert 0.3 < usual_pace(trained, "calm") < 3.0
+def test_a_style_starts_about_as_fast_as_it_usually_walks(generator):
+    starts = np.asarray(generator.trained.start_poses["calm"], np.float64)
+    pace, pose = usual_walk(generator.trained, "calm")
+    gap = np.abs(FPS * pose_speed(starts) - pace)
+    assert 0.3 < pace < 3.0 and np.abs(FPS * pose_speed(pose[None])[0] - pace) == gap.min()

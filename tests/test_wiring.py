@@ -36,6 +36,7 @@ from f3amd_lib.measures import real_clips
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.rollout.start_poses import starting_poses
 from f3amd_lib.training import denoising_task as task_module
 from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, advance, held_out_terms, initial_state
@@ -270,6 +271,11 @@ class Told:
         return frames.at[..., 3:].set(pose)
 
 
+def first(style, members, counts):
+    """Of the starting poses that fit, the first for everybody."""
+    return np.zeros(len(members), int)
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_everybody_in_a_rollout_has_their_own_style_and_path(monkeypatch, together):
     trained = dataclasses.replace(tiny_trained(), normaliser=Normaliser.identity(CHANNELS))
@@ -282,7 +288,7 @@ def test_everybody_in_a_rollout_has_their_own_style_and_path(monkeypatch, togeth
     else:  # a key each, as in a crowd
         trained_index = [trained.style_index(style) for style in styles]
         position, yaw = (np.stack([getattr(path, name) for path in paths]) for name in ("position", "yaw"))
-        history = generator._starting_poses(styles, np.zeros((4, 2)), yaw[:, 0], np.ones(4), 0)
+        history = starting_poses(trained, trained_index, np.zeros((4, 2)), yaw[:, 0], np.ones(4), first)
         keys = jax.random.split(jax.random.key(0), 4)
         frames = generator.generate(position, yaw, np.array(trained_index), history, keys)
     np.testing.assert_allclose(frames[..., 1], np.array([1, 2, 2, 1])[:, None] * np.ones(2 * WINDOW))
@@ -292,8 +298,7 @@ def test_everybody_in_a_rollout_has_their_own_style_and_path(monkeypatch, togeth
 
 def test_each_style_starts_from_a_pose_of_its_own():
     trained = tiny_trained()
-    generator = MotionGenerator(trained, num_steps=1)
-    poses = generator._starting_poses(["proud", "calm"], np.zeros((2, 2)), np.zeros(2), np.full(2, 0.04), 0)
+    poses = starting_poses(trained, [1, 0], np.zeros((2, 2)), np.zeros(2), np.full(2, 0.04), first)
     for pose, style in zip(poses, ("proud", "calm"), strict=True):
         heights = [start[:, 1] for start in trained.start_poses[style]]
         assert min(np.abs(pose[:, 1] - height).max() for height in heights) < 1e-5

@@ -8,7 +8,7 @@ import numpy as np
 from f3amd_companion.measuring.literal_update import Walks, walk_conditions
 from f3amd_lib.data.features import path_condition
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.rollout.rollout import pose_speed
+from f3amd_lib.rollout.start_poses import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
 

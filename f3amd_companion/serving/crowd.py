@@ -32,24 +32,22 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, keep_apart
-from f3amd_lib.data.features import center_window, motion_from_frames, split_frames, turn_frames
+from f3amd_companion.serving.crowd_planning import FPS, MIN_DISTANCE, keep_apart
+from f3amd_lib.data.features import motion_from_frames, split_frames
 from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
-from f3amd_lib.rollout.rollout import MotionGenerator, as_fast_as, path_start, pose_speed
+from f3amd_lib.rollout.rollout import MotionGenerator, path_start, pose_speed
+from f3amd_lib.rollout.start_poses import path_start, pose_speed, starting_poses
+from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton
 
 PATHS = tuple(name for name in NAMES if name != "complex")
 """Names that the paths of a crowd are drawn from: those that face where they go."""
 
 FORMAT = "f3amd-crowd-1"
 
-_ARRAYS = {"root": "<f4", "rotations": "<f2", "path": "<f4", "styles": "<i4"}
-"""File stem -> type of its numbers."""
-
-_FPS = 30.0
 # CPU time a character on two cores with 2 MiB of L2 (F3AMD-FNO-96, one step, 32 frames): least at
 # 128; 64 costs 8 % more, 512 15 %, 4096 38 %.
 _CHUNK = 128
@@ -77,8 +75,8 @@ _POSES, _WAYS = range(2)  # purposes of draws
 @functools.lru_cache(maxsize=4)
 def _templates(names: tuple[str, ...], num_frames: int, seed: int):
     """Return named paths long enough to enter late: positions [N, L, 2] and yaw [N, L]."""
-    length = num_frames + round(_TEMPLATE_SECONDS * _FPS)
-    made = [named_path(name, length, speed=_TEMPLATE_SPEED, seed=seed, fps=_FPS) for name in names]
+    length = num_frames + round(_TEMPLATE_SECONDS * FPS)
+    made = [named_path(name, length, speed=_TEMPLATE_SPEED, seed=seed, fps=FPS) for name in names]
     return np.stack([path.position for path in made]), np.stack([path.yaw for path in made])
 
 
@@ -150,8 +148,8 @@ def plan_crowd(
     if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
         raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
     paths = crowd_paths(range(num_characters), np.broadcast_to(pace, (num_characters,)), num_frames, seed)
-    position, yaw = keep_apart(*paths, min_distance=min_distance, fps=_FPS)
-    return tuple(RootPath(line, facing, _FPS) for line, facing in zip(position, yaw, strict=True))
+    position, yaw = keep_apart(*paths, min_distance=min_distance)
+    return tuple(RootPath(line, facing, FPS) for line, facing in zip(position, yaw, strict=True))
 
 
 def default_chunk(num_frames: int, channels: int) -> int:
@@ -261,7 +259,7 @@ def generate_crowd(
         "format": FORMAT,
         "num_characters": num_characters,
         "num_frames": num_frames,
-        "fps": _FPS,
+        "fps": FPS,
         "seed": seed,
         "chunk": chunk,
         "paths": PATHS,
@@ -302,7 +300,7 @@ def _generate(generator, settings, in_turn, out: Path, overwrite, finished_too, 
 
     if settings["min_distance"] is not None:
         _, _, *wanted = asked_of(range(num_characters))
-        planned = keep_apart(*wanted, min_distance=settings["min_distance"], fps=_FPS)
+        planned = keep_apart(*wanted, min_distance=settings["min_distance"])
     beginning = asked_of(range(chunk))
     # In tenths of a millimetre and milliradian: last bits of the same path may differ between machines.
     tenths = np.rint(1e4 * np.column_stack([array[0] for array in beginning[2:]])).astype("<i8")
@@ -313,14 +311,17 @@ def _generate(generator, settings, in_turn, out: Path, overwrite, finished_too, 
     if finished == 0:
         _write_settings(out, settings, 0)
         _lay_out(out, settings)
-    for name in _ARRAYS:
+    for name in _layout(settings):
         _open_array(out, name, settings)
     noise = jax.random.key(seed)
     with tqdm(total=num_characters, initial=finished, unit=" characters", disable=not progress) as bar:
         for first in range(finished, num_characters, chunk):
             characters = range(first, min(first + chunk, num_characters))
             style_index, pose, position, yaw = asked_of(characters) if first else beginning
-            history = _starting_poses(generator, style_index, position, yaw, pose)
+            start = path_start(position)
+            speed = np.linalg.norm(position[:, 0] - start, axis=-1)
+            pick = lambda style, members, counts, draw=pose: (draw[members] * counts).astype(int)
+            history = starting_poses(trained, style_index, start, yaw[:, 0], speed, pick).astype(np.float32)
             # The last chunk is filled up with its last character, so that nothing compiles twice.
             number = np.minimum(np.arange(first, first + chunk), characters.stop - 1)
             row, keys = number - first, jax.vmap(jax.random.fold_in, (None, 0))(noise, number)
@@ -332,7 +333,7 @@ def _generate(generator, settings, in_turn, out: Path, overwrite, finished_too, 
                 raise ArithmeticError(f"{what}; its weights or its noise levels are broken")
             root, rotations = split_frames(frames)
             path = np.concatenate([position, yaw[..., None]], axis=-1)
-            for name, values in zip(_ARRAYS, (root, rotations, path, style_index), strict=True):
+            for name, values in zip(_layout(settings), (root, rotations, path, style_index), strict=True):
                 _write_rows(out, name, settings, first, values)
             _write_settings(out, settings, characters.stop)
             bar.update(len(characters))
@@ -360,7 +361,7 @@ def read_crowd(folder) -> Crowd:
         raise ValueError(f"{folder}: {what}; make the same call again and it goes on")
     with errors_name(folder / _SETTINGS):
         skeleton = described_skeleton(settings, settings["offsets"])
-    return Crowd(settings, skeleton, *(_open_array(folder, name, settings) for name in _ARRAYS))
+    return Crowd(settings, skeleton, *(_open_array(folder, name, settings) for name in _layout(settings)))
 
 
 def _whole(name: str, value, least: int) -> int:
@@ -381,25 +382,9 @@ def _paces(generator: MotionGenerator, characters: range, style_index, seed: int
     pace = np.empty(len(characters))
     for style in np.unique(style_index):
         members = style_index == style
-        speeds = _FPS * pose_speed(trained.start_poses[trained.styles[style]])
+        speeds = FPS * pose_speed(trained.start_poses[trained.styles[style]])
         pace[members] = speeds[(which[members] * len(speeds)).astype(int)]
     return np.maximum(pace, _SLOWEST), pose
-
-
-def _starting_poses(generator: MotionGenerator, style_index, position, yaw, draw) -> np.ndarray:
-    """Return histories [n, H, C]: poses about as fast as the paths, moved to where those start."""
-    trained, config = generator.trained, generator.trained.config
-    start = path_start(position)
-    speed = np.linalg.norm(position[:, 0] - start, axis=-1)
-    poses = np.empty((len(start), config.num_history, config.channels))
-    for style in np.unique(style_index):
-        members = style_index == style
-        choices = trained.start_poses[trained.styles[style]]
-        fitting = as_fast_as(choices, speed[members])
-        number = (draw[members] * fitting.sum(axis=1)).astype(int)
-        # The first place where more than `number` fitting poses have been passed.
-        poses[members] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
-    return center_window(turn_frames(poses, yaw[:, 0]), -start).astype(np.float32)
 
 
 _SETTINGS = "crowd.json"
@@ -455,18 +440,22 @@ def _look_into(out: Path, settings: dict, overwrite: bool, finished_too: bool) -
     return there["num_finished"], there.get(_FIRST_PATH)
 
 
-def _shape(name: str, settings: dict) -> tuple[int, ...]:
-    """Return the shape of an array of all characters."""
+def _layout(settings: dict) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Return file stem -> type and shape of its numbers."""
     count, frames = settings["num_characters"], settings["num_frames"]
-    last = {"root": (frames, 3), "rotations": (frames, len(settings["joints"]), 6), "path": (frames, 3), "styles": ()}
-    return count, *last[name]
+    return {
+        "root": ("<f4", (count, frames, 3)),
+        "rotations": ("<f2", (count, frames, len(settings["joints"]), 6)),
+        "path": ("<f4", (count, frames, 3)),
+        "styles": ("<i4", (count,)),
+    }
 
 
 def _check_room(out: Path, settings: dict) -> None:
     """Raise ValueError if the disk lacks room for what is not there yet."""
-    needed = sum(np.dtype(dtype).itemsize * math.prod(_shape(name, settings)) for name, dtype in _ARRAYS.items())
-    files = [out / f"{name}.npy" for name in _ARRAYS]
-    needed -= sum(path.stat().st_size for path in files if path.exists())
+    layout = _layout(settings)
+    needed = sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
+    needed -= sum(path.stat().st_size for path in (out / f"{name}.npy" for name in layout) if path.exists())
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
@@ -479,9 +468,9 @@ def _lay_out(out: Path, settings: dict) -> None:
 
     Their room is taken at once: a disk that is full halfway would kill a process that writes to a map.
     """
-    for name, dtype in _ARRAYS.items():
+    for name, (dtype, shape) in _layout(settings).items():
         path = out / f"{name}.npy"
-        np.lib.format.open_memmap(path, "w+", dtype, _shape(name, settings))
+        np.lib.format.open_memmap(path, "w+", dtype, shape)
         with path.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
 
@@ -497,7 +486,7 @@ def _open_array(folder: Path, name: str, settings: dict, mode: str = "r") -> np.
         # What numpy and Python's own tokenizer raise over damaged bytes is no closed list.
         except Exception as error:
             raise ValueError(f"is not a whole array ({error}); the crowd has to be made anew") from error
-        if (array.shape, array.dtype) != (_shape(name, settings), np.dtype(_ARRAYS[name])):
+        if (array.dtype, array.shape) != _layout(settings)[name]:
             raise ValueError(f"holds {array.dtype} {array.shape}, which is not what {_SETTINGS} says")
         return array
 

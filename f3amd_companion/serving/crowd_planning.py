@@ -20,10 +20,11 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from f3amd_lib.ground.arrays import check_positive, finite_array
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.root_paths import tangent_yaw
 from f3amd_lib.motion.rotations import wrap_angle
 
+FPS = 30.0
 MIN_DISTANCE = 0.8
 """Metres between two roots by default: shoulders of 0.45 m and a swinging arm."""
 
@@ -60,16 +61,13 @@ def closest_approach(position) -> np.ndarray:
     return np.array([cKDTree(frame).query(frame, k=2)[0][:, 1].min() for frame in frames])
 
 
-def keep_apart(
-    position, yaw, *, min_distance: float = MIN_DISTANCE, fps: float = 30.0
-) -> tuple[np.ndarray, np.ndarray]:
+def keep_apart(position, yaw, *, min_distance: float = MIN_DISTANCE) -> tuple[np.ndarray, np.ndarray]:
     """Bend and spread paths until all characters keep a distance at every frame.
 
     Args:
-      position: paths that know nothing of each other, [B, F, 2], metres.
+      position: paths that know nothing of each other, [B, F, 2], metres, 30 frames a second.
       yaw: their facing, [B, F], radians; turned with the line.
       min_distance: metres between any two roots at any frame.
-      fps: frames per second.
 
     Returns:
       (position [B, F, 2], yaw [B, F]), float64; the same for the same input. Every character's
@@ -84,7 +82,6 @@ def keep_apart(
     yaw = finite_array("yaw", yaw, position.shape[:2])
     if not (np.isfinite(min_distance) and min_distance > 0):
         raise ValueError(f"min_distance must be above 0 metres, got {min_distance}")
-    check_positive("fps", fps)
     if closest_approach(position).min() >= min_distance:
         return position.copy(), yaw.copy()
     start = position[:, 0]
@@ -92,25 +89,25 @@ def keep_apart(
     places, walked = start - middle, position - position[:, :1]
     for spread in _SPREADS[2 if len(position) > _LARGE else 0 :]:
         wanted = middle + spread * places[:, None] + walked
-        bent = _untangle(wanted, min_distance, fps)
+        bent = _untangle(wanted, min_distance)
         if bent is not None:
-            return bent, _turned(wanted, bent, yaw, fps)
+            return bent, _turned(wanted, bent, yaw)
     what = f"{len(position)} characters found no paths {min_distance:g} m apart"
     raise ValueError(f"{what} however far they were spread; do some of them start in the same place?")
 
 
-def _untangle(wanted: np.ndarray, min_distance: float, fps: float) -> np.ndarray | None:
+def _untangle(wanted: np.ndarray, min_distance: float) -> np.ndarray | None:
     """Bend paths until they keep apart at every frame and speeds fit; None if that does not end."""
     bent = wanted.copy()
     as_a_whole = np.zeros(len(wanted), bool)
-    half = max(2, round(_HALF_WIDTH * fps))
+    half = max(2, round(_HALF_WIDTH * FPS))
     bump = np.cos(0.5 * np.pi * np.arange(-half, half + 1) / (half + 1)) ** 2
     for _ in range(_ROUNDS):
         pairs, frames = _conflicts(bent, min_distance, _EVERY)
         if not len(pairs):
             pairs, frames = _conflicts(bent, min_distance)
         if not len(pairs):
-            outside = ~_speeds_fit(wanted, bent, fps) & ~as_a_whole
+            outside = ~_speeds_fit(wanted, bent) & ~as_a_whole
             if not outside.any():
                 return bent
             bent[outside] = wanted[outside]
@@ -174,10 +171,10 @@ def _conflicts(position: np.ndarray, min_distance: float, every: int = 1):
     return np.column_stack([one, other])[first], frames[first]
 
 
-def _speeds_fit(wanted: np.ndarray, bent: np.ndarray, fps: float) -> np.ndarray:
+def _speeds_fit(wanted: np.ndarray, bent: np.ndarray) -> np.ndarray:
     """Tell whose bent path is walked within `SPEED_BOUNDS` of the speeds that were wanted, [B]."""
-    asked = fps * np.linalg.norm(np.diff(wanted, axis=1), axis=-1)
-    walked = fps * np.linalg.norm(np.diff(bent, axis=1), axis=-1)
+    asked = FPS * np.linalg.norm(np.diff(wanted, axis=1), axis=-1)
+    walked = FPS * np.linalg.norm(np.diff(bent, axis=1), axis=-1)
     slowest, fastest = SPEED_BOUNDS
     greatest = asked.max(axis=1, keepdims=True, initial=0.0)
     tolerance = 1e-9
@@ -186,11 +183,11 @@ def _speeds_fit(wanted: np.ndarray, bent: np.ndarray, fps: float) -> np.ndarray:
     return ~(slow | fast)
 
 
-def _turned(wanted: np.ndarray, bent: np.ndarray, yaw: np.ndarray, fps: float) -> np.ndarray:
+def _turned(wanted: np.ndarray, bent: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Turn the facing as the line was turned; paths that were not bent keep theirs."""
     turned = yaw.copy()
     for character in np.flatnonzero((wanted != bent).any(axis=(1, 2))):
         change = tangent_yaw(bent[character]) - tangent_yaw(wanted[character])
         change = np.unwrap(wrap_angle(change))
-        turned[character] += gaussian_filter1d(change, _SMOOTH_TURN * fps, mode="nearest")
+        turned[character] += gaussian_filter1d(change, _SMOOTH_TURN * FPS, mode="nearest")
     return turned

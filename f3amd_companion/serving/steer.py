@@ -3,6 +3,9 @@
 `steer_page` makes one HTML file with everything in it: the weights as ONNX, ONNX Runtime for WebAssembly, three.js, and
 our own modules (`serving/web`). All of it is gzipped and in base64, so that the page works from a disk and asks nothing
 of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
+
+Runtime and three.js are npm packages of fixed versions, fetched once from the public registry, checked by sha512 and
+kept in the cache; npm itself is not needed.
 """
 
 import base64
@@ -10,22 +13,23 @@ import gzip
 import html
 import re
 import string
+import tarfile
 from pathlib import Path
 
 import jax
 import numpy as np
+import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
-from f3amd_companion.serving.npm_packages import package_credit, package_file
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.steering import first_pose, usual_pace
 from f3amd_companion.serving.web_page import FOLDER, page_json
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
+from f3amd_lib.rollout.start_poses import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
-_PAGE = read_toml(Path(__file__).with_name("steer.toml"))
+_PAGE, _PINNED = (read_toml(Path(__file__).with_name(name)) for name in ("steer.toml", "npm_packages.toml"))
 MODULES = _PAGE["modules"]
 """Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
 
@@ -61,8 +65,7 @@ def steer_page(
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
     if program is None:
         program = denoiser_program(trained.network(), weights=weights)
-    paces = {style: usual_pace(trained, style) for style in trained.styles}
-    poses = [first_pose(trained, style, (0.0, 0.0), 0.0, pace) for style, pace in paces.items()]
+    paces, poses = zip(*(usual_walk(trained, style) for style in trained.styles), strict=True)
     legs = _legs(trained.skeleton)
     files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
     files |= {
@@ -78,7 +81,7 @@ def steer_page(
         "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
         "head": head_and_parent(trained.skeleton),
-        "paces": list(paces.values()),
+        "paces": paces,
         "colors": LIMB_COLORS,
         "marks": _MARKS,
         "first_styles": _first_styles(trained.styles),
@@ -119,6 +122,47 @@ def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **option
     """
     path = named_file(path, ".html", "pages")
     return write_whole(path, steer_page(trained, **options), overwrite=overwrite)
+
+
+def package_file(package: str, path: str) -> bytes:
+    """Return a file of a pinned package.
+
+    Args:
+      package: a name of `npm_packages.toml`.
+      path: inside the package, such as "build/three.module.js".
+
+    Raises:
+      ValueError: if it is not in the cache and cannot be fetched, or is not what was pinned.
+    """
+    pinned = _PINNED[package]
+    name = f"{package}-{pinned['version']}.tgz"
+    url, folder = f"https://registry.npmjs.org/{package}/-/{name}", Path(pooch.os_cache("f3amd"))
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        archive = pooch.retrieve(url, f"sha512:{pinned['sha512']}", fname=name, path=folder)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{url}: not fetched ({error}); put that file at {folder / name} yourself") from None
+    with tarfile.open(archive) as files:
+        return files.extractfile(f"package/{path}").read()
+
+
+def package_credit(package: str) -> str:
+    """Return name, version, holder and licence of a pinned package, for the page that carries it."""
+    pinned = _PINNED[package]
+    return f"{package} {pinned['version']}: {pinned['about']}, {pinned['licence']} licence"
+
+
+def usual_walk(trained: TrainedModel, style: str) -> tuple[float, np.ndarray]:
+    """Return how fast a style walks, and the stored starting pose that moves most nearly as fast.
+
+    Returns:
+      (metres a second: the median of the starting poses that move; world frames [H, C]).
+    """
+    poses = np.asarray(trained.start_poses[style], np.float64)
+    speeds = 30.0 * pose_speed(poses)
+    moving = speeds[speeds > 0.3]
+    pace = float(np.median(moving)) if len(moving) else 1.0
+    return pace, poses[np.argmin(np.abs(speeds - pace))]
 
 
 def _worker(script: str) -> str:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition, turn_frames
+from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import finite_array
@@ -22,6 +22,7 @@ from f3amd_lib.networks.config import cast_network
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.rollout.rounds import sample_round
+from f3amd_lib.rollout.start_poses import path_start, starting_poses
 from f3amd_lib.training.checkpoints import TrainedModel
 
 MOST_STEPS = 1000
@@ -200,50 +201,16 @@ class MotionGenerator:
         start = path_start(position)
         if history is None:
             speed = np.linalg.norm(position[:, 0] - start, axis=-1)
-            history = self._starting_poses(styles, start, yaw[:, 0], speed, seed)
+            if missing := [style for style in styles if style not in trained.start_poses]:
+                raise ValueError(f"no starting pose is stored for style {missing[0]!r}: pass `history`")
+
+            def in_turn(style, members, counts):  # those of one style take others, in an order of the seed's own
+                orders = (np.random.default_rng([seed, style]).permutation(count) for count in counts)
+                return np.array([order[k % len(order)] for k, order in enumerate(orders)])
+
+            history = starting_poses(trained, indices, start, yaw[:, 0], speed, in_turn)
         shape = (batch, config.num_history, num_channels(trained.skeleton))
         history = finite_array("history", history, shape, np.float32)
         frames = self.generate(position, yaw, indices, history, jax.random.key(seed))
         rollout = Rollout(trained.skeleton, frames, history, tuple(paths), tuple(styles), config.window)
         return blend_rollout(rollout, blend_frames)
-
-    def _starting_poses(self, styles, start, yaw, speed, seed: int) -> np.ndarray:
-        """Pick a stored pose for each character; those of one style take others in turn."""
-        taken = dict.fromkeys(styles, 0)
-        poses = []
-        for character, style in enumerate(styles):
-            if style not in self.trained.start_poses:
-                raise ValueError(f"no starting pose is stored for style {style!r}: pass `history`")
-            choices = self.trained.start_poses[style]
-            choices = choices[as_fast_as(choices, speed[character])]
-            order = np.random.default_rng([seed, self.trained.style_index(style)])
-            number = order.permutation(len(choices))[taken[style] % len(choices)]
-            taken[style] += 1
-            pose = turn_frames(choices[number], yaw[character])
-            poses.append(center_window(pose, -start[character]))
-        return np.stack(poses).astype(np.float32)
-
-
-def path_start(position):
-    """Return where a path [..., F, 2] would have been one frame before its first, [..., 2]."""
-    return 2.0 * position[..., 0, :] - position[..., 1, :]
-
-
-def as_fast_as(poses: np.ndarray, speed) -> np.ndarray:
-    """Tell which starting poses move about as fast as a path.
-
-    Args:
-      poses: [K, H, C], metres.
-      speed: of the path, [...], metres a frame.
-
-    Returns:
-      Booleans, [..., K]; at least one is true for each speed.
-    """
-    gap = np.abs(pose_speed(poses) - np.asarray(speed)[..., None])
-    return gap <= gap.min(axis=-1, keepdims=True) + 0.1 / 30.0
-
-
-def pose_speed(poses: np.ndarray) -> np.ndarray:
-    """Return how fast starting poses [K, H, C] move over the ground, [K], metres a frame."""
-    travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
-    return travelled / max(1, poses.shape[1] - 1)

@@ -1,4 +1,6 @@
-"""A rollout that begins where a motion of the user's ends: `f3amd rollout --start my.bvh`."""
+"""Where rollouts begin: in a stored starting pose, or where a motion of the user's ends (`f3amd rollout --start`)."""
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -6,8 +8,45 @@ from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames
 from f3amd_lib.motion.retarget import retarget
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.skeleton import Motion, resample
-from f3amd_lib.rollout.rollout import path_start
 from f3amd_lib.training.checkpoints import TrainedModel
+
+
+def path_start(position):
+    """Return where a path [..., F, 2] would have been one frame before its first, [..., 2]."""
+    return 2.0 * position[..., 0, :] - position[..., 1, :]
+
+
+def pose_speed(poses: np.ndarray) -> np.ndarray:
+    """Return how fast starting poses [K, H, C] move over the ground, [K], metres a frame."""
+    travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
+    return travelled / max(1, poses.shape[1] - 1)
+
+
+def starting_poses(trained: TrainedModel, style_index, start, yaw, speed, pick: Callable) -> np.ndarray:
+    """Pick a stored starting pose for each character, and move it to where its path begins.
+
+    Args:
+      trained: the model; it has to have poses of all the styles.
+      style_index: places in `trained.styles`, [B].
+      start: x, z of the last frame, [B, 2], metres.
+      yaw: facing there, [B], radians.
+      speed: of the path, [B], metres a frame.
+      pick: chooses among the poses about as fast as the paths: `pick(style, members, counts)` returns a number from 0
+        for each of the characters `members` of a style, who have `counts` poses to choose from.
+
+    Returns:
+      World frames, [B, H, C], float64.
+    """
+    poses = np.empty((len(style_index), trained.config.num_history, trained.config.channels))
+    for style in np.unique(style_index):
+        members = np.flatnonzero(np.asarray(style_index) == style)
+        choices = trained.start_poses[trained.styles[style]]
+        gap = np.abs(pose_speed(choices) - speed[members, None])
+        fitting = gap <= gap.min(axis=-1, keepdims=True) + 0.1 / 30.0
+        number = pick(style, members, fitting.sum(axis=1))
+        # The first place where more than `number` fitting poses have been passed.
+        poses[members] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
+    return center_window(turn_frames(poses, yaw), -start)
 
 
 def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tuple[np.ndarray, str]:

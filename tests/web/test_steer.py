@@ -5,11 +5,11 @@ import json
 import builders  # noqa: F401  (tests/ is on the path)
 import numpy as np
 import pytest
+from steering_oracle import FPS, Steering, first_pose
 
 from f3amd_companion.serving import steer
 from f3amd_companion.serving.onnx_export import denoiser_program
 from f3amd_companion.serving.steer import write_steer
-from f3amd_companion.serving.steering import FPS, Steering, first_pose
 from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.measures.walking import seam_kick, slide_speed
 from f3amd_lib.rollout.rollout import MotionGenerator
@@ -54,7 +54,7 @@ def choose(browser, name: str, value) -> None:
     browser.script(f"document.querySelector('input[name={name}][value=\"{value}\"]').click()")
 
 
-def pythons_rounds(trained, page_paces, num_steps, rounds):
+def pythons_rounds(trained, num_steps, rounds):
     """What Python makes of two characters, and what a page needs to be asked for the same."""
     config, rng = trained.config, np.random.default_rng(0)
     noise = rng.standard_normal((rounds, 2, config.window, config.channels)).astype(np.float32)
@@ -62,10 +62,7 @@ def pythons_rounds(trained, page_paces, num_steps, rounds):
     numbers = [trained.style_index(name) for name in names]
     style = np.eye(len(trained.styles))[numbers]
     style[1] = 0.5 * style[0] + 0.5 * style[1]
-    poses = [
-        first_pose(trained, name, (k, 2.0 * k), yaws[k], page_paces[number])
-        for k, (name, number) in enumerate(zip(names, numbers, strict=True))
-    ]
+    poses = [first_pose(trained, name, (k, 2.0 * k), yaws[k]) for k, name in enumerate(names)]
     steering = Steering(MotionGenerator(trained, num_steps), np.stack(poses), yaws)
     asked = {
         "places": [{"x": k, "z": 2.0 * k, "yaw": yaws[k], "style": number} for k, number in enumerate(numbers)],
@@ -80,8 +77,7 @@ def pythons_rounds(trained, page_paces, num_steps, rounds):
 
 
 def same_as_python(browser, trained, num_steps, rounds):
-    page_paces = browser.script("return JSON.parse(document.getElementById('steer-data').textContent).paces")
-    wanted, asked = pythons_rounds(trained, page_paces, num_steps, rounds)
+    wanted, asked = pythons_rounds(trained, num_steps, rounds)
     # No single call of the driver may take long: selenium gives up after two minutes.
     browser.script(
         "window.made = null; const done = (found) => { window.made = found; };"

@@ -20,11 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from f3amd_companion.serving.steer import usual_walk
 from f3amd_lib.data.features import bend_path, center_window, orthonormalise, path_condition, turn_frames
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.blending import blend_seams
-from f3amd_lib.rollout.rollout import MotionGenerator, pose_speed
+from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.rollout.start_poses import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
 FPS = 30.0
@@ -139,23 +141,7 @@ class Steering:
         return future
 
 
-def usual_pace(trained: TrainedModel, style: str) -> float:
-    """Return how fast a style walks, metres a second: the median of its starting poses that move."""
-    speeds = FPS * pose_speed(np.asarray(trained.start_poses[style], np.float64))
-    moving = speeds[speeds > 0.3]
-    return float(np.median(moving)) if len(moving) else 1.0
-
-
-def first_pose(trained: TrainedModel, style: str, position, heading: float, speed: float) -> np.ndarray:
-    """Return the stored starting pose of a style that moves most nearly as fast, [H, C], world frames.
-
-    Args:
-      trained: the model.
-      style: a name that it knows.
-      position: x, z of the last frame, metres.
-      heading: where it faces, radians.
-      speed: metres a second.
-    """
-    poses = np.asarray(trained.start_poses[style], np.float64)
-    nearest = np.argmin(np.abs(FPS * pose_speed(poses) - speed))
-    return center_window(turn_frames(poses[nearest], float(heading)), -np.asarray(position, np.float64))
+def first_pose(trained: TrainedModel, style: str, position, heading: float) -> np.ndarray:
+    """Return the page's starting pose of a style, [H, C], at a place (x, z) and a heading."""
+    pose = usual_walk(trained, style)[1]
+    return center_window(turn_frames(pose, heading), -np.asarray(position, np.float64))
