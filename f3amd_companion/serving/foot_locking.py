@@ -22,6 +22,7 @@ stretched bones.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy import sparse
@@ -178,11 +179,11 @@ def _settle(toe, contact, heights, fps: float) -> np.ndarray:
     return path
 
 
-def _plan_toe(hip, ankle, toe, contact, floor: float, limit, fps: float):
+def _plan_toe(leg, contact, floor: float, limit, fps: float):
     """Settle a toe, with contacts cut where they ask too much.
 
     Args:
-      hip, ankle, toe: as they were, [T, 3].
+      leg: hip, knee, ankle and toe as they were, [T, 4, 3].
       contact: [T].
       floor: height of a resting toe.
       limit: how far an ankle may be from its hip, [T].
@@ -191,6 +192,7 @@ def _plan_toe(hip, ankle, toe, contact, floor: float, limit, fps: float):
     Returns:
       Where the ankle shall be, [T, 3], and how far the hip has to come down for it, [T].
     """
+    hip, _, ankle, toe = np.moveaxis(leg, 1, 0)
     foot, contact, wanted = toe - ankle, contact.copy(), toe.copy()
     heights = floor + np.maximum(foot[:, 1], 0.0)  # neither toe nor ankle under the floor
     gap = max(3, round(_STEP_SECONDS * fps))
@@ -229,41 +231,46 @@ def _shortest_turn(first, second) -> np.ndarray:
     return Rotation.from_rotvec(unit(axis) * angle[:, None]).as_matrix()
 
 
-def knee_axes(hip, knee, ankle, thigh_turn, across) -> np.ndarray:
+def knee_axes(leg, thigh_turn, across) -> np.ndarray:
     """Return the axis of each knee's bend, as the thigh sees it, [T, 3]; the longer, the more it bends.
 
     Args:
-      hip, knee, ankle: [T, 3].
+      leg: hip, knee, ankle and toe, [T, 4, 3].
       thigh_turn: the thigh's global rotations, [T, 3, 3].
       across: from the right hip to the left one, [T, 3]: the axis of a leg that is straight throughout.
     """
-    axis = np.cross(unit(knee - hip), unit(ankle - knee))
+    axis = np.cross(unit(leg[:, 1] - leg[:, 0]), unit(leg[:, 2] - leg[:, 1]))
     return np.einsum("tba,tb->ta", thigh_turn, axis + 1e-3 * across)
 
 
-def leg_reach(hip, knee, ankle) -> np.ndarray:
+def leg_reach(leg) -> np.ndarray:
     """Return how long the line from hip to ankle may become, [T, 2]: what `bend_leg` takes.
 
     A leg yields from the first length on and never gets longer than the second; one that is straighter already stays.
     """
+    hip, knee, ankle, _ = np.moveaxis(leg, 1, 0)
     length = np.linalg.norm(knee - hip, axis=-1) + np.linalg.norm(ankle - knee, axis=-1)
     before = np.linalg.norm(ankle - hip, axis=-1)
     return np.stack([np.maximum(before, share * length) for share in (_STRAIGHT, 0.9995)], axis=-1)
 
 
-def bend_leg(hip, knee, ankle, usual, line, reach):
-    """Bend a knee and turn a hip until the ankle lies where it shall.
+def bend_leg(skeleton: Skeleton, chain, leg, turned, usual, line, reach) -> np.ndarray:
+    """Bend a knee and turn a hip until the ankle lies where it shall; the foot keeps its orientation.
 
     Args:
-      hip, knee, ankle: as they were, [T, 3].
-      usual: the axis about which this knee usually bends, of length 1, [T, 3].
+      skeleton: of all joints.
+      chain: hip, knee, ankle and toe of the leg, numbers.
+      leg: where they were, [T, 4, 3].
+      turned: global rotations of all joints, [T, J, 3, 3].
+      usual: the axis about which this knee usually bends, of length 1, as the thigh sees it, [3].
       line: from hip to ankle as it shall be, [T, 3].
       reach: how long that line may be, [T, 2]: yields from the first length on, to the second.
 
     Returns:
-      Rotations to multiply from the left to the global ones of thigh and shank, [T, 3, 3] each.
+      Local rotations of hip, knee and ankle, [3, T, 3, 3].
     """
-    thigh, shank = unit(knee - hip), unit(ankle - knee)
+    hip, knee, ankle, _ = np.moveaxis(leg, 1, 0)
+    thigh, shank, usual = unit(knee - hip), unit(ankle - knee), turned[:, chain[0]] @ usual
     upper, lower = np.linalg.norm(knee - hip, axis=-1), np.linalg.norm(ankle - knee, axis=-1)
     near, far = reach.T
     length, room = np.linalg.norm(line, axis=-1), np.maximum(far - near, 1e-9)
@@ -278,7 +285,9 @@ def bend_leg(hip, knee, ankle, usual, line, reach):
     bent = np.cos(angle) * thigh + np.sin(angle) * np.cross(axis, thigh)
     knee_turn = _shortest_turn(shank, bent)
     hip_turn = _shortest_turn(unit(upper[:, None] * thigh + lower[:, None] * bent), unit(line))
-    return hip_turn, hip_turn @ knee_turn
+    parent, *own = (turned[:, joint] for joint in (skeleton.parents[chain[0]], *chain[:3]))
+    frames = [parent, hip_turn @ own[0], hip_turn @ knee_turn @ own[1], own[2]]
+    return np.stack([np.swapaxes(above, -1, -2) @ below for above, below in itertools.pairwise(frames)])
 
 
 def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
@@ -311,29 +320,21 @@ def lock_feet(motion: Motion, contacts=None, floor=None) -> Motion:
     if motion.num_frames < 3:
         return motion
 
-    lowered, targets, reaches = np.zeros(motion.num_frames), [], []
-    for foot, chain in enumerate(chains):
-        hip, _, ankle, toe = np.moveaxis(positions[:, chain], 1, 0)
-        reach = leg_reach(*np.moveaxis(positions[:, chain[:3]], 1, 0))
-        target, lack = _plan_toe(hip, ankle, toe, contacts[:, foot], floor, reach[:, 0], fps)
-        lowered = np.maximum(lowered, lack)
-        targets.append(target)
-        reaches.append(reach)
-    lowered = smooth_above(lowered, fps)
+    legs = np.moveaxis(positions[:, chains], 1, 0)  # [2, T, 4, 3]
+    reaches = [leg_reach(leg) for leg in legs]
+    planned = [
+        _plan_toe(leg, contact, floor, reach[:, 0], fps)
+        for leg, contact, reach in zip(legs, contacts.T, reaches, strict=True)
+    ]
+    lowered = smooth_above(np.maximum(*(lack for _, lack in planned)), fps)
     drop = lowered[:, None] * np.array([0.0, -1.0, 0.0])
 
     rotations = np.array(motion.needed_rotations("locking feet"), np.float64)
-    turned = global_rotations(skeleton, rotations)
-    across = positions[:, chains[0, 0]] - positions[:, chains[1, 0]]
-    for chain, target, reach in zip(chains, targets, reaches, strict=True):
-        hip, knee, ankle, _ = np.moveaxis(positions[:, chain], 1, 0)
-        usual = turned[:, chain[0]] @ unit(knee_axes(hip, knee, ankle, turned[:, chain[0]], across).sum(axis=0))
-        turns = bend_leg(hip, knee, ankle, usual, target - hip - drop, reach)
-        frames = [turned[:, skeleton.parents[chain[0]]]]
-        frames += [turn @ turned[:, joint] for turn, joint in zip(turns, chain[:2], strict=True)]
-        frames += [turned[:, chain[2]]]
-        for above, own, joint in zip(frames[:3], frames[1:], chain[:3], strict=True):
-            rotations[:, joint] = np.swapaxes(above, -1, -2) @ own
+    turned, across = global_rotations(skeleton, rotations), legs[0, :, 0] - legs[1, :, 0]
+    for chain, leg, (target, _), reach in zip(chains, legs, planned, reaches, strict=True):
+        usual = unit(knee_axes(leg, turned[:, chain[0]], across).sum(axis=0))
+        bent = bend_leg(skeleton, chain, leg, turned, usual, target - leg[:, 0] - drop, reach)
+        rotations[:, chain[:3]] = np.moveaxis(bent, 0, 1)
     root = np.asarray(motion.root_position, np.float64) + drop
     return motion.replace(root_position=root, rotations=rotations)
 

@@ -77,13 +77,12 @@ class Feet(NamedTuple):
     axis: np.ndarray
 
 
-def start_feet(skeleton: Skeleton, history, floor: float | None = None) -> Feet:
+def start_feet(skeleton: Skeleton, history) -> Feet:
     """Begin after a history, whose feet are left as they are.
 
     Args:
       skeleton: its legs must be hip, knee, ankle and toe.
-      history: world frames [H, C].
-      floor: height of a resting toe, metres; by default the lowest of the history.
+      history: world frames [H, C]; the floor is where its lowest toe is.
 
     Raises:
       ValueError: for other legs, or frames that do not fit.
@@ -92,7 +91,7 @@ def start_feet(skeleton: Skeleton, history, floor: float | None = None) -> Feet:
     history = finite_array("history", history, ("frame", 3 + 6 * skeleton.num_joints))
     root, turns = split_frames(history)
     path = forward_kinematics(skeleton, root, matrix_from_rotation_6d(turns))[:, toes]
-    floor = float(path[..., 1].min() if floor is None else floor)
+    floor = float(path[..., 1].min())
     zero = np.zeros((2, 3))
     feet = Feet(
         floor, False, np.zeros(2, bool), np.zeros(2, int), path[0][:, [0, 2]], path[0], zero, zero, zero,
@@ -116,9 +115,10 @@ def lock_frame(skeleton: Skeleton, feet: Feet, frame, *, locking: bool = True) -
     frame = np.asarray(frame, np.float64)
     chains, (root, turns) = leg_chains(skeleton), split_frames(frame)
     rotations = matrix_from_rotation_6d(turns)
-    turned = global_rotations(skeleton, rotations[None])[0]
+    turned = global_rotations(skeleton, rotations[None])
     points = forward_kinematics(skeleton, root, rotations)
-    toe, ankle = points[chains[:, 3]], points[chains[:, 2]]
+    legs = points[chains][:, None]  # [2, 1, 4, 3]: a frame each
+    hips, ankle, toe = legs[:, 0, 0], legs[:, 0, 2], legs[:, 0, 3]
 
     # How unlike a carrying foot each one is.
     velocity = FPS * (toe - feet.toe)
@@ -136,18 +136,16 @@ def lock_frame(skeleton: Skeleton, feet: Feet, frame, *, locking: bool = True) -
     foot = toe - ankle
     level = feet.floor + np.maximum(foot[:, 1], 0.0)  # neither toe nor ankle under the floor
     going = feet.shown + feet.pace / FPS  # where each toe would be without a change of mind
-    hips = [points[chain[0]] for chain in chains]
-    reaches = [leg_reach(*points[chain[:3], None])[0] for chain in chains]
+    reaches = np.array([leg_reach(leg) for leg in legs])
     run_out = going[:, [0, 2]] + feet.pace[:, [0, 2]] / RUN_OUT
     anchor = np.where((carries & ~feet.carries)[:, None], run_out, feet.anchor)
-    for k in np.flatnonzero(carries):
-        asked = np.array([anchor[k, 0], level[k], anchor[k, 1]]) - foot[k] - hips[k]
-        too_far = np.linalg.norm(anchor[k] - toe[k, [0, 2]]) > FARTHEST or np.linalg.norm(asked) > reaches[k][1] + SLACK
-        if too_far:
-            carries[k], pause[k] = False, PAUSE
+    point = np.stack([anchor[:, 0], level, anchor[:, 1]], axis=-1)
+    away = np.linalg.norm(anchor - toe[:, [0, 2]], axis=-1)
+    let_go = carries & ((away > FARTHEST) | (np.linalg.norm(point - foot - hips, axis=-1) > reaches[:, 0, 1] + SLACK))
+    carries, pause = carries & ~let_go, np.where(let_go, PAUSE, pause)
 
     free = np.stack([toe[:, 0], np.maximum(toe[:, 1], level) if locking else toe[:, 1], toe[:, 2]], axis=-1)
-    goal = np.where(carries[:, None], np.stack([anchor[:, 0], level, anchor[:, 1]], axis=-1), free)
+    goal = np.where(carries[:, None], point, free)
     changed = (carries != feet.carries) | (locking != feet.locking)
     rate = np.where(carries, RUN_OUT, LET_GO)[:, None]
     push = (feet.off_pace + rate * feet.off) / FPS
@@ -161,17 +159,11 @@ def lock_frame(skeleton: Skeleton, feet: Feet, frame, *, locking: bool = True) -
         shown[:, 1] = np.maximum(shown[:, 1], level)
 
     settled, axis = frame.copy(), feet.axis.copy()
-    across = hips[0] - hips[1]
     for k, chain in enumerate(chains):
-        hip, knee, heel = points[chain[:3], None]
-        thigh = turned[chain[0]]
-        axis[k] = 0.97 * axis[k] + knee_axes(hip, knee, heel, thigh[None], across[None])[0]
-        line = shown[k] - foot[k] - hip[0]
-        turns = bend_leg(hip, knee, heel, (thigh @ unit(axis[k]))[None], line[None], reaches[k][None])
-        above, shank = turned[skeleton.parents[chain[0]]], turned[chain[1]]
-        frames = [above, turns[0][0] @ thigh, turns[1][0] @ shank, turned[chain[2]]]
-        for parent, own, joint in zip(frames[:3], frames[1:], chain[:3], strict=True):
-            settled[3 + 6 * joint : 9 + 6 * joint] = rotation_6d_from_matrix(parent.T @ own)
+        axis[k] = 0.97 * axis[k] + knee_axes(legs[k], turned[:, chain[0]], hips[0] - hips[1])[0]
+        line = shown[k] - foot[k] - hips[k]
+        bent = bend_leg(skeleton, chain, legs[k], turned, unit(axis[k]), line[None], reaches[k])
+        settled[3:].reshape(-1, 6)[chain[:3]] = rotation_6d_from_matrix(bent[:, 0])
     kept = Feet(
         feet.floor, locking, carries, pause, anchor, shown, FPS * (shown - feet.shown), off, off_pace,
         toe, calm, lowest, usual, axis,
