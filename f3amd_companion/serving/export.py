@@ -41,7 +41,6 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.checkpoints import TrainedModel
 
@@ -67,21 +66,14 @@ class ExportedRound:
     """One round of synthesis as a program.
 
     Attributes:
-      config: of the network.
-      sigmas: noise levels that the sampler visits, [N + 1].
-      sampler: a name of `samplers.SAMPLERS`.
-      batch: B, characters.
       inputs: shapes by name, in the order of a call.
-      weights_digest: tells one set of weights from another.
+      manifest: what the program is, as `artefact` tells it: config, steps, sampler, noise levels, batch, shapes, and a
+        digest that tells one set of weights from another.
       exported: the program, for JAX; without the places of its operations in source files.
     """
 
-    config: NetworkConfig
-    sigmas: tuple[float, ...]
-    sampler: str
-    batch: int
     inputs: dict[str, tuple[int, ...]]
-    weights_digest: str
+    manifest: dict
     exported: export.Exported
 
     @property
@@ -134,11 +126,18 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
     program = export.export(
         jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
     )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
-    return ExportedRound(
-        config=config, sigmas=tuple(sigmas.tolist()), sampler=sampler, batch=batch, inputs=inputs,
-        weights_digest=weights_digest(state),
-        exported=dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized)),
-    )  # fmt: skip
+    program = dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized))
+    manifest = {
+        "config": config.to_dict(),
+        "num_steps": len(sigmas) - 1,
+        "sampler": sampler,
+        "sigmas": sigmas.tolist(),
+        "batch": batch,
+        "inputs": [{"name": name, "shape": list(shape), "dtype": "float32"} for name, shape in inputs.items()],
+        "output": {"name": "x0_hat", "shape": list(shape), "dtype": "float32"},
+        "weights": weights_digest(state),
+    }
+    return ExportedRound(inputs, manifest, program)
 
 
 def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
@@ -248,12 +247,12 @@ def save_artefact(
     """
     folder = Path(folder)
     _check_free(folder, overwrite)
-    if trained is not None and weights_digest(trained.params) != exported.weights_digest:
+    if trained is not None and weights_digest(trained.params) != exported.manifest["weights"]:
         raise ValueError(f"the exported round does not hold the weights of the trained model {trained.name}")
     files = {artefact.STABLEHLO: exported.stablehlo, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
-    compiled = {}
-    for target in dict.fromkeys(targets):
-        file, settings, started = f"round.{target}.vmfb", _find_target(target), time.perf_counter()
+    found, compiled = {target: _find_target(target) for target in targets}, {}
+    for target, settings in found.items():
+        file, started = f"round.{target}.vmfb", time.perf_counter()
         files[file], flags = compile_iree(exported.stablehlo, target)
         host = {"machine": platform.machine(), "features": list(artefact.cpu_features())}
         compiled[target] = {
@@ -270,7 +269,15 @@ def save_artefact(
         scales = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
         features = {"normaliser": scales, "styles": list(trained.styles)}
         files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
-    manifest = _manifest(exported, name, files, compiled, trained)
+    training = trained.record if trained else {}
+    record = run_record(
+        profile="export", dataset=training.get("dataset", "none"), seed=training.get("seed", 0), training=training
+    )
+    record |= {key: training.get(key) for key in ("dataset_fingerprint", "dataset_licence", "dataset_credit")}
+    sums = {name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()}
+    manifest = {"format": artefact.FORMAT, "model": name, **exported.manifest}
+    manifest |= {"targets": compiled, "files": sums, "record": record}
+    manifest["sha256"] = artefact.manifest_digest(manifest)
     files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
     place = folder.resolve()  # of a link, what it points to
     earlier = place.with_name(f".{place.name}.{uuid.uuid4().hex}.earlier")
@@ -285,33 +292,6 @@ def save_artefact(
             earlier.rename(place)
     shutil.rmtree(earlier, ignore_errors=True)
     return folder
-
-
-def _manifest(
-    exported: ExportedRound, name: str, files: dict[str, bytes], targets: dict[str, dict], trained: TrainedModel | None
-) -> dict:
-    training, config = trained.record if trained else {}, exported.config
-    dataset, seed = training.get("dataset", "none"), training.get("seed", 0)
-    record = run_record(profile="export", dataset=dataset, seed=seed, training=training)
-    record |= {key: training.get(key) for key in ("dataset_fingerprint", "dataset_licence", "dataset_credit")}
-    manifest = {
-        "format": artefact.FORMAT,
-        "model": name,
-        "config": config.to_dict(),
-        "num_steps": len(exported.sigmas) - 1,
-        "sampler": exported.sampler,
-        "sigmas": list(exported.sigmas),
-        "batch": exported.batch,
-        "inputs": [{"name": item, "shape": list(shape), "dtype": "float32"} for item, shape in exported.inputs.items()],
-        "output": {"name": "x0_hat", "shape": [exported.batch, config.window, config.channels], "dtype": "float32"},
-        "weights": exported.weights_digest,
-        "targets": targets,
-        "files": {
-            name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()
-        },
-        "record": record,
-    }
-    return manifest | {"sha256": artefact.manifest_digest(manifest)}
 
 
 def _check_free(folder: Path, overwrite: bool) -> None:
@@ -345,10 +325,6 @@ def export_model(
     Raises:
       ImportError, ValueError: as `export_round`, `compile_iree` and `save_artefact`.
     """
-    schedule, targets = trained.diffusion, tuple(targets)
-    # Before the minutes of compiling.
-    _check_free(Path(folder), overwrite)
-    for target in targets:
-        _find_target(target)
+    schedule = trained.diffusion
     exported = export_round(trained.network(), schedule.grid(num_steps), batch, sampler or schedule.sampler)
     return save_artefact(folder, exported, name=trained.name, targets=targets, trained=trained, overwrite=overwrite)
