@@ -5,7 +5,6 @@ imported inside, so that `f3amd --help` is quick.
 """
 
 import contextlib
-import functools
 import importlib.util
 import logging
 import os
@@ -316,6 +315,7 @@ def rollout(
 
 def _write_shown(targets, scene, trained, *, overwrite: bool) -> None:
     """Write a scene of one character as GIF (its first 12 s), player page with film strip, and in each format asked."""
+    from f3amd_companion.serving.motion_files import write_motion
     from f3amd_companion.serving.player import write_player
     from f3amd_lib.drawing.pictures import write_gif
     from f3amd_lib.rollout.generated import generated_credit
@@ -328,7 +328,7 @@ def _write_shown(targets, scene, trained, *, overwrite: bool) -> None:
     write_gif(gif, motion, target_paths=character.path, titles=[scene.title], every=every, max_seconds=12.0)
     write_player(page, scene, credit=credit)  # the strip has its name
     for path in files:
-        _write_motion(path, motion, credit, overwrite)
+        write_motion(path, motion, credit=credit, overwrite=overwrite)
     for target in targets:
         log.info("wrote        %s", target)
 
@@ -430,16 +430,6 @@ def _motion_formats(given: str) -> list[str]:
     return wanted
 
 
-def _write_motion(path: Path, motion, credit: str, overwrite: bool) -> None:
-    """Write a motion as .bvh, .glb or .csv."""
-    from f3amd_companion.serving import gltf, motion_csv
-    from f3amd_lib.motion import bvh
-
-    write_glb = functools.partial(gltf.write_glb, credit=credit)
-    writers = {".bvh": bvh.write_bvh, ".csv": motion_csv.write_motion_csv, ".glb": write_glb}
-    writers[path.suffix](path, motion, overwrite=overwrite)
-
-
 def _has_legs(skeleton) -> bool:
     """Say whether feet can be held: legs of hip, knee, ankle and toe."""
     from f3amd_companion.serving.foot_locking import leg_chains
@@ -528,6 +518,8 @@ def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
 
     Files of an earlier crowd are removed first; what else lies there stays. A new folder is there whole or not at all.
     """
+    from f3amd_companion.serving import motion_files
+
     digits = len(str(len(crowd) - 1))
     for file in folder.glob("*"):
         if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
@@ -536,7 +528,7 @@ def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
         for character in range(len(crowd)):
             motion, name = shown(character), f"{character:0{digits}d}_{crowd.style(character)}"
             for ending in formats:
-                _write_motion(place / f"{name}{ending}", motion, credit, False)
+                motion_files.write_motion(place / f"{name}{ending}", motion, credit=credit)
 
 
 def _crowd_pictures(crowd, shown, credit: str, still: Path, page: Path) -> None:
@@ -565,15 +557,14 @@ def export(
       out: folder to write to.
     """
     if "onnx" in target:
-        from f3amd_companion.serving import onnx_export, onnx_text
+        from f3amd_companion.serving import onnx_export
 
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
-        how = {"num_steps": model.steps, "batch": characters, "weights": stored, "overwrite": model.overwrite}
-        if captioned := model.weights and onnx_text.load_text_or_latent(model.weights):
-            folder = onnx_text.export_text_onnx(captioned, out, **how)
-        else:
-            folder = onnx_export.export_onnx(model.load(), out, **how)
+        trained = (model.weights and onnx_export.load_text_or_latent(model.weights)) or model.load()
+        folder = onnx_export.export_onnx(
+            trained, out, num_steps=model.steps, batch=characters, weights=stored, overwrite=model.overwrite
+        )
     else:
         from f3amd_companion.serving.export import export_model
 

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from builders import WINDOW, tiny_trained
 
-from f3amd_companion import __main__ as command_line
 from f3amd_companion.__main__ import COMMANDS, main
+from f3amd_companion.serving import motion_files
 from f3amd_companion.serving.crowd import read_crowd
 from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, closest_approach
 from f3amd_companion.speed import machine, measurements
@@ -109,16 +109,16 @@ def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsy
 def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tmp_path, monkeypatch, capsys):
     out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
-    write, written = command_line._write_motion, []
+    write, written = motion_files.write_motion, []
 
-    def stop_after_one(path, *arguments):
+    def stop_after_one(path, motion, **options):
         if len(written) == 1:
             written.append(path)
             raise KeyboardInterrupt
         written.append(path)
-        return write(path, *arguments)
+        return write(path, motion, **options)
 
-    monkeypatch.setattr(command_line, "_write_motion", stop_after_one)
+    monkeypatch.setattr(motion_files, "write_motion", stop_after_one)
     assert main([*words, "--format", "csv", "--pictures"]) == 130
     assert "the same command goes on" in capsys.readouterr().err
     before = {file: file.stat().st_mtime_ns for file in out.iterdir() if file.suffix == ".npy"}

@@ -9,8 +9,7 @@ from builders import refused, wandering_motion
 from scipy.spatial.transform import Rotation
 from test_skeleton import BANDAI, random_motion
 
-from f3amd_companion.serving.gltf import write_glb
-from f3amd_companion.serving.motion_csv import write_motion_csv
+from f3amd_companion.serving.motion_files import write_glb, write_motion_csv
 from f3amd_lib.motion.body import make_body, pose_body
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON

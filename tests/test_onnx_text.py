@@ -16,10 +16,11 @@ from f3amd_companion.serving.onnx_export import (
     PROGRAM,
     OnnxProgram,
     denoiser_program,
-    input_shapes,
+    export_onnx,
+    load_text_or_latent,
     seeded_inputs,
+    signature,
 )
-from f3amd_companion.serving.onnx_text import export_text_onnx, load_text_or_latent
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
@@ -175,9 +176,9 @@ def test_what_is_no_model_of_text_is_left_to_others_or_refused(tmp_path, monkeyp
     save_model(tmp_path / "walker.safetensors", walker)
     assert load_text_or_latent(tmp_path / "walker.safetensors") is None
     refused("other.safetensors", load_text_or_latent, tmp_path / "other.safetensors")
-    refused("got LatentAutoencoderConfig", input_shapes, motionpcm(0).autoencoder, 2)
+    refused("got LatentAutoencoderConfig", signature, motionpcm(0).autoencoder, 2)
     alone = dataclasses.replace(motionpcm(0), config=None, params=None)
-    refused("autoencoder alone", export_text_onnx, alone, tmp_path / "out")
+    refused("autoencoder alone", export_onnx, alone, tmp_path / "out")
     network = network_with(acmdm().config, acmdm().params)
     refused("at least 1", denoiser_program, network, batch=0)
     refused("unknown weights", denoiser_program, network, weights="int4")

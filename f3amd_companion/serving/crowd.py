@@ -39,9 +39,8 @@ from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
-from f3amd_lib.rollout.rollout import MotionGenerator, path_start, pose_speed
+from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.rollout.start_poses import path_start, pose_speed, starting_poses
-from f3amd_lib.training.checkpoints import describe_skeleton, described_skeleton
 
 PATHS = tuple(name for name in NAMES if name != "complex")
 """Names that the paths of a crowd are drawn from: those that face where they go."""

@@ -1,8 +1,10 @@
-"""A model as ONNX: what engines and web pages load, for any number of characters.
+"""A model as ONNX: what engines and web pages load, for any number of characters or captions.
 
 What is exported is one evaluation of the denoiser, with its condition, and not a whole round:
 
-    x0_hat = denoiser(x_noisy [B, T, C], sigma [B], history [B, H, C], path [B, T, 8], style [B, S])
+    F3AMD, CAMDM:  x0_hat = denoiser(x_noisy [B, T, C], sigma [B], history [B, H, C], path [B, T, 8], style [B, S])
+    ACMDM:         prediction = denoiser(state [B, l, J, C], time [B], text [B, W], mask [B, l])
+    MotionPCM:     prediction = denoiser(state [B, 16, 32], time [B], text [B, W], guidance [B])
 
 One file then serves any number of steps, any sampler and any B; a page that offers 8 steps and 1 loads the weights
 once. The walk around it is three lines in any language (DDIM, `diffusion.samplers.ddim_step`). The price is that the
@@ -10,25 +12,40 @@ condition is encoded anew at every step, 43 tokens through three linear layers. 
 is what `serving.export` makes, for StableHLO and IREE.
 
 Beside the program lies a card, JSON: shapes, scales of the features, skeleton, styles, noise levels, and how far the
-program is from JAX; and a worked example in Python and one in C#.
+program is from JAX; and, of F3AMD and CAMDM, a worked example in Python and one in C#.
+
+`prediction` is what the network was trained to say: x0, the noise or the velocity. A teacher of MotionPCM has no input
+`guidance`; whoever guides it, or ACMDM, calls twice (ACMDM section 4.1, MotionPCM Eq. 11), the second time with zeros
+for the text. The card has the times to ask at, and the shares of signal and noise there, so that the walk is three
+lines:
+
+    x0, eps = from prediction, state, alpha, sigma;   state = alpha_next x0 + sigma_next eps
+
+What an autoencoder makes of a latent is not exported, nor is the text encoder: the card says which one it was.
 """
 
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.skeleton import Skeleton, describe_skeleton
+from f3amd_lib.ground.trees import file_kind
+from f3amd_lib.motion.skeleton import describe_skeleton
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition, ConditionedConfig
-from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
+from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
 from f3amd_lib.text.networks.motionpcm import LatentDenoiserConfig
-from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel
+from f3amd_lib.text.phases import cut_phases, ddim_times, shares
+from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model
+from f3amd_lib.training.checkpoints import EIGHT_BITS_FROM, TrainedModel, network_with
 
 PROGRAM = "denoiser.onnx"
 CARD = "card.json"
@@ -46,12 +63,12 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
     """Return one evaluation of a network as an ONNX program, weights inside.
 
     Args:
-      network: with its weights: of history, path and style (F3AMD and CAMDM), or of text to motion (`onnx_text`).
+      network: with its weights: F3AMD, CAMDM, ACMDM, or a teacher or student of MotionPCM.
       batch: B; by default the program takes any.
       weights: one of `WEIGHTS`.
 
     Returns:
-      The file's content. Inputs are those of `input_shapes`, float32, the output that of `output_name`.
+      The file's content. Inputs, float32, and output are those of `signature`.
 
     Raises:
       ImportError: if jax2onnx is not installed, saying how to install it.
@@ -59,7 +76,7 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
     """
     if batch is not None and batch < 1:
         raise ValueError(f"batch must be at least 1 character, got {batch}")
-    shapes = input_shapes(network.config, batch or "B")
+    inputs, output, ask = signature(network.config, batch or "B")
     check_known(weights, WEIGHTS, "weights")
     try:
         import jax2onnx
@@ -71,44 +88,49 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
     network = nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(jnp.float32), state))
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of every shape that it does not need to know
     model = jax2onnx.to_onnx(
-        lambda *inputs: evaluate(network, *inputs), list(shapes.values()), model_name="denoiser",
-        input_names=list(shapes), output_names=[output_name(network.config)],
+        lambda *given: ask(network, *given), list(inputs.values()), model_name="denoiser",
+        input_names=list(inputs), output_names=[output],
     )  # fmt: skip
     if weights != "float32":
         _store_small(model.graph, weights)
     return model.SerializeToString()
 
 
-def input_shapes(config, batch) -> dict[str, tuple]:
-    """Return input -> shape in the order of a call; `batch` may be a name. ValueError for a network of another kind."""
+class Signature(NamedTuple):
+    """How a network is called as a program.
+
+    Attributes:
+      inputs: shapes by name, in the order of a call; the output has the shape of the first.
+      output: its name.
+      ask: `ask(network, *inputs)`; of a mask, 1 is motion and 0 padding.
+    """
+
+    inputs: dict[str, tuple]
+    output: str
+    ask: Callable
+
+
+def signature(config, batch) -> Signature:
+    """Return how a network is called; `batch` may be a name. ValueError for a network of another kind."""
     if isinstance(config, ConditionedConfig):
         frames, history = (batch, config.window, config.channels), (batch, config.num_history, config.channels)
         path, style = (batch, config.window, PATH_CHANNELS), (batch, config.num_styles)
-        return {"x_noisy": frames, "sigma": (batch,), "history": history, "path": path, "style": style}
+        inputs = {"x_noisy": frames, "sigma": (batch,), "history": history, "path": path, "style": style}
+        ask = lambda network, x_noisy, sigma, *given: network(x_noisy, sigma, network.encode(Condition(*given)))
+        return Signature(inputs, "x0_hat", ask)
     if type(config) not in (ACMDMConfig, LatentDenoiserConfig):  # of masked ACMDM one evaluation is another thing
         known = "networks of history, path and style, ACMDM, and teacher or student of MotionPCM"
         raise ValueError(f"only {known} are exported, got {type(config).__name__}")
     state = config.state_shape(batch)
     inputs = {"state": state, "time": (batch,), "text": (batch, config.text_width)}
     if type(config) is ACMDMConfig:
-        return inputs | {"mask": state[:2]}
-    return inputs | ({"guidance": (batch,)} if config.guidance_features else {})
-
-
-def output_name(config) -> str:
-    """Return what a program's output is called; it has the shape of its first input."""
-    return "x0_hat" if isinstance(config, ConditionedConfig) else "prediction"
-
-
-def evaluate(network, state, level, *given):
-    """Ask a network; the inputs are those of `input_shapes`, of which a mask is 1 or 0."""
-    if isinstance(network.config, ConditionedConfig):
-        return network(state, level, network.encode(Condition(*given)))
-    if isinstance(network, ACMDM):
-        text, mask = given
-        return network(state, level, network.encode(TextCondition(text, mask > 0.5)))
-    text, *guidance = given
-    return network(state, level, network.encode(text), *guidance)
+        ask = lambda network, state, time, text, mask: network(
+            state, time, network.encode(TextCondition(text, mask > 0.5))
+        )
+        return Signature(inputs | {"mask": state[:2]}, "prediction", ask)
+    inputs |= {"guidance": (batch,)} if config.guidance_features else {}
+    ask = lambda network, state, time, text, *guidance: network(state, time, network.encode(text), *guidance)
+    return Signature(inputs, "prediction", ask)
 
 
 def _store_small(graph, weights: str) -> None:
@@ -158,7 +180,7 @@ class OnnxProgram:
 
 def seeded_inputs(config, batch: int) -> dict[str, np.ndarray]:
     """Return inputs to compare programs by, float32; of a mask the last quarter of each second sample is padding."""
-    draw, shapes = np.random.default_rng(0), input_shapes(config, batch)
+    draw, shapes = np.random.default_rng(0), signature(config, batch).inputs
     drawn = [name for name in shapes if name not in ("sigma", "style")]
     inputs = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
     inputs |= {name: draw.normal(size=shapes[name]).astype(np.float32) for name in drawn}
@@ -192,7 +214,7 @@ def largest_difference(program: bytes, network, levels) -> float:
     fixed = run.input_shapes[level][0]
     inputs = seeded_inputs(network.config, fixed if isinstance(fixed, int) else 2)
     noise, _, *given = inputs.values()
-    ask = lambda state, level: evaluate(network, state, level, *given)
+    ask = lambda state, level: signature(network.config, len(noise)).ask(network, state, level, *given)
     if level == "sigma":
         ask = jax.jit(ask)
     differences = []
@@ -203,91 +225,117 @@ def largest_difference(program: bytes, network, levels) -> float:
     return float(max(differences))
 
 
-def card_head(trained, form: str, frames_per_second: float) -> dict:
-    """Return how a card begins: what the model is, under which terms, and what goes in and out."""
-    shapes = {name: {"shape": list(shape)} for name, shape in input_shapes(trained.config, "B").items()}
-    return {
-        "format": form,
+def load_text_or_latent(path) -> TextModel | LatentModel | None:
+    """Read a model of text to motion; None for a weights file of another kind, ValueError for one that is damaged."""
+    return load_text_model(path) if file_kind(path) in (TextModel.kind, LatentModel.kind) else None
+
+
+def asked_at(trained: TextModel | LatentModel, num_steps: int) -> dict[str, list[float]]:
+    """Return what the walk visits, N + 1 numbers each: `time` that the network is told, `alpha` and `sigma` there.
+
+    A student of MotionPCM jumps along the edges of N phases, with the skip of its training; a teacher takes the
+    levels of `ddim_times`.
+    """
+    schedule = trained.schedule
+    if isinstance(trained, TextModel):
+        times = network_time(schedule, np.append(schedule.times(num_steps), 1.0))
+        alpha, sigma = schedule.scaled_grid(num_steps)
+    else:
+        levels = len(schedule.levels)
+        if trained.config.guidance_features:
+            times = cut_phases(levels, trained.training.get("skip", 100), num_steps).visited
+        else:
+            times = ddim_times(levels, num_steps)
+        alpha, sigma = shares(schedule, times, np)
+    visited = {"time": times, "alpha": alpha, "sigma": sigma}
+    return {name: np.asarray(values, float).tolist() for name, values in visited.items()}
+
+
+def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) -> dict:
+    """Return what whoever runs the program has to know, JSON-ready.
+
+    Arrays are [batch, frames, ...], metres, radians, +Y up; a character with yaw 0 faces +Z. Noise levels or times are
+    listed for 1 and for `num_steps`, but for a student of MotionPCM for the number that it was trained for.
+    """
+    inputs, output, _ = signature(trained.config, "B")
+    walks = isinstance(trained, TrainedModel)
+    card = {
+        "format": "f3amd-onnx-1" if walks else "f3amd-onnx-text-1",
         "model": trained.name,
         "data": trained.record.get("dataset"),
         "terms": trained.record.get("dataset_licence"),
         "credit": trained.record.get("dataset_credit"),
-        "frames_per_second": frames_per_second,
-        "inputs": shapes,
-        "output": {output_name(trained.config): next(iter(shapes.values()))},
+        "frames_per_second": 30 if walks else trained.fps,
+        "inputs": {name: {"shape": list(shape)} for name, shape in inputs.items()},
+        "output": {output: list(next(iter(inputs.values())))},
     }
-
-
-def skeleton_card(skeleton: Skeleton) -> dict:
-    """Return a skeleton with its offsets, JSON-ready."""
-    return describe_skeleton(skeleton) | {"offsets": np.asarray(skeleton.offsets).tolist()}
-
-
-def model_card(trained: TrainedModel, num_steps: int) -> dict:
-    """Return what whoever runs the program has to know, JSON-ready.
-
-    Arrays are [batch, frames, ...], metres, radians, +Y up; a character with yaw 0 faces +Z.
-    """
-    scales = trained.normaliser._asdict()
-    return card_head(trained, "f3amd-onnx-1", 30) | {
-        "about": ABOUT["walk"],
-        "normaliser": {name: np.asarray(value, np.float32).tolist() for name, value in scales.items()},
-        "skeleton": skeleton_card(trained.skeleton),
-        "styles": list(trained.styles),
-        "sampler": trained.diffusion.sampler,
-        "sigmas": {number: trained.diffusion.grid(number).tolist() for number in sorted({1, num_steps})},
+    skeleton = describe_skeleton(trained.skeleton) | {"offsets": np.asarray(trained.skeleton.offsets).tolist()}
+    counts, latent = sorted({1, num_steps}), isinstance(trained, LatentModel)
+    if walks:
+        scales = trained.normaliser._asdict()
+        return card | {
+            "about": ABOUT["walk"],
+            "normaliser": {name: np.asarray(value, np.float32).tolist() for name, value in scales.items()},
+            "skeleton": skeleton,
+            "styles": list(trained.styles),
+            "sampler": trained.diffusion.sampler,
+            "sigmas": {number: trained.diffusion.grid(number).tolist() for number in counts},
+        }
+    if latent and trained.config.guidance_features:
+        counts = [trained.training.get("num_phases", 1)]
+    decoded = latent or trained.codec.autoencoder is not None
+    explained = [*inputs, *([] if decoded else ["normaliser"])]
+    card |= {
+        "predicts": trained.config.objective,
+        "text_encoder": trained.text_encoder,
+        "about": {name: text for name, text in ABOUT["text"].items() if name in explained},
+        "skeleton": skeleton,
+        "steps": {str(number): asked_at(trained, number) for number in counts},
     }
+    if decoded:
+        made = "motion is" if latent else "positions are"
+        told = f"the state is a latent: {made} what the model's autoencoder makes of it, not exported"
+        return card | {"decoder": told}
+    axes = {name: np.asarray(value, float).tolist() for name, value in trained.codec.axes._asdict().items()}
+    return card | {"decoder": None, "normaliser": axes}
 
 
-def export_onnx(trained: TrainedModel, folder, *, num_steps: int = 8, **how) -> Path:
-    """Write a trained model as ONNX with its card and worked examples: `f3amd export --target onnx`.
-
-    Args:
-      trained: the model.
-      folder: is made, if need be.
-      num_steps: for which the card lists noise levels, beside 1; the program is compared with JAX at them.
-      **how: batch, weights and overwrite, of `write_export`.
-
-    Raises:
-      ImportError, ValueError: as `write_export`.
-    """
-    levels = trained.diffusion.grid(num_steps)[:-1]
-    return write_export(folder, trained.network(), model_card(trained, num_steps), levels, examples=True, **how)
-
-
-def write_export(
-    folder, network, card: dict, levels, *, batch: int | None = None, weights: str = "float32", overwrite: bool = False,
-    examples: bool = False,
+def export_onnx(
+    trained: TrainedModel | TextModel | LatentModel, folder, *, num_steps: int = 8, batch: int | None = None,
+    weights: str = "float32", overwrite: bool = False,
 ) -> Path:  # fmt: skip
-    """Make a program, measure it, and write it with its card, each file whole or not at all.
+    """Write a model as ONNX with its card, and of one that walks worked examples: `f3amd export --target onnx`.
 
     Args:
-      folder: is made, if need be.
-      network: with its weights.
-      card: what whoever runs the program has to know; added are batch, weights, size, and how far the program is from
-        JAX, network units (`largest_error`).
-      levels: at which it is compared, as of `largest_difference`.
+      trained: the model, with a denoiser.
+      folder: is made, if need be; each file is written whole or not at all.
+      num_steps: for which the card lists noise levels or times, beside 1 (`model_card`). The program is compared with
+        JAX at them, and the card says how far apart they are, in network units (`largest_error`).
       batch, weights: as for `denoiser_program`.
       overwrite: replace an earlier export.
-      examples: write the worked examples beside it.
 
     Returns:
       The folder.
 
     Raises:
-      ImportError, ValueError: as `denoiser_program`; if an export is there that may not be replaced, said before
-        anything is made.
+      ImportError, ValueError: as `denoiser_program`; if the file holds an autoencoder alone, or an export is there that
+        may not be replaced, said before anything is made.
     """
     folder = Path(folder)
+    if trained.config is None:
+        raise ValueError(f"{trained.name} is an autoencoder alone: export a model that denoises")
     if not overwrite and (folder / PROGRAM).exists():
         raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
+    card, network = model_card(trained, num_steps), network_with(trained.config, trained.params)
+    walks = isinstance(trained, TrainedModel)
+    levels = card["sigmas"][num_steps] if walks else list(card["steps"].values())[-1]["time"]
     program = denoiser_program(network, batch=batch, weights=weights)
-    error = largest_difference(program, network, levels)
+    error = largest_difference(program, network, levels[:-1])
     card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
     folder.mkdir(parents=True, exist_ok=True)
     files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()}
     for path in EXAMPLES.glob("*.txt"):
-        if examples:
+        if walks:
             files[path.stem] = path.read_bytes()
         else:  # those of an export that is replaced would not fit the new card
             (folder / path.stem).unlink(missing_ok=True)

@@ -138,7 +138,7 @@ def save_figure(figure: Figure, path) -> Path:
       ValueError: if the name does not end in .png.
     """
     path = named_file(path, ".png", "figures")
-    return write_whole(path, _png(figure, 150))
+    return write_whole(path, _png(figure, 110))
 
 
 def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):

@@ -1,7 +1,8 @@
-"""Motion as glTF 2.0 (`.glb`): skeleton, skin and animation in one file, which engines and Blender open.
+"""Motion in the files of others: BVH, glTF 2.0 (`.glb`), and a table that any program reads.
 
-A character has joints, a skin and a mesh (`motion.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z:
-glTF's own conventions. Rotations are quaternions (x, y, z, w) without jumps of sign.
+glTF has skeleton, skin and animation in one file, which engines and Blender open. A character has joints, a skin and a
+mesh (`motion.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z: glTF's own conventions. Rotations are
+quaternions (x, y, z, w) without jumps of sign.
 
 Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
 """
@@ -9,11 +10,13 @@ Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import make_body
+from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.skeleton import Motion
 
 _COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u2": gltf.UNSIGNED_SHORT, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
@@ -115,3 +118,38 @@ def write_glb(path, motion: Motion, *, credit: str = "", overwrite: bool = False
     document.buffers.append(gltf.Buffer(byteLength=len(file.bytes)))
     document.set_binary_blob(file.bytes)
     return write_whole(path, b"".join(document.save_to_bytes()), overwrite=overwrite)
+
+
+def write_motion_csv(path, motion: Motion, *, overwrite: bool = False) -> Path:
+    """Write a motion as CSV, a row for each frame and joint.
+
+    Columns: frame, seconds, joint, x, y, z (global position, metres), qw, qx, qy, qz (local rotation; the root's is
+    global; empty where motion has positions alone).
+
+    Args:
+      path: where to; folders are made.
+      motion: any.
+      overwrite: replace what is there.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: for a file that is there.
+    """
+    frames, joints = motion.positions.shape[:2]
+    number = np.repeat(np.arange(frames), joints)
+    columns = {"frame": number, "seconds": number / motion.fps, "joint": np.tile(motion.skeleton.names, frames)}
+    columns |= dict(zip("xyz", motion.positions.reshape(-1, 3).T, strict=True))
+    turns = np.full((frames * joints, 4), np.nan)
+    if motion.rotations is not None:
+        turns = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    columns |= {f"q{axis}": turns[:, k] for k, axis in enumerate("wxyz")}
+    return write_whole(path, pd.DataFrame(columns).to_csv(index=False, float_format="%.6f"), overwrite=overwrite)
+
+
+def write_motion(path: Path, motion: Motion, *, credit: str = "", overwrite: bool = False) -> Path:
+    """Write a motion in the format that the path ends in, .bvh, .glb or .csv; arguments are those of `write_glb`."""
+    if path.suffix == ".glb":
+        return write_glb(path, motion, credit=credit, overwrite=overwrite)
+    return {".bvh": write_bvh, ".csv": write_motion_csv}[path.suffix](path, motion, overwrite=overwrite)
