@@ -259,23 +259,6 @@ def test_a_perfect_network_follows_every_path_of_the_crowd(trained, tmp_path, mo
         np.testing.assert_allclose(wrap_angle(motion.yaw - target.yaw), 0.0, atol=2e-3)
 
 
-def test_paths_are_asked_for_chunk_by_chunk(still, tmp_path, monkeypatch):
-    asked = []
-
-    def rows(characters, pace, num_frames, seed):
-        asked.append((characters, pace.shape, num_frames, seed))
-        time = np.arange(num_frames) / 30
-        x = np.array(characters)[:, None] + 0 * time
-        z = pace[:, None] * time
-        return np.stack([x, z], axis=-1), 0 * z
-
-    monkeypatch.setattr(crowds, "crowd_paths", rows)
-    crowd = generate_crowd(still, 5, 6, tmp_path, chunk=2, seed=7)
-    expected = [range(0, 2), range(2, 4), range(4, 5)]
-    assert asked == [(part, (len(part),), 6, 7) for part in expected]
-    np.testing.assert_array_equal(crowd.path[:, :, 0], np.arange(5)[:, None] + np.zeros(6))
-
-
 # --- memory ------------------------------------------------------------------------------------
 
 

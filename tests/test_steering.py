@@ -46,14 +46,6 @@ def test_a_target_that_shall_stop_stops_and_turns_no_more():
     assert 0.1 < np.linalg.norm(positions[0, -1] - moving.position[0]) < 0.8
 
 
-def test_a_target_goes_on_where_it_was():
-    whole, positions, _ = move_target(STILL, [1.0], [2.0], 16)
-    half, first, _ = move_target(STILL, [1.0], [2.0], 8)
-    again, second, _ = move_target(half, [1.0], [2.0], 8)
-    np.testing.assert_allclose(np.concatenate([first, second], axis=1), positions)
-    np.testing.assert_allclose(again.position, whole.position)
-
-
 def test_whole_windows_without_blending_are_a_rollout(generator):
     """The same frame, normaliser, path and style reach the network as in `MotionGenerator.generate`."""
     window = generator.trained.config.window
@@ -82,13 +74,6 @@ def test_the_seam_is_inertialised_and_the_history_is_what_was_shown(generator):
     assert np.abs(made[:, 0] - raw[:, 0]).max() > 1e-3
     whole = np.concatenate([before, made], axis=1)
     np.testing.assert_array_equal(steering.history, whole[:, -before.shape[1] :])
-
-
-def test_characters_of_a_batch_do_not_hear_of_each_other(generator):
-    noise = noise_of(generator)
-    together = start(generator).advance([1.0, 0.5], [0.0, 1.0], np.eye(2), noise)
-    alone = start(generator, 1).advance([1.0], [0.0], np.eye(2)[:1], noise[:1])
-    np.testing.assert_allclose(together[:1], alone, atol=1e-5)
 
 
 def test_a_style_starts_about_as_fast_as_it_usually_walks(generator):
