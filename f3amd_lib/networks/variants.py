@@ -76,16 +76,17 @@ class VariantConfig(F3AMDConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.history_input and self.conditioning == "concatenation":
-            raise ValueError("concatenation lays c before the features: leave history_input off")
-        if self.block_bypass and self.block_residual:
-            raise ValueError("block_residual has a bypass already: leave block_bypass off")
-        residual = [("is residual", option) for option in ("block_residual", "block_bypass")]
-        for has, option in (*residual, ("normalises what a block reads", "pre_norm")):
-            if self.conditioning == "adaln_zero" and getattr(self, option):
-                raise ValueError(f"adaln_zero {has} already: leave {option} off")
-        if self.film_from_identity and self.conditioning != "film":
-            raise ValueError(f"film_from_identity is of FiLM, and c enters by {self.conditioning}")
+        adaln = self.conditioning == "adaln_zero"
+        for option, contradicted, why in (
+            ("history_input", self.conditioning == "concatenation", "concatenation lays c before the features"),
+            ("block_bypass", self.block_residual, "block_residual has a bypass already"),
+            ("block_bypass", adaln, "adaln_zero is residual already"),
+            ("block_residual", adaln, "adaln_zero is residual already"),
+            ("pre_norm", adaln, "adaln_zero normalises what a block reads already"),
+            ("film_from_identity", self.conditioning != "film", f"it is of FiLM, and c enters by {self.conditioning}"),
+        ):
+            if contradicted and getattr(self, option):
+                raise ValueError(f"{why}: leave {option} off")
 
     @classmethod
     def from_dict(cls, values: dict) -> F3AMDConfig:
