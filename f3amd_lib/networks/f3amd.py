@@ -145,12 +145,14 @@ class F3AMD(DenoisingNetwork):
         config = self.config
         config.check_state(x_noisy)
         sigma = jnp.asarray(sigma, x_noisy.dtype)
+        # The noise level asks history, path and style: one answer for each frame (section 3.3).
         c = self.condition(context, sigma)
         yield "c", c
         z, c = self._turned(self._seen(x_noisy, sigma, context)), self._turned(c)
         z = encoded = self._encoded(z)
         yield "encoder", self._turned(z)
         if config.conditioning == "concatenation":
+            # Once, ahead of the first block; the decoder drops these frames again.
             z = jnp.concatenate([c, z], axis=self._frames_axis)
         if config.base_block == "transformer":
             # Attention has no sense of order of its own (section 3.4.1).
@@ -159,7 +161,7 @@ class F3AMD(DenoisingNetwork):
             base = partial(self._run, block, key=None if key is None else jax.random.fold_in(key, number))
             z = self._updated(conditioning, base, z, c)
             yield f"block {number + 1}", self._turned(z)
-        x0_hat = self._turned(self._decoded(self._last(z, encoded)))
+        x0_hat = self._turned(self._decoded(self._last(z, encoded)))[:, config.frames_before :]
         yield "decoder", x0_hat
         yield "x0_hat", x0_hat
 
@@ -173,7 +175,7 @@ class F3AMD(DenoisingNetwork):
         return self._run(self.encoder, z)
 
     def _updated(self, conditioning, base, z, c):
-        """Return z after a base block under the condition (Eqs 5 to 7, or a row of Table 11)."""
+        """Return z after a base block under the condition (Table 11)."""
         return conditioning(base, z, c)
 
     def _last(self, z, encoded):

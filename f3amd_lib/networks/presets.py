@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +32,7 @@ FAMILIES: dict[str, tuple[str, str]] = {}
 
 
 @functools.cache
-def find_family(name: str) -> tuple[type[CheckedConfig], type[nnx.Module]]:
+def find_family(name: str) -> tuple[type[CheckedConfig], Callable[..., nnx.Module]]:
     """Return config and network of a family; their module is imported when the family is first asked for."""
     config, network = map(pkgutil.resolve_name, FAMILIES[name])
     return config, network

@@ -258,5 +258,4 @@ class Variant(F3AMD):
     def _decoded(self, z):
         if self.config.decoder_hidden_width:
             z = nnx.gelu(self._run(self.decoder_hidden, z))
-        # Frames of the history hold the period of the last transform together, and are no answer.
-        return jax.lax.slice_in_dim(super()._decoded(z), -self.config.window, None, axis=self._frames_axis)
+        return super()._decoded(z)
