@@ -161,16 +161,15 @@ def bone_swing(positions, skeleton: Skeleton):
     return np.rad2deg(np.sqrt(np.maximum(2.0 * (1.0 - together), 0.0))).mean(axis=-1)
 
 
-def steps_by_frame_in_window(positions, window: int, fps: float = 30.0) -> pd.DataFrame:
+def steps_by_frame_in_window(positions, window: int) -> pd.DataFrame:
     """Average joint step and acceleration by the place of the newest frame in its window.
 
     Place 0 is the seam: its step is `metrics.ird`, its acceleration `metrics.ird_excess`. Motion
     that does not know of windows gives level lines.
 
     Args:
-      positions: [..., T, J, 3], metres; window k starts at frame k * window.
+      positions: [..., T, J, 3], metres, at 30 fps; window k starts at frame k * window.
       window: frames.
-      fps: frame rate; figures are for 1/30 s.
 
     Returns:
       Columns place, step_cm, acceleration_cm; `window` rows.
@@ -181,11 +180,10 @@ def steps_by_frame_in_window(positions, window: int, fps: float = 30.0) -> pd.Da
     positions = np.asarray(positions, np.float64)
     if positions.shape[-3] < window + 2:
         raise ValueError(f"{positions.shape[-3]} frames do not show every place of a window; at least {window + 2} do")
-    rate = fps / 30.0
     columns = {"place": np.arange(window)}
     for order, name in ((1, "step_cm"), (2, "acceleration_cm")):
         change = np.linalg.norm(np.diff(positions, n=order, axis=-3), axis=-1).mean(axis=-1)
-        change = 100.0 * rate**order * change.reshape(-1, change.shape[-1]).mean(axis=0)
+        change = 100.0 * change.reshape(-1, change.shape[-1]).mean(axis=0)
         place = np.arange(order, positions.shape[-3]) % window
         columns[name] = np.bincount(place, change) / np.bincount(place)
     return pd.DataFrame(columns)
@@ -198,21 +196,20 @@ FACTORS = {"joint_acceleration": 1.5, "foot_alternation": 1.5, "bone_swing": 1.5
 to count as a walking person (our choice)."""
 
 
-def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None, fps: float = 30.0) -> dict:
+def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None) -> dict:
     """Measure what tells a walking person from a floating, frozen or shaking one.
 
     Args:
-      positions: [..., T, J, 3], metres.
+      positions: [..., T, J, 3], metres, at 30 fps.
       skeleton: J joints.
       floor_shift: see `metrics.foot_sliding`.
-      fps: frame rate of `positions`.
 
     Returns:
       The keys of `FACTORS` in dicts of figures (`registry.Metric.key`) -> one number a character.
     """
     return {
-        "joint_acceleration_cm": joint_acceleration(positions, fps),
-        "foot_alternation_hz": support_changes_per_s(positions, skeleton, fps),
+        "joint_acceleration_cm": joint_acceleration(positions),
+        "foot_alternation_hz": support_changes_per_s(positions, skeleton),
         "bone_swing_deg": bone_swing(positions, skeleton),
         "contact_share": foot_sliding(positions, skeleton, floor_shift)[1],
     }
