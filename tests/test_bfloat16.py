@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config, tiny_packed, tiny_trained
 
-from f3amd_companion.measuring import bfloat16
+from f3amd_companion.measuring import measure
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
@@ -41,13 +41,13 @@ def test_rollouts_in_bfloat16_stay_near_and_come_as_float32():
 def test_comparison_tells_change_and_its_yardstick(monkeypatch):
     packed = tiny_packed()
     monkeypatch.setattr(
-        bfloat16,
+        measure,
         "evaluation_paths",
         lambda packed, styles, frames, *, seed: [
             named_path("straight", frames, speed=1.0 + 0.1 * seed) for _ in styles
         ],
     )
-    table = bfloat16.compare_precisions(
+    table = measure.compare_precisions(
         tiny_trained(), packed, packed.styles, steps=1, num_frames=3 * WINDOW, seeds=(0, 1)
     ).set_index("metric")
     known = table.dropna(subset=["float32"])

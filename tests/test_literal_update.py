@@ -9,9 +9,15 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, refused, tiny_camdm, tiny_packed, tiny_trained, tiny_windows
 
-from f3amd_companion.measuring import literal_update, measure
-from f3amd_companion.measuring.literal_update import UPDATES, WINDOW_METRICS, walk_windows, window_figures
-from f3amd_companion.measuring.seed_histories import seed_condition, walk_seed_histories
+from f3amd_companion.measuring import measure
+from f3amd_companion.measuring.literal_update import (
+    UPDATES,
+    WINDOW_METRICS,
+    seed_condition,
+    walk_seed_histories,
+    walk_windows,
+    window_figures,
+)
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.samplers import sample
@@ -128,7 +134,7 @@ def measurement(tmp_path, monkeypatch):
     monkeypatch.setattr(measure, "available_models", lambda profile: list(models))
     monkeypatch.setattr(measure, "STEPS", (2, 1))
     monkeypatch.setattr(measure, "SIGMAS", (0.1, 128.0))
-    monkeypatch.setattr(literal_update, "walk_windows", walk)
+    monkeypatch.setattr(measure, "walk_windows", walk)
     profile = load_profile("smoke", "synthetic")
 
     def run(asked=None):

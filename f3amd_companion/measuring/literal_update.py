@@ -4,7 +4,8 @@ Appendix F prints a DDIM step that takes a variance-exploding state and returns 
 rescale it before the next step gives plain DDIM ("rescaled"); to leave it as it is gives another
 walk ("literal", see `samplers.ddim_step_literal`). Which of the two a table was measured with can
 only show where a network uses its noise. These functions look at single windows, all from the same
-noise: after held-out motion (`walk_windows`), or under any conditions (`walk_conditions`). Long
+noise: after held-out motion (`walk_windows`), under any conditions (`walk_conditions`), or after the captured
+histories that weights carry with them, for which no motion data are needed (`walk_seed_histories`). Long
 rollouts choose the update by the name of its sampler, `UPDATES[...]`.
 """
 
@@ -13,16 +14,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.data.features import frame_positions
+from f3amd_lib.data.features import frame_positions, path_condition
 from f3amd_lib.data.windows import WindowSet, spread_windows
 from f3amd_lib.diffusion.samplers import walk
 from f3amd_lib.measures.denoising import CM
 from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.networks.conditioning import Condition
+from f3amd_lib.rollout.start_poses import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
 
@@ -85,6 +88,40 @@ def walk_conditions(
             *_, end = walk(UPDATES[update], denoise, grids[number][0] * noise, grids[number])
             draws.append(trained.joint_positions(end.x_noisy))
     return {way: np.stack(draws) for way, draws in made.items()}
+
+
+def seed_condition(trained: TrainedModel) -> Condition:
+    """Return one condition for each style: its first stored history, and straight on at its pace.
+
+    Args:
+      trained: the model.
+
+    Returns:
+      Condition of as many rows as there are styles, in the order of `trained.styles`, in network
+      units.
+    """
+    history = np.stack([trained.start_poses[style][0] for style in trained.styles])
+    # Stored histories end at the origin and face +Z.
+    ahead = pose_speed(history)[:, None] * np.arange(1, trained.config.window + 1)
+    position = np.stack([0.0 * ahead, ahead], axis=-1)
+    path = path_condition(position, 0.0 * ahead).astype(np.float32)
+    return Condition(
+        history=trained.normaliser.normalise(jnp.asarray(history)),
+        path=trained.normaliser.normalise_path(jnp.asarray(path)),
+        style=jnp.eye(len(trained.styles), dtype=jnp.float32),
+    )
+
+
+def walk_seed_histories(trained: TrainedModel, steps=(8, 4, 2, 1), **settings) -> Walks:
+    """Sample the window after a stored history of each style with both updates.
+
+    Args:
+      trained, steps, **settings: as for `walk_conditions`.
+
+    Returns:
+      The walks; nothing real stands beside them.
+    """
+    return walk_conditions(trained, seed_condition(trained), steps, **settings)
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> float:

@@ -22,13 +22,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.measuring import literal_update, sensitivity
-from f3amd_companion.measuring.bfloat16 import compare_precisions
+from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve, snapshot
+from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
 from f3amd_companion.measuring.posterior import POSTERIOR, posterior_table
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
@@ -57,6 +58,7 @@ from f3amd_lib.measures.protocol import (
 )
 from f3amd_lib.measures.real_clips import reference_clips, style_floor
 from f3amd_lib.measures.registry import SHOWN
+from f3amd_lib.measures.rollout_measures import measure_rollout
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
@@ -131,26 +133,37 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
     return run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement, **settings)
 
 
-def _asked(
+def _models(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False,
     among: Iterable[str] = (),
-) -> tuple[list[str], dict[str, TrainedModel]]:  # fmt: skip
-    """Return the presets that were asked for by name, and the models: theirs, or all (of `among`) that have weights."""
-    names = asked = list(models or ())
-    if not asked:
+) -> dict[str, TrainedModel]:  # fmt: skip
+    """Return the models that were asked for by name, or all (of `among`) that have weights."""
+    names = models
+    if not names:
         known = (models_with_weights if at_least_one else available_models)(profile)
         names = [name for name in among if name in known] if among else known
-    return asked, {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+    return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
     return {name: weights_digest(model.params) for name, model in trained.items()}
 
 
-def _with_weights(rows: Iterable[dict], trained: Mapping[str, TrainedModel], *, other: str = "") -> list[dict]:
-    """Add to what is to be measured the digest of its network's weights, `other` where there is no network."""
-    digests = _digests(trained)
-    return [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in rows]
+def _measure(
+    profile: Profile, record: dict, keys: Mapping[str, list[str]], todo: Iterable[dict], measure: Callable, *,
+    again: Iterable[str] | None, trained: Mapping[str, TrainedModel] | None = None, other: str = "",
+    summaries: Mapping[str, tuple[str, Callable]] = {},
+) -> Path:  # fmt: skip
+    """Measure what has no rows yet (see `Records.measure`), or is of models that are asked for `again` by name.
+
+    With `trained` models, what names a measurement holds the digest of its network's weights, `other` where it has no
+    network.
+    """
+    if trained is not None:
+        digests = _digests(trained)
+        todo = [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in todo]
+    records = Records(_records_dir(profile), record, keys, again=list(again or ()), summaries=summaries)
+    return records.measure(todo, measure)
 
 
 def _write_anew(
@@ -199,14 +212,13 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     Returns:
       The table, `records/learning.csv`.
     """
-    record = _record(prepared, profile, "learning", **SHORT_RUN)
-    asked = list(models or ())
-    records = Records(_records_dir(profile), record, {"learning": ["model"]}, again=asked)
 
     def curve(row: Mapping) -> dict:
         return {"learning": learning_curve(prepared, row["model"], seed=profile.seed)}
 
-    return records.measure([{"model": name} for name in asked or presets.of_paper()], curve)
+    record, todo = _record(prepared, profile, "learning", **SHORT_RUN), models or presets.of_paper()
+    todo = [{"model": name} for name in todo]
+    return _measure(profile, record, {"learning": ["model"]}, todo, curve, again=models)
 
 
 def measure_quality(
@@ -224,7 +236,7 @@ def measure_quality(
     packed = prepared.packed
     classifier, protocol, record = protocol_of(prepared, profile, "quality")
     held_out = prepared.windows(prepared.held_out_split)
-    asked, trained = _asked(prepared, profile, models)
+    trained = _models(prepared, profile, models)
     if published is not None:
         trained[PUBLISHED] = published_model(published, packed)
     if not trained:
@@ -237,11 +249,6 @@ def measure_quality(
         todo += [(name, steps) for steps in counts]
         if levels:  # respaced in the other way that is in use, see `NoiseSchedule.times`
             todo += [(name + LEADING, steps) for steps in counts if steps < levels]
-    keys = ["model", "window_frames", "steps"]
-    records = Records(
-        _records_dir(profile), record, {"quality_by_seed": keys, "quality_by_round": keys}, again=asked,
-        summaries={"quality": ("quality_by_seed", summarise)},
-    )  # fmt: skip
 
     def score(row: Mapping) -> dict:
         started, tables = time.perf_counter(), {}
@@ -255,8 +262,12 @@ def measure_quality(
         return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
 
     rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in todo]
+    keys = dict.fromkeys(["quality_by_seed", "quality_by_round"], ["model", "window_frames", "steps"])
     # Real motion has no weights, but it is seen through the classifier's.
-    return records.measure(_with_weights(rows, trained, other=record["classifier_weights"]), score)
+    return _measure(
+        profile, record, keys, rows, score, again=models, trained=trained, other=record["classifier_weights"],
+        summaries={"quality": ("quality_by_seed", summarise)},
+    )  # fmt: skip
 
 
 TREATMENTS: dict[str, tuple[int, Callable | None]] = {
@@ -306,7 +317,7 @@ def _measure_walks(
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
     paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
     record = _record(prepared, profile, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
-    asked, trained = _asked(prepared, profile, models)
+    trained = _models(prepared, profile, models)
 
     def walks(row: Mapping):
         """Yield (treatment, seed, style, motion)."""
@@ -336,8 +347,7 @@ def _measure_walks(
 
     rows = [("real", 0), *itertools.product(trained, (8, 1))]
     todo = [{"model": model, **also, "steps": steps} for model, steps in rows]
-    records = Records(_records_dir(profile), record, {name: list(todo[0])}, again=asked)
-    return records.measure(_with_weights(todo, trained), measured)
+    return _measure(profile, record, {name: list(todo[0])}, todo, measured, again=models, trained=trained)
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -349,9 +359,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
       the held-out loss fell over the last quarter of training (NaN where none was watched).
     """
-    asked = list(models or ())
-    record = _record(prepared, profile, "trained")
-    found = {name: obtain_model(prepared, profile, preset=name) for name in asked or available_models(profile)}
+    found = {name: obtain_model(prepared, profile, preset=name) for name in models or available_models(profile)}
 
     def sum_up(row: Mapping) -> dict:
         trained, history, _ = found[row["model"]]
@@ -363,9 +371,10 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
         figures = {"windows": trained.windows_seen, "held_out_fall": fall}
         return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
 
-    records = Records(_records_dir(profile), record, {"trained": ["model", "window_frames"]}, again=asked)
     todo = [{"model": name, "window_frames": profile.window} for name in found]
-    return records.measure(_with_weights(todo, {name: model for name, (model, *_) in found.items()}), sum_up)
+    record, keys = _record(prepared, profile, "trained"), {"trained": ["model", "window_frames"]}
+    by_name = {name: model for name, (model, *_) in found.items()}
+    return _measure(profile, record, keys, todo, sum_up, again=models, trained=by_name)
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -400,7 +409,7 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
     packed, styles, seed = prepared.packed, _styles(prepared, profile), profile.seed
     paths = evaluation_paths(packed, styles, profile.rollout_frames, seed=seed)
     feet = {("real", profile.window, 0): _real_walks(packed, profile, styles)}
-    _, trained = _asked(prepared, profile, models)
+    trained = _models(prepared, profile, models)
     for name, model in trained.items():
         log.info("foot spectrum of %s", name)
         rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
@@ -419,7 +428,7 @@ def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable
       The table `records/posterior.csv` (see `posterior.posterior_table`), measured anew.
     """
     settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
-    _, trained = _asked(prepared, profile, models)
+    trained = _models(prepared, profile, models)
     table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
     return _write_anew(
         prepared, profile, "posterior", table, trained, held_out_split=prepared.held_out_split, settings=settings,
@@ -444,33 +453,26 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     """
     classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
     held_out = prepared.windows(prepared.held_out_split)
-    asked, trained = _asked(prepared, profile, models, at_least_one=True)
-    for name, model in list(trained.items()):
-        if model.diffusion.sampler != literal_update.UPDATES["rescaled"]:
-            if asked:
-                raise ValueError(
-                    f"{name} samples by {model.diffusion.sampler!r}, which has no printed "
-                    "update: name models that sample by DDIM in the VE state"
-                )
-            del trained[name]
+    trained = _models(prepared, profile, models, at_least_one=True)
+    others = {name for name, model in trained.items() if model.diffusion.sampler != UPDATES["rescaled"]}
+    if others and models:
+        raise ValueError(
+            f"{', '.join(sorted(others))}: another sampler than DDIM has no printed update: name models that sample by "
+            "DDIM in the VE state"
+        )
+    trained = {name: model for name, model in trained.items() if name not in others}
 
     def summary(rows: pd.DataFrame) -> pd.DataFrame:
         groups = rows.groupby(["spacing", "update"], sort=False)
         return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
 
-    way = ["model", "spacing", "update", "steps"]
-    records = Records(
-        _records_dir(profile), record, {"literal_update_by_seed": way, "literal_update_windows": way[:2]}, again=asked,
-        summaries={"literal_update": ("literal_update_by_seed", summary)},
-    )  # fmt: skip
-
-    def walk_windows(row: Mapping) -> dict:
-        walks = literal_update.walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
-        return {"literal_update_windows": literal_update.window_figures(*walks)}
+    def windows_of(row: Mapping) -> dict:
+        walks = walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
+        return {"literal_update_windows": window_figures(*walks)}
 
     def walk_rollouts(row: Mapping) -> dict:
         generator = MotionGenerator(
-            trained[row["model"]], row["steps"], spacing=row["spacing"], sampler=literal_update.UPDATES[row["update"]]
+            trained[row["model"]], row["steps"], spacing=row["spacing"], sampler=UPDATES[row["update"]]
         )
         rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out, name=row["model"])
         return {"literal_update_by_seed": rows}
@@ -478,11 +480,14 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     windows = [{"model": name, "spacing": spacing} for name, spacing in itertools.product(trained, SPACINGS)]
     rollouts = [
         {"model": name, "spacing": spacing, "update": update, "steps": steps}
-        for name, spacing, update, steps in itertools.product(trained, SPACINGS, literal_update.UPDATES, STEPS)
+        for name, spacing, update, steps in itertools.product(trained, SPACINGS, UPDATES, STEPS)
         if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
     ]
-    records.measure(_with_weights(windows, trained), walk_windows, into="literal_update_windows")
-    return records.measure(_with_weights(rollouts, trained), walk_rollouts)
+    way, how = ["model", "spacing", "update", "steps"], {"again": models, "trained": trained}
+    _measure(profile, record, {"literal_update_windows": way[:2]}, windows, windows_of, **how)
+    summaries = {"literal_update": ("literal_update_by_seed", summary)}
+    keys = {"literal_update_by_seed": way}
+    return _measure(profile, record, keys, rollouts, walk_rollouts, summaries=summaries, **how)
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -494,9 +499,8 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
       the levels that a model was told where it was told some, and `input_use.csv`, how far the
       estimates move with noisy input and noise level (see `denoising.input_use`).
     """
-    record = _record(prepared, profile, "noise_use")
     held_out = prepared.windows(prepared.held_out_split)
-    asked, trained = _asked(prepared, profile, models, at_least_one=True)
+    trained = _models(prepared, profile, models, at_least_one=True)
 
     def ask(row: Mapping) -> dict:
         model = trained[row["model"]]
@@ -511,9 +515,8 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
 
     # The table that says what was measured is written last.
     keys = dict.fromkeys(["noise_use", "x0_by_sigma", "input_use"], ["model"])
-    records = Records(_records_dir(profile), record, keys, again=asked)
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
-    return records.measure(_with_weights(rows, trained), ask)
+    return _measure(profile, _record(prepared, profile, "noise_use"), keys, rows, ask, again=models, trained=trained)
 
 
 def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -525,9 +528,9 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     Raises:
       ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
     """
-    asked, by_name = _asked(prepared, profile, models or ["F3AMD-FNO-96"])
-    if len(asked) > 1:
-        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(asked)}: name one with --model")
+    by_name = _models(prepared, profile, models or ["F3AMD-FNO-96"])
+    if len(by_name) > 1:
+        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(by_name)}: name one with --model")
     (trained,) = by_name.values()
     task = prepared.task(trained.name, profile_recipe(profile, trained.name), normaliser=trained.normaliser)
     held_out = prepared.windows(prepared.held_out_split)
@@ -547,10 +550,7 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
     classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
     protocol = dataclasses.replace(protocol, num_seeds=1)
     held_out = prepared.windows(prepared.held_out_split)
-    asked = list(models or ())
     folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
-    keys = ["model", "snapshot"]
-    records = Records(_records_dir(profile), record, {"quality_by_epoch": keys}, again=asked)
 
     def score(row: Mapping) -> dict:
         recipe = profile_recipe(profile, row["model"])
@@ -563,9 +563,9 @@ def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: I
         rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
         return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
 
-    names = asked or ["F3AMD-FNO-96", "CAMDM"]
+    names = models or ["F3AMD-FNO-96", "CAMDM"]
     todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
-    return records.measure(todo, score)
+    return _measure(profile, record, {"quality_by_epoch": ["model", "snapshot"]}, todo, score, again=models)
 
 
 def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -590,28 +590,69 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
         rows = denoising.window_row(trained, held_out, seed=profile.seed)
         return {"recipes": rows.assign(**row, weights=weights_digest(trained.params))}
 
-    records = Records(_records_dir(profile), record, {"recipes": ["recipe"]})
-    return records.measure([{"recipe": name, "change": RECIPES[name].change} for name in RECIPES], train_and_ask)
+    todo = [{"recipe": name, "change": recipe.change} for name, recipe in RECIPES.items()]
+    return _measure(profile, record, {"recipes": ["recipe"]}, todo, train_and_ask, again=None)
+
+
+def compare_precisions(
+    trained, packed, styles: Iterable[str], *, steps: int, num_frames: int, seeds: Iterable[int]
+) -> pd.DataFrame:
+    """Generate the same characters in float32 and in bfloat16 and measure both.
+
+    Args:
+      trained: a trained model.
+      packed: its data, for paths and floors.
+      styles: of the characters.
+      steps: a round.
+      num_frames: of each character.
+      seeds: each draws paths, starting poses and noise anew.
+
+    Returns:
+      A row a metric: model, steps, metric, float32 and bfloat16 (means over seeds and characters),
+      change (their difference), and seed_deviation: how much the float32 mean moves from seed to
+      seed, the yardstick for the change. One more row, "joint distance (cm)": how far joints of the
+      two motions are apart in the first window.
+    """
+    styles, seeds = list(styles), list(seeds)
+    floors = [style_floor(packed, style) for style in styles]
+    precisions = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
+    generators = {name: MotionGenerator(trained, steps, dtype=dtype) for name, dtype in precisions.items()}
+    means, distances = {name: [] for name in generators}, []
+    for seed in seeds:
+        paths = evaluation_paths(packed, styles, num_frames, seed=seed)
+        first_windows = []
+        for name, generator in generators.items():
+            rollout = generator.rollout(paths, styles, seed=seed)
+            measures = measure_rollout(rollout, floors)
+            means[name].append({key: np.nanmean(values) for key, values in measures.items()})
+            motions = [rollout.motion(character) for character in range(len(styles))]
+            first_windows.append(np.stack([motion.positions[: trained.config.window] for motion in motions]))
+        distances.append(100.0 * np.linalg.norm(first_windows[0] - first_windows[1], axis=-1).mean())
+    float32, bfloat16 = (pd.DataFrame(rows) for rows in means.values())
+    table = pd.DataFrame({"float32": float32.mean(), "bfloat16": bfloat16.mean(), "seed_deviation": float32.std()})
+    table.loc["joint distance (cm)"] = {"float32": 0.0, "bfloat16": np.mean(distances), "seed_deviation": np.nan}
+    table = table.rename_axis("metric").reset_index()
+    table = table.assign(model=trained.name, steps=steps, change=table["bfloat16"] - table["float32"])
+    return table[["model", "steps", "metric", "float32", "bfloat16", "change", "seed_deviation"]]
 
 
 def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Compare float32 and bfloat16 on trained models, with 1 step and with 8 (see `measuring.bfloat16`).
+    """Compare float32 and bfloat16 on trained models, with 1 step and with 8 (see `compare_precisions`).
 
     Returns:
       The table `records/precision.csv`.
     """
     packed, styles = prepared.packed, _styles(prepared, profile)
     seeds = range(profile.seed, profile.seed + PRECISION_SEEDS)
-    asked, trained = _asked(prepared, profile, models, at_least_one=True)
+    trained = _models(prepared, profile, models, at_least_one=True)
     record = _record(prepared, profile, "precision", styles=styles, num_seeds=PRECISION_SEEDS)
 
     def compare(row: Mapping) -> dict:
         settings = {"steps": row["steps"], "num_frames": profile.rollout_frames, "seeds": seeds}
         return {"precision": compare_precisions(trained[row["model"]], packed, styles, **settings)}
 
-    records = Records(_records_dir(profile), record, {"precision": ["model", "steps"]}, again=asked)
     todo = [{"model": name, "steps": steps} for name, steps in itertools.product(trained, (1, 8))]
-    return records.measure(_with_weights(todo, trained), compare)
+    return _measure(profile, record, {"precision": ["model", "steps"]}, todo, compare, again=models, trained=trained)
 
 
 DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
@@ -631,14 +672,9 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
     packed, num_steps = prepared.packed, STUDENT_STEPS[profile.name]
     held_out = prepared.windows(prepared.held_out_split)
     classifier, protocol, record = protocol_of(prepared, profile, "one_step")
-    asked, trained = _asked(prepared, profile, models, among=ONE_STEP_MODELS)
+    trained = _models(prepared, profile, models, among=ONE_STEP_MODELS)
     folder = runs_dir(profile.dataset, profile.name) / "one_step"
     record |= {"distillation_steps": num_steps, "batch_size": STUDENT_BATCH}
-    keys = ["model", "window_frames", "steps"]
-    records = Records(
-        _records_dir(profile), record, {"one_step_by_seed": keys, "one_step_input_use": keys}, again=asked,
-        summaries={"one_step": ("one_step_by_seed", summarise)},
-    )  # fmt: skip
 
     def score(row: Mapping) -> dict:
         walker, steps = trained[asked_network(row["model"])], row["steps"]
@@ -655,7 +691,9 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
     todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
     walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
     rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in walks + todo]
-    return records.measure(_with_weights(rows, trained), score)
+    keys = dict.fromkeys(["one_step_by_seed", "one_step_input_use"], ["model", "window_frames", "steps"])
+    summaries = {"one_step": ("one_step_by_seed", summarise)}
+    return _measure(profile, record, keys, rows, score, again=models, trained=trained, summaries=summaries)
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -666,7 +704,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     Returns:
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
-    _, trained = _asked(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
+    trained = _models(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
     batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
 
     def compiled(model: TrainedModel, steps: int) -> Callable:

@@ -73,18 +73,15 @@ class Records:
             digests = used.map(list).to_dict()
         write_table(self.path(name), rows, self.record | {"weights_digests": digests})
 
-    def measure(
-        self, todo: Iterable[Mapping], measure: Callable[[Mapping], Mapping[str, pd.DataFrame]], *, into: str = ""
-    ) -> Path:
+    def measure(self, todo: Iterable[Mapping], measure: Callable[[Mapping], Mapping[str, pd.DataFrame]]) -> Path:
         """Measure what has no rows yet, keep each as soon as it is measured; return the table, or its summary.
 
         Args:
           todo: what names each measurement, column -> value, with the digest of its weights where
             it has some.
           measure: function of one of them; returns table -> rows, to which the columns are added.
-          into: the table that says whether it was measured; the first by default.
         """
-        into = into or next(iter(self.keys))
+        into = next(iter(self.keys))  # says whether it was measured
         todo = [row for row in todo if not self.has(into, row)]
         for number, row in enumerate(todo, 1):
             named = ", ".join(str(row[key]) for key in self.keys[into])
