@@ -101,7 +101,7 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
     prepared = PreparedData(packed, 32, 10)
     for each in (run, Run("F3AMD-FNO-96")):
         given = 10_240, 128, "float32", {}, tmp_path, None, False
-        assert campaign._measured(prepared, None, None, each, *given) is None
+        assert campaign._measured(prepared, None, None, each, *given, rows_of=None) is None
     assert [(config.batch_size, steps) for config, steps in seen] == [(512, 20), (128, 80)]
 
 
@@ -111,7 +111,7 @@ def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp
     look = lambda *_, **__: (seen.append(jax.config.jax_default_matmul_precision), (None, 0.0))[1]
     monkeypatch.setattr(campaign, "snapshot", look)
     given = 10_240, 128, precision, {}, tmp_path, None, False
-    assert campaign._measured(PreparedData(packed, 32, 10), None, None, SEEDED, *given) is None
+    assert campaign._measured(PreparedData(packed, 32, 10), None, None, SEEDED, *given, rows_of=None) is None
     assert seen == [products] and jax.config.jax_default_matmul_precision != products
 
 

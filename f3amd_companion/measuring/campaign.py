@@ -210,7 +210,7 @@ def run_campaign(
     )  # fmt: skip
     folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {table: ["run", "windows"]}
     records = Records(folder_of_records, record, keys, known=known)
-    measure = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
+    rows_of = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
     if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
         clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
         real = real_rows(prepared.packed, clips, window=prepared.window)
@@ -227,7 +227,7 @@ def run_campaign(
             yield run.name, windows, "unfinished"
             return
         how = batch_size, precision, record, folder, stop_at, progress
-        rows = _measured(prepared, classifier, protocol, run, windows, *how, measure=measure)
+        rows = _measured(prepared, classifier, protocol, run, windows, *how, rows_of=rows_of)
         if rows is None:
             yield run.name, windows, "unfinished"
             return
@@ -285,19 +285,15 @@ def _trained(
     """
     data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
     config = run.config(data.windows("train").num_windows, batch_size)
-    network, steps = find_recipe(run.recipe).network, max(1, windows // config.batch_size)
-    file = _weights(folder, run, windows)
+    network, file = find_recipe(run.recipe).network, _weights(folder, run, windows)
     if file.exists() and (found := load_model(file)).record["training"] == config.to_dict():
-        task, state = (
-            data.task(run.preset, config, network=network),
-            SimpleNamespace(averaged=found.params, statistics=None),
-        )
+        task = data.task(run.preset, config, network=network)
+        state = SimpleNamespace(averaged=found.params, statistics=None)
         return data, found, held_out_terms(task, state, data.windows(data.held_out_split))["loss"], config
     with matmul_precision(precision):
         trained, loss = snapshot(
-            data, run.preset, config, steps, record,
-            folder=file.parent, network=network, every=_EVERY.get(device_name(), 1000),
-            stop_at=stop_at, progress=progress,
+            data, run.preset, config, max(1, windows // config.batch_size), record, folder=file.parent, network=network,
+            every=_EVERY.get(device_name(), 1000), stop_at=stop_at, progress=progress,
         )  # fmt: skip
     if trained is None:
         return None
@@ -306,19 +302,21 @@ def _trained(
 
 
 def _measured(
-    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, precision: str, record, folder, stop_at,
-    progress, *, measure: Callable | None = None,
+    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, precision: str, record, *how,
+    rows_of: Callable,
 ) -> pd.DataFrame | None:  # fmt: skip
     """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
-    done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
+    done = _trained(prepared, run, windows, batch_size, precision, record, *how)
     if done is None:
         return None
     data, trained, loss, config = done
     log.info("measuring %s after %s windows", run.name, f"{windows:,}")
-    held_out = data.windows(data.held_out_split)
-    rows = (measure or _campaign_rows)(trained, data, classifier, protocol, held_out)
-    error = held_out_error(trained, held_out, seed=protocol.path_seed)
-    of_windows = pd.DataFrame({"steps": 0, "metric": ["held_out_loss", "held_out_error"], "value": [loss, error]})
+    held_out, seed = data.windows(data.held_out_split), protocol.path_seed
+    rows = rows_of(trained, data, classifier, protocol, held_out)
+    use = input_use(trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=seed)
+    use = use.assign(steps=STEPS_MEASURED[0])[["metric", "unit", "value", "steps"]]
+    errors = [loss, held_out_error(trained, held_out, seed=seed)]
+    of_windows = pd.DataFrame({"steps": 0, "metric": ["held_out_loss", "held_out_error"], "value": errors})
     seen = max(1, windows // config.batch_size) * config.batch_size
     columns = {
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
@@ -326,20 +324,12 @@ def _measured(
         "classifier": weights_digest(classifier.params),
         "device": jax.devices()[0].device_kind, "precision": precision, "commit": (record["git_commit"] or "")[:10],
     }  # fmt: skip
-    return pd.concat([rows, of_windows]).assign(**columns)
-
-
-def _input_use(trained: TrainedModel, held_out: WindowSet, seed: int) -> pd.DataFrame:
-    use = input_use(trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=seed)
-    return use.assign(steps=STEPS_MEASURED[0])
+    return pd.concat([rows, use, of_windows]).assign(**columns)
 
 
 def _campaign_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
-    tables = [
-        measure_model(MotionGenerator(trained, count), data.packed, classifier, protocol, held_out)[0]
-        for count in STEPS_MEASURED
-    ]
-    tables.append(_input_use(trained, held_out, protocol.path_seed))
+    generators = [MotionGenerator(trained, count) for count in STEPS_MEASURED]
+    tables = [measure_model(one, data.packed, classifier, protocol, held_out)[0] for one in generators]
     return pd.concat(tables)[["steps", "metric", "unit", "value"]]
 
 
@@ -350,5 +340,4 @@ def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, h
     tables = [walk_rows(trained, data.packed, classifier, seed=protocol.path_seed), pd.DataFrame(figures)]
     if trained.diffusion.kind == "variance_exploding":
         tables.append(window_rows(trained, held_out, seed=protocol.path_seed))
-    tables.append(_input_use(trained, held_out, protocol.path_seed)[["metric", "unit", "value", "steps"]])
     return pd.concat(tables, ignore_index=True)
