@@ -16,23 +16,21 @@ from f3amd_lib.ground.trees import save_tree
 from f3amd_lib.measures import classifier as module
 from f3amd_lib.measures.classifier import (
     ACCURACY_BAR,
+    CLASSIFIER_JOINTS,
+    NUM_CHANNELS,
     ClassifierConfig,
     ClassifierTraining,
     StyleNetwork,
     StyleTask,
+    classifier_frames,
+    classifier_joints,
     load_classifier,
+    mirror_channels,
     obtain_classifier,
     require_telling_styles,
     save_classifier,
-    train_classifier,
-)
-from f3amd_lib.measures.classifier_windows import (
-    CLASSIFIER_JOINTS,
-    NUM_CHANNELS,
-    classifier_frames,
-    classifier_joints,
-    mirror_channels,
     side_by_side,
+    train_classifier,
 )
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
