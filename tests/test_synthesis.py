@@ -7,8 +7,8 @@ from builders import CHANNELS, WINDOW, network_of, refused, tiny_camdm, tiny_con
 
 from f3amd_companion.speed import implementations, measurements, synthesis
 from f3amd_companion.speed.implementations import NotPossible, Workload, prepare_round, random_condition
+from f3amd_companion.speed.measurements import PARTS, time_breakdown, without
 from f3amd_companion.speed.synthesis import Candidate, plan, time_group
-from f3amd_companion.speed.time_breakdown import PARTS, time_breakdown, without
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -93,12 +93,6 @@ def test_a_group_is_timed_and_counted():
     np.testing.assert_allclose(table["share_of_peak"], table["gflops"] / table["peak_gflops"])
     assert table["peak_gflops"].nunique() == 1
     assert table["flops"].iloc[0] == implementations.round_flops(workload(steps=1))
-
-
-def test_groups_are_not_mixed():
-    mixed = [Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW) for count in (1, 2)]
-    refused("candidates of 2 groups cannot be timed by turns", time_group, mixed, tiny)
-    refused("candidates of 0 groups", time_group, [], tiny)
 
 
 def test_plans_name_presets_and_implementations_that_exist_each_once():

@@ -38,14 +38,13 @@ class Clock:
         return self.now
 
 
-def test_median_spread_and_first_call_are_told_apart():
+def test_median_and_spread_leave_the_warm_up_out():
     clock = Clock()
     call = clock.work("a", [9.0, 9.0, 9.0, *range(1, 102)])
     timing = take_turns({"a": call}, min_rounds=101, min_seconds=1e9, clock=clock)["a"]
     assert timing.median == 51.0
     assert (timing.low, timing.high) == (6.0, 96.0)
     assert timing.rounds == 101
-    assert timing.first == 9.0
 
 
 def test_candidates_run_by_turns():
@@ -113,7 +112,6 @@ def test_matmul_probe_has_the_type_of_its_precision():
 
 def test_unknown_precision_is_refused():
     refused("tf32", matmul_precision, "fp8")
-    refused("size must be at least 1, got 0", matmul_probe, size=0)
 
 
 def test_fast_flags_start_jax_with_as_many_devices():

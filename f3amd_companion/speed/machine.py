@@ -113,11 +113,9 @@ def matmul_probe(precision: str = "float32", size: int | None = None) -> tuple[C
       (function that multiplies and waits, its operations 2 size^3).
 
     Raises:
-      ValueError: for an unknown precision, or a size below 1.
+      ValueError: for an unknown precision.
     """
-    size = (2048 if device_name() == "CPU" else 8192) if size is None else size
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
+    size = size or (2048 if device_name() == "CPU" else 8192)
     with matmul_precision(precision):
         matrix = jax.random.normal(jax.random.key(0), (size, size), PRECISIONS[precision][1])
         multiply = jax.jit(jnp.matmul).lower(matrix, matrix).compile()

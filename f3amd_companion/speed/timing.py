@@ -23,7 +23,6 @@ class Timing:
       low, high: their 5 % and 95 % quantiles.
       median_low, median_high: 95 % interval of the median itself.
       rounds: how many were timed.
-      first: the first call of all, which also compiles; not among the rounds.
     """
 
     median: float
@@ -32,7 +31,6 @@ class Timing:
     median_low: float
     median_high: float
     rounds: int
-    first: float
 
     def columns(self, unit: str, scale: float) -> dict:
         """Return unit, value and both pairs of bounds as a table has them; `scale` units are a second."""
@@ -60,25 +58,18 @@ def take_turns(
 
     Args:
       candidates: name -> function without arguments that comes back when its work is done (JAX
-        calls must block until ready). The first call of each is reported apart.
+        calls must block until ready).
       min_rounds: a candidate is done after this many rounds,
       min_seconds: or once its own rounds have taken this long,
       fewest_rounds: but not before it has had this many.
-      warmup: calls before the first timed round, one of them the first.
+      warmup: calls before the first timed round; the first one may compile.
       clock: seconds, rising.
       progress: show a bar.
 
     Returns:
       Name -> timing, in the order of `candidates`. Each has one round at least, whatever the counts.
     """
-
-    def timed(call) -> float:
-        started = clock()
-        call()
-        return clock() - started
-
-    first = {name: timed(call) for name, call in candidates.items()}
-    for _ in range(warmup - 1):
+    for _ in range(warmup):
         for call in candidates.values():
             call()
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
@@ -86,8 +77,9 @@ def take_turns(
         waiting = dict(candidates)
         while waiting:
             for name, call in list(waiting.items()):
-                rounds = seconds[name]
-                rounds.append(timed(call))
+                rounds, started = seconds[name], clock()
+                call()
+                rounds.append(clock() - started)
                 enough = len(rounds) >= min_rounds or sum(rounds) >= min_seconds
                 if enough and len(rounds) >= min(fewest_rounds, min_rounds):
                     del waiting[name]
@@ -95,5 +87,5 @@ def take_turns(
     timings = {}
     for name, rounds in seconds.items():
         quantiles = map(float, np.quantile(rounds, (0.5, 0.05, 0.95)))
-        timings[name] = Timing(*quantiles, *median_interval(rounds), len(rounds), first[name])
+        timings[name] = Timing(*quantiles, *median_interval(rounds), len(rounds))
     return timings
