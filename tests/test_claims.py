@@ -1091,6 +1091,7 @@ def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
 def test_the_command_tells_by_its_status(tmp_path, monkeypatch, caplog):
     caplog.set_level("INFO", logger="f3amd")
     monkeypatch.setattr(claims, "repository_root", lambda: tmp_path)
+    claims.load_commands()  # of all claims, and kept
     only = {"Q13": claims.load_claims()["Q13"]}
     monkeypatch.setattr(claims, "load_claims", lambda paper: only)
     results = keep(tmp_path / "paper_figures", SOUND)

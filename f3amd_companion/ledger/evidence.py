@@ -317,7 +317,7 @@ def _hardware(record: Mapping, device: str | None) -> str:
         return record["paper_setting"]
     if (device or record.get("device_platform", "").upper()) == "CPU":
         return f"CPU, {counted_cores(record)}" if "cores" in record else "CPU"
-    return record["device_kind"] if record.get("device_kind") != "cpu" else "GPU"
+    return "GPU" if record.get("device_kind") == "cpu" else str(record.get("device_kind"))
 
 
 def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
