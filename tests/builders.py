@@ -7,7 +7,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 from compiled import Compiled
 from flax import nnx
@@ -18,7 +17,6 @@ from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import build_windows, fit_normaliser, starting_poses
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
@@ -287,13 +285,6 @@ def captioned_walks(styles, splits, num_frames: int) -> TextMotions:
             motion, split = resample(walk, 20.0).slice(0, num_frames), splits[min(seed, len(splits) - 1)]
             clips.append((f"{style}_{seed}", motion, (f"a person walks {style}",), split, style))
     return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
-
-
-def rows_of_one_step() -> pd.DataFrame:
-    """Records `quality` and `one_step` of Bandai together, by model, steps and metric."""
-    folder = repository_root() / "paper_figures/bandai/laptop/records"
-    rows = pd.concat([pd.read_csv(folder / f"{name}.csv") for name in ("quality", "one_step")])
-    return rows.set_index(["model", "steps", "metric"])
 
 
 def placed(path: RootPath, position, yaw: float = 0.0) -> RootPath:

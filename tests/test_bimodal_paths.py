@@ -3,14 +3,11 @@
 import jax
 import numpy as np
 import pytest
-from builders import evaluate
 from f3amd_notebooks import bimodal_paths as toy
 from f3amd_notebooks.bimodal_paths import BimodalPaths
-from flax import nnx
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
-from f3amd_lib.training.optimise import advance as advance_program
 
 DATA = BimodalPaths()
 SMALL = BimodalPaths(num_frames=8, num_modes=4)
@@ -51,14 +48,6 @@ def test_paths_scatter_about_their_mean_by_the_wobble_and_have_unit_size():
     assert paths.std() == pytest.approx(1.0, abs=0.1)  # so that metres are network units
 
 
-def test_every_path_is_made_of_the_first_cosine_modes():
-    paths, _ = real_paths(SMALL, 5)
-    time = (np.arange(8) + 0.5) / 8
-    modes = np.cos(np.pi * np.outer(np.arange(4), time))  # not normalised, written out
-    residual = paths[..., 0].T - modes.T @ np.linalg.lstsq(modes.T, paths[..., 0].T, rcond=None)[0]
-    assert np.abs(residual).max() < 1e-5
-
-
 # ------------------------------------------------------------------------------- exact denoiser
 
 
@@ -75,46 +64,7 @@ def test_exact_denoiser_is_the_weighted_mean_over_many_real_paths(sigma):
         np.testing.assert_allclose(answer, expected, atol=0.03)
 
 
-def test_exact_denoiser_has_the_lowest_error_of_all():
-    paths, _ = real_paths(DATA, 2000)
-    x_noisy, unknown = noisy(paths, 2.5), np.zeros(2000, int)
-    answer = np.asarray(DATA.denoise(x_noisy, 2.5, unknown))
-    error = np.mean((answer - paths) ** 2)
-    # The mean error of a mean is orthogonal to whatever one may add that depends on the input.
-    for other in (0.9 * answer, answer + 0.05 * np.sign(answer), answer + 0.02 * x_noisy):
-        assert np.mean((other - paths) ** 2) > error
-
-
-@pytest.mark.slow
-def test_noise_levels_may_differ_from_path_to_path():
-    paths, _ = real_paths(DATA, 3)
-    levels, side = np.array([0.1, 2.0, 30.0]), np.array([0, 1, 2])
-    together = DATA.denoise(paths, levels, side)
-    for row in range(3):
-        alone = DATA.denoise(paths[row : row + 1], levels[row], side[row : row + 1])
-        np.testing.assert_allclose(together[row], alone[0], atol=1e-6)
-
-
-def test_conditions_show_a_straight_path_or_the_side():
-    condition = DATA.condition(np.array([0, 1, 2]))
-    sideways = np.asarray(condition.path[:, :, 0])
-    assert np.all(sideways[0] == 0) and np.all(sideways[1:].max(axis=1) != 0)
-    np.testing.assert_allclose(condition.path[1:, :, :2], DATA.mean_paths, atol=1e-6)
-    # The approach ends one pace before the path begins, and tells nothing.
-    pace = condition.path[0, 1, 1] - condition.path[0, 0, 1]
-    np.testing.assert_allclose(condition.path[0, 0, 1] - condition.history[0, -1, 1], pace, 1e-5)
-    assert np.ptp(np.asarray(condition.history), axis=0).max() == 0
-
-
 # ------------------------------------------------------------------------------------- outcomes
-
-
-def test_crossings_are_interpolated_and_absent_where_nobody_arrives():
-    crosses = [[0.0, -2.0], [1.0, -1.0], [2.0, 3.0], [5.0, 4.0]]
-    again = [[0.0, -1.0], [-1.0, 1.0], [0.0, -1.0], [7.0, 1.0]]  # the first time counts
-    stops = [[0.0, -2.0], [0.1, -1.0], [0.2, -0.5], [0.3, -0.1]]
-    found = toy.crossing(np.array([crosses, again, stops]))
-    np.testing.assert_allclose(found, [1.25, -0.5, np.nan])
 
 
 def test_outcomes_are_counted_by_the_wall():
@@ -152,26 +102,6 @@ def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_cho
         assert np.isnan(table.loc[(1, False), "as_told"])
 
 
-def test_a_second_step_at_the_lowest_level_changes_nothing():
-    # The grid of Eq. 9 for N = 2 is 128, 0.01, 0: the second look comes when all is decided.
-    unknown = np.zeros(300, int)
-    one, two = (toy.sample_paths(DATA, EXPLODING, n, unknown, jax.random.key(0)) for n in (1, 2))
-    assert np.abs(one - two).max() < 0.1
-    assert toy.outcome_shares(DATA, two)["wall"] == 1.0
-
-
-def test_exact_errors_follow_from_the_widths_where_the_side_is_known_or_lost():
-    low, high = toy.error_table(DATA, (0.5, 1e4), num_samples=3000)["x0_error"]
-    # Once the side is known, each of the modes is one Gaussian of known width.
-    width = DATA.mixture.width
-    share = DATA.num_modes / DATA.num_frames
-    one_mode = np.sqrt(share * (width**-2 + 0.5**-2) ** -1)
-    assert low == pytest.approx(one_mode, rel=0.02)
-    left, right = DATA.mean_paths
-    everything = np.sqrt(np.mean((0.5 * (left - right)) ** 2) + share * width**2)
-    assert high == pytest.approx(everything, rel=0.02)
-
-
 # ------------------------------------------------------------------------------------- networks
 
 
@@ -182,13 +112,6 @@ SHORT = {"num_steps": 400, "batch_size": 16, "learning_rate": 8e-3, "latent_widt
 def trained():
     networks, losses = toy.train_networks(SMALL, PRESERVING, (0, 1), **SHORT)
     return networks[0], losses[0], losses[1]
-
-
-@pytest.mark.slow
-def test_trainings_that_differ_in_noise_alone_are_compiled_once(trained):
-    compiled = advance_program._cache_size()
-    toy.train_networks(SMALL, EXPLODING, (2, 3), **SHORT)
-    assert advance_program._cache_size() == compiled
 
 
 @pytest.mark.slow
@@ -206,24 +129,3 @@ def test_a_trained_network_comes_near_the_exact_error_and_not_below(trained):
     found = toy.error_table(trained[0], sigmas, num_samples=1000)["x0_error"]
     exact = toy.error_table(SMALL, sigmas, num_samples=1000)["x0_error"]
     assert (found > 0.995 * exact).all() and (found < 1.3 * exact + 0.1).all()
-
-
-@pytest.mark.slow
-def test_seeds_that_train_side_by_side_differ_and_know_nothing_of_each_other(trained):
-    _, losses, other = trained
-    assert not np.allclose(losses, other, rtol=0.01)
-    (alone,), again = toy.train_networks(SMALL, PRESERVING, (0,), **SHORT)
-    np.testing.assert_allclose(again[0, :20], losses[:20], rtol=1e-3)
-    table = toy.outcome_table(alone, PRESERVING, (1,), num_samples=200).set_index("told")
-    assert table.loc[True, "as_told"] > 0.95
-
-
-def test_a_network_is_the_librarys_own_with_scaled_input(trained):
-    network = trained[0]
-    merged = nnx.merge(network.graph, network.params)
-    assert merged.config.input_scaling
-    x_noisy = 3.0 * jax.random.normal(jax.random.key(2), (3, 8, 2))
-    side = np.array([0, 1, 2])
-    expected = evaluate(merged, x_noisy, 3.0, SMALL.condition(side))
-    found = jax.jit(lambda model: model.denoise(x_noisy, 3.0, side))(network)
-    np.testing.assert_allclose(found, expected, atol=1e-5)

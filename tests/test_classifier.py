@@ -152,14 +152,6 @@ def test_a_frame_is_moved_to_its_hips_and_turned_to_face_z():
     np.testing.assert_allclose(at["right clavicle"], [-0.05, 0.4, 0], atol=1e-12)
 
 
-def test_facing_lies_halfway_between_hips_and_shoulders():
-    """Unit vectors are added: that the hips are twice as broad gives them no more say."""
-    at = seen(figure(hips_yaw=0.0, clavicle_yaw=0.8))
-    turned = matrix_from_yaw(-0.4)
-    np.testing.assert_allclose(at["left hip"], turned @ [0.1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(at["head"], turned @ [0, 0.6, 0.2], atol=1e-12)
-
-
 def test_place_and_direction_of_each_frame_are_not_seen():
     motion = walk()
     rng = np.random.default_rng(0)
@@ -178,18 +170,6 @@ def test_mirrored_channels_show_the_mirrored_motion():
     mirrored = classifier_frames(mirror(motion).positions, SYNTHETIC_SKELETON)
     np.testing.assert_allclose(shown, mirrored, atol=1e-6)
     assert np.abs(shown - classifier_frames(motion.positions, SYNTHETIC_SKELETON)).max() > 0.05
-
-
-def test_windows_lie_side_by_side_and_the_rest_is_left():
-    motion = walk(seconds=130 / 30)
-    frames = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
-    windows = side_by_side(frames, 60)
-    assert windows.shape == (2, 60, NUM_CHANNELS) and windows.dtype == np.float32
-    np.testing.assert_allclose(windows[1], frames[60:120], atol=1e-6)
-    many = np.stack([motion.positions, walk(8, seconds=130 / 30).positions])
-    both = side_by_side(classifier_frames(many, SYNTHETIC_SKELETON), 60)
-    assert both.shape == (2, 2, 60, NUM_CHANNELS)
-    np.testing.assert_array_equal(both[0], windows)
 
 
 def test_motion_that_is_shorter_than_a_window_or_not_finite_gives_none():
@@ -278,18 +258,6 @@ def test_in_training_the_batch_itself_is_the_norm_and_dropout_blanks():
     np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-3, atol=1e-4)
 
 
-def test_dropout_keeps_the_mean_of_what_it_passes_on():
-    window = np.random.default_rng(1).normal(size=(1, WINDOW, NUM_CHANNELS))
-    windows = np.repeat(window, 500, axis=0)
-    every = dataclasses.replace(CONFIG, dropout=0.0)
-    whole = train_forward(every, windows, jax.random.key(0))[1].hidden_norm
-    thinned = train_forward(CONFIG, windows, jax.random.key(0))[1].hidden_norm
-    spread = np.abs(whole.mean[...]).max()
-    np.testing.assert_allclose(thinned.mean[...], whole.mean[...], atol=0.1 * spread)
-    assert whole.var[...].max() < 0.901  # one window again and again
-    assert thinned.var[...].min() > 0.901
-
-
 def test_sizes_that_make_no_network_are_refused():
     assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
     refused("hidden_width must be above 0", ClassifierConfig, num_styles=3, hidden_width=0)
@@ -339,41 +307,6 @@ def test_held_out_accuracy_is_the_share_of_right_answers_on_held_out_clips(packe
     assert weak.accuracy < 0.9  # or the test would say nothing
 
 
-def test_references_are_the_features_of_real_windows(packed, trained):
-    assert trained.references.keys() == {"train", "held_out"}
-    # 120 frames hold 6 windows of 20, 90 hold 4.
-    assert len(trained.reference("train")) == 3 * 2 * 6
-    assert len(trained.reference("held_out", "Zombie")) == 2 * 4
-    clip = int(np.flatnonzero((packed.clip_style == 1) & (packed.clip_split == 2))[0])
-    features = trained.features(trained.windows_of(packed.motion(clip).positions, packed.skeleton))
-    known = trained.references["held_out"]
-    np.testing.assert_allclose(known.features[known.clips == clip], features, rtol=1e-3, atol=1e-3)
-    assert set(known.styles[known.clips == clip]) == {1}
-
-
-def test_a_windows_features_depend_on_nothing_else(trained, monkeypatch):
-    windows = trained.windows_of(walk(9, seconds=130 / 30).positions, SYNTHETIC_SKELETON)
-    features = trained.features(windows)
-    assert features.shape == (6, 16)
-    np.testing.assert_array_equal(trained.features(windows[::-1])[::-1], features)
-    np.testing.assert_array_equal(trained.features(windows[3]), features[3])
-    nested = trained.features(windows.reshape(2, 3, WINDOW, NUM_CHANNELS))
-    np.testing.assert_array_equal(nested, features.reshape(2, 3, 16))
-    monkeypatch.setattr(module, "_BATCH", 2)
-    np.testing.assert_allclose(trained.features(windows), features, rtol=1e-5, atol=1e-5)
-
-
-def test_primary_styles_are_the_classes(packed):
-    fewer = dataclasses.replace(packed, primary_styles=("Zombie", "ArmsOverhead"))
-    asked, *_ = module._asked_for(fewer, num_steps=1, batch_size=2, seed=0)
-    assert asked == ("Zombie", "ArmsOverhead")
-    _, labels, clips = module._collect(fewer, asked, ("train",), WINDOW)
-    assert labels.tolist() == [0, 0, 1, 1]
-    assert [STYLES[packed.clip_style[clip]] for clip in clips] == [
-        *("Zombie", "Zombie", "ArmsOverhead", "ArmsOverhead")
-    ]
-
-
 def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
     frames = np.zeros((40, NUM_CHANNELS), np.float32)
     frames[:, 3] = 1.0  # x of the neck
@@ -393,18 +326,6 @@ def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
     assert np.mean(np.asarray(windows)[~second, 0, 3]) == pytest.approx(0.0, abs=0.1)
     np.testing.assert_array_equal(np.abs(windows[:, :, 3]), 1.0)
     np.testing.assert_array_equal(np.asarray(windows)[second, :, 3], 1.0)
-
-
-def test_windows_start_every_stride_within_a_clip_and_short_clips_give_none():
-    uneven = three_styles(seconds=(1.0, 0.5, 1.4, 1.4))
-    frames, styles, clips = module._collect(uneven, STYLES, ("train",), WINDOW)
-    assert [len(part) for part in frames] == [30, 30, 30]  # the clips of 15 frames are left out
-    assert styles.tolist() == [0, 1, 2] and clips.tolist() == [0, 4, 8]
-    assert np.array_equal(module._starts([30, 30, 30], WINDOW, 10), [[0, 10], [30, 40], [60, 70]])
-    frames, styles, clips = module._collect(uneven, STYLES, ("validation", "test"), WINDOW)
-    assert [len(part) for part in frames] == [42] * 6
-    np.testing.assert_array_equal(side_by_side(frames[1], WINDOW)[1], frames[1][20:40])
-    assert styles.tolist() == [0, 0, 1, 1, 2, 2] and clips.tolist() == [2, 3, 6, 7, 10, 11]
 
 
 def test_references_tell_style_and_clip_of_each_window(trained):
@@ -517,16 +438,3 @@ def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, m
         assert obtain_classifier(data, profile, **settings)[1] == "trained now"
         assert settings.items() <= asked[-1].items()
     assert len(list(tmp_path.rglob("synthetic/smoke/classifier/*.safetensors"))) == 6
-
-
-def test_profiles_train_for_different_lengths(packed, tmp_path, trained, monkeypatch):
-    monkeypatch.setattr(module, "runs_dir", lambda dataset, profile: tmp_path / dataset / profile)
-    asked = {}
-    for name in ("smoke", "laptop", "gpu"):
-        monkeypatch.setattr(
-            module, "train_classifier", lambda packed, name=name, **settings: asked.update({name: settings}) or trained
-        )
-        obtain_classifier(packed, load_profile(name, "synthetic"), progress=False)
-    samples = [asked[name]["num_steps"] * asked[name]["batch_size"] for name in asked]
-    assert list(asked) == ["smoke", "laptop", "gpu"] and samples == sorted(samples)
-    assert {settings["seed"] for settings in asked.values()} == {0}

@@ -55,18 +55,6 @@ def test_strength_zero_gives_the_motion_back(name):
     np.testing.assert_allclose(same.rotations, motion.rotations, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", CORRUPTIONS)
-def test_recipes_are_repeatable_and_leave_their_input_alone(name):
-    motion = wandering_motion()
-    before = motion.root_position.copy(), motion.rotations.copy()
-    first, again = corrupt(name, motion, seed=1), corrupt(name, motion, seed=1)
-    np.testing.assert_array_equal(first.rotations, again.rotations)
-    np.testing.assert_array_equal(motion.root_position, before[0])
-    np.testing.assert_array_equal(motion.rotations, before[1])
-    other = corrupt(name, motion, seed=2)
-    assert np.array_equal(first.rotations, other.rotations) == (name == "frozen pose")
-
-
 def test_frozen_pose_is_the_first_pose_carried_along_the_path():
     motion = wandering_motion()
     frozen = frozen_pose(motion)
@@ -78,19 +66,6 @@ def test_frozen_pose_is_the_first_pose_carried_along_the_path():
     own = np.einsum("tab,tjb->tja", matrix_from_yaw(-frozen.yaw), relative)
     np.testing.assert_allclose(own, np.broadcast_to(own[:1], own.shape), atol=1e-9)
     np.testing.assert_allclose(frozen.positions[0], motion.positions[0], atol=1e-9)
-
-
-def test_half_frozen_joints_are_half_as_far_from_the_first_pose():
-    motion = wandering_motion()
-    half = frozen_pose(motion, strength=0.5)
-
-    def angle(rotations):
-        turned = np.swapaxes(motion.rotations[:1, 1:], -1, -2) @ rotations[:, 1:]
-        return Rotation.from_matrix(turned.reshape(-1, 3, 3)).magnitude()
-
-    np.testing.assert_allclose(angle(half.rotations), 0.5 * angle(motion.rotations), atol=1e-6)
-    lift = motion.root_position[:, 1] - motion.root_position[0, 1]
-    np.testing.assert_allclose(half.root_position[:, 1] - motion.root_position[0, 1], 0.5 * lift)
 
 
 def places(shuffled, motion):
@@ -107,17 +82,6 @@ def test_shuffled_frames_are_the_same_frames_elsewhere():
     assert np.all(order != np.arange(40))
     np.testing.assert_array_equal(shuffled.root_position, motion.root_position[order])
     np.testing.assert_array_equal(shuffled.rotations, motion.rotations[order])
-
-
-def test_a_weaker_shuffle_moves_its_share_of_the_same_frames():
-    motion = wandering_motion()
-    moved = []
-    for strength in (0.25, 0.5, 1.0):
-        order = places(shuffled_frames(motion, 5, strength), motion)
-        moved.append(set(np.flatnonzero(order != np.arange(40))))
-        assert sorted(order) == list(range(40))
-    assert [len(each) for each in moved] == [10, 20, 40]
-    assert moved[0] < moved[1] < moved[2]
 
 
 def test_noise_has_the_stated_size():
@@ -164,22 +128,6 @@ def test_noise_has_the_stated_size():
 def test_each_bad_generator_is_seen(name, key, least, most):
     """Between which factors of the whole walk's own figure the broken one lies."""
     assert least < measured(name)[key] / measured()[key] < most
-
-
-@pytest.mark.parametrize(
-    ("name", "key"),
-    [
-        ("frozen pose", "trajectory_error_m"),
-        ("frozen pose", "direction_error_deg"),
-        ("frozen pose", "inter_frame_step_cm"),
-        ("shuffled frames", "contact_share"),
-        ("shuffled frames", "coherence"),
-        ("shuffled frames", "camdm_orientation_error_deg"),
-    ],
-)
-def test_what_a_metric_cannot_see(name, key):
-    """Each of these bad generators passes for a walk where one metric looks alone."""
-    assert measured(name)[key] == pytest.approx(measured()[key], rel=0.1, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)

@@ -1,7 +1,5 @@
 """Distances of feature clouds, styles, diversity and intervals, against known answers."""
 
-import itertools
-
 import numpy as np
 import pytest
 from builders import refused
@@ -52,13 +50,6 @@ def test_fid_agrees_with_scipy_sqrtm(dimensions):
     assert answer == pytest.approx(expected, rel=1e-7)
 
 
-def test_fid_of_many_draws_comes_near_that_of_the_gaussians():
-    rng = np.random.default_rng(0)
-    one = rng.normal(size=(40_000, 2)) * [2.0, 3.0] + [3.0, 4.0]
-    two = rng.normal(size=(40_000, 2))
-    assert d.frechet_distance(one, two) == pytest.approx(30.0, rel=0.02)
-
-
 def test_fid_of_flat_gaussians():
     """Covariances without full rank, as fewer windows than features have."""
     # Two thin clouds in 30 dimensions: scipy's root exists to about half of its digits.
@@ -77,48 +68,12 @@ def test_fid_of_a_cloud_with_itself_is_zero(count):
     assert 0.0 <= d.frechet_distance(features, again) < 1e-8
 
 
-def test_fid_of_a_shifted_cloud_is_the_squared_shift():
-    features, shift = cloud(), np.arange(6.0)
-    assert d.frechet_distance(features, features + shift) == pytest.approx(np.sum(shift**2))
-
-
-def test_fid_is_symmetric_and_follows_the_space():
-    one, two = cloud(30, 3, 1), cloud(40, 3, 2, shift=0.5)
-    answer = d.frechet_distance(one, two)
-    turn = Rotation.random(random_state=4).as_matrix()
-    assert d.frechet_distance(two, one) == pytest.approx(answer)
-    assert d.frechet_distance(one[::-1], two) == pytest.approx(answer)
-    assert d.frechet_distance(one @ turn + 7.0, two @ turn + 7.0) == pytest.approx(answer)
-    assert d.frechet_distance(3.0 * one, 3.0 * two) == pytest.approx(9.0 * answer)
-
-
 def test_fid_in_the_scale_of_camdm_has_a_name_of_its_own():
     one, two = cloud(30, 8, 1), cloud(30, 8, 2, shift=1.0)
     assert d.frechet_distance_per_dimension(one, two) == pytest.approx(d.frechet_distance(one, two) / 8)
 
 
 # -------------------------------------------------------------------------------------------- EMD
-
-
-def test_emd_of_a_cloud_with_itself_is_zero_in_any_order():
-    features = cloud()
-    assert d.earth_movers_distance(features, features) == 0.0
-    assert d.earth_movers_distance(features, features[::-1]) == 0.0
-
-
-def test_emd_of_a_shifted_cloud_is_the_shift():
-    features = cloud()
-    shift = np.array([3.0, 0.0, 0.0, 4.0, 0.0, 0.0])
-    assert d.earth_movers_distance(features, features + shift) == pytest.approx(5.0)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_emd_against_every_pairing(seed):
-    one, two = cloud(6, 3, seed), cloud(6, 3, seed + 10)
-    gaps = cdist(one, two)
-    pairings = itertools.permutations(range(6))
-    least = min(np.mean(gaps[range(6), list(pairing)]) for pairing in pairings)
-    assert d.earth_movers_distance(one, two) == pytest.approx(least)
 
 
 @pytest.mark.parametrize("count", [60, 900])
@@ -182,24 +137,12 @@ def test_coverage_of_half_the_styles_is_half():
     assert d.style_coverage([10, 35, 5], [20, 20, 20]) == pytest.approx(100.0 * 35 / 60)
 
 
-def test_coverage_does_not_see_styles_that_are_mixed_up():
-    asked = np.repeat([0, 1, 2], 10)
-    predicted = np.repeat([1, 0, 2], 10)
-    covered = d.style_coverage(np.bincount(predicted), np.bincount(asked))
-    assert covered == 100.0
-    assert d.style_accuracy(predicted, asked) == pytest.approx(100.0 / 3)
-
-
 # -------------------------------------------------------------------------------------- diversity
 
 
 def samples(seeds=6, frames=8, joints=5, seed=0):
     """Positions of several samples of one condition, [seeds, frames, joints, 3]."""
     return np.random.default_rng(seed).normal(size=(seeds, frames, joints, 3))
-
-
-def test_diversity_of_identical_samples_is_zero():
-    assert d.diversity(np.repeat(samples(1), 10, axis=0)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_diversity_of_one_joint_that_differs():
@@ -265,13 +208,6 @@ def test_interval_of_one_repeat_or_none():
     assert d.mean_and_interval([5.0, 5.0])["low"] == 5.0
 
 
-def test_interval_holds_the_truth_as_often_as_it_says():
-    draws = np.random.default_rng(0).normal(size=(1500, 4))
-    rows = [d.mean_and_interval(each) for each in draws]
-    held = np.mean([row["low"] <= 0.0 <= row["high"] for row in rows])
-    assert held == pytest.approx(0.95, abs=0.015)
-
-
 def test_intervals_of_what_is_no_list_are_refused():
     refused("values must be", d.mean_and_interval, [1.0, np.inf])
     refused("values must be", d.mean_and_interval, np.ones((2, 2)))
@@ -290,15 +226,6 @@ def test_distances_settle_as_windows_are_added():
         assert set(rows["repeats"]) == {4}
     fid = curve[curve["metric"] == "FID"]["value"].to_numpy()
     assert fid[0] > 8 * fid[-1]
-
-
-def test_draws_of_a_size_do_not_depend_on_the_other_sizes():
-    one, two = cloud(60, 3, 1), cloud(60, 3, 2)
-    whole = d.settling_curve(one, two, [5, 20], repeats=2, seed=3)
-    alone = d.settling_curve(one, two, [20], repeats=2, seed=3)
-    np.testing.assert_array_equal(whole["value"][whole["windows"] == 20], alone["value"])
-    other = d.settling_curve(one, two, [20], repeats=2, seed=4)
-    assert np.all(other["value"] != alone["value"])
 
 
 def test_sizes_that_a_cloud_does_not_hold_are_refused():

@@ -66,11 +66,6 @@ def walking_frames(num_frames=16, windows=2):
     return np.concatenate([np.tile(root, (windows, 1, 1)), flat], axis=-1)
 
 
-def test_every_joint_has_one_body_part():
-    groups = ex.joint_groups(SKELETON)
-    assert groups == {"root": (0,), "trunk and head": (1,), "legs": (2, 4), "toes": (3, 5)}
-
-
 def test_the_squares_of_a_spectrum_add_up_to_the_variance():
     frames = walking_frames()
     table = ex.motion_spectrum(SKELETON, frames, fps=16.0)
@@ -81,13 +76,6 @@ def test_the_squares_of_a_spectrum_add_up_to_the_variance():
             rows = table[(table["band"] == band) & (table["group"] == group)]
             np.testing.assert_allclose(rows["frequency_hz"], np.arange(9.0))
             np.testing.assert_allclose(np.sum(rows["amplitude_cm"].to_numpy()[1:] ** 2), spread, rtol=1e-9, atol=1e-12)
-
-
-def test_a_spectrum_has_its_peak_at_the_frequency_of_a_swing():
-    table = ex.motion_spectrum(SKELETON, walking_frames(), fps=16.0)
-    toes = table[(table["group"] == "toes") & (table["frequency_hz"] > 0)]
-    for _, rows in toes.groupby("band"):
-        assert rows.loc[rows["amplitude_cm"].idxmax(), "frequency_hz"] in (2.0, 4.0)
 
 
 def test_a_walk_costs_its_root_at_the_ends_and_a_line_mends_it():
@@ -121,14 +109,6 @@ def test_energy_of_a_line_is_that_of_its_transform(num_frames):
     np.testing.assert_allclose(ex.ramp_energy(num_frames, "cosine"), expected, atol=1e-9)
 
 
-def test_what_is_left_of_a_line_falls_as_one_half_and_three_halves():
-    kept = np.array([16, 32, 64])
-    for band, step, exponent in (("fourier", 1, -0.5), ("cosine", 2, -1.5)):
-        energy = ex.ramp_energy(1024, band)
-        left = [np.sqrt(energy[step * (m - 1) + 1 :].sum()) for m in kept]
-        assert abs(np.polyfit(np.log(kept), np.log(left), 1)[0] - exponent) < 0.1
-
-
 def least_squares_share(target, parts):
     columns = np.stack([part.ravel() for part in parts], axis=1)
     fit = columns @ np.linalg.lstsq(columns, target.ravel(), rcond=None)[0]
@@ -145,14 +125,6 @@ def test_the_share_that_wraps_is_what_least_squares_leave(reach):
     for taps in (np.ones(1), np.array([1.0, -1.0]), np.ones(5), rng.standard_normal(12)):
         expected = least_squares_share(ex.causal_filter(taps, num_frames), parts)
         np.testing.assert_allclose(ex.wrapped_share(taps, num_frames, reach), expected, atol=1e-12)
-
-
-def test_a_filter_matrix_sees_zeros_before_the_window():
-    x = np.random.default_rng(0).standard_normal(9)
-    taps = np.array([0.5, -1.0, 2.0])
-    np.testing.assert_allclose(ex.causal_filter(taps, 9) @ x, np.convolve(x, taps)[:9])
-    with pytest.raises(ValueError):
-        ex.causal_filter(np.ones(4), 3)
 
 
 # ----------------------------------------------------------------------- filters by condition
@@ -181,21 +153,6 @@ def test_film_has_every_family_of_low_rank_exactly():
     np.testing.assert_allclose(through(base, film, signal, np.eye(5)), expected, atol=1e-4)
 
 
-def test_film_with_fewer_kernels_leaves_the_share_that_is_foretold():
-    filters = np.random.default_rng(1).standard_normal((6, 10))
-    base, film = ex.film_for_filters(filters, 3)
-    kernels = through(base, film, np.eye(10)[0], np.eye(6))
-    left = np.sum((kernels - filters) ** 2) / np.sum(filters**2)
-    np.testing.assert_allclose(left, ex.film_share(filters, 3), rtol=1e-4)
-    assert 0.1 < left < 0.9
-    refused("between 1 and 6, got 7", ex.film_for_filters, filters, 7)
-
-
-def test_each_channel_buys_one_delay():
-    for channels in (0, 3, 8):
-        np.testing.assert_allclose(ex.film_share(np.eye(8, 32), channels), 1 - channels / 8)
-
-
 def test_no_shared_kernels_do_better_than_the_share_foretold():
     # Alternating least squares from random starts finds the bound and never goes below it.
     rng = np.random.default_rng(2)
@@ -206,13 +163,6 @@ def test_no_shared_kernels_do_better_than_the_share_foretold():
         kernels = np.linalg.pinv(gains) @ filters
     left = np.sum((filters - gains @ kernels) ** 2) / np.sum(filters**2)
     np.testing.assert_allclose(left, ex.film_share(filters, 2), rtol=1e-6)
-
-
-def test_a_condition_that_is_added_leaves_one_filter_for_all():
-    filters = np.random.default_rng(3).standard_normal((4, 7))
-    expected = np.sum((filters - filters.mean(axis=0)) ** 2) / np.sum(filters**2)
-    np.testing.assert_allclose(ex.additive_share(filters), expected)
-    np.testing.assert_allclose(ex.additive_share(np.eye(8)), 7 / 8)
 
 
 def test_three_blocks_of_two_channels_have_all_eight_delays():
@@ -264,30 +214,6 @@ def draw(*shape, seed=0):
     return jnp.asarray(np.random.default_rng(seed).standard_normal(shape), jnp.float32)
 
 
-def test_without_its_activation_film_is_equation_six_and_a_linear_layer():
-    film = conditioning_layer("film", WIDTH, WIDTH, rngs=nnx.Rngs(1))
-    base = BASES[WINDOW]
-    film.output.bias[...] = draw(WIDTH, seed=9)
-    z, c = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
-    gamma, beta = np.split(np.asarray(film.modulation(c)), 2, axis=-1)
-    z_tilde = np.asarray(base(z)) * (1 + np.tanh(gamma)) + beta
-    expected = z_tilde @ np.asarray(film.output.kernel[...]) + np.asarray(film.output.bias[...])
-    found = jax.jit(lambda z, c: ex.without_activation(film, base, z, c))(z, c)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_only_gains_filter_by_a_condition_that_is_constant(blocks):
-    first, second = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
-    styles = [jnp.tile(draw(WIDTH, seed=seed), (1, WINDOW, 1)) for seed in (2, 3)]
-    filters_by_it = {}
-    for name, block in blocks.items():
-        effect = [block(first, c) - block(second, c) for c in styles]
-        filters_by_it[name] = bool(jnp.abs(effect[0] - effect[1]).max() > 1e-4)
-    assert filters_by_it == {
-        "film": True, "concatenation": False, "adaln_zero": True, "cross_attention": False
-    }  # fmt: skip
-
-
 def test_a_condition_meets_the_signal_where_each_way_lets_it(blocks):
     z, c, frame = draw(WINDOW, WIDTH), draw(WINDOW, WIDTH, seed=1), 4
     maps = {name: ex.interaction_map(block, z, c, frame) for name, block in blocks.items()}
@@ -299,19 +225,3 @@ def test_a_condition_meets_the_signal_where_each_way_lets_it(blocks):
     assert (gate > 1e-4).all() and (before[diagonal] > 1e-4).all()
     assert (before[~diagonal] < 1e-6).all()
     assert np.mean(maps["cross_attention"] > 1e-6) > 0.9
-
-
-def test_an_interaction_map_is_the_size_of_the_mixed_derivative():
-    # y_t = c_t z_t + 3 c_0 z_1: derivative 1 at (t, t) and 3 at (0, 1).
-    way = lambda z, c: c * z + 3.0 * c[:, :1] * z[:, 1:2]
-    found = ex.interaction_map(way, draw(4, 1), draw(4, 1, seed=1), 2)
-    expected = np.zeros((4, 4))
-    expected[2, 2], expected[0, 1] = 1.0, 3.0
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_adaln_zero_adds_the_same_to_a_motion_and_to_twice_it(blocks):
-    z, c = draw(1, WINDOW, WIDTH), draw(1, WINDOW, WIDTH, seed=1)
-    added = lambda z: blocks["adaln_zero"](z, c) - z
-    assert float(jnp.abs(added(z)).max()) > 0.05
-    np.testing.assert_allclose(added(2 * z), added(z), atol=1e-4)

@@ -29,17 +29,6 @@ def test_a_failure_leaves_the_old_file(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["table.csv"]
 
 
-def test_two_writers_of_one_process_do_not_share_a_temporary_file(tmp_path):
-    path = tmp_path / "table.csv"
-    with whole_file(path) as one:
-        one.write_text("one")
-        with whole_file(path) as other:
-            assert other != one
-            other.write_text("other")
-        assert path.read_text() == "other"
-    assert path.read_text() == "one"
-
-
 def test_nothing_is_overwritten_unasked(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("old")

@@ -5,14 +5,10 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from builders import rows_of_one_step
 from f3amd_notebooks import bimodal_paths as toy
 from f3amd_notebooks import one_step_ways as ways
 
 from f3amd_lib.diffusion.schedules import variance_exploding
-
-STEADY = (("F3AMD-FNO-96-steady", 1), ("F3AMD-FNO-96-steady, distilled", 1))
-"""Model and steps: our own recipe in one step, as it ships and distilled."""
 
 DATA, EXPLODING = toy.BimodalPaths(num_frames=8, num_modes=4), variance_exploding()
 
@@ -53,38 +49,3 @@ def test_students_begin_as_the_networks_and_come_to_use_their_noise():
 
 def _recipe():
     return ways.TrainingConfig(10, 8, 1e-3)
-
-
-@pytest.fixture(scope="module")
-def of_record():
-    """Value of (model, steps, metric), by the records that notebook 22 draws."""
-    return rows_of_one_step()
-
-
-def test_what_notebook_22_says_of_variety_follows_from_the_records(of_record):
-    value = of_record["value"]
-    for metric in ("diversity", "seed_spread"):
-        student, walk = value["CAMDM, distilled", 1, metric], value["CAMDM, by DDIM", 8, metric]
-        assert student > walk > value["CAMDM", 1, metric]
-        steady = [value[name, steps, metric] for name, steps in (*STEADY, (STEADY[0][0], 8))]
-        assert steady[0] < steady[1] < steady[2]  # "gains less": the student stays below the walk of eight steps
-    figures = [round(value[name, steps, "diversity"], 2) for name, steps in (*STEADY, (STEADY[0][0], 8))]
-    assert figures == [0.58, 0.83, 1.18]
-    for name in ("CAMDM", STEADY[0][0]):  # one plain step loses variety, and no FID by the intervals
-        assert value[name, 1, "diversity"] < value[name, 8, "diversity"]
-        assert of_record.loc[(name, 1, "FID"), "low"] < of_record.loc[(name, 8, "FID"), "high"]
-    one, eight = (value.xs(steps, level="steps").unstack() for steps in (1, 8))
-    assert (round(one["joint_acceleration"]["CAMDM"], 1), round(eight["joint_acceleration"]["CAMDM"], 1)) == (1.9, 1.4)
-    assert [round(way["foot_alternation"]["CAMDM"], 2) for way in (one, eight)] == [0.55, 0.97]
-    assert [round(way["joint_acceleration"][STEADY[0][0]], 2) for way in (one, eight)] == [0.52, 0.60]
-    assert [round(way["foot_alternation"][STEADY[0][0]], 2) for way in (one, eight)] == [1.77, 1.77]
-
-
-def test_what_notebook_22_says_of_the_price_follows_from_the_records(of_record):
-    value = of_record["value"]
-    for metric in ("foot_sliding", "joint_acceleration"):
-        one, two, four = (value["CAMDM, distilled", steps, metric] for steps in (1, 2, 4))
-        assert one > two > four and one > 1.2 * value["CAMDM, by DDIM", 8, metric]
-    assert [round(value[(*way, "foot_sliding")], 2) for way in STEADY] == [0.22, 0.42]  # "pays too"
-    assert [round(100 * value[(*way, "contact_share")]) for way in STEADY] == [48, 4]
-    assert value[(*STEADY[1], "joint_acceleration")] < 1.1 * value[(*STEADY[0], "joint_acceleration")]

@@ -7,22 +7,15 @@ import numpy as np
 import pytest
 from builders import refused, straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
-from matplotlib.colors import same_color
 
-from f3amd_lib.drawing.diagrams import arrow, boxes, influence_maps
+from f3amd_lib.drawing.diagrams import arrow, boxes
 from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside, write_gif
-from f3amd_lib.drawing.stick_figures import Camera, body_lines, drawn_points
-from f3amd_lib.drawing.style import keep_figure, model_style, new_figure
-from f3amd_lib.measures.corruptions import CORRUPTIONS
+from f3amd_lib.drawing.stick_figures import Camera, drawn_points
+from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import synthesize
 
 # --- the camera --------------------------------------------------------------------------------
-
-
-def test_the_camera_sees_its_target_in_the_middle():
-    camera = Camera(0.7, 0.5, target=(3.0, 0.9, -2.0), distance=10.0)
-    np.testing.assert_allclose(camera.project([3.0, 0.9, -2.0]), 0.0, atol=1e-12)
 
 
 def test_perspective_by_hand():
@@ -33,28 +26,11 @@ def test_perspective_by_hand():
     np.testing.assert_allclose(Camera().project(points), points, atol=1e-12)  # parallel rays: no size is lost
 
 
-def test_only_a_body_with_a_head_gets_one():
-    for motion, heads in ((synthesize("Neutral", seconds=1.0), 1), (wandering_motion(20), 0)):
-        lines, sides = body_lines(motion.skeleton, drawn_points(motion, np.array([5]))[0])
-        assert sides.count("head") == heads and len(lines) == len(sides)
-
-
 # --- poses -------------------------------------------------------------------------------------
 
 
 def bodies(axis) -> list[LineCollection]:
     return [item for item in axis.collections if isinstance(item, LineCollection) and item.get_zorder() == 5]
-
-
-def test_poses_stand_in_a_row_and_a_panel_may_stay_empty():
-    motions = {"real": wandering_motion(20), "": None, "frozen pose": straight_motion(20)}
-    figure = poses_beside(motions, [0, 5, 10])
-    assert [axis.get_title(loc="left") for axis in figure.axes] == ["real", "", "frozen pose", ""]
-    assert [len(bodies(axis)) for axis in figure.axes] == [3, 0, 3, 0]
-    # The hips of the stiff figure stand where the poses stand.
-    middles = [np.concatenate(body.get_segments())[:, 0].mean() for body in bodies(figure.axes[2])]
-    np.testing.assert_allclose(np.diff(middles), SLOT, atol=1e-6)
-    assert [text.get_text() for text in figure.axes[0].texts] == ["0.0 s", "0.2 s", "0.3 s"]
 
 
 def test_toes_stand_below_their_poses_and_are_thick_where_they_rest():
@@ -75,12 +51,6 @@ def test_toes_stand_below_their_poses_and_are_thick_where_they_rest():
         assert thick.get_linewidth() > 2 * thin.get_linewidth()
 
 
-def test_broken_motion_has_colours_that_no_network_has():
-    networks = ("real", "F3AMD-FNO-96", "F3AMD-FNO-96-plus", "F3AMD-FNO-96-steady", "F3AMD-Transformer-64", "CAMDM")
-    for name in CORRUPTIONS:
-        assert not any(same_color(model_style(name).color, model_style(other).color) for other in (*networks, "?"))
-
-
 # --- crowds ------------------------------------------------------------------------------------
 
 
@@ -89,11 +59,6 @@ def standing_at(x, z, seed=0, num_frames=20):
     motion = wandering_motion(num_frames, seed=seed)
     shift = np.array([x, 0.0, z]) - motion.root_position[10] * np.array([1.0, 0.0, 1.0])
     return motion.replace(root_position=motion.root_position + shift)
-
-
-def test_equal_labels_have_equal_colours_and_others_differ():
-    colors = crowd_colors([f"style {k % 22}" for k in range(44)])
-    assert colors[:22] == colors[22:] and len(set(colors)) == 22
 
 
 def test_near_bodies_cover_far_ones_and_are_drawn_larger():
@@ -119,14 +84,6 @@ def test_a_crowd_is_shown_whole():
     assert drawn[:, 0].max() - drawn[:, 0].min() > 0.8 * (right - left)  # and no room is wasted
 
 
-def test_a_long_note_makes_no_panel_narrower(tmp_path):
-    crowd = ([standing_at(x, z) for x, z in ((0.0, -9.0), (0.0, 9.0), (-9.0, 0.0), (9.0, 0.0))], ["#542788"] * 4)
-    figure = crowd_figure({f"{name}\n{'a long note ' * 9}\nand another": crowd for name in ("One", "Two")}, 10)
-    keep_figure(figure, tmp_path, "any", data="synthetic")
-    panel = figure.get_window_extent().width / 2
-    assert min(axis.get_window_extent().width for axis in figure.axes) > 0.9 * panel
-
-
 def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_slide():
     walk = synthesize("Neutral", seconds=3.0)
     glide = walk.root_position.copy()
@@ -139,15 +96,6 @@ def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_s
         assert len(prints) == 2 and np.isnan(steps).any()  # a foot each, with gaps where it swings
         length[name] = np.nansum(steps)
     assert length["slides"] > 2.0 * length["stands"]
-
-
-def test_crowds_have_titles_notes_and_empty_panels():
-    crowd = ([standing_at(0.0, 0.0), standing_at(2.0, 1.0, seed=1)], ["#542788", "#F1A340"])
-    figure = crowd_figure({"One\nnote": crowd, "Two\nnote": crowd, "Three": crowd}, 10)
-    assert [axis.get_title(loc="left") for axis in figure.axes] == ["One", "Two", "Three", ""]
-    texts = [text.get_text() for axis in figure.axes for text in axis.texts]
-    assert texts.count("note") == 2
-    assert not bodies(figure.axes[3])
 
 
 # --- diagrams ----------------------------------------------------------------------------------
@@ -165,17 +113,6 @@ def test_arrows_run_from_edge_to_edge_of_boxes():
     left, right = (edge.get_window_extent().transformed(axis.transData.inverted()) for edge in edges)
     assert left.x1 < right.x0 and drawn[0].patchA is edges[0] and drawn[0].patchB is edges[1]
     assert third.get_bbox_patch().get_edgecolor()[3] == 0
-
-
-def test_influence_maps_share_a_scale():
-    maps = {"weak": np.full((4, 4), 0.5), "strong": np.eye(4) * 3}
-    for highest, end in ((None, 3.0), (2.0, 2.0)):
-        figure = influence_maps(maps, "here", "there", highest=highest)
-        images = [axis.images[0] for axis in figure.axes[:2]]
-        assert [image.get_clim() for image in images] == [(0.0, end)] * 2
-        assert figure.axes[0].get_ylabel() == "there"
-        # An arrow on the colour bar where something lies beyond it.
-        assert figure.axes[-1]._colorbar.extend == ("max" if end < 3 else "neither")
 
 
 def test_motion_of_positions_alone_is_drawn_without_its_tips():

@@ -98,22 +98,6 @@ def test_paths_are_told_apart_where_histories_are_alike():
     assert table.loc["style, path", "path_apart"] < 0.1 < table.loc["style", "path_apart"]
 
 
-def test_other_styles_are_no_neighbours():
-    alone = [(kick(sign * SWING), 0) for sign in (1, -1, 1, -1)]
-    others = [(kick(2.0), 1), (kick(-2.0), 1)]
-    table = spreads(alone + others, num_neighbours=4, given=["style, path, history"])
-    mine = 4 * spread_of(2, 2) ** 2 + 2 * (spread_of(1, 1) * np.sin(2.0) / np.sin(SWING)) ** 2
-    assert table["value"].item() == pytest.approx(np.sqrt(mine / 6), rel=1e-3)
-
-
-def test_where_somebody_faces_does_not_matter():
-    facings = (0.0, 1.0, -2.0, 3.0)
-    clips = [(kick(s * SWING, facing=f), 0) for s, f in zip((1, -1, 1, -1), facings, strict=True)]
-    table = spreads(clips, num_neighbours=4)
-    assert table["value"].to_numpy() == pytest.approx(3 * [spread_of(2, 2)], rel=1e-3)
-    assert table["history_apart"].max() < 0.1
-
-
 def test_windows_that_overlap_are_not_counted_twice_and_nobody_is_their_own_neighbour():
     starts = np.array([0, 3, 12, 13, 40])
     assert posterior._apart(np.array([1, 0, 2, 3, 4]), starts, 10, 4) == [1, 3, 4]

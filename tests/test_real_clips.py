@@ -8,7 +8,6 @@ from builders import packed_from, refused, stiff_walk, walks_and_runs
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.measures import real_clips
-from f3amd_lib.measures.real_clips import path_statistics
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion, tangent_yaw
 
 TRAIN = 0
@@ -25,13 +24,6 @@ def test_pace_and_floor_come_from_training_clips(packed):
     assert real_clips.style_pace(packed, "proud") == pytest.approx(0.9, rel=1e-3)
     assert real_clips.style_floor(packed, "calm") == pytest.approx(0.02)
     refused("unknown style of data set '.*': 'clam'", real_clips.style_pace, packed, "clam")
-
-
-def test_standing_frames_do_not_slow_the_pace():
-    clips = [(stiff_walk(0.04), 0, TRAIN), (stiff_walk(0.0, 200), 0, TRAIN), (stiff_walk(0.0), 1, TRAIN)]
-    packed = packed_from(clips)
-    assert real_clips.style_pace(packed, "calm") == pytest.approx(1.2, rel=1e-3)
-    assert real_clips.style_pace(packed, "proud") == 0.1
 
 
 def test_sideways_and_backward_steps_are_counted():
@@ -96,18 +88,3 @@ def test_the_longest_held_out_clip_of_a_style_is_followed():
     wanted = real_clips.follow_clip(packed, 3, num_history=5, num_frames=20)
     np.testing.assert_array_equal(found[0], wanted[0])
     np.testing.assert_array_equal(found[2].positions, wanted[2].positions)
-
-
-def test_path_statistics_of_a_line_and_of_a_circle():
-    line = path_statistics([named_path("straight", 300, speed=1.5)])
-    assert line["speed_m_s"] == pytest.approx(1.5, rel=1e-3)
-    assert line["turn_deg_s"] == pytest.approx(0.0, abs=1e-6)
-    assert line["standing_share"] == 0.0
-    angle = np.arange(600) / 30.0 * np.deg2rad(36.0)
-    circle = 2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    turning = path_statistics([RootPath(circle, np.zeros(600))])
-    assert turning["turn_deg_s"] == pytest.approx(36.0, rel=1e-3)
-    # It faces +Z all the way round: three quarters of the way go more than 45 degrees off.
-    assert turning["sideways_share"] == pytest.approx(0.75, abs=0.02)
-    still = RootPath(np.zeros((90, 2)), np.zeros(90))
-    assert path_statistics([still, RootPath(circle, angle)])["standing_share"] > 0.1

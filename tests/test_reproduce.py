@@ -1,7 +1,6 @@
 """The main job runs notebooks in order, passes parameters, stops where one stops and says where."""
 
 import json
-import os
 from pathlib import Path
 
 import nbformat
@@ -11,7 +10,6 @@ from builders import refused
 
 from f3amd_companion import reproduce
 from f3amd_companion.__main__ import main
-from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.records import read_table
 
@@ -70,40 +68,6 @@ def test_notebooks_run_in_order_with_their_parameters(checkout):
     # One line a notebook: its time, and what it wrote.
     assert [line.split()[0] for line in news] == ["00_first", "01_second"]
     assert all("wrote no file" in line for line in news)  # a record alone is no result
-
-
-def test_news_tell_what_was_written_and_how_long_the_rest_takes(tmp_path):
-    for name, when in (("figures/a.png", 5), ("figures/old.png", 1), ("media/a.gif", 9)):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-        os.utime(path, (when, when))
-    (tmp_path / "figures" / "a.json").touch()  # a record, not a result
-    assert reproduce.written_since(tmp_path, 3.0) == {"figures": 1, "media": 1}
-    line = reproduce._news(Path("05_rollout.ipynb"), 100.0, {"figures": 2}, 30.0)
-    assert line.split() == "05_rollout 1.7 min wrote 2 figures; about 30 s left".split()
-
-
-def test_a_notebook_that_the_last_whole_run_lacked_counts_as_an_average_one(checkout, monkeypatch):
-    monkeypatch.setattr(reproduce, "_execute", lambda *args: None)
-    for name in ("00_long", "01_short", "02_new"):
-        write_notebook(checkout / "notebooks", name, PARAMETERS)
-    last = {"00_long.ipynb": 300.0, "01_short.ipynb": 100.0}
-    monkeypatch.setattr(reproduce, "_usual_seconds", lambda results: last)
-    news = []
-    reproduce.reproduce("bandai", "smoke", say=news.append)
-    # Nothing takes time here: 60 s at the usual pace stand against what would have taken 360 s, and then 460 s.
-    assert [line.partition("; ")[2] for line in news] == ["about 50 s left", "about 26 s left", ""]
-
-
-def test_only_files_that_are_there_are_worth_opening(checkout):
-    results = checkout / "results"
-    assert reproduce.what_to_open(results) == []
-    gif = results / "media" / "05_rollout.gif"
-    gif.parent.mkdir(parents=True)
-    gif.touch()
-    (line,) = reproduce.what_to_open(results)
-    assert line.endswith("results/media/05_rollout.gif")
 
 
 def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):
@@ -223,13 +187,6 @@ def test_only_real_runs_write_into_the_committed_folder(checkout, monkeypatch, p
     assert profiles.results_dir("synthetic", profile) == checkout / expected / "synthetic" / profile
 
 
-def test_relative_folders_are_found_from_the_notebooks_folder(checkout, monkeypatch):
-    monkeypatch.chdir(checkout)
-    monkeypatch.setenv(CACHE_DIR_VARIABLE, "cache")
-    reproduce.set_folders("smoke")
-    assert os.environ[CACHE_DIR_VARIABLE] == str(checkout / "cache")
-
-
 @pytest.mark.parametrize(
     "text, expected",
     [
@@ -247,15 +204,6 @@ def test_assignments_on_the_command_line(text, expected):
 def test_broken_assignments_are_refused(text, capsys):
     assert main(["figures", "--set", text]) == 2
     assert text.partition("=")[0] in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "number, parameters", [("05", ["num_steps"]), ("04", ["train_steps"]), ("04", ["compare_preset"])]
-)
-def test_parameters_that_the_documents_name_exist(number, parameters):
-    notebooks = reproduce.find_notebooks(profiles.repository_root() / "notebooks")
-    chosen = reproduce.select_notebooks(notebooks, [number])
-    reproduce.check_parameters(chosen, ["profile", "data", *parameters])
 
 
 def test_the_course_runs_without_parameters_into_copies_of_its_own(checkout):

@@ -30,19 +30,6 @@ def test_machines_take_the_first_leg_that_may_begin(machines, ends):
     assert scaling.finished_after(LEGS, SECONDS, machines) == ends
 
 
-def test_a_chain_is_no_faster_on_two_machines():
-    assert scaling.enough(LEGS, SECONDS) == 2
-    assert scaling.enough(LEGS[:2], SECONDS) == 1
-    assert scaling.enough([leg for leg in LEGS if leg.after is None], {**SECONDS, "one-b": 1.0}) == 2
-
-
-def test_presets_that_were_not_timed_stand_for_their_kind():
-    timed = ["F3AMD-FNO-96", "F3AMD-Transformer-64", "CAMDM", "F3AMD-FNO-32"]
-    asked = ["F3AMD-FNO-32", "CAMDM-VE", "F3AMD-Transformer-64-linear", "F3AMD-DCT-96"]
-    found = [scaling.timed_as(preset, timed) for preset in asked]
-    assert found == ["F3AMD-FNO-32", "CAMDM", "F3AMD-Transformer-64", "F3AMD-FNO-96"]
-
-
 def test_the_page_says_what_the_records_say():
     page = scaling.PAGE.read_text(encoding="utf-8")
     assert scaling.written(page) == page

@@ -206,14 +206,6 @@ def test_100style_tree(tmp_path, monkeypatch, no_network, packing):
     assert dataset.fingerprint == open_dataset("100style", path=tmp_path / "tree").fingerprint
 
 
-def test_cutting_at_60_fps_and_then_halving_is_the_same():
-    motion = sources.parse_bvh(line_bvh(200), "line")
-    for start, stop in [(20, 180), (21, 180), (20, 181), (21, 181)]:
-        halved = sources.resample(motion, 30.0).slice(start // 2, stop // 2)
-        cut = sources.resample(motion.slice(2 * (start // 2), 2 * (stop // 2)), 30.0)
-        np.testing.assert_array_equal(halved.root_position, cut.root_position)
-
-
 def test_100style_missing_files_are_reported(tmp_path):
     folder = write_100style(tmp_path)
     before = {clip.name: clip.split for clip in open_dataset("100style", path=tmp_path).clips}
@@ -228,20 +220,6 @@ def test_100style_missing_files_are_reported(tmp_path):
     shutil.rmtree(folder / "LimpLeft")
     shutil.rmtree(folder / "Aeroplane")
     refused("none of the 6 files", open_dataset, "100style", path=tmp_path)
-
-
-def test_100style_first_transition_may_be_called_tr(tmp_path):
-    folder = write_100style(tmp_path)
-    (folder / "Aeroplane" / "Aeroplane_TR1.bvh").rename(folder / "Aeroplane" / "Aeroplane_TR.bvh")
-    dataset = open_dataset("100style", path=tmp_path)
-    assert "Aeroplane_TR1" in {clip.name for clip in dataset.clips} and dataset.notes == ()
-
-
-def test_100style_file_shorter_than_its_cut(tmp_path):
-    folder = write_100style(tmp_path)
-    (folder / "Aeroplane" / "Aeroplane_FW.bvh").write_text(line_bvh(150))
-    (clip, *_) = open_dataset("100style", path=tmp_path).clips
-    refused(r"Aeroplane_FW\.bvh: has 75 frames .* cuts it at 90", clip.load)
 
 
 @pytest.mark.parametrize(

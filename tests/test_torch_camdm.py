@@ -14,8 +14,6 @@ from flax import nnx
 
 from f3amd_companion.speed import implementations
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
-from f3amd_lib.networks import presets
-from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rounds import sample_round
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make bench-tools")
@@ -101,13 +99,6 @@ def test_denoiser_gives_the_numbers_of_jax(layout, products):
         np.testing.assert_allclose(found, expected, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_context_is_that_of_jax(layout):
-    network, condition = lively(small(**LAYOUTS[layout])), make_condition()
-    found = torch_camdm.torch_camdm(network).encode(torch_camdm.torch_condition(condition))
-    np.testing.assert_allclose(found.numpy(), network.encode(condition), atol=1e-5)
-
-
 @pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
 @pytest.mark.parametrize("layout", list(LAYOUTS)[:2])
 def test_round_gives_the_numbers_of_jax(layout, sampler):
@@ -121,92 +112,6 @@ def test_round_gives_the_numbers_of_jax(layout, sampler):
             torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise)
         )
         np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
-
-
-def test_the_papers_camdm_gives_the_numbers_of_jax_in_one_round():
-    preset = presets.find_preset("CAMDM")
-    network = lively(presets.build_config("CAMDM", channels=135, num_styles=100))
-    config, sigmas = network.config, preset.diffusion.grid(2)
-    condition = Condition(
-        draw(1, config.num_history, config.channels, seed=1), draw(1, config.window, 8, seed=2), jnp.eye(100)[7:8]
-    )
-    noise, step_noise = given_noise(1, 2, config)
-    expected = jax_round(network, condition, sigmas, preset.diffusion.sampler)
-    for runtime in ("eager", "onnx"):
-        run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), sigmas, runtime=runtime)
-        found = run(torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise))
-        np.testing.assert_allclose(found.numpy(), expected, atol=TOLERANCE)
-
-
-def test_round_draws_its_start_and_all_steps_but_the_last():
-    network, shape = lively(small()), (2, WINDOW, CHANNELS)
-    condition = torch_camdm.torch_condition(make_condition())
-    run = torch_camdm.torch_round(torch_camdm.torch_camdm(network), SIGMAS, "ddpm")
-    seeded = lambda seed: torch.Generator().manual_seed(seed)
-    drawn, generator = run(condition, seeded(1)), seeded(1)
-    noise = torch.randn(shape, generator=generator)
-    steps = torch.stack([torch.randn(shape, generator=generator) for _ in range(3)])
-    steps = torch.cat([steps, torch.full((1, *shape), torch.nan)])
-    torch.testing.assert_close(run(condition, noise=noise, step_noise=steps), drawn)
-    assert float((run(condition, seeded(2)) - drawn).abs().max()) > 1e-3
-
-
-def test_given_arrays_stay_as_they_are():
-    network = lively(small())
-    module, condition = torch_camdm.torch_camdm(network), make_condition()
-    given = torch_camdm.torch_condition(condition)
-    noise, step_noise = map(as_tensor, given_noise(2, 4, network.config))
-    first = noise.clone(), step_noise.clone()
-    run = torch_camdm.torch_round(module, SIGMAS)
-    once = run(given, noise=noise, step_noise=step_noise)
-    torch.testing.assert_close(run(given, noise=noise, step_noise=step_noise), once)
-    context = module.encode(given)
-    before = context.clone()
-    module.denoise(noise, module.noise_tokens(torch.ones(2, module.config.latent_width)), context)
-    for now, then in ((noise, first[0]), (step_noise, first[1]), (context, before)):
-        assert torch.equal(now, then)
-    for now, then in zip(given, condition, strict=True):
-        np.testing.assert_array_equal(now.numpy(), then)
-
-
-def test_every_weight_counts_and_is_a_copy():
-    network = lively(small(split_path=True))
-    module = torch_camdm.torch_camdm(network)
-    condition, x_noisy = make_condition(), draw(2, WINDOW, CHANNELS)
-    base = in_torch(module, x_noisy, 1.0, condition)
-    expected = evaluate(network, x_noisy, jnp.float32(1.0), condition)
-    parameters = dict(module.named_parameters())
-    assert sum(p.numel() for p in parameters.values()) == presets.count_parameters(network.config)
-    for name, parameter in parameters.items():
-        before = parameter.clone()
-        # Not the same everywhere: softmax and norms do not see a shift.
-        parameter += 0.5 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0))
-        moved = np.abs(in_torch(module, x_noisy, 1.0, condition) - base).max()
-        assert moved > 1e-4, name
-        parameter.copy_(before)
-    np.testing.assert_allclose(in_torch(module, x_noisy, 1.0, condition), expected, atol=TOLERANCE)
-    np.testing.assert_array_equal(evaluate(network, x_noisy, jnp.float32(1.0), condition), expected)
-
-
-@pytest.fixture
-def eager_compiler(monkeypatch):
-    """torch.compile without its code generator: it traces, guards and counts variants as ever."""
-    torch._dynamo.reset()
-    compile_lazily = functools.partial(torch.compile, backend="eager")
-    monkeypatch.setattr(torch, "compile", compile_lazily)
-    yield
-    torch._dynamo.reset()
-
-
-def test_compiled_round_takes_more_batch_sizes_than_pytorch_may_allow(eager_compiler):
-    module = torch_camdm.torch_camdm(lively(tiny_camdm()))
-    plain = torch_camdm.torch_round(module, SIGMAS)
-    with torch._dynamo.config.patch(recompile_limit=1):
-        quick = torch_camdm.torch_round(module, SIGMAS, runtime="compiled")
-        for batch in (1, 2, 3):
-            condition = torch_camdm.torch_condition(make_condition(batch))
-            found, expected = (run(condition, torch.Generator().manual_seed(batch)) for run in (quick, plain))
-            torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
 
 
 def test_compiler_that_fails_says_why(monkeypatch):
@@ -237,12 +142,6 @@ def test_probe_multiplies_and_counts():
     matrix = torch.randn(48, 48, generator=torch.Generator().manual_seed(0)).numpy()
     np.testing.assert_allclose(multiply().numpy(), matrix @ matrix, atol=1e-4)
     assert operations == 2 * 48**3
-
-
-def test_pytorch_computes_on_all_cores_that_it_may_use(monkeypatch):
-    monkeypatch.setattr(torch_camdm, "usable_cores", lambda: 3)
-    torch_camdm.torch_camdm(lively(small()))
-    assert torch.get_num_threads() == 3
 
 
 def test_bad_input_is_refused():

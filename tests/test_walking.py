@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from builders import SKELETON, refused, straight_motion, wandering_motion
+from builders import SKELETON, refused, wandering_motion
 
 from f3amd_lib.ground.profiles import SHOWN_STYLES
-from f3amd_lib.measures import metrics, walking
+from f3amd_lib.measures import walking
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.synthetic import style_parameters, synthesize, walk_along
@@ -127,11 +127,6 @@ def test_the_source_of_every_shown_style_walks(style):
 # ------------------------------------------------------------- planted feet, bones, frames of a window
 
 
-def stiff_walk(step, num_frames=60):
-    """A stiff figure at `step` metres a frame along +Z."""
-    return straight_motion(num_frames, (0.0, 0.0, step))
-
-
 def feet(sides, rest_on=1.0, stride=0.03):
     """Positions in which toes rest where `sides` says: -1 right, 1 left, 0 neither, 2 both."""
     sides = np.asarray(sides)
@@ -140,36 +135,6 @@ def feet(sides, rest_on=1.0, stride=0.03):
         moving = ~np.isin(sides, (own, 2))
         positions[:, toe, 2] = np.concatenate([[0.0], np.cumsum(stride * moving)[:-1]])
     return positions
-
-
-def test_steps_are_counted_per_second():
-    # Six phases of ten frames: weight passes five times in two seconds.
-    assert walking.support_changes_per_s(feet(np.repeat([1, -1] * 3, 10)), SKELETON) == 2.5
-    # At 60 fps the toes move half as far in a frame, and the same walk is twice as fast.
-    fast = walking.support_changes_per_s(feet(np.repeat([1, -1] * 3, 10)), SKELETON, fps=60.0)
-    assert fast == 5.0
-
-
-@pytest.mark.parametrize(
-    "sides",
-    [np.full(60, 2), np.zeros(60), np.repeat([1, 0] * 3, 10), np.repeat([1, 2] * 3, 10)],
-    ids=["stands", "slides", "hops on one leg", "taps with one foot"],
-)
-def test_what_is_no_walk_does_not_alternate(sides):
-    assert walking.support_changes_per_s(feet(sides), SKELETON) == 0.0
-
-
-def test_a_flicker_of_contact_is_no_step():
-    sides = np.full(60, 1)
-    sides[[10, 11, 30]] = -1
-    assert walking.support_changes_per_s(feet(sides), SKELETON) == 0.0
-    sides[[12]] = -1  # three frames in a row: there and back again
-    assert walking.support_changes_per_s(feet(sides), SKELETON) == 2 * 30 / 60
-
-
-def test_alternation_of_a_batch():
-    both = np.stack([feet(np.repeat([1, -1] * 3, 10)), feet(np.full(60, 2))])
-    np.testing.assert_array_equal(walking.support_changes_per_s(both, SKELETON), [2.5, 0.0])
 
 
 def test_a_stiff_figure_swings_nothing_however_it_turns():
@@ -183,17 +148,6 @@ def test_a_stiff_figure_swings_nothing_however_it_turns():
     assert walking.bone_swing(motion.positions, SKELETON) > 5.0
 
 
-def test_swing_of_one_bone_by_hand():
-    positions = np.array(stiff_walk(0.04, 40).positions)
-    hips, spine = positions[:, 0], SKELETON.names.index("Spine")
-    angle = np.deg2rad(30.0) * np.where(np.arange(40) % 2, 1.0, -1.0)
-    lean = np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=-1)
-    positions[:, spine] = hips + 0.5 * lean
-    # 30 degrees to each side: the mean vector has length cos 30, one bone of five moves.
-    expected = np.rad2deg(np.sqrt(2.0 * (1.0 - np.cos(np.deg2rad(30.0))))) / 5.0
-    assert walking.bone_swing(positions, SKELETON) == pytest.approx(expected, rel=1e-6)
-
-
 def test_checks_pass_within_the_factor_and_not_beyond():
     real = {METRICS[name].key: np.array([1.0, 3.0]) for name in walking.FACTORS}
     near = {METRICS[name].key: np.array([2.0]) * 0.99 * f for name, f in walking.FACTORS.items()}
@@ -205,24 +159,3 @@ def test_checks_pass_within_the_factor_and_not_beyond():
     assert passed.loc["far, 8 steps"].tolist() == [False, False]
     assert passed.loc["low, 1 step"].tolist() == [False, False]
     assert set(table["real"]) == {2.0}
-
-
-def test_place_zero_is_the_seam():
-    motion = wandering_motion(40, 3)
-    positions = np.array(motion.positions)
-    positions[16:] += np.array([0.03, 0.0, 0.0])  # a jump of 3 cm into window 2
-    both = np.stack([positions, np.array(motion.positions)])
-    table = walking.steps_by_frame_in_window(both, 8)
-    assert table["place"].tolist() == list(range(8))
-    assert table["step_cm"][0] == pytest.approx(metrics.ird(both, 8).mean())
-    excess = metrics.ird_excess(both, 8).mean()
-    assert table["acceleration_cm"][0] == pytest.approx(excess)
-    level = walking.steps_by_frame_in_window(stiff_walk(0.04).positions, 8)
-    np.testing.assert_allclose(level["step_cm"], 4.0)
-    np.testing.assert_allclose(level["acceleration_cm"], 0.0, atol=1e-9)
-
-
-def test_places_need_enough_frames():
-    positions = np.array(stiff_walk(0.04, 8 + 2).positions)
-    assert np.isfinite(walking.steps_by_frame_in_window(positions, 8)).all(axis=None)
-    refused("at least 10", walking.steps_by_frame_in_window, positions[:-1], 8)

@@ -45,8 +45,6 @@ return [...document.querySelectorAll(".bd-article table")].filter((table) => {
 # What MathJax leaves where it does not understand: a message, or the unknown command in red.
 NOT_UNDERSTOOD = '[data-mml-node="merror"], mjx-merror, [fill="red"]'
 
-PAGE_BACKGROUND = "return getComputedStyle(document.body).backgroundColor.match(/[0-9.]+/g).map(Number)"
-
 
 def notebooks() -> list[str]:
     """Addresses of the notebooks that the built site has."""
@@ -116,19 +114,6 @@ def test_every_notebook_is_whole_on_a_phone_and_on_a_small_laptop(browser):
     assert equations > 100 and tables > 50
 
 
-@pytest.mark.parametrize("name", LEDGERS)
-def test_on_a_phone_a_claim_is_a_card_that_names_its_fields(browser, screenshots, name):
-    browser.resize(*PHONE, phone=True)
-    page = browser.open(SITE / name)
-    cell = "const td = document.querySelector('[id^=claims-of-] table:has(th:nth-child(8)) td:nth-child(4)');"
-    assert page.script(cell + "return getComputedStyle(td).display") == "block"
-    assert page.script(cell + "return getComputedStyle(td, '::before').content") == '"ours: "'
-    page.screenshot(screenshots / f"site_{Path(name).stem}_phone.png")
-    browser.resize(*DESKTOP)
-    assert page.script(cell + "return getComputedStyle(td).display") == "table-cell"
-    assert page.script(CUT_OFF) == []
-
-
 def test_a_notebook_opens_with_its_question_and_folded_imports(browser):
     page = browser.open(SITE / "notebooks/05_rollout.html")
     assert page.script("return document.querySelector('.bd-article p').textContent").startswith("Question.")
@@ -159,12 +144,6 @@ def test_a_word_is_found_and_leads_to_its_notebook(browser):
     assert page.errors() == [] and page.outside() == []
 
 
-def test_a_word_that_nobody_wrote_is_not_found(browser):
-    page = browser.open(f"{(SITE / 'search.html').as_uri()}?q=zyzzyvas")
-    page.wait("return document.querySelector('#search-results p.search-summary, #search-results')")
-    page.wait("return /did not match/.test(document.querySelector('#search-results').textContent)")
-
-
 def test_the_walk_stands_still_for_who_asked_for_less_motion(browser):
     browser.reduced_motion()
     page = browser.open(SITE / "docs/index.html")
@@ -173,15 +152,3 @@ def test_the_walk_stands_still_for_who_asked_for_less_motion(browser):
     assert "walks" in page.find(".hero canvas.moving").get_attribute("aria-label")
     drawn = "const c = document.querySelector('.hero canvas.moving'); return c.width * c.height"
     assert page.script(drawn) > 10_000
-
-
-def test_figures_stay_on_white_in_the_dark(browser, screenshots):
-    browser.dark()
-    page = browser.open(SITE / "notebooks/02_sampler_theory.html")
-    assert max(page.script(PAGE_BACKGROUND)[:3]) < 60
-    backgrounds = page.script(
-        "return [...document.querySelectorAll('.cell_output img')]"
-        ".map((image) => getComputedStyle(image)).map((s) => s.backgroundColor + ' ' + s.filter)"
-    )
-    assert set(backgrounds) == {"rgb(255, 255, 255) none"}
-    page.screenshot(screenshots / "site_dark.png")
