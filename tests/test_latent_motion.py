@@ -44,7 +44,7 @@ from f3amd_lib.text.stages.motionpcm_training import (
 )
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
-from f3amd_lib.training.settings import part_recipe
+from f3amd_lib.training.recipe import part_recipe
 
 SCHEDULE = variance_preserving_betas()
 SMALL = {"latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32, "dropout": 0.0}

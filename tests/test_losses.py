@@ -9,7 +9,8 @@ import pytest
 from builders import CHANNELS, SKELETON, random_frames, refused, straight_motion
 
 from f3amd_lib.data.features import frame_positions, world_frames
-from f3amd_lib.training.losses import LOSS_TERMS, LossWeights, loss_terms, total_loss
+from f3amd_lib.training.losses import LOSS_TERMS, loss_terms, total_loss
+from f3amd_lib.training.recipe import LossWeights
 
 FRAMES = 5
 

@@ -33,7 +33,7 @@ from f3amd_lib.text.stages.acmdm_training import (
 from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
-from f3amd_lib.training.settings import part_recipe
+from f3amd_lib.training.recipe import part_recipe
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
 CLIPS, FRAMES, JOINTS = 6, 40, 3

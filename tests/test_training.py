@@ -15,9 +15,9 @@ from f3amd_lib.diffusion.schedules import variance_exploding, variance_preservin
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import denoising_task
 from f3amd_lib.training.denoising_task import network_inputs, own_history_share
-from f3amd_lib.training.losses import LOSS_TERMS, LossWeights
+from f3amd_lib.training.losses import LOSS_TERMS
 from f3amd_lib.training.optimise import advance, held_out_terms, initial_state, optimise, restore_state, save_state
-from f3amd_lib.training.recipe import TrainingConfig, learning_rate_schedule, paper_recipe, short_recipe
+from f3amd_lib.training.recipe import LossWeights, TrainingConfig, learning_rate_schedule, paper_recipe, short_recipe
 
 STEPS = 32
 QUIET = {"progress": False, "chunk": 2}

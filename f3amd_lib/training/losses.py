@@ -7,51 +7,14 @@ sets them all to 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
-from f3amd_lib.training.settings import check_settings
+from f3amd_lib.training.recipe import LossWeights
 
 LOSS_TERMS = ("sample", "position", "feature_velocity", "joint_velocity", "foot", "floor", "ird")
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of the terms, and the form of the inter-round discontinuity.
-
-    Attributes:
-      sample: lambda of Eq. 11.
-      position: lambda of Eq. 12.
-      feature_velocity, joint_velocity: lambda of the two halves of Eq. 13 (the paper has one).
-      foot: lambda of the foot-contact term.
-      floor: lambda of our term against sinking; the paper has none.
-      ird: lambda of Eq. 10.
-      ird_form: "literal" is Eq. 10, the distance between the last frame before the seam and the
-        first after it, which asks the character to stand still there; "squared" is its square, as all
-        other terms are; "excess" measures the step across the seam against the step that the data takes.
-      raw_features: compare features in metres and 6D numbers, as CAMDM's code does, which the paper
-        adopts (section 4.1), instead of network units.
-
-    Raises:
-      ValueError: for a weight that is negative or not finite, or an unknown form.
-    """
-
-    sample: float = 1.0
-    position: float = 1.0
-    feature_velocity: float = 1.0
-    joint_velocity: float = 1.0
-    foot: float = 1.0
-    floor: float = 0.0
-    ird: float = 1.0
-    ird_form: str = "literal"
-    raw_features: bool = False
-
-    def __post_init__(self):
-        check_settings(self, "loss weight ")
 
 
 def _mean(values, weights):

@@ -9,18 +9,68 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import optax
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
-from f3amd_lib.ground.names import refuse_unknown
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known, checked_value, refuse_unknown
+from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
-from f3amd_lib.training.losses import LossWeights
-from f3amd_lib.training.settings import check_settings
+
+_SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
 
 PAPER_STEPS = 390_000
 """Of 512 windows in the paper's 100 epochs: its windows of 100STYLE (section 4.5), counted by us."""
+
+
+def check_settings(settings, kind: str = "") -> None:
+    """Raise ValueError for a field that is not of its type, or not what `settings.toml` says of it.
+
+    Args:
+      settings: of any dataclass; its numbers are above 0 where the file says nothing else.
+      kind: what its fields are, before their names in a message, such as "loss weight ".
+    """
+    rules = _SETTINGS.get(type(settings).__name__, {})
+    for each in dataclasses.fields(settings):
+        checked_value(kind + each.name, getattr(settings, each.name), each.type, rules.get(each.name, "above 0"))
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms, and the form of the inter-round discontinuity.
+
+    Attributes:
+      sample: lambda of Eq. 11.
+      position: lambda of Eq. 12.
+      feature_velocity, joint_velocity: lambda of the two halves of Eq. 13 (the paper has one).
+      foot: lambda of the foot-contact term.
+      floor: lambda of our term against sinking; the paper has none.
+      ird: lambda of Eq. 10.
+      ird_form: "literal" is Eq. 10, the distance between the last frame before the seam and the
+        first after it, which asks the character to stand still there; "squared" is its square, as all
+        other terms are; "excess" measures the step across the seam against the step that the data takes.
+      raw_features: compare features in metres and 6D numbers, as CAMDM's code does, which the paper
+        adopts (section 4.1), instead of network units.
+
+    Raises:
+      ValueError: for a weight that is negative or not finite, or an unknown form.
+    """
+
+    sample: float = 1.0
+    position: float = 1.0
+    feature_velocity: float = 1.0
+    joint_velocity: float = 1.0
+    foot: float = 1.0
+    floor: float = 0.0
+    ird: float = 1.0
+    ird_form: str = "literal"
+    raw_features: bool = False
+
+    def __post_init__(self):
+        check_settings(self, "loss weight ")
 
 
 @dataclass(frozen=True)
@@ -167,6 +217,37 @@ def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfi
     recipe = paper_recipe if as_printed else short_recipe
     own = {name: getattr(profile, name) for name in ("learning_rate", "batch_size", "seed")}
     return recipe(preset, profile.train_steps, **own)
+
+
+def part_recipe(training: type, part: str, num_steps: int, preset: str | None = None, **settings):
+    """Return how a part of a paper's model is trained.
+
+    Args:
+      training: class of the settings; its `paper` names the folder of the recipes.
+      part: a name of `papers/<paper>/recipes.toml`, "denoiser" or "short-denoiser" for instance.
+      num_steps: optimiser steps.
+      preset: adds what its own training says (`presets.find_preset`).
+      **settings: fields to change.
+
+    Raises:
+      ValueError: for an unknown part, preset or field, with the nearest name.
+    """
+    recipes = load_paper_file("recipes", training.paper)
+    check_known(part, recipes, "recipe")
+    own = {} if preset is None else find_preset(preset).training
+    values = {**recipes[part]["training"], **own, **settings}
+    refuse_unknown(values, training, "training setting")
+    return training(num_steps, **values)
+
+
+def profile_part_recipe(training: type, part: str, profile: Profile, preset: str | None, batch_size=None, **settings):
+    """Return how a profile trains a part: by the paper's recipe on `gpu`, by the short one and its share elsewhere."""
+    if batch_size is not None:
+        settings["batch_size"] = batch_size
+    name = part if profile.name == "gpu" else f"short-{part}"
+    share = load_paper_file("recipes", training.paper)[name].get("share", 1.0)
+    num_steps = max(1, round(share * profile.train_steps))
+    return part_recipe(training, name, num_steps, preset, seed=profile.seed, **settings)
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:

@@ -33,7 +33,7 @@ from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, load_text_m
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree, optimise
 from f3amd_lib.training.pipeline import ModelFiles
-from f3amd_lib.training.settings import check_settings
+from f3amd_lib.training.recipe import check_settings
 
 _BATCH = 64
 

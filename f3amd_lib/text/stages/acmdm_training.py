@@ -32,7 +32,7 @@ from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
 from f3amd_lib.text.stages.text_models import PELVIS, Asked, TextModel, controlled_joints
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
-from f3amd_lib.training.settings import check_settings
+from f3amd_lib.training.recipe import check_settings
 
 _ENCODED_AT_ONCE = 64
 

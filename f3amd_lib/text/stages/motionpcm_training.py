@@ -25,7 +25,7 @@ from f3amd_lib.text.networks import motionpcm
 from f3amd_lib.text.stages.text_models import Asked, LatentModel
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
-from f3amd_lib.training.settings import check_settings
+from f3amd_lib.training.recipe import check_settings
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from f3amd_lib.text.stages.motion_codec import MotionCodec
 from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model, preset_and_branch
 from f3amd_lib.training.optimise import differences
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
-from f3amd_lib.training.settings import profile_part_recipe
+from f3amd_lib.training.recipe import profile_part_recipe
 
 STAGES = {
     "motion autoencoder": acmdm_training.AutoencoderTask,
