@@ -89,6 +89,7 @@ def test_the_card_says_what_the_model_is_and_how_near_it_is(folder, trained):
     np.testing.assert_allclose(card["normaliser"]["mean"], trained.normaliser.mean)
     np.testing.assert_allclose(card["sigmas"]["2"], trained.diffusion.grid(2))
     assert card["inputs"]["sigma"]["shape"] == ["B"] and 0 < card["largest_error"] < 1e-4
+    assert card["output"] == {"x0_hat": card["inputs"]["x_noisy"]}
     assert {path.suffix for path in folder.iterdir()} == {".onnx", ".json", ".py", ".cs"}
 
 

@@ -164,7 +164,7 @@ def test_the_card_says_what_the_model_is(exported):
     card = json.loads((folder / CARD).read_text(encoding="utf-8"))
     assert (card["model"], card["terms"], card["batch"]) == (trained.name, "CC BY 4.0", "any")
     assert card["text_encoder"] == "tiny-8" and card["frames_per_second"] == 20
-    assert 0 < card["largest_error"] < 1e-3
+    assert 0 < card["largest_error"] < 1e-3 and card["output"] == {"prediction": card["inputs"]["state"]}
     assert set(card["about"]) - {"normaliser"} == set(card["inputs"])
     latent = isinstance(trained, LatentModel)
     assert ("not exported" in card["decoder"]) if latent else card["normaliser"]["deviation"] == [2.0] * 3

@@ -258,6 +258,7 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
     listed for 1 and for `num_steps`, but for a student of MotionPCM for the number that it was trained for.
     """
     inputs, output, _ = signature(trained.config, "B")
+    shapes = {name: {"shape": list(shape)} for name, shape in inputs.items()}
     walks = isinstance(trained, TrainedModel)
     card = {
         "format": "f3amd-onnx-1" if walks else "f3amd-onnx-text-1",
@@ -266,8 +267,8 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
         "terms": trained.record.get("dataset_licence"),
         "credit": trained.record.get("dataset_credit"),
         "frames_per_second": 30 if walks else trained.fps,
-        "inputs": {name: {"shape": list(shape)} for name, shape in inputs.items()},
-        "output": {output: list(next(iter(inputs.values())))},
+        "inputs": shapes,
+        "output": {output: next(iter(shapes.values()))},
     }
     skeleton = describe_skeleton(trained.skeleton) | {"offsets": np.asarray(trained.skeleton.offsets).tolist()}
     counts, latent = sorted({1, num_steps}), isinstance(trained, LatentModel)
