@@ -180,13 +180,6 @@ def test_a_root_that_only_carries_the_hips_is_folded():
     np.testing.assert_allclose(motion.positions[1, 1], [0.03, 0.91, -0.56], atol=1e-12)
 
 
-def test_a_folded_root_that_turns_is_composed():
-    motion = parse_bvh(folded_text("0 0 0 0 0 0", "100 0 0 0 0 -90"), "turning")
-    # Yaw -90 carries (3, 91, 4) to (-4, 91, 3); with the hips' +90 the facing is back at 0.
-    np.testing.assert_allclose(motion.root_position[1], [0.96, 0.91, 0.03], atol=1e-12)
-    np.testing.assert_allclose(motion.positions[1, 1], [1.06, 0.91, 0.03], atol=1e-12)
-
-
 def stretching_bone(second: str) -> str:
     return body(
         f"ROOT Hips {{ OFFSET 0 0 0 {SIX}",

@@ -70,28 +70,6 @@ def test_slalom_returns_to_its_axis():
     assert np.rad2deg(np.abs(path.yaw)).max() == pytest.approx(50.0, abs=0.1)
 
 
-def test_square_closes_after_four_corners():
-    path = named_path("square", 1201, speed=24.0 / 40.0)
-    np.testing.assert_allclose(path.position[-1], 0.0, atol=1e-3)
-    assert path.yaw[-1] == pytest.approx(2 * np.pi)
-    on_sides = np.isclose(np.mod(path.yaw, np.pi / 2), 0.0, atol=1e-12)
-    assert 0.4 < on_sides.mean() < 0.6  # half of the way is straight
-
-
-def test_spiral_arms_lie_a_metre_apart():
-    path = named_path("spiral", 3000)
-    whole_turns = [np.argmin(np.abs(path.yaw - 2 * np.pi * turn)) for turn in (1, 2, 3, 4)]
-    apart = np.linalg.norm(np.diff(path.position[whole_turns], axis=0), axis=-1)
-    np.testing.assert_allclose(apart, 1.0, atol=0.06)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_longer_path_begins_with_the_shorter(name):
-    short, long = named_path(name, 200, seed=3), named_path(name, 1000, seed=3)
-    np.testing.assert_allclose(long.position[:200], short.position, atol=1e-9)
-    np.testing.assert_allclose(long.yaw[:200], short.yaw, atol=1e-9)
-
-
 def test_complex_has_speeds_turns_stops_and_directions():
     for seed in range(4):
         path = named_path("complex", 2560, seed=seed)

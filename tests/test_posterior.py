@@ -5,23 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from builders import (
-    HISTORY,
-    SKELETON,
-    WINDOW,
-    packed_from,
-    straight_motion,
-    tiny_camdm,
-    tiny_packed,
-    tiny_trained,
-    tiny_windows,
-)
+from builders import HISTORY, SKELETON, WINDOW, packed_from, straight_motion, tiny_packed, tiny_trained, tiny_windows
 from scipy.spatial.transform import Rotation
 
 from f3amd_companion.measuring import measure, posterior
 from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.windows import spread_windows
-from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.skeleton import turn
@@ -155,16 +144,6 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
     assert by.loc["x0 error", "value"] == pytest.approx(size, rel=1e-3)
     assert list(by.loc[["answer spread", "x0 error"], "unit"]) == ["cm", "network units"]
     assert (by["low"] < by["value"]).all() and (by["value"] < by["high"]).all()
-
-
-@pytest.mark.slow
-def test_a_network_that_is_told_steps_is_asked_at_its_own_levels(model_that):
-    schedule = variance_preserving_cosine(4)
-    config = tiny_camdm(noise_levels=tuple(schedule.levels.tolist()))
-    trained = model_that(lambda x_noisy, sigma: x_noisy, config=config, diffusion=schedule)
-    for sigmas, expected in (((0.01, 3.0), schedule.levels[:3]), ((1e-3, 1e-2), [schedule.sigma_max])):
-        table = posterior.answer_spread(trained, tiny_windows(), sigmas, num_windows=2, num_draws=2)
-        np.testing.assert_allclose(sorted(set(table["sigma"])), expected, rtol=1e-6)
 
 
 def test_one_draw_has_no_spread():

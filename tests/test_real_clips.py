@@ -1,14 +1,12 @@
 """Real clips that stand beside rollouts: which ones, their pace, floor and paths."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from builders import packed_from, refused, stiff_walk, walks_and_runs
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.measures import real_clips
-from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion, tangent_yaw
+from f3amd_lib.motion.root_paths import path_from_motion
 
 TRAIN = 0
 WINDOW = 8
@@ -24,21 +22,6 @@ def test_pace_and_floor_come_from_training_clips(packed):
     assert real_clips.style_pace(packed, "proud") == pytest.approx(0.9, rel=1e-3)
     assert real_clips.style_floor(packed, "calm") == pytest.approx(0.02)
     refused("unknown style of data set '.*': 'clam'", real_clips.style_pace, packed, "clam")
-
-
-def test_sideways_and_backward_steps_are_counted():
-    yaw = np.repeat([0.0, 0.5 * np.pi, np.pi, 0.25], 25)
-    path = RootPath(np.arange(101)[:, None] * [0.0, 0.04], np.append(yaw, 0.25))
-    assert real_clips.sideways_share(path) == 0.5
-    assert real_clips.sideways_share(RootPath(np.zeros((9, 2)), np.zeros(9))) == 0.0
-
-
-def test_a_path_can_be_walked_facing_ahead():
-    path = named_path("complex", 900, seed=0)
-    ahead = dataclasses.replace(path, yaw=tangent_yaw(path.position))
-    assert real_clips.sideways_share(path) > 0.1
-    assert real_clips.sideways_share(ahead) == 0.0
-    assert np.abs(np.diff(ahead.yaw)).max() < np.deg2rad(10)  # nobody spins
 
 
 def test_reference_clips_are_held_out_and_walk_at_the_pace(packed):

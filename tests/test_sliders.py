@@ -74,13 +74,6 @@ def test_every_frame_is_there_and_lies_where_matplotlib_would_draw_it(drawn):
         np.testing.assert_allclose(stroke[1:], fine * places, atol=0.51)  # the first stands twice
 
 
-def test_a_row_of_nan_lifts_the_pen(drawn):
-    figure, line, _ = drawn
-    frames = {"one": [np.array([[0, 0], [1, 1], [np.nan, np.nan], [2, 0], [3, 1]])]}
-    page = Elements(slide(figure, [line], frames, label="k", alt="").data)
-    assert [len(stroke) for stroke in points(page.all("path")[0]["d"])] == [3, 3]
-
-
 def test_frames_that_do_not_fit_are_refused(drawn):
     figure, line, frames = drawn
     refused("'short'", slide, figure, [line], frames | {"short": []}, label="k", alt="")

@@ -125,13 +125,6 @@ def test_windows_never_straddle_two_clips(packed, train):
     np.testing.assert_array_equal(np.bincount(owner[first]), np.array(lengths) - SPAN + 1)
 
 
-def test_room_counts_the_frames_of_the_clip_before_each_window(packed, train):
-    begin = np.cumsum([0, 30, 30, 21])
-    first = np.asarray(train.starts)
-    owner = np.searchsorted(begin, first, side="right") - 1
-    np.testing.assert_array_equal(train.room, first - begin[owner])
-
-
 def test_earlier_windows_end_where_the_later_begin(packed, train):
     index = jnp.flatnonzero(train.room >= WINDOW)
     settings = index, jnp.full(len(index), 0.7), jnp.zeros(len(index), jnp.int32)
@@ -191,17 +184,6 @@ def test_smoothed_paths_turn_with_the_window(train, smoothing):
         np.testing.assert_allclose(turned.path[..., column], plain.path[..., column] @ matrix.T, atol=1e-5)
 
 
-def test_smoothing_keeps_a_straight_path():
-    windows = build_windows(packed_from([(straight_motion(), 0, 0)]), "train", **SIZES)
-    captured = all_windows(windows)
-    for smoothing in (1, 2):
-        smooth = all_windows(windows, 0.0, smoothing)
-        np.testing.assert_allclose(smooth.path, captured.path, atol=1e-4)
-    steps = np.arange(1, WINDOW + 1)[:, None] * [0.03, 0.04]
-    expected = np.broadcast_to(steps, (*captured.path.shape[:2], 2))
-    np.testing.assert_allclose(captured.path[..., :2], expected, atol=1e-5)
-
-
 def test_smoothing_takes_out_the_sway_of_each_step():
     motion = straight_motion(200)
     root = motion.root_position.copy()
@@ -233,16 +215,6 @@ def test_section_3_2_facing_of_samples_is_uniform(sampled):
     assert counts.sum() == 512 and np.all((counts > 90) & (counts < 170))
 
 
-def test_samples_cover_all_windows_evenly(train, sampled):
-    # Turning leaves the local rotations, which tell the windows apart.
-    known = np.asarray(all_windows(train).future[:, 0, 9:])
-    which = [int(np.flatnonzero((known == row).all(axis=1))[0]) for row in np.asarray(sampled.future[:, 0, 9:])]
-    counts = np.bincount(which, minlength=train.num_windows)
-    assert np.all(counts > 0) and counts.max() < 30
-    expected = np.asarray(train.one_hot[train.styles])[which]
-    np.testing.assert_array_equal(sampled.style, expected)
-
-
 def test_half_of_the_samples_show_the_captured_path(sampled):
     captured = path_condition(sampled.future[..., [0, 2]], frame_yaw(SKELETON, sampled.future))
     same = np.abs(np.asarray(sampled.path - captured)).max(axis=(1, 2)) < 1e-4
@@ -261,14 +233,6 @@ def test_normaliser_makes_training_features_standard(train):
     lively = deviation > 0.02
     assert np.abs(flat.mean(axis=0)).max() < 0.25
     np.testing.assert_allclose(flat.std(axis=0)[lively], 1.0, atol=0.15)
-
-
-def test_normaliser_of_a_figure_that_stands_still_is_finite():
-    still = packed_from([(straight_motion(40, (0.0, 0.0, 0.0)), 0, 0)])
-    windows = build_windows(still, "train", **SIZES)
-    normaliser = _fit(windows, jax.random.key(0))
-    path = normaliser.normalise_path(all_windows(windows).path)
-    assert bool(jnp.all(jnp.isfinite(path)))
 
 
 def test_bent_path_by_hand():
@@ -308,16 +272,6 @@ def test_restarting_bends_target_and_path_back_to_the_captured_line():
     np.testing.assert_array_equal(after.style, batch.style)
 
 
-def test_restarting_measures_from_where_the_character_stands():
-    offset = np.random.default_rng(1).normal(size=CHANNELS)
-    _, history, after = restarted(offset)
-    np.testing.assert_array_equal(after.history[:, -1, [0, 2]], 0.0)
-    np.testing.assert_array_equal(after.history[..., 3:], history[..., 3:])
-    np.testing.assert_allclose(
-        after.history[..., :3] - after.history[:, :1, :3], history[..., :3] - history[:, :1, :3], atol=1e-5
-    )
-
-
 def test_restarting_leads_height_back_without_a_jump():
     offset = np.zeros(CHANNELS)
     offset[1] = 0.16
@@ -355,13 +309,3 @@ def test_starting_poses_look_into_other_splits_if_they_must():
     assert set(starts) == {"calm", "proud"}
     none = packed_from([(wandering_motion(20, 0), 0, 0)])
     assert set(starting_poses(none, num_history=HISTORY)) == {"calm"}
-
-
-def test_windows_of_64_frames():
-    long = packed_from([(straight_motion(120), 0, 0)])
-    windows = build_windows(long, "train", window=64, num_history=10)
-    assert windows.num_windows == 120 - 74 + 1
-    batch = gather_windows(windows, jnp.arange(2), jnp.zeros(2), jnp.zeros(2, int))
-    assert batch.future.shape[:2] == batch.path.shape[:2] == (2, 64)
-    step = np.diff(np.asarray(batch.future[..., [0, 2]]), axis=1)
-    np.testing.assert_allclose(step, np.broadcast_to([0.03, 0.04], step.shape), atol=1e-5)
