@@ -89,7 +89,7 @@ fi
 
 # 4. The packages.
 log="$venv/install.log"
-packages="$(grep -c '^[a-z0-9].*==' requirements.lock)"
+packages="$(grep '^[a-z0-9].*==' requirements.lock | grep -vc 'extra ==')"
 echo "Installing up to $packages packages into $venv (some minutes, about 1.4 GB; log: $log) ..."
 pip=("$venv/bin/python" -m pip --disable-pip-version-check --no-input)
 # The lock is whole (`pip check` below), so nothing is resolved; bytecode is made below, on all cores: half the time.

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Write requirements.lock anew from pyproject.toml: exact versions with hashes, one file for every
 # platform and for Python 3.11 and newer; behind the plain install what each extra adds. For maintainers; it needs the
-# network and changes nothing but the lock. Pins of bench and onnx stay: raise them by hand. Look at the difference, run `make test`, and note a moved figure in CHANGELOG.md.
+# network and changes nothing but the lock. Pins of bench and onnx stay: raise them by hand. Look at the difference, run `make test`.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
