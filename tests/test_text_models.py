@@ -20,7 +20,7 @@ from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.sampling import captioned_motion
-from f3amd_lib.text.stages import text_models, train_stage
+from f3amd_lib.text.stages import acmdm_training, text_models, train_stage
 from f3amd_lib.text.stages.text_models import controlled_joints, find_text_model, load_text_model, save_text_model
 
 pytestmark = pytest.mark.slow
@@ -246,8 +246,8 @@ def test_positions_do_not_train_a_preset_of_other_channels(folder, data, monkeyp
 
 def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, data):
     plain, trained = load(folder, "tiny"), load(folder, "tiny-redundant")
-    states = train_stage.encoded_clips(trained.codec, data)
-    np.testing.assert_array_equal(states[..., :3], train_stage.encoded_clips(plain.codec, data))
+    states = acmdm_training.encoded_clips(trained.codec, data)
+    np.testing.assert_array_equal(states[..., :3], acmdm_training.encoded_clips(plain.codec, data))
     part = np.repeat([split == "train" for split in data.splits], data.lengths)
     np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)
     np.testing.assert_allclose(states[part, :, 3:].std(axis=(0, 1)), 1.0, atol=1e-3)
@@ -274,7 +274,7 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
     clip = codec.axes.normalise(data.clip(0)[None])
     vertices = codec.axes.restore(codec.vertices_of(clip[0]))
     np.testing.assert_allclose(mesh.joints(vertices), data.clip(0), atol=2e-3)
-    states = train_stage.encoded_clips(codec, data)
+    states = acmdm_training.encoded_clips(codec, data)
     assert states.shape == (len(data.positions), 12, 5)
     one = np.asarray(codec.encode(clip, np.ones(clip.shape[:2], bool)))[0]
     np.testing.assert_allclose(one, states[: len(one)], atol=1e-4)
