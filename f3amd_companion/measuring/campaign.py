@@ -322,7 +322,9 @@ def _measured(
         "model": run.preset, "recipe": run.recipe, "seed": run.seed, "window_frames": run.window,
         "epochs": seen / data.windows("train").num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
-        "device": jax.devices()[0].device_kind, "precision": precision, "commit": (record["git_commit"] or "")[:10],
+        # Where it was trained, which may be elsewhere.
+        "device": trained.record["device_kind"], "precision": precision,
+        "commit": (trained.record["git_commit"] or "")[:10],
     }  # fmt: skip
     return pd.concat([rows, use, of_windows]).assign(**columns)
 
