@@ -46,6 +46,7 @@ from f3amd_companion.measuring.text_tables import PAPERS
 from f3amd_companion.serving.artefact import FEATURES, JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd
 from f3amd_companion.serving.export import export_model
+from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_companion.serving.motion_files import write_glb, write_motion_csv
 from f3amd_companion.serving.onnx_export import export_onnx, load_text_or_latent, model_card
 from f3amd_companion.serving.player import player_page, rollout_scene
@@ -72,7 +73,7 @@ from f3amd_lib.motion.inverse_kinematics import fitted
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, resample
 from f3amd_lib.motion.synthetic import STYLES, synthesize
-from f3amd_lib.networks.presets import FAMILIES, PRESETS, Preset, build_config, find_preset, of_paper, table
+from f3amd_lib.networks.presets import PRESETS, Preset, build_config, find_family, find_preset, of_paper, table
 from f3amd_lib.papers.printed import beside_printed
 from f3amd_lib.papers.readings import readings_table
 from f3amd_lib.rollout.rollout import MotionGenerator
@@ -83,7 +84,7 @@ from f3amd_lib.text.judge.text_metrics import clip_score, foot_skating_ratio, ma
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, stream_motions, told_captions
 from f3amd_lib.text.stages.train_stage import train_stage
 from f3amd_lib.training.checkpoints import load_model
-from f3amd_lib.training.pipeline import PRETRAINED_DIR, PreparedData, train
+from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles, PreparedData, train
 from f3amd_lib.training.recipe import short_recipe
 
 RECORDS = repository_root() / "paper_figures"
@@ -161,7 +162,7 @@ def finished(folder: Path) -> dict:
     """Blend seams and hold feet of the synthetic model's walk, write it in each format; and a crowd."""
     generator = MotionGenerator(load_model(WALKERS[-1]), 2)
     line = named_path("spiral", 96, seed=1)
-    rollout = generator.rollout(line, generator.trained.styles[0], seed=1, blend_frames=4, lock_feet=True)
+    rollout = lock_rollout(generator.rollout(line, generator.trained.styles[0], seed=1, blend_frames=4))
     motion, page = rollout.motion(), player_page(rollout_scene(rollout, "walk"), title="walk", credit="nobody")
     crowd = generate_crowd(generator, 3, 40, folder / "crowd", min_distance=0.8, seed=0, chunk=2)
     glb, table = write_glb(folder / "walk.glb", motion, credit="nobody"), write_motion_csv(folder / "walk.csv", motion)
@@ -216,7 +217,7 @@ def papers(folder: Path) -> dict:
     for paper in paper_folders():
         for name, preset in of_paper(paper).items():
             if not name.startswith("tiny") and not name.endswith("-shallow"):  # those are of the trainings below
-                wanted = set(FAMILIES[preset.family][0].from_data) - set(preset.network)
+                wanted = set(find_family(preset.family)[0].from_data) - set(preset.network)
                 config = build_config(name, **{key: value for key, value in sizes.items() if key in wanted})
                 made[name] = digest(json.dumps([config.to_dict(), preset.diffusion.to_dict(), dict(preset.training)]))
         equations = equation_map(paper=paper, course=True)
@@ -336,8 +337,8 @@ def trains_judges(folder: Path) -> dict:
     """Train a judge of text to motion and a classifier of styles."""
     sizes = {"movement_width": 16, "motion_hidden": 16, "text_hidden": 16, "embedding_width": 8}
     training = EvaluatorTraining(num_steps=STEPS, batch_size=8, num_frames=40)
-    state = folder / "judge.state.safetensors"
-    judge = train_judge(captions(), load_text_encoder(), training, checkpoint=state, progress=False, **sizes)
+    files = ModelFiles.of(folder, "judge")
+    judge = train_judge(captions(), load_text_encoder(), training, files=files, progress=False, **sizes)
     losses = {f"judge, {name}": value for row in judge.record["history"] for name, value in row.items()}
     small = {"widths": (8, 8), "hidden_width": 16, "feature_width": 8}
     classifier = train_classifier(motions().packed, num_steps=STEPS, batch_size=8, progress=False, **small)

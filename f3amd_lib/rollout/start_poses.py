@@ -4,7 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames, turn_frames, world_frames
+from f3amd_lib.data.features import (
+    center_window,
+    frame_yaw,
+    motion_from_frames,
+    num_channels,
+    turn_frames,
+    world_frames,
+)
 from f3amd_lib.motion.retarget import retarget
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.skeleton import Motion, resample
@@ -37,7 +44,7 @@ def starting_poses(trained: TrainedModel, style_index, start, yaw, speed, pick: 
     Returns:
       World frames, [B, H, C], float64.
     """
-    poses = np.empty((len(style_index), trained.config.num_history, trained.config.channels))
+    poses = np.empty((len(style_index), trained.config.num_history, num_channels(trained.skeleton)))
     for style in np.unique(style_index):
         members = np.flatnonzero(np.asarray(style_index) == style)
         choices = trained.start_poses[trained.styles[style]]
