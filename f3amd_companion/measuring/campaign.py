@@ -50,8 +50,8 @@ from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks import presets
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
-from f3amd_lib.training.optimise import compile_steps, held_out_terms
-from f3amd_lib.training.pipeline import PreparedData
+from f3amd_lib.training.optimise import compile_steps, held_out_terms, restore_state
+from f3amd_lib.training.pipeline import ModelFiles, PreparedData
 from f3amd_lib.training.recipe import TrainingConfig
 
 log = logging.getLogger("f3amd")
@@ -286,13 +286,16 @@ def _trained(
     data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
     config = run.config(data.windows("train").num_windows, batch_size)
     network, file = find_recipe(run.recipe).network, _weights(folder, run, windows)
-    if file.exists() and (found := load_model(file)).record["training"] == config.to_dict():
-        task = data.task(run.preset, config, network=network)
-        state = SimpleNamespace(averaged=found.params, statistics=None)
-        return data, found, held_out_terms(task, state, data.windows(data.held_out_split))["loss"], config
+    task, steps = data.task(run.preset, config, network=network), max(1, windows // config.batch_size)
+    state = ModelFiles.of(file.parent, run.preset).state
+    # A leg that was killed before it was measured has the state still, which is not rounded as the kept weights are.
+    rounded = file.exists() and not (state.exists() and int(restore_state(state, task).step) == steps)
+    if rounded and (found := load_model(file)).record["training"] == config.to_dict():
+        kept = SimpleNamespace(averaged=found.params, statistics=None)
+        return data, found, held_out_terms(task, kept, data.windows(data.held_out_split))["loss"], config
     with matmul_precision(precision):
         trained, loss = snapshot(
-            data, run.preset, config, max(1, windows // config.batch_size), record, folder=file.parent, network=network,
+            data, run.preset, config, steps, record, folder=file.parent, network=network,
             every=_EVERY.get(device_name(), 1000), stop_at=stop_at, progress=progress,
         )  # fmt: skip
     if trained is None:
