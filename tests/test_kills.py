@@ -128,7 +128,7 @@ def run_campaign(folder: Path) -> list[str]:
     judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(("calm", "proud")), None
     campaign.measure_model, measure.protocol_of = figures, lambda *a: judges
     run = Run(MODEL, window=WINDOW)
-    campaign.queue = lambda: [(run, 8), (run, 16)]
+    campaign.queue = lambda *a: [(run, 8), (run, 16)]
     return ["campaign", *SMOKE, "--batch-size", "4", "--out", str(folder / "runs")]
 
 
