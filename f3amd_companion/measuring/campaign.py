@@ -50,6 +50,7 @@ from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks import presets
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
+from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import compile_steps, held_out_terms, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData
 from f3amd_lib.training.recipe import TrainingConfig
@@ -241,7 +242,7 @@ def train_snapshots(
 ) -> Iterator[tuple[str, int, str]]:  # fmt: skip
     """Train snapshots and keep their weights, for a GPU that is at hand for minutes: measured where there is time.
 
-    The programs of all runs are compiled side by side while the first one trains, if JAX keeps a cache of them.
+    The programs of all runs are compiled side by side before the first one trains, if JAX keeps a cache of them.
 
     Args:
       prepared, profile, snapshots, folder, batch_size, precision, stop_at, progress: as for `run_campaign`.
@@ -254,21 +255,27 @@ def train_snapshots(
     record = run_record(profile=profile, dataset=prepared.packed, seed=0, measurement="package", batch_size=batch_size)
 
     def compiled(run: Run) -> None:
-        config = run.config(prepared.windows("train").num_windows, batch_size)
         with matmul_precision(precision):
-            compile_steps(prepared.task(run.preset, config, network=find_recipe(run.recipe).network), 50)
+            compile_steps(_laid_out(prepared, run, batch_size)[1], 50)
 
-    with ThreadPoolExecutor() as pool:
-        if jax.config.jax_compilation_cache_dir:
+    if jax.config.jax_compilation_cache_dir:
+        with ThreadPoolExecutor() as pool:
             list(pool.map(compiled, dict.fromkeys(run for run, _ in snapshots)))
-        for run, windows in snapshots:
-            state = "kept before"
-            if not _weights(folder, run, windows).exists():
-                done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
-                state = "unfinished" if done is None else "kept"
-            yield run.name, windows, state
-            if state == "unfinished":
-                return
+    for run, windows in snapshots:
+        state = "kept before"
+        if not _weights(folder, run, windows).exists():
+            done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
+            state = "unfinished" if done is None else "kept"
+        yield run.name, windows, state
+        if state == "unfinished":
+            return
+
+
+def _laid_out(prepared: PreparedData, run: Run, batch_size: int) -> tuple[PreparedData, DenoisingTask]:
+    """Return the data in a run's windows, and what trains the run on them."""
+    data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
+    config = run.config(data.windows("train").num_windows, batch_size)
+    return data, data.task(run.preset, config, network=find_recipe(run.recipe).network)
 
 
 def _weights(folder, run: Run, windows: int) -> Path:
@@ -283,10 +290,8 @@ def _trained(
     Returns:
       (the data in the run's windows, model, held-out loss, config); None where the time was over before.
     """
-    data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
-    config = run.config(data.windows("train").num_windows, batch_size)
-    network, file = find_recipe(run.recipe).network, _weights(folder, run, windows)
-    task, steps = data.task(run.preset, config, network=network), max(1, windows // config.batch_size)
+    (data, task), file = _laid_out(prepared, run, batch_size), _weights(folder, run, windows)
+    config, steps = task.config, max(1, windows // task.config.batch_size)
     state = ModelFiles.of(file.parent, run.preset).state
     # A leg that was killed before it was measured has the state still, which is not rounded as the kept weights are.
     rounded = file.exists() and not (state.exists() and int(restore_state(state, task).step) == steps)
@@ -295,7 +300,7 @@ def _trained(
         return data, found, held_out_terms(task, kept, data.windows(data.held_out_split))["loss"], config
     with matmul_precision(precision):
         trained, loss = snapshot(
-            data, run.preset, config, steps, record, folder=file.parent, network=network,
+            data, run.preset, config, steps, record, folder=file.parent, network=find_recipe(run.recipe).network,
             every=_EVERY.get(device_name(), 1000), stop_at=stop_at, progress=progress,
         )  # fmt: skip
     if trained is None:
