@@ -39,7 +39,10 @@ def _two_variances(answer) -> str | None:
     state = np.ones((1, 1))
     kept = float(samplers.ddpm_step(state, data.denoise(state, sigma), sigma, lower, 0.0)[0, 0])
     old = kept**2 * (sigma**2 + 1.0)
-    small, large = (lower / sigma) ** 2 * (sigma**2 - lower**2), sigma**2 - lower**2
+    gained = sigma**2 - lower**2
+    small, large = (lower / sigma) ** 2 * gained, (1 + lower**2) / (1 + sigma**2) * gained
+    if agree(found[1], old + gained, rtol=0.01):
+        return "the larger variance is beta_t, in units of sigma (1 + sigma'^2) / (1 + sigma^2) of what the level loses"
     for name, value, right in zip(
         ("with the smaller variance x'", "with the larger variance x'", "what x' should have"),
         found,

@@ -28,8 +28,11 @@ def _multistep(answer) -> str | None:
             return "the ratio stands on its head: a long step after a short one continues the line farther"
         if agree(found, step(0.5), **FLOAT32):
             return "this is right where both steps are as long in log sigma; the ratio of their lengths is missing"
+        length = np.log(sigma / lower)
+        if agree(found, step(ratio * (length - 1 + lower / sigma) / (length * (1 - lower / sigma))), **FLOAT32):
+            return "this takes the exact mean of the line, another solver; 2M takes the value in the middle of the step"
         if agree(found, step(ratio), **FLOAT32):
-            return "this continues the line to the end of the step; its mean over the step lies half as far"
+            return "this continues the line to the end of the step; its middle lies half as far"
         return f"over {first:g}, {sigma:g}, {lower:g} the state ends elsewhere; lengths of steps are in log sigma"
     return None
 
