@@ -19,7 +19,6 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +30,13 @@ from f3amd_companion.ledger import theory
 from f3amd_companion.ledger.evidence import (
     Evidence,
     NotMeasured,
-    Setting,
     Source,
     paper_evidence,
     recorded_evidence,
     snapshot_evidence,
 )
 from f3amd_companion.ledger.gate import LEAST_SHARE, why_not_judged
-from f3amd_lib.ground.files import named_file, read_toml, write_whole
+from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.tables import compact_table, markdown_table
@@ -55,6 +53,14 @@ PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
 _MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
+
+_KINDS = {
+    name: function
+    for module in (judging, theory)
+    for name, function in inspect.getmembers(module, inspect.isfunction)
+    if function.__annotations__.get("return") == "Finding" and name[0] != "_"
+}
+"""Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,7 @@ class Statement:
     sources: tuple[Source, ...] = ()
     known: int = 0
 
-    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int] = {}, poor=()) -> Statement:
+    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int], poor) -> Statement:
         """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
         evidence.forget()
         try:
@@ -92,7 +98,7 @@ class Statement:
             return replace(self, verdict=judging.UNMEASURED, figure=str(gap), known=gap.known)
         reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
         verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
-        known, sources = 2 if verdict == judging.UNJUDGED else 3, tuple(dict.fromkeys(evidence.sources))
+        known, sources = 2 if reasons else 3, tuple(dict.fromkeys(evidence.sources))
         return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources, known=known)
 
 
@@ -110,7 +116,7 @@ class Claim:
       statements: what it stands for, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
-      poor: (model, window) of networks that it says do badly; they need not walk to be judged.
+      poor: networks that it says do badly, as rows of a table; they need not walk to be judged.
     """
 
     paper: str
@@ -122,58 +128,56 @@ class Claim:
     statements: tuple[Statement, ...]
     paper_says: str = ""
     computed: bool = False
-    poor: tuple[tuple[str, int], ...] = ()
+    poor: Sequence[Mapping] = ()
 
     def judge(self, evidence: Evidence) -> list[Statement]:
         """Return its statements as this evidence has them."""
         windows = load_paper_file("paper", self.paper).get("training", {}).get("windows", {})
-        return [statement.judge(evidence, windows, self.poor) for statement in self.statements]
+        poor = [(one["model"], one["window_frames"]) for one in self.poor]
+        return [statement.judge(evidence, windows, poor) for statement in self.statements]
 
 
 # ------------------------------------------------------------------------------------- the paper's file
 
-_KINDS = judging.KINDS | theory.KINDS
-_MODELS = ("model", "models", "against", "slow", "fast", "over", "under", "released")
+_MODELS = ("model", "models", "against", "slow", "fast", "over", "under")
 
 
-def _read_models(value, families: Mapping, where: str) -> Setting | judging.Family | list[Setting]:
+def _read_models(value, families: Mapping, where: str) -> dict | list[dict]:
+    """Return a model, or several, as rows of a table; a family as lists of them."""
     if isinstance(value, list):
         return [_read_models(item, families, where) for item in value]
-    value = {"model": value} if isinstance(value, str) else value
-    if "family" not in value:
-        check_entry(value, where, ("model",), ("steps", "window"))
-        check_model(value["model"], where)
-        return Setting(**value)
-    check_entry(value, where, ("family",), ("window",))
-    family, window = find_entry(families, value["family"], "family", where), value.get("window", 32)
-    named = lambda key: _read_models([{"model": model, "window": window} for model in family[key]], {}, where)
-    return judging.Family(named("models"), named("required"))
+    value = {"window": 32, "steps": 8} | ({"model": value} if isinstance(value, str) else value)
+    if "family" in value:
+        family = find_entry(families, value["family"], "family", where)
+        member = lambda name: _read_models({"model": name, "window": value["window"]}, {}, where)
+        return {key: list(map(member, names)) for key, names in family.items()}
+    check_entry(value, where, ("model", "window", "steps"), ("framework",))
+    check_model(value["model"], where)
+    row = {"model": value.pop("model"), "window_frames": value.pop("window"), "steps": value.pop("steps")}
+    return row | value
 
 
 def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:
     where = f"{where}, {entry.get('says')!r}"
     check_entry(entry, where, ("says", "kind"), entry)
-    parameters = {"optional": False, "remark": False} | entry
-    says, kind, optional, remark = (parameters.pop(key) for key in ("says", "kind", "optional", "remark"))
-    kind = find_entry(_KINDS, kind, "kind of judgement", where)
+    kind = find_entry(_KINDS, entry["kind"], "kind of judgement", where)
+    parameters = {key: value for key, value in entry.items() if key not in ("says", "kind", "optional", "remark")}
     for key in set(_MODELS) & set(parameters):
         parameters[key] = _read_models(parameters[key], about.get("families", {}), where)
     for key, known in (("metric", METRICS), ("table", SCHEMAS)):
         if key in parameters:
             find_entry(known, parameters[key], key, where)
-    ranges = {key: parameters.pop(key) for key in judging.RANGES if key in parameters}
-    if len(ranges) > 1:
-        raise ValueError(f"{where}: has the ranges {' and '.join(ranges)}; keep one")
-    thresholds = about.get("thresholds", {})
-    number = lambda bound: find_entry(thresholds, bound, "threshold", where) if isinstance(bound, str) else bound
+    number = lambda one: find_entry(about["thresholds"], one, "threshold", where) if isinstance(one, str) else one
     try:
-        for key, value in ranges.items():
-            numbers = value if isinstance(value, list) else [value]
-            parameters["bounds"] = judging.RANGES[key](*map(number, numbers))
+        if key := next(filter(parameters.get, judging.RANGES), None):
+            numbers = parameters.pop(key)
+            bounds = judging.RANGES[key](*map(number, numbers if isinstance(numbers, list) else [numbers]))
+            parameters["bounds"] = bounds
         inspect.signature(kind).bind(None, **parameters)
     except TypeError as error:
         raise ValueError(f"{where}: {error}; {kind.__name__} takes {inspect.signature(kind)}") from None
-    return Statement(says, functools.partial(kind, **parameters), optional or remark, remark)
+    remark = entry.get("remark", False)
+    return Statement(entry["says"], functools.partial(kind, **parameters), entry.get("optional", remark), remark)
 
 
 def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
@@ -188,7 +192,6 @@ def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
       ValueError: for what is missing, unknown or twice; the message says file, claim and statement.
     """
     check_entry(about, where, ("groups", "claim"), ("page", "thresholds", "families"))
-    check_entry(about.get("page", {}), f"{where}, page", (), tuple(_TEXTS["page"]))
     claims: dict[str, Claim] = {}
     for entry in about["claim"]:
         here = f"{where}, claim {entry.get('id')}"
@@ -196,33 +199,23 @@ def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
             raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
         fields = {key: value for key, value in entry.items() if key != "statement"}
-        fields["poor"] = tuple((one.model, one.window) for one in _read_models(entry.get("poor", []), {}, here))
-        statements = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
-        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], statements=statements, **fields)
+        fields["statements"] = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
+        fields["poor"] = _read_models(entry.get("poor", []), {}, here)
+        claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], **fields)
     return claims
-
-
-@functools.cache
-def load_commands(paper: str = "f3amd") -> dict[str, tuple[str, ...]]:
-    """Return what one types to measure each claim again: id -> command lines, in the order of `commands.toml`.
-
-    Raises:
-      ValueError: for a claim without a command, or a command of an unknown claim.
-    """
-    where, known = f"{paper}/commands.toml", {claim_id: [] for claim_id in load_claims(paper)}
-    for entry in load_paper_file("commands", paper)["command"]:
-        check_entry(entry, where, ("run", "claims"))
-        for claim_id in entry["claims"]:
-            find_entry(known, claim_id, "claim", where).append(entry["run"])
-    if lacking := [claim_id for claim_id, runs in known.items() if not runs]:
-        raise ValueError(f"{where}: no command measures {', '.join(lacking)}; add one")
-    return {claim_id: tuple(runs) for claim_id, runs in known.items()}
 
 
 @functools.cache
 def load_claims(paper: str = "f3amd") -> dict[str, Claim]:
     """Return the claims of a paper by their ids, in the order of its file; ValueError as `read_claims`."""
     return read_claims(load_paper_file("claims", paper), paper, f"{paper}/claims.toml")
+
+
+@functools.cache
+def load_commands(paper: str = "f3amd") -> dict[str, list[str]]:
+    """Return what one types to measure each claim again: id -> command lines, in the order of `commands.toml`."""
+    commands = load_paper_file("commands", paper)["command"]
+    return {name: [one["run"] for one in commands if name in one["claims"]] for name in load_claims(paper)}
 
 
 # ------------------------------------------------------------------------------------------ judging
@@ -262,10 +255,10 @@ def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
     return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
 
 
-def _merged(claim: Claim, evidences: Sequence[Evidence]) -> tuple[Statement, ...]:
+def _merged(claim: Claim, evidences: Sequence[Evidence]) -> list[Statement]:
     """Take each statement from the evidence that knows most of it, of equals the first."""
     judged = zip(*(claim.judge(evidence) for evidence in evidences), strict=True)
-    return tuple(max(statements, key=lambda statement: statement.known) for statements in judged)
+    return [max(statements, key=lambda statement: statement.known) for statements in judged]
 
 
 def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Judgement:
@@ -284,15 +277,15 @@ def judge_claim(claim: Claim, evidences: Mapping[str, Sequence[Evidence]]) -> Ju
         return Judgement(claim, paper, (), "computed")
     tried = {data: _merged(claim, some) for data, some in evidences.items()}
     dataset = max(tried, key=lambda data: max((s.known for s in tried[data] if not s.remark), default=0))
-    ours, times_of = list(tried.pop(dataset)), {}
+    ours, times_of = tried.pop(dataset), {}
     # Times hang on the device and hardly on the data: those of other data sets fill gaps, the first that has some.
-    for place, data in product(range(len(ours)), tried):
-        sources = tried[data][place].sources
-        if ours[place].verdict == judging.UNMEASURED and sources and all(one.name in TIMES for one in sources):
-            ours[place] = tried[data][place]
-            times_of[data] = None
-    nothing = judging.combine(statement.verdict for statement in _seen(ours)) == judging.UNMEASURED
-    return Judgement(claim, _seen(ours), paper, "" if nothing else dataset, tuple(times_of))
+    for data, others in tried.items():
+        for place, other in enumerate(others):
+            of_times = other.sources and all(source.name in TIMES for source in other.sources)
+            if ours[place].verdict == judging.UNMEASURED and of_times:
+                ours[place], times_of[data] = other, None
+    judgement = Judgement(claim, _seen(ours), paper, dataset, tuple(times_of))
+    return replace(judgement, dataset="") if judgement.verdict == judging.UNMEASURED else judgement
 
 
 def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper: str = "f3amd") -> list[Judgement]:
@@ -300,8 +293,8 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
 
     Args:
       root: folder of results; `paper_figures/` of the checkout by default.
-      dataset: whose records decide, or several of which the first that can does.
-      profile: of `profiles.PROFILES`, or several, without "smoke".
+      dataset: data sets, of which the first that can decides.
+      profile: of `profiles.PROFILES`, without "smoke".
       paper: whose claims.
 
     Returns:
@@ -311,11 +304,10 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
       ValueError: for unknown names, or records that are broken or lie in the wrong folder.
     """
     root = repository_root() / "paper_figures" if root is None else Path(root)
-    datasets, profiles = ([given] if isinstance(given, str) else given for given in (dataset, profile))
     evidences = {}
-    for data in datasets:
-        snapshots = [late for name in profiles for late in snapshot_evidence(root, data, name)]
-        evidences[data] = [recorded_evidence(root, data, name) for name in profiles] + snapshots
+    for data in dataset:
+        snapshots = [late for name in profile for late in snapshot_evidence(root, data, name)]
+        evidences[data] = [recorded_evidence(root, data, name) for name in profile] + snapshots
     return [judge_claim(claim, evidences) for claim in load_claims(paper).values()]
 
 
@@ -333,23 +325,6 @@ def _figures(statements: Sequence[Statement]) -> str:
     return "; ".join([*dict.fromkeys(reason for s in statements for reason in s.reasons), *measured, *missing])
 
 
-def _row(judgement: Judgement) -> dict:
-    claim = judgement.claim
-    # Without a data set a remark may have looked into a table, and decided nothing.
-    sources = [source for statement in judgement.ours for source in statement.sources if judgement.dataset]
-    joined = lambda words: "; ".join(dict.fromkeys(filter(None, words)))
-    label = lambda name: name + " (procedural, no real motion)" * (name == "synthetic")
-    return {
-        "id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where,
-        "decided_by": claim.decided_by, "verdict": judgement.verdict, "ours": _figures(judgement.ours),
-        "paper_says": claim.paper_says, "paper_verdict": judgement.paper_verdict,
-        "paper_figure": _figures(judgement.paper),
-        "dataset": joined(map(label, (judgement.dataset, *judgement.times_of))),
-        "hardware": "float64" if claim.computed else joined(source.hardware for source in sources),
-        "record": joined(map(str, sources)),
-    }  # fmt: skip
-
-
 def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
     """Return the claims ledger as a table.
 
@@ -362,7 +337,22 @@ def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
       on the paper's own tables), dataset, hardware, record (file and the first digits of its
       SHA-256).
     """
-    return pd.DataFrame(map(_row, judgements))
+    joined = lambda words: "; ".join(dict.fromkeys(filter(None, words)))
+    label = lambda name: name + " (procedural, no real motion)" * (name == "synthetic")
+    rows = []
+    for each in judgements:
+        claim = each.claim
+        # Without a data set a remark may have looked into a table, and decided nothing.
+        sources = [source for statement in each.ours for source in statement.sources if each.dataset]
+        rows.append({
+            "id": claim.id, "group": claim.group, "claim": claim.text, "where": claim.where,
+            "decided_by": claim.decided_by, "verdict": each.verdict, "ours": _figures(each.ours),
+            "paper_says": claim.paper_says, "paper_verdict": each.paper_verdict, "paper_figure": _figures(each.paper),
+            "dataset": joined(map(label, (each.dataset, *each.times_of))),
+            "hardware": "float64" if claim.computed else joined(source.hardware for source in sources),
+            "record": joined(source.place for source in sources),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def _found(statement: Statement) -> str:
@@ -382,10 +372,6 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
     return found.reindex(list(says)).dropna(how="all").fillna("").rename(says).rename_axis("statement").reset_index()
 
 
-_TEXTS = read_toml(Path(__file__).with_name("claims_page.toml"))
-"""Head of the page, and what it says where `[page]` of a paper's claims does not."""
-
-
 def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     """Render the ledger of one paper as Markdown: counts, a table for each group, then every statement.
 
@@ -393,28 +379,28 @@ def ledger_markdown(judgements: Sequence[Judgement]) -> str:
       judgements: from `judge_claims`, at least one.
     """
     frame, paper = ledger(judgements), judgements[0].claim.paper
-    counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
-    counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
-    marks = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)
-    about, words = load_paper_file("paper", paper), _TEXTS["page"] | load_paper_file("claims", paper).get("page", {})
-    gpu = load_profile("gpu", "100style")
+    texts = read_toml(Path(__file__).with_name("claims_page.toml"))
+    about, words = load_paper_file("paper", paper), texts["page"] | load_paper_file("claims", paper).get("page", {})
     training = {"windows": {}, "says": "their number is not known"} | about.get("training", {})
+    gpu = load_profile("gpu", "100style")
     seen = gpu.train_steps * gpu.batch_size
     share = 100.0 * seen / training["windows"].get("32", np.nan)
     fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}
     fields |= {"least": 100.0 * LEAST_SHARE, "windows": training["says"]}
-    head = _TEXTS["head"].format(
-        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper, marks=marks,
+    head = texts["head"].format(
+        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper,
+        marks=", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict),
         **{key: text.strip().format(**fields) for key, text in words.items()},
     )  # fmt: skip
+    counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
+    counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
     parts = [head, markdown_table(counted.reset_index())]
     frame["ours"] = frame["verdict"] + ": " + frame["ours"]
     printed = frame["paper_verdict"] + ": " + frame["paper_figure"]
     frame["the paper's tables"] = printed.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
     frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
     short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
-    for group in frame["group"].unique():
-        parts.append(f"## {group}\n\n{compact_table(short[frame['group'] == group])}")
+    parts += [f"## {group}\n\n{compact_table(rows)}" for group, rows in short.groupby(frame["group"], sort=False)]
     parts.append("## Statement by statement\n")
     for judgement in judgements:
         claim = judgement.claim
@@ -431,7 +417,7 @@ def ledger_path(paper: str = "f3amd") -> Path:
     return repository_root() / "paper_figures" / ("claims.md" if paper == "f3amd" else f"claims_{paper}.md")
 
 
-def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
+def accepted_verdicts(path: Path | None = None) -> dict[str, dict[str, str]]:
     """Read the verdicts that were accepted.
 
     Args:
@@ -440,7 +426,7 @@ def accepted_verdicts(path=None) -> dict[str, dict[str, str]]:
     Returns:
       Claim id -> verdict, figure, paper_verdict, paper_figure; empty if nothing was accepted yet.
     """
-    path = (ledger_path() if path is None else Path(path)).with_suffix(".json")
+    path = (path or ledger_path()).with_suffix(".json")
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
@@ -467,7 +453,7 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
     return changes + [f"{name}: is no claim any more" for name in accepted if name not in verdicts]
 
 
-def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
+def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
     """Write the ledger as Markdown, and accept its verdicts if asked to.
 
     Args:
@@ -477,11 +463,8 @@ def write_ledger(path, judgements: Sequence[Judgement], *, accept: bool = False)
 
     Returns:
       What changed, as from `changed_verdicts`. Without `accept` a change leaves both files alone.
-
-    Raises:
-      ValueError: if the name does not end in .md.
     """
-    path, frame = named_file(path, ".md", "ledgers"), ledger(judgements)
+    frame = ledger(judgements)
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if accept or not changes:
         write_whole(path, ledger_markdown(judgements))
@@ -498,23 +481,17 @@ def main(accept: bool = False, paper: str | None = None) -> int:
       paper: whose claims; each paper's if none.
 
     Returns:
-      Exit status: 0 if the ledger was written, 1 if a verdict changed and was not accepted, 2 for
-      records, or a paper's file, that are broken.
+      Exit status: 0 if the ledgers were written, 1 if a verdict changed and was not accepted.
     """
     status = 0
     for name in [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]:
         path = ledger_path(name)
-        try:
-            changes = write_ledger(path, judge_claims(paper=name), accept=accept)
-        except ValueError as error:
-            log.error("Stopped: %s", error)
-            status = 2
-            continue
+        changes = write_ledger(path, judge_claims(paper=name), accept=accept)
         for change in changes:
             log.info("%s", change)
         if changes and not accept:
             log.error("Nothing was written. If these are right: --accept")
-            status = max(status, 1)
+            status = 1
         else:
             log.info("%s is up to date", path.relative_to(repository_root()))
     return status

@@ -16,7 +16,7 @@ import ast
 import functools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,10 +50,11 @@ def _patterns() -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]
     """Return the patterns of mentions and test names, papers by name, and marks by how a test spells them."""
     names = {load_paper_file("paper", folder)["name"]: folder for folder in paper_folders()}
     labels = [label for folder in names.values() for label in equation_labels(folder)]
-    marks = {label.lower().replace(" ", "_"): label for label in labels if "Eq." not in label}
+    marks = {label.lower().replace(" ", "_"): label for label in labels if "Eq. " not in label}
     either = lambda words: "|".join(map(re.escape, words))
-    mention = re.compile(_MENTION.format(papers=either(names), marks=either(marks.values())))
-    return mention, re.compile(_TEST_NAME.format(papers=either(names.values()), marks=either(marks))), names, marks
+    mention = _MENTION.format(papers=either(names), marks=either(marks.values()))
+    test = _TEST_NAME.format(papers=either(names.values()), marks=either(marks))
+    return re.compile(mention), re.compile(test), names, marks
 
 
 def clauses(text: str) -> list[str]:
@@ -76,16 +77,15 @@ def mentioned_equations(text: str) -> Mentions:
             if not _OTHERS.search(clause[: match.start()]):
                 paper = names.get(name, _DEFAULT)
                 # A mark means an equation in the paper that calls one so, and any text elsewhere.
-                marked = {mark} & set(equation_labels(paper))
-                labels = marked if mark else {f"Eq. {number}" for number in _numbers(numbers)}
+                labels = {mark} & set(equation_labels(paper)) if mark else _numbered(numbers)
                 found |= {(paper, label) for label in labels}
     return found
 
 
-def _numbers(text: str) -> set[int]:
+def _numbered(text: str) -> set[str]:
     """Read "2-4" or "10, 12 and 13"."""
-    parts = [[int(number) for number in re.findall(r"\d+", part)] for part in re.split(r",|and", text)]
-    return {number for ends in parts if ends for number in range(ends[0], ends[-1] + 1)}
+    parts = [re.findall(r"\d+", part) for part in re.split(r",|and", text)]
+    return {f"Eq. {one}" for ends in parts if ends for one in range(int(ends[0]), int(ends[-1]) + 1)}
 
 
 def tested_equations(name: str) -> Mentions:
@@ -94,7 +94,7 @@ def tested_equations(name: str) -> Mentions:
     if not (named := pattern.match(name)):
         return set()
     paper, first, last, mark = named.groups()
-    labels = [marks[mark]] if mark else [f"Eq. {number}" for number in range(int(first), int(last or first) + 1)]
+    labels = {marks[mark]} if mark else _numbered(f"{first}-{last or first}")
     return {(paper or _DEFAULT, label) for label in labels}
 
 
@@ -118,7 +118,7 @@ def equation_map(*, root=None, paper: str = _DEFAULT, course: bool = False) -> p
 
 def _rows_of(paper: str, places: pd.DataFrame) -> pd.DataFrame:
     rows = pd.DataFrame(load_paper_file("paper", paper).get("equation", ()), columns=["label", "section", "what"])
-    own = places[places["paper"] == paper].groupby(["label", "kind"])["place"].agg(", ".join).unstack(fill_value="")
+    own = places[places["paper"] == paper].pivot_table("place", "label", "kind", aggfunc=", ".join, fill_value="")
     own = own.reindex(index=rows["label"], columns=_KINDS, fill_value="")
     return rows.join(own, on="label").rename(columns={"label": "equation"})
 
@@ -127,14 +127,15 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
     """Return where equations live: kind (of `_KINDS`), place, paper, label."""
     found: list[tuple] = []
     note = lambda kind, place, mentions: found.extend((kind, place, *each) for each in mentions)
-    for package in ("f3amd_lib", "f3amd_companion"):
-        for path in sorted((root / package).rglob("*.py")):
-            module = path.relative_to(root / package).with_suffix("").as_posix()
-            if not module.startswith("ledger/"):  # what draws and lists implements nothing
-                for name, text in _documented(path.read_text(encoding="utf-8")):
-                    note("functions", f"{module}: {name}", mentioned_equations(text))
+    for path in [
+        path for package in ("f3amd_lib", "f3amd_companion") for path in sorted((root / package).rglob("*.py"))
+    ]:
+        module = "/".join(path.relative_to(root).with_suffix("").parts[1:])
+        if not module.startswith("ledger/"):  # what draws and lists implements nothing
+            for name, text in _documented(path):
+                note("functions", f"{module}: {name}", mentioned_equations(text))
     for path in sorted((root / "tests").glob("test_*.py")):
-        for name, text in _documented(path.read_text(encoding="utf-8")):
+        for name, text in _documented(path):
             if name.startswith("test_") and "." not in name:
                 note("tests", f"{path.stem}: {name}", mentioned_equations(text) | tested_equations(name))
     folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
@@ -143,16 +144,16 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
         markdown = ("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "markdown")
-        note("notebooks", path.stem, Section("", "\n\n".join(markdown), []).equations)
-        for section in notebook_sections(path):
-            for kind, place in [("cells", section.number), *(("figures", figure) for figure in section.figures)]:
-                note(kind, place, section.equations if section.number else ())
+        note("notebooks", path.stem, Section("", "\n\n".join(markdown)).equations)
+        for section in filter(lambda section: section.number, notebook_sections(path)):
+            note("cells", section.number, section.equations)
+            for figure in section.figures:
+                note("figures", figure, section.equations)
     return pd.DataFrame(found, columns=["kind", "place", "paper", "label"])
 
 
-@functools.cache
-def _documented(source: str) -> list[tuple[str, str]]:
-    """Return (qualified name, docstring) of the classes, functions and methods of a file."""
+def _documented(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield (qualified name, docstring) of the classes, functions and methods of a file."""
 
     def visit(body, above: str):
         for node in body:
@@ -162,7 +163,7 @@ def _documented(source: str) -> list[tuple[str, str]]:
                 yield above + node.name, re.sub(r"Attributes:.*?(\n\n|\Z)", "", text, flags=re.S)
                 yield from visit(node.body, f"{above}{node.name}.")
 
-    return list(visit(ast.parse(source).body, ""))
+    return visit(ast.parse(path.read_text(encoding="utf-8")).body, "")
 
 
 @dataclass
@@ -172,12 +173,10 @@ class Section:
     Attributes:
       heading: its line, without the marks: "2.3 One line, three labels (Eq. 9)".
       text: all of it, code and heading included.
-      figures: names of the figures that its code draws and keeps, "02_schedule".
     """
 
     heading: str
     text: str
-    figures: list[str]
 
     @property
     def number(self) -> str:
@@ -190,6 +189,11 @@ class Section:
         """Equations that it mentions or, F3AMD's, displays with the number: "\\qquad (11)$$"."""
         numbers = [one.strip() for one in ",".join(_DISPLAYED.findall(self.text)).split(",")]
         return mentioned_equations(self.text) | {(_DEFAULT, f"Eq. {one}") for one in numbers if one.isdigit()}
+
+    @property
+    def figures(self) -> list[str]:
+        """Names of the figures that its code draws and keeps: `keep_figure(..., "02_schedule")`."""
+        return re.findall(r'keep_\w+\([^"]*"(\d\d_\w+)"', self.text)
 
 
 def notebook_sections(path) -> list[Section]:
@@ -204,21 +208,9 @@ def notebook_sections(path) -> list[Section]:
         before, *parts = [source] if code else re.split(r"^## (.*)$", source, flags=re.M)
         if sections:
             sections[-1].text += f"\n\n{before}"
-            sections[-1].figures += _kept_figures(source) if code else []
         for heading, text in zip(parts[::2], parts[1::2], strict=True):
-            sections.append(Section(heading.strip(), f"{heading}\n\n{text}", []))
+            sections.append(Section(heading.strip(), f"{heading}\n\n{text}"))
     return sections
-
-
-def _kept_figures(source: str) -> list[str]:
-    """Return the names under which a code cell keeps figures: `keep_figure(..., "02_paths")`."""
-    names = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and node.args and isinstance(node.args[-1], ast.Constant):
-            called = ast.unparse(node.func).split(".")[-1]
-            if called.startswith("keep_") and re.match(r"\d\d_", str(node.args[-1].value)):
-                names.append((node.lineno, node.args[-1].value))
-    return [name for _, name in sorted(names)]
 
 
 def _cells(path) -> list[dict]:
@@ -241,35 +233,30 @@ def equations_markdown(*, root=None) -> str:
     parts = [Path(__file__).with_suffix(".template").read_text(encoding="utf-8")]
     for paper in sorted(filter(equation_labels, paper_folders()), key=lambda paper: paper != _DEFAULT):
         about, rows = load_paper_file("paper", paper), _rows_of(paper, places)
-        functions = rows["functions"].str.replace(": ", ".").map(lambda names: _joined(names, "`{}`".format))
+        code = rows["functions"].str.replace(": ", ".").str.replace(r"([^, ]+)", r"`\1`", regex=True)
         reasons = [f"*cited only:* {one['cited_only']}" if "cited_only" in one else "" for one in about["equation"]]
         page = rows[["equation", "section"]].assign(**{"what it says": rows["what"]})
-        page["functions"] = functions.where(functions != "", reasons)
+        page["functions"] = code.where(code != "", reasons)
         page["tests"] = rows["tests"].map(_first_tests)
-        page["notebooks"] = rows["cells"].map(lambda cells: _joined(cells, lambda cell: _section_link(root, cell)))
+        link = lambda cell: f"[{cell[0]}](/{_notebook_of(root, cell[0]).relative_to(root).as_posix()})"
+        page["notebooks"] = rows["cells"].str.replace(r"[^, ]+", link, regex=True)
         parts.append(f"\n## {about['name']}\n\n{compact_table(page)}")
     return "".join(parts)
-
-
-def _joined(names: str, written: Callable[[str], str]) -> str:
-    return ", ".join(map(written, filter(None, names.split(", "))))
 
 
 def _first_tests(names: str) -> str:
     """Return the first test of each file, and how many more it has."""
     files: dict[str, list[str]] = {}
-    for name in filter(None, names.split(", ")):
-        file, test = name.split(": ")
+    for file, test in re.findall(r"(\w+): (\w+)", names):
         files.setdefault(file, []).append(test)
     more = lambda tests: f" and {len(tests) - 1} more" if len(tests) > 1 else ""
     return "; ".join(f"`tests/{file}.py`: `{tests[0]}`{more(tests)}" for file, tests in files.items())
 
 
-def _section_link(root: Path, cell: str) -> str:
-    """Return a section as a link to its notebook: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
-    folder = root / "notebooks" / ("course" if cell[0] == "C" else "")
-    (path,) = folder.glob(f"{int(cell.lstrip('C').split('.')[0]):02d}_*.ipynb")
-    return f"[{cell}](/{path.relative_to(root).as_posix()})"
+def _notebook_of(root: Path, section: str) -> Path:
+    """Return the notebook of a section by its number: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
+    number = int(section.lstrip("C").split(".")[0])
+    return next((root / "notebooks" / ("course" if section[0] == "C" else "")).glob(f"{number:02d}_*.ipynb"))
 
 
 def running_times(*, root=None) -> pd.DataFrame:

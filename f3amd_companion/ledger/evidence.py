@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,15 +20,7 @@ from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
 from f3amd_lib.measures.distributions import intervals_over_repeats
-from f3amd_lib.papers.printed import (
-    NINE_METRICS,
-    OF_TEXT,
-    PUBLISHED_CAMDM,
-    REFERENCE_ROWS,
-    SCHEMAS,
-    checked_table,
-    printed_tables,
-)
+from f3amd_lib.papers import printed
 
 
 class NotMeasured(LookupError):
@@ -54,63 +46,38 @@ def known(look: Callable, *arguments, **named):
 # ---------------------------------------------------------------------------- figures and intervals
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A number with the interval it lies in.
-
-    Attributes:
-      value: mean over seeds, or median time.
-      low, high: 95 % interval of that mean or median; both equal to `value` where there was a single
-        repeat, so that nothing is known about its spread.
-    """
+class Figure(NamedTuple):
+    """A number, the mean over seeds or the median of times, with its 95 % interval; all three equal for one repeat."""
 
     value: float
     low: float
     high: float
 
     @staticmethod
-    def of(value, low=float("nan"), high=float("nan")) -> Figure:
-        """Make a figure; bounds that are NaN (a single repeat) become the value itself.
-
-        Raises:
-          ValueError: for a value that is no finite number or lies outside its interval.
-        """
-        value = float(value)
-        low, high = (value if np.isnan(bound) else float(bound) for bound in (low, high))
-        if not (np.isfinite(value) and low <= value <= high):
-            raise ValueError(f"a figure needs low <= value <= high, got {low}, {value}, {high}")
-        return Figure(value, low, high)
+    def of(value, low=np.nan, high=np.nan) -> Figure:
+        """Make a figure; bounds that are NaN (a single repeat) become the value itself."""
+        return Figure(*(float(value if np.isnan(bound) else bound) for bound in (value, low, high)))
 
     def map(self, function: Callable[[float], float]) -> Figure:
         """Return the figure under a rising function."""
-        return Figure(*(function(bound) for bound in (self.value, self.low, self.high)))
+        return Figure(*map(function, self))
 
 
 def _combine_logs(figures: Sequence[Figure], weights) -> Figure:
     """Return exp of the weighted sum of logarithms of positive figures, with its interval."""
     weights = np.asarray(weights, dtype=np.float64)
-    value = np.log([figure.value for figure in figures])
     with np.errstate(divide="ignore"):
-        below = value - np.log([max(figure.low, 0.0) for figure in figures])
-        above = np.log([figure.high for figure in figures]) - value
-    down = np.where(weights > 0, below, above)
-    up = np.where(weights > 0, above, below)
-    middle = weights @ value
-    reach = [np.sqrt(np.sum((weights * side)[weights != 0] ** 2)) for side in (down, up)]
-    return Figure(*(float(np.exp(x)) for x in (middle, middle - reach[0], middle + reach[1])))
+        value, low, high = np.log(np.maximum(np.transpose(figures), 0.0))
+    sides = np.where(weights > 0, [value - low, high - value], [high - value, value - low])
+    down, up = np.sqrt(np.sum((weights * sides) ** 2, axis=1))
+    return Figure(*(float(np.exp(weights @ value + reach)) for reach in (0.0, -down, up)))
 
 
 def ratio(numerator: Figure, denominator: Figure) -> Figure:
     """Return the quotient of two figures with its interval, both being independent.
 
     The interval is recovered from those of the two logarithms: distances from value to bound add
-    up in squares.
-
-    Args:
-      numerator, denominator: not negative.
-
-    Returns:
-      The quotient; infinite for a denominator of 0, and 1 for 0 / 0.
+    up in squares. The quotient is infinite for a denominator of 0, and 1 for 0 / 0.
 
     Raises:
       ValueError: for a negative figure.
@@ -135,15 +102,9 @@ def mean_figure(figures: Sequence[Figure]) -> Figure:
 
 
 def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
-    """Fit figure = c x^p by least squares of logarithms and return p with its interval.
-
-    Args:
-      x: positive, at least two different ones.
-      figures: positive, one for each x.
-    """
+    """Fit figure = c x^p by least squares of logarithms and return p with its interval; all are positive."""
     spread = np.log(x) - np.mean(np.log(x))
-    fitted = _combine_logs(figures, spread / np.sum(spread**2))
-    return fitted.map(lambda bound: float(np.log(bound)))
+    return _combine_logs(figures, spread / np.sum(spread**2)).map(lambda bound: float(np.log(bound)))
 
 
 # ------------------------------------------------------------------------------------------- tables
@@ -152,51 +113,16 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
 _LEAST_STEPS = 10_000
 """Optimiser steps below which a comparison of recipes decides nothing."""
 
-
 OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm")
 """Tables that say how well a network does: it must have passed the gate (`ledger.gate`)."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A model as it is used: preset, denoising steps, window."""
+class Source(NamedTuple):
+    """Where figures come from: a table of `SCHEMAS`, its path with the first digits of its checksum, and the device."""
 
-    model: str
-    steps: int = 8
-    window: int = 32
-
-    @property
-    def columns(self) -> dict:
-        """Its row in a table of `SCHEMAS`."""
-        return {"model": self.model, "window_frames": self.window, "steps": self.steps}
-
-    def __str__(self) -> str:
-        steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
-        window = f", {self.window} frames" if self.window != 32 else ""
-        return f"{self.model} ({steps}{window})"
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where figures come from.
-
-    Attributes:
-      table: path of the CSV below the results' root, or a table of the paper.
-      sha256: first digits of its checksum; "" for a table of the paper.
-      hardware: what it was measured on.
-    """
-
-    table: str
-    sha256: str
+    name: str
+    place: str
     hardware: str
-
-    def __str__(self) -> str:
-        return f"{self.table} ({self.sha256})" if self.sha256 else self.table
-
-    @property
-    def name(self) -> str:
-        """The table's name, as in `SCHEMAS`."""
-        return Path(self.table).stem
 
 
 class Evidence:
@@ -204,6 +130,7 @@ class Evidence:
 
     Attributes:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
+      printed: whether these are a paper's tables.
       sources: the tables that were looked into since `forget`, in that order and as often.
       trained: (model, window) of the trained networks whose quality was looked up since then.
       told: of text to motion, model -> (what was trained in its place, motions it saw), since then.
@@ -211,7 +138,7 @@ class Evidence:
 
     def __init__(self, load: Callable, framework: str = "jax"):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
-        self.framework = framework
+        self.framework, self.printed = framework, framework != "jax"
         self._load = functools.cache(load)
         # A ledger asks for thousands of figures, by few values of a column.
         self._holding = functools.cache(lambda name, column, value: (load(name)[0][column] == value).to_numpy())
@@ -222,11 +149,6 @@ class Evidence:
         self.sources: list[Source] = []
         self.trained: list[tuple[str, int]] = []
         self.told: dict[str, tuple[str, int]] = {}
-
-    @property
-    def printed(self) -> bool:
-        """Whether these are a paper's tables."""
-        return self.framework != "jax"
 
     def called(self, name: str) -> str:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
@@ -247,20 +169,21 @@ class Evidence:
         device = row.get("device")
         if device and not self._holding(name, "device", device).any():
             raise NotMeasured(f"{self.called(name)} no rows of a {device}")
-        self.sources.append(Source(path, record.get("table", {}).get("sha256", "")[:12], _hardware(record, device)))
+        digest = f" ({record['table']['sha256'][:12]})" if "table" in record else ""
+        self.sources.append(Source(name, path + digest, _hardware(record, device)))
         # A claim names the paper's data set; a record of ours lies among those of one data set, its own.
         wanted = [self._holding(name, *each) for each in row.items() if each[0] != "dataset" or self.printed]
         if wanted:
             which = np.logical_and.reduce(wanted)
             table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
-        if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS and len(table):
+        if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in printed.REFERENCE_ROWS and len(table):
             self.trained.append((asked_network(row["model"]), row.get("window_frames", 32)))
-        if name in OF_TEXT and not self.printed:
+        if name in printed.OF_TEXT and not self.printed:
             self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
         return table
 
     def figure(self, name: str, value: str = "value", **row) -> Figure:
-        """Return one figure of a table.
+        """Return one figure of a table, of the first row that has one.
 
         Args:
           name: a key of `SCHEMAS`.
@@ -272,44 +195,18 @@ class Evidence:
         """
         found = self.rows(name, **row)
         if value in found and len(found := found[found[value].notna()]):
-            bounds = ["value", "low", "high"] if value == "value" else [value]
-            return Figure.of(*found[bounds].iloc[0])
+            return Figure.of(*found[["value", "low", "high"] if value == "value" else [value]].iloc[0])
         what = "" if value == "value" else f"{value} of "
         raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}")
 
-    def quality(self, setting: Setting, metric: str) -> Figure:
-        """Return a metric of a model; the published one has a window and a number of steps of its own."""
-        columns = setting.columns
-        if setting.model == PUBLISHED_CAMDM and (rows := self.rows("quality", model=setting.model))["steps"].size:
-            columns = rows.loc[rows["steps"].idxmax(), list(columns)].to_dict()
-        return self.figure("quality", **columns, metric=metric)
 
-    def time(self, setting: Setting, device: str, characters: int, framework: str | None = None) -> Figure:
-        """Return the time of a round in ms; by default in the framework of this evidence."""
-        row = {"framework": framework or self.framework, "characters": characters, "device": device}
-        return self.figure("synthesis_time", **setting.columns, **row)
-
-    def counts(self, setting: Setting, device: str, framework: str | None = None) -> set[int]:
-        """Return the numbers of characters that a model was timed with; maybe none."""
-        row = {"framework": framework or self.framework, "device": device}
-        return {int(count) for count in self.rows("synthesis_time", **setting.columns, **row)["characters"]}
-
-    def speedup(self, slow: Setting, fast: Setting, device: str, characters: int) -> Figure:
-        """Return how many times as fast `fast` is."""
-        return ratio(self.time(slow, device, characters), self.time(fast, device, characters))
-
-
-_WORDS = {
-    "steps": "{} step{s}",
-    "characters": "{:,} character{s}",
-    "window_frames": "{} frames",
-    "batch_size": "batch {}",
-}
+_TOLD = {
+    "steps": "{} step{s}", "characters": "{:,} character{s}", "window_frames": "{} frames", "batch_size": "batch {}",
+}  # fmt: skip
 
 
 def _row_text(row: Mapping) -> str:
-    words = (_WORDS.get(column, "{}").format(value, s="" if value == 1 else "s") for column, value in row.items())
-    return ", ".join(words)
+    return ", ".join(_TOLD.get(column, "{}").format(value, s="s" * (value != 1)) for column, value in row.items())
 
 
 def _hardware(record: Mapping, device: str | None) -> str:
@@ -334,7 +231,7 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
 
     Raises:
       ValueError: for an unknown data set or profile; later, for a table without a run record, one
-        that its record does not describe, or a record of another data set, profile or device.
+        that its record does not describe, or a record of another data set or profile.
     """
     check_known(dataset, DATASETS, "data set")
     check_known(profile, [name for name in PROFILES if name != "smoke"], "profile")
@@ -345,20 +242,14 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         if not path.exists() and not path.with_suffix(".json").exists():
             raise NoTable(f"no {name}.csv yet")
         table, record = read_table(path)
-        for key, here in (("dataset", dataset), ("profile", profile)):
-            if record.get(key) != here:
-                raise ValueError(f"{path}: is a record of {key} {record.get(key)!r}, yet lies among those of {here!r}")
+        if (of := (record.get("dataset"), record.get("profile"))) != (dataset, profile):
+            raise ValueError(f"{path}: is a record of {' and '.join(map(str, of))}; move it to where those lie")
         if reason := folder_reason(path, record):
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
         if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
             raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
         others = [one for paper in paper_folders() for one in load_paper_file("paper", paper).get("others", ())]
-        table = checked_table(name, table, str(path), others if name in OF_TEXT else ())
-        if "device" in table and record.get("device_platform") == "cpu":
-            # PyTorch finds its own device; the record tells that of JAX.
-            own = table.get("framework", pd.Series("jax", index=table.index)) != "torch"
-            if (own & (table["device"] == "GPU")).any():
-                raise ValueError(f"{path}: has rows of a GPU, but its record knows only a CPU")
+        table = printed.checked_table(name, table, str(path), others if name in printed.OF_TEXT else ())
         return table, record, path.relative_to(root).as_posix()
 
     return Evidence(load)
@@ -399,22 +290,20 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
         where = f"{place} at {windows:,} windows, {most} a network"
         seen = trainings.reset_index().assign(metric="windows", value=windows)
-        tables = {"quality": intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]), "trained": seen}
-        tables = {name: checked_table(name, one, where) for name, one in tables.items()}
+        tables = {"quality": intervals_over_repeats(rows, [*printed.SCHEMAS["quality"], "unit"]), "trained": seen}
+        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items()}
         found.append(_evidence_of(tables, record, where, gap))
-    curves = _snapshot_curves(table)
-    tables = {} if curves.empty else {"quality_by_epoch": checked_table("quality_by_epoch", curves, place)}
-    return [*found, _evidence_of(tables, record, place, gap)]
+    curves = printed.checked_table("quality_by_epoch", _learning_curves(table), place)
+    return [*found, _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]
 
 
-def _snapshot_curves(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the learning curves among rows of the long queue."""
-    rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
-    rows = rows[rows["steps"].isin([0, 8])]  # the loss has no steps
+def _learning_curves(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return, of rows of the long queue, those of each model's run with most snapshots, if it has two or more."""
+    rows = rows[rows["metric"].isin([*printed.NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
+    rows = rows[rows["steps"].isin([0, 8])].rename(columns={"epochs": "epoch"})  # the loss has no steps
     lengths = rows.groupby(["model", "run"])["windows"].nunique()
     longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
-    curves = rows[rows["run"].isin(longest)].rename(columns={"epochs": "epoch"})
-    return curves[[*SCHEMAS["quality_by_epoch"], "value"]]
+    return rows.loc[rows["run"].isin(longest), [*printed.SCHEMAS["quality_by_epoch"], "value"]]
 
 
 @functools.cache
@@ -426,4 +315,4 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
     """
     record = {"paper_setting": load_paper_file("paper", paper)["setting"]}
     where, gap = "the paper's tables", "the paper has no table of it"
-    return _evidence_of(printed_tables(paper), record, where, gap, framework="iree")
+    return _evidence_of(printed.printed_tables(paper), record, where, gap, framework="iree")

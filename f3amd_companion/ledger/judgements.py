@@ -21,20 +21,16 @@ was known, and nothing else.
 
 from __future__ import annotations
 
-import functools
-import inspect
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations, pairwise, product
 
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.ledger.evidence import Evidence, Figure, NotMeasured, Setting, known, mean_figure, power_law, ratio
+from f3amd_companion.ledger.evidence import Evidence, Figure, NotMeasured, known, mean_figure, power_law, ratio
 from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.papers.printed import NINE_METRICS
+from f3amd_lib.papers.printed import NINE_METRICS, PUBLISHED_CAMDM
 
 HOLDS = "holds"
 IN_PART = "holds in part"
@@ -71,24 +67,6 @@ LEAST_METRICS = 5
 """Of the nine of Table 3, so many must be there before "every metric" means something."""
 
 EVERYTHING = (0.0, np.inf)
-
-
-@dataclass(frozen=True)
-class Family:
-    """Models that are judged together, as far as they were measured.
-
-    Attributes:
-      models: all of them.
-      required: those without which nothing is judged.
-    """
-
-    models: tuple[Setting, ...]
-    required: tuple[Setting, ...]
-
-    def measured(self, look: Callable[[Setting], object]) -> list[Setting]:
-        """Return those for which `look` finds all it needs; NotMeasured if a required one lacks it."""
-        found = lambda setting: look(setting) if setting in self.required else known(look, setting)
-        return [setting for setting in self.models if found(setting) is not None]
 
 
 # ------------------------------------------------------------------------------ verdicts and ranges
@@ -163,15 +141,6 @@ def _compared(figure: Figure, bounds: tuple[float, float] | None, *, gain: bool 
     return ordered(figure) if bounds is None else within(figure, bounds, gain=gain)
 
 
-def _ranged(figures: Sequence[Figure], bounds: tuple[float, float], unit: str, *, gain: bool = True) -> Finding:
-    """Judge whether figures lie in a range, each of them a part of the whole; say how many do."""
-    verdicts = [within(figure, bounds, gain=gain) for figure in figures]
-    text, inside = range_text(figures, unit), verdicts.count(HOLDS)
-    if len(figures) > 1 and inside < len(figures):
-        text += f", {inside} of {len(figures)} in the range"
-    return majority(verdicts), text
-
-
 def stated_factor(figure: float, over: float = 1.0) -> tuple[float, float]:
     """Return the bounds of "about figure / over times", a factor above 1."""
     factor = figure / over
@@ -235,15 +204,14 @@ def _change_text(figure: Figure) -> str:
     return f"{100.0 * (figure.value - 1.0):+.3g} %"
 
 
-def _harm_text(harm: Figure) -> str:
-    return f"{_change_text(harm).lstrip('+-')} {'worse' if harm.value >= 1.0 else 'better'}"
-
-
 def _in_percent(figure: Figure) -> Figure:
     return figure.map(lambda bound: 100.0 * (bound - 1.0))
 
 
-# ------------------------------------------------------- six kinds that most statements are judged by
+# ------------------------------------------------- six kinds that most statements are judged by
+#
+# A model is its row in a table of `SCHEMAS` (model, window_frames, steps, and framework where it is not the
+# evidence's own); a family has `models`, of which the `required` ones must have been measured.
 
 
 def figure(evidence: Evidence, table: str, row: dict, bounds=None, ratio_to=None, unit="", text="{}") -> Finding:
@@ -260,15 +228,7 @@ def _times_worse(metric: str, figure: Figure, against: Figure) -> Figure:
 
 
 def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
-    """Judge whether rows stand in this order, best first: each against the next.
-
-    Args:
-      evidence: of one paper or data set.
-      table: a table of `SCHEMAS`.
-      metric: of `measures/metrics.toml`, which says what is better.
-      rows: columns of each row.
-      among: columns that all rows share.
-    """
+    """Judge whether rows (their columns, and `among` for all) stand in this order, best first."""
     figures = [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
     verdict = majority(ordered(_times_worse(metric, second, first)) for first, second in pairwise(figures))
     return verdict, _values_text(figures)
@@ -281,51 +241,78 @@ def leads(evidence: Evidence, table: str, metric: str, rows, among=None) -> Find
     return verdict, f"{number_text(first.value)} against {_values_text(others)}"
 
 
-def _saving(gain: Figure) -> Figure:
-    return gain.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
+def _measured(models: Mapping, look: Callable[[Mapping], object]) -> list[Mapping]:
+    """Return the models of a family for which `look` finds all it needs; NotMeasured if a required one lacks it."""
+    found = lambda model: look(model) if model in models["required"] else known(look, model)
+    return [model for model in models["models"] if found(model) is not None]
 
 
-def _timed(evidence: Evidence, fast: Setting | Family, device: str, characters) -> list[Setting]:
-    if isinstance(fast, Setting):
-        return [fast]
-    return fast.measured(lambda setting: [evidence.time(setting, device, count) for count in characters])
+def _time(evidence: Evidence, model: Mapping, device: str, count: int) -> Figure:
+    row = {**model, "framework": model.get("framework", evidence.framework), "characters": count, "device": device}
+    return evidence.figure("synthesis_time", **row)
+
+
+def _gain(evidence: Evidence, slow: Mapping, fast: Mapping, device: str, count: int) -> Figure:
+    """Return how many times as fast `fast` is."""
+    return ratio(_time(evidence, slow, device, count), _time(evidence, fast, device, count))
+
+
+def _timed(evidence: Evidence, models: Mapping, device: str, characters) -> list[Mapping]:
+    """Return the models of a family, or the one that is given, which were timed with all these characters."""
+    look = lambda model: [_time(evidence, model, device, count) for count in characters]
+    return _measured(models, look) if "required" in models else [models]
 
 
 def speedup(
-    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}"
-) -> Finding:
+    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}", some=False,
+    mean=False,
+) -> Finding:  # fmt: skip
     """Judge how many times as fast one model, or each of a family, is at some numbers of characters.
 
-    With the unit " %" it is the time saved.
+    With the unit " %" it is the time saved. `some`: at those of them that were timed; `mean`: on average over these.
     """
-    models = _timed(evidence, fast, device, characters)
-    figures = [evidence.speedup(slow, model, device, count) for model in models for count in characters]
-    verdict, found = _ranged([_saving(one) for one in figures] if unit == " %" else figures, bounds, unit, gain=gain)
-    return verdict, text.format(found)
+    timed = lambda count: known(_gain, evidence, slow, fast, device, count)
+    # If none was timed, the reason is that of the first.
+    counts = (list(filter(timed, characters)) or characters[:1]) if some or mean else characters
+    models = _timed(evidence, fast, device, counts)
+    figures = [_gain(evidence, slow, model, device, count) for model in models for count in counts]
+    figures = [mean_figure(figures)] if mean else figures
+    saved = lambda one: one.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
+    figures = [saved(one) for one in figures] if unit == " %" else figures
+    verdict, inside = majority(verdicts := [within(one, bounds, gain=gain) for one in figures]), verdicts.count(HOLDS)
+    found = range_text(figures, unit)
+    if 1 < len(figures) != inside:
+        found += f", {inside} of {len(figures)} in the range"
+    return verdict, text.format(found) + (f" at {_list_text(counts)}" if mean or len(counts) < len(characters) else "")
 
 
 def training_ratio(
     evidence: Evidence, over, under, bounds=None, column="value", text="{figure}x at batch {batch}"
 ) -> Finding:
     """Judge the training time (or another column) of one model over another's, at the largest shared batch."""
-    rows = evidence.rows("training_time", window_frames=over.window, device="GPU")
-    sizes = [set(rows.loc[rows["model"] == setting.model, "batch_size"]) for setting in (over, under)]
-    if not (shared := set.intersection(*sizes)):
-        gap = f"no batch size of both {over.model} and {under.model}, GPU"
-        raise NotMeasured(f"{evidence.called('training_time')} {gap}")
-    row = {"window_frames": over.window, "batch_size": int(max(shared)), "device": "GPU"}
-    found = ratio(*(evidence.figure("training_time", column, model=one.model, **row) for one in (over, under)))
+    row = {"window_frames": over["window_frames"], "device": "GPU"}
+    names, rows = (over["model"], under["model"]), evidence.rows("training_time", **row)
+    if not (shared := set.intersection(*(set(rows.loc[rows["model"] == name, "batch_size"]) for name in names))):
+        raise NotMeasured(f"{evidence.called('training_time')} no batch size of both {' and '.join(names)}, GPU")
+    row |= {"batch_size": int(max(shared))}
+    found = ratio(*(evidence.figure("training_time", column, model=name, **row) for name in names))
     return _compared(found, bounds, gain=True), text.format(figure=figure_text(found), batch=row["batch_size"])
 
 
-def _harm(evidence: Evidence, model: Setting, against: Setting, metric: str) -> Figure:
+def _quality(evidence: Evidence, model: Mapping, metric: str) -> Figure:
+    """Return a metric of a model; the published one has a window and a number of steps of its own."""
+    row = {"model": PUBLISHED_CAMDM} if model["model"] == PUBLISHED_CAMDM else model
+    return evidence.figure("quality", **row, metric=metric)
+
+
+def _harm(evidence: Evidence, model: Mapping, against: Mapping, metric: str) -> Figure:
     """Return how many times worse a metric is; above 1 where `model` is the worse one."""
-    return _times_worse(metric, evidence.quality(model, metric), evidence.quality(against, metric))
+    return _times_worse(metric, _quality(evidence, model, metric), _quality(evidence, against, metric))
 
 
 def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
     """Judge whether a model is worse than another in one metric, or by a factor in a range."""
-    figures = [evidence.quality(setting, metric) for setting in (model, against)]
+    figures = [_quality(evidence, one, metric) for one in (model, against)]
     harm = _times_worse(metric, *figures)
     text = f"{' against '.join(map(figure_text, figures))} {METRICS[metric].unit}".rstrip()
     return _compared(harm, bounds), text + (f", {number_text(harm.value)} times worse" if bounds else "")
@@ -334,99 +321,30 @@ def worse(evidence: Evidence, model, against, metric, bounds=None) -> Finding:
 # ------------------------------------------------------------ functions for a question or two: of times
 
 
-def speedup_on_some_device(evidence: Evidence, slow, fast, crowds: dict, bounds) -> Finding:
-    """Judge the gain in a large crowd (device -> characters), on every device that was timed."""
-    times = {f"{device}, {count:,}": (slow, fast, device, count) for device, count in crowds.items()}
-    figures = {at: gain for at, timed in times.items() if (gain := known(evidence.speedup, *timed))}
-    if not figures:
-        evidence.speedup(slow, fast, *next(iter(crowds.items())))  # the reason is that of the first
-    verdict = every(within(gain, bounds, gain=True) for gain in figures.values())
-    return verdict, ", ".join(f"{figure_text(gain)}x ({at})" for at, gain in figures.items())
-
-
 def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Finding:
     """Judge whether the gain of a family is larger with the second number of characters."""
     models = _timed(evidence, fast, device, characters)
-    gains = [[evidence.speedup(slow, model, device, count) for count in characters] for model in models]
+    gains = [[_gain(evidence, slow, model, device, count) for count in characters] for model in models]
     growth = [ratio(many, few) for few, many in gains]
     return majority(map(ordered, growth)), f"{range_text(growth)} times the gain"
 
 
-def speedup_at_each(evidence: Evidence, slow, fast, device, characters) -> Finding:
-    """Write the gain at each number of characters (a remark)."""
-    gains = {count: evidence.speedup(slow, fast, device, count) for count in characters}
-    return REMARK, " and ".join(f"{figure_text(gain)}x at {count:,}" for count, gain in gains.items())
+def step_exponent(evidence: Evidence, model, device, characters, bounds=None) -> Finding:
+    """Judge the exponent p of time ~ steps^p, or of two numbers of characters whether it is larger with the second."""
+    steps, found = (8, 4, 2, 1), []
+    for count in characters:
+        found.append(power_law(steps, [_time(evidence, model | {"steps": each}, device, count) for each in steps]))
+    text = ", ".join(f"{figure_text(one)} at {count:,}" for one, count in zip(found, characters, strict=True))
+    return _compared(
+        found[0] if bounds else ratio(found[1].map(np.exp), found[0].map(np.exp)), bounds
+    ), f"exponent {text}"
 
 
-def speedup_above(evidence: Evidence, slow, fast, device, factor) -> Finding:
-    """Write at which numbers of characters a gain is passed (a remark)."""
-    shared = sorted(evidence.counts(slow, device) & evidence.counts(fast, device))
-    counts = [count for count in shared if evidence.speedup(slow, fast, device, count).value > factor]
-    return REMARK, f"above {factor:g} at {_list_text(counts)}" if counts else f"nowhere above {factor:g}"
-
-
-def mean_saving(evidence: Evidence, slow, fast, device, characters, bounds) -> Finding:
-    """Judge the time saved, %, on average over the numbers of characters that were timed."""
-    shared = sorted(evidence.counts(slow, device) & evidence.counts(fast, device) & set(characters))
-    # Without any, the reason is that of the first.
-    found = _saving(mean_figure([evidence.speedup(slow, fast, device, count) for count in shared or characters[:1]]))
-    return within(found, bounds, gain=True), f"{figure_text(found)} % at {_list_text(shared)}"
-
-
-def _jax_over_torch(evidence: Evidence, model, released, device, characters, compiler=None) -> dict[int, Figure]:
-    """Return time in JAX over time in PyTorch, which has the same network or the released one."""
-    peer = model if evidence.counts(model, device, "torch") else released
-    shared = evidence.counts(model, device, compiler) & evidence.counts(peer, device, "torch") & set(characters)
-    return {
-        count: ratio(evidence.time(model, device, count, compiler), evidence.time(peer, device, count, "torch"))
-        for count in sorted(shared) or characters[:1]
-    }
-
-
-def jax_over_torch(
-    evidence: Evidence, model, released, device, characters, bounds=EVERYTHING, gain=False, compiler=None
-) -> Finding:
-    """Judge the time in JAX, compiled by XLA ("jax") or "iree", over that in PyTorch at each number of characters."""
-    found = _jax_over_torch(evidence, model, released, device, characters, compiler)
-    verdict, text = _ranged(list(found.values()), bounds, "", gain=gain)
-    by = {"iree": "IREE", "jax": "XLA"}[compiler or evidence.framework]
-    at = "" if len(found) == len(characters) else f" at {_list_text(found)}"
-    return verdict, f"JAX by {by} / PyTorch {text}{at}"
-
-
-def speedup_over_torch(evidence: Evidence, slow, released, fast, device, characters) -> Finding:
-    """Write how many times as fast a model in JAX is as another one in PyTorch (a remark)."""
-    over_torch = _jax_over_torch(evidence, slow, released, device, characters)
-    gains = {count: ratio(evidence.speedup(slow, fast, device, count), found) for count, found in over_torch.items()}
-    slower = [count for count, gain in gains.items() if gain.value < 1.0]
-    return REMARK, f"{range_text(list(gains.values()))}x" + (f", slower at {_list_text(slower)}" if slower else "")
-
-
-def _exponent(evidence: Evidence, model: Setting, device: str, count: int) -> Figure:
-    """Return p of time ~ steps^p."""
-    steps = (8, 4, 2, 1)
-    return power_law(steps, [evidence.time(Setting(model.model, n), device, count) for n in steps])
-
-
-def step_exponent(evidence: Evidence, model, device, characters, bounds) -> Finding:
-    """Judge the exponent of time against the number of steps."""
-    found = _exponent(evidence, model, device, characters)
-    return within(found, bounds), f"exponent {figure_text(found)}"
-
-
-def step_exponent_growth(evidence: Evidence, model, device, characters) -> Finding:
-    """Judge whether that exponent is larger with the second number of characters."""
-    low, high = (_exponent(evidence, model, device, count) for count in characters)
-    text = f"exponent {figure_text(low)} at {characters[0]}, {figure_text(high)} at {characters[1]:,}"
-    return ordered(ratio(high.map(np.exp), low.map(np.exp))), text
-
-
-def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
-    """Return the first epoch that comes close to the best one; NotMeasured if it may yet fall."""
-    curve = curve[curve["metric"] == metric].sort_values("epoch")
-    values, up = curve["value"], NINE_METRICS.get(metric, ("", "down"))[1] == "up"
-    close = values >= values.max() * (1.0 - CONVERGED) if up else values <= values.min() * (1.0 + CONVERGED)
-    reached, last = float(curve.loc[close, "epoch"].iloc[0]), float(curve["epoch"].iloc[-1])
+def _converged_epoch(curve: pd.Series, model: str, metric: str) -> float:
+    """Return the first epoch of a curve that comes close to the best one; NotMeasured if it may yet get better."""
+    up = NINE_METRICS.get(metric, ("", "down"))[1] == "up"
+    close = curve >= curve.max() * (1.0 - CONVERGED) if up else curve <= curve.min() * (1.0 + CONVERGED)
+    reached, last = float(close.idxmax()), float(curve.index[-1])
     if reached > STILL_BETTER * last:
         raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:.3g}")
     return reached
@@ -434,12 +352,13 @@ def _converged_epoch(curve: pd.DataFrame, metric: str, model: str) -> float:
 
 def convergence(evidence: Evidence, model, against) -> Finding:
     """Judge, metric by metric, whether a model converges in no more epochs than another."""
-    curves = {setting.model: evidence.rows("quality_by_epoch", model=setting.model) for setting in (model, against)}
-    shared = functools.reduce(pd.Index.intersection, (pd.Index(curve["metric"].unique()) for curve in curves.values()))
-    if shared.empty:
-        gap = next((name for name, curve in curves.items() if curve.empty), "metric of both models")
-        raise NotMeasured(f"quality_by_epoch.csv has no {gap}")
-    epochs = {name: [_converged_epoch(curves[one], name, one) for one in curves] for name in shared}
+    names = [model["model"], against["model"]]
+    curves = {name: evidence.rows("quality_by_epoch", model=name).set_index("epoch").sort_index() for name in names}
+    own, other = curves.values()
+    if not (shared := [metric for metric in own["metric"].unique() if metric in set(other["metric"])]):
+        raise NotMeasured(f"quality_by_epoch.csv has no metric of both {' and '.join(names)}")
+    reached = lambda metric, name, curve: _converged_epoch(curve.loc[curve["metric"] == metric, "value"], name, metric)
+    epochs = {metric: [reached(metric, *each) for each in curves.items()] for metric in shared}
     verdict = majority(HOLDS if own <= (1.0 + TOLERANCE) * other else FAILS for own, other in epochs.values())
     return verdict, ", ".join(f"{name} {own:g} against {other:g}" for name, (own, other) in epochs.items())
 
@@ -447,78 +366,74 @@ def convergence(evidence: Evidence, model, against) -> Finding:
 # ------------------------------------------------------------------------------------- of quality
 
 
-def _shared_metrics(evidence: Evidence, settings: Sequence[Setting]) -> dict[str, list[Figure]]:
-    """Return figures of all settings, by those of the nine metrics that all of them have."""
-    figures = {metric: [known(evidence.quality, one, metric) for one in settings] for metric in NINE_METRICS}
+def _shared_metrics(evidence: Evidence, models: Sequence[Mapping]) -> dict[str, list[Figure]]:
+    """Return figures of all models, by those of the nine metrics that all of them have."""
+    figures = {metric: [known(_quality, evidence, one, metric) for one in models] for metric in NINE_METRICS}
     shared = {metric: found for metric, found in figures.items() if None not in found}
     if len(shared) < LEAST_METRICS:
-        for asked in product(settings, NINE_METRICS):  # the reason is that of the first gap
-            evidence.quality(*asked)
+        for asked in product(models, NINE_METRICS):  # the reason is that of the first gap
+            _quality(evidence, *asked)
     return shared
 
 
-def _by_metric(verdicts: Mapping[str, str], text: str, heading: str, notes: Sequence[str]) -> Finding:
-    """Sum verdicts by metric up: how many hold, in the place of {} in `text`, and under a heading the notes, if any."""
-    held = f"{list(verdicts.values()).count(HOLDS)} of {len(verdicts)}"
-    return majority(verdicts.values()), text.format(held) + (heading + ", ".join(notes) if notes else "")
+def _by_metric(changes: Mapping[str, Mapping[str, Figure]], bounds=None) -> Finding:
+    """Judge, metric by metric, whether each of its changes lies in a range; without one, whether each is for the worse.
+
+    Told is how many metrics hold, and the largest change of each of the others, or of all where all hold.
+    """
+    size = lambda named: abs(np.log(max(named[1].value, 1e-9)))
+    verdicts, largest = {}, {}
+    for metric, some in changes.items():
+        verdicts[metric] = every(_compared(one, bounds) for one in some.values())
+        apart = {name: one for name, one in some.items() if _compared(one, bounds) != HOLDS}
+        largest[metric] = max((apart or some).items(), key=size)
+    others = [metric for metric in verdicts if verdicts[metric] != HOLDS]
+    told = others or [max(largest, key=lambda metric: size(largest[metric]))]
+    notes = (f"{metric} {_change_text(largest[metric][1])} ({largest[metric][0]})" for metric in told)
+    text = f"{len(verdicts) - len(others)} of {len(verdicts)} metrics; {'not' if others else 'largest change'}: "
+    return majority(verdicts.values()), text + ", ".join(notes)
 
 
-def _spread(settings: Sequence[Setting], figures: Sequence[Figure]) -> tuple[Figure, str, str]:
+def _spread(models: Sequence[Mapping], figures: Sequence[Figure]) -> tuple[Figure, str, str]:
     """Return largest over least value of a metric, and whose they are."""
-    value = lambda pair: pair[1].value
-    (largest, most), (least, fewest) = (pick(zip(settings, figures, strict=True), key=value) for pick in (max, min))
-    return ratio(most, fewest), largest.model, least.model
+    values = [figure.value for figure in figures]
+    most, least = (int(pick(values)) for pick in (np.argmax, np.argmin))
+    return ratio(figures[most], figures[least]), models[most]["model"], models[least]["model"]
 
 
 def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) -> Finding:
     """Judge whether each, or any, of some metrics is worse by a factor in a range."""
     harms = {metric: _harm(evidence, model, against, metric) for metric in metrics}
     order = {"each": (FAILS, OPEN, HOLDS), "any": (HOLDS, OPEN, FAILS)}[quantifier]
-    verdict = every((within(harm, bounds) for harm in harms.values()), order)
-    texts = (f"{metric} {_harm_text(harm)}" for metric, harm in harms.items())
-    return verdict, ", ".join(texts)
+    amount = lambda harm: f"{_change_text(harm).lstrip('+-')} {'worse' if harm.value >= 1.0 else 'better'}"
+    texts = (f"{metric} {amount(harm)}" for metric, harm in harms.items())
+    return every((within(harm, bounds) for harm in harms.values()), order), ", ".join(texts)
 
 
 def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
     """Judge, metric by metric, whether a model is worse than another."""
     shared = _shared_metrics(evidence, [model, against])
-    verdicts = {metric: ordered(_times_worse(metric, *figures)) for metric, figures in shared.items()}
-    better = [metric for metric, verdict in verdicts.items() if verdict == FAILS]
-    return _by_metric(verdicts, "worse in {}", ", better in ", better)
-
-
-def worst_in(evidence: Evidence, model, models) -> Finding:
-    """Write in which metrics a model is the last of several (a remark)."""
-    shared = _shared_metrics(evidence, [model, *models])
-    worst = lambda metric, own, *others: all(_times_worse(metric, own, other).value > 1.0 for other in others)
-    return REMARK, _list_text(one for one, figures in shared.items() if worst(one, *figures)) or "in no metric"
+    return _by_metric({metric: {model["model"]: _times_worse(metric, *pair)} for metric, pair in shared.items()})
 
 
 def alike(evidence: Evidence, models, bounds) -> Finding:
     """Judge, metric by metric, whether the largest value of several models over the least lies in a range."""
     spreads = {metric: _spread(models, figures) for metric, figures in _shared_metrics(evidence, models).items()}
-    verdicts = {metric: within(spread, bounds) for metric, (spread, *_) in spreads.items()}
-    apart = [
-        f"{metric} {number_text(spread.value)}x ({largest} over {least})"
-        for metric, (spread, largest, least) in spreads.items()
-        if verdicts[metric] != HOLDS
-    ]
-    return _by_metric(verdicts, "alike in {}", "; apart: ", apart)
+    return _by_metric({metric: {f"{most} over {least}": one} for metric, (one, most, least) in spreads.items()}, bounds)
 
 
 def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
     """Judge the largest value of one metric over the least, of a family."""
-    models = models.measured(lambda setting: evidence.quality(setting, metric))
-    spread, largest, least = _spread(models, [evidence.quality(setting, metric) for setting in models])
-    return within(
-        spread, bounds
-    ), f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least} to {largest})"
+    models = _measured(models, lambda model: _quality(evidence, model, metric))
+    spread, largest, least = _spread(models, [_quality(evidence, model, metric) for model in models])
+    text = f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least} to {largest})"
+    return within(spread, bounds), text
 
 
 def best_of(evidence: Evidence, model, models, metric) -> Finding:
     """Judge whether a model has the best value of a metric in its family."""
-    others = [other for other in models.measured(lambda setting: evidence.quality(setting, metric)) if other != model]
-    harms = {other.model: _harm(evidence, other, model, metric) for other in others}
+    others = [one for one in _measured(models, lambda one: _quality(evidence, one, metric)) if one != model]
+    harms = {one["model"]: _harm(evidence, one, model, metric) for one in others}
     nearest = min(harms, key=lambda name: harms[name].value)
     text = f"next is {nearest} with {figure_text(harms[nearest])} times its {metric}"
     return every(map(ordered, harms.values())), text
@@ -526,41 +441,26 @@ def best_of(evidence: Evidence, model, models, metric) -> Finding:
 
 def better_at_each_width(evidence: Evidence, better, worse, widths, metric, window=32) -> Finding:
     """Judge, width by width (the one that must be there first), whether one kind of network beats another."""
-    pair = lambda width, *kinds: [Setting(f"{kind}-{width}", window=window) for kind in kinds]
-    harms = {width: known(_harm, evidence, *pair(width, worse, better), metric) for width in sorted(widths)}
-    verdicts = {width: ordered(harm) for width, harm in harms.items() if harm}
-    if not verdicts:
-        _harm(evidence, *pair(widths[0], better, worse), metric)  # the reason is that of the first
+    model = lambda kind, width: {"model": f"{kind}-{width}", "window_frames": window, "steps": 8}
+    harm = lambda *pair: ordered(_harm(evidence, *pair, metric))
+    verdicts = {width: known(harm, model(worse, width), model(better, width)) for width in sorted(widths)}
+    if not any(verdicts.values()):
+        harm(model(better, widths[0]), model(worse, widths[0]))  # the reason is that of the first
+    by_verdict = {one: [width for width in verdicts if verdicts[width] == one] for one in (HOLDS, FAILS, OPEN)}
     words = {HOLDS: "yes", FAILS: "no", OPEN: "open"}
-    by_verdict = {word: [width for width in verdicts if verdicts[width] == verdict] for verdict, word in words.items()}
-    texts = (f"{word} at D = {_list_text(widths)}" for word, widths in by_verdict.items() if widths)
-    return majority(verdicts.values()), ", ".join(texts)
-
-
-def _window_pairs(evidence: Evidence, models: Family, window: int) -> list[tuple[Setting, Setting]]:
-    """Return (longer window, usual window) of every model that has both."""
-    pair = lambda setting: (Setting(setting.model, window=window), setting)
-    return [pair(one) for one in models.measured(lambda one: [evidence.quality(each, "FID") for each in pair(one)])]
+    texts = (f"{words[one]} at D = {_list_text(widths)}" for one, widths in by_verdict.items() if widths)
+    return majority(filter(None, verdicts.values())), ", ".join(texts)
 
 
 def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
-    """Judge, metric by metric, whether no model of a family is much worse with longer windows."""
-    pairs = _window_pairs(evidence, models, window)
-    verdicts, worst = {}, []
-    for metric, figures in _shared_metrics(evidence, [setting for pair in pairs for setting in pair]).items():
-        harms = [_times_worse(metric, *both) for both in zip(figures[::2], figures[1::2], strict=True)]
-        verdicts[metric] = every(within(harm, bounds) for harm in harms)
-        if verdicts[metric] != HOLDS:
-            harm, (longer, _) = max(zip(harms, pairs, strict=True), key=lambda each: each[0].value)
-            worst.append(f"{metric} {_change_text(harm)} ({longer.model})")
-    return _by_metric(verdicts, "{} metrics", "; worse: ", worst)
-
-
-def window_gain(evidence: Evidence, models, window, metric) -> Finding:
-    """Write how many models are better with longer windows (a remark)."""
-    pairs = _window_pairs(evidence, models, window)
-    better = sum(_harm(evidence, *pair, metric).value < 1.0 for pair in pairs)
-    return REMARK, f"in {better} of {len(pairs)} models"
+    """Judge, metric by metric, whether no model of a family (of those with both) is much worse with longer windows."""
+    longer = lambda model: model | {"window_frames": window}
+    both = lambda model: [_quality(evidence, each, "FID") for each in (longer(model), model)]
+    models = _measured(models, both)
+    shared = _shared_metrics(evidence, [*map(longer, models), *models])
+    harms = lambda metric: zip(models, shared[metric], shared[metric][len(models) :], strict=False)
+    named = {metric: {one["model"]: _times_worse(metric, *pair) for one, *pair in harms(metric)} for metric in shared}
+    return _by_metric(named, bounds)
 
 
 def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=0.0) -> Finding:
@@ -569,37 +469,15 @@ def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=
     A network that gives one motion whatever its noise does so for a dull reason: where samples of
     one condition differ by less than `least_diversity` cm, nothing was kept.
     """
-    settings = [model, *(Setting(model.model, count) for count in steps)]
-    shared = _shared_metrics(evidence, settings)
+    models = [model, *(model | {"steps": count} for count in steps)]
+    shared = _shared_metrics(evidence, models)
+    labels = [f"{count} step{'s' * (count > 1)}" for count in steps]
     changes = {name: [ratio(figure, own) for figure in fewer] for name, (own, *fewer) in shared.items()}
-    verdicts = {name: every(within(change, bounds) for change in some) for name, some in changes.items()}
-    every_change = [(name, *each) for name, some in changes.items() for each in zip(steps, some, strict=True)]
-    metric, count, change = max(every_change, key=lambda each: abs(np.log(each[2].value)))
-    largest = f"{metric} {figure_text(_in_percent(change))} % at {count} step{'s' if count > 1 else ''}"
-    verdict, text = _by_metric(verdicts, "{} metrics", "; largest change: ", [largest])
-    spread = max((evidence.quality(one, "diversity") for one in settings), key=lambda figure: figure.value)
+    verdict, text = _by_metric({name: dict(zip(labels, some, strict=True)) for name, some in changes.items()}, bounds)
+    spread = max(_quality(evidence, one, "diversity") for one in models)
     if spread.high < least_diversity:
         return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
     return verdict, text
-
-
-def change_between_steps(evidence: Evidence, model, steps) -> Finding:
-    """Write the largest change of a metric from each number of steps to the next (a remark)."""
-    shared = _shared_metrics(evidence, [Setting(model.model, count) for count in steps])
-    values = np.array([[figure.value for figure in figures] for figures in shared.values()])
-    changes = 100.0 * np.abs(values[:, 1:] / values[:, :-1] - 1.0).max(axis=0)
-    texts = (f"{one} to {other} {change:.2g} %" for (one, other), change in zip(pairwise(steps), changes, strict=True))
-    return REMARK, ", ".join(texts)
-
-
-def moved_by_inputs(evidence: Evidence, model) -> Finding:
-    """Write how far a model's estimates move with its noisy input and with the noise level alone (a remark).
-
-    A model that moves with the level makes other motion with other numbers of steps, even if it ignores its input.
-    """
-    inputs = {"use_of_x": "the noisy input", "use_of_sigma": "the noise level alone"}
-    moved = lambda metric: figure_text(evidence.figure("input_use", model=model.model, metric=metric), " cm")
-    return REMARK, ", ".join(f"{moved(metric)} with {name}" for metric, name in inputs.items())
 
 
 def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
@@ -608,17 +486,15 @@ def drift(evidence: Evidence, model, metrics, bounds) -> Finding:
     Looked at are `metrics` and those of the nine that are better low. Rounds follow one another, so
     that these intervals are narrower than those of free repeats.
     """
-    low_ones = {*metrics, *(metric for metric, (_, better) in NINE_METRICS.items() if better == "down")}
-    growth = {}
-    for metric, rows in evidence.rows("quality_by_round", **model.columns).groupby("metric", sort=False):
+    growth, metrics = {}, {*metrics, *(metric for metric, (_, better) in NINE_METRICS.items() if better == "down")}
+    for metric, rows in evidence.rows("quality_by_round", **model).groupby("metric", sort=False):
         values = rows.sort_values("round")["value"].to_numpy(np.float64)
-        if (quarter := len(values) // 4) >= 2 and metric in low_ones:
+        if (quarter := len(values) // 4) >= 2 and metric in metrics:
             late, early = (mean_and_interval(some) for some in (values[-quarter:], values[:quarter]))
             growth[metric] = ratio(*(Figure(one["value"], one["low"], one["high"]) for one in (late, early)))
     if not growth:
-        raise NotMeasured(f"{evidence.called('quality_by_round')} no {model} over 8 rounds or more")
-    verdicts = {metric: within(found, bounds) for metric, found in growth.items()}
-    return _by_metric(verdicts, "{}", ": ", [f"{metric} {_change_text(found)}" for metric, found in growth.items()])
+        raise NotMeasured(f"quality_by_round.csv has no {model['model']} over 8 rounds or more")
+    return _by_metric({metric: {model["model"]: found} for metric, found in growth.items()}, bounds)
 
 
 def _order_score(rows: pd.DataFrame) -> float:
@@ -631,13 +507,11 @@ def _order_score(rows: pd.DataFrame) -> float:
 def better_graded(evidence: Evidence, metric, than) -> Finding:
     """Judge whether one metric puts graded corruptions into their order more often than another."""
     table = evidence.rows("corruptions")
-    found = [
-        [_order_score(rows) for _, rows in table[table["metric"] == one].groupby("corruption") if len(rows) >= 3]
-        for one in (metric, than)
-    ]
-    if min(map(len, found)) < table["corruption"].nunique():
+    graded = table.groupby(["metric", "corruption"]).filter(lambda rows: len(rows) >= 3)
+    found = {one: [*graded[graded["metric"] == one].groupby("corruption")] for one in (metric, than)}
+    if min(map(len, found.values())) < table["corruption"].nunique():
         raise NotMeasured(f"corruptions.csv has not three strengths of each with {metric} and {than}")
-    first, second = map(np.mean, found)
+    first, second = (np.mean([_order_score(rows) for _, rows in some]) for some in found.values())
     verdict = HOLDS if first - second > GRADED else FAILS if second - first > GRADED else OPEN
     return verdict, f"ordered pairs: {metric} {100 * first:.0f} %, {than} {100 * second:.0f} %"
 
@@ -645,15 +519,15 @@ def better_graded(evidence: Evidence, metric, than) -> Finding:
 # ------------------------------------------------------------------------------- of levels of noise
 
 
-def _over_noise(evidence: Evidence, table: str, model: Setting) -> pd.Series:
+def _over_noise(evidence: Evidence, table: str, model: str) -> pd.Series:
     """Return the figures of a model by noise level, low ones first; NotMeasured where there are not three."""
-    figures = evidence.rows(table, model=model.model).set_index("sigma")["value"].astype(np.float64).sort_index()
+    figures = evidence.rows(table, model=model).set_index("sigma")["value"].astype(np.float64).sort_index()
     if len(figures) < 3:
-        raise NotMeasured(f"{table}.csv has no three noise levels of {model.model}")
+        raise NotMeasured(f"{table}.csv has no three noise levels of {model}")
     return figures
 
 
-def _excess_errors(evidence: Evidence, model: Setting) -> pd.Series:
+def _excess_errors(evidence: Evidence, model: str) -> pd.Series:
     """Return the x0 error of a model over that of linear shrinkage, by noise level.
 
     Where x0 has the deviation s, the estimate x s² / (s² + sigma²) is off by s sigma / sqrt(s² + sigma²):
@@ -671,21 +545,21 @@ def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
     An exact denoiser of Gaussian data reads 1. One that ignores its input has one error for all
     levels, and at a low level many times what is due.
     """
-    excess = _excess_errors(evidence, model)
-    worst = Figure.of(excess.max())
-    text = f"x0 error at most {number_text(worst.value)}x that of linear shrinkage, at sigma {excess.idxmax():.2g}"
-    return within(worst, bounds), text
+    excess = _excess_errors(evidence, model["model"])
+    text = f"x0 error at most {number_text(excess.max())}x that of linear shrinkage, at sigma {excess.idxmax():.2g}"
+    return within(Figure.of(excess.max()), bounds), text
 
 
 def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
     """Judge how many times larger that figure is of another model, over the noise levels that both know."""
-    curves = [_excess_errors(evidence, setting) for setting in (model, against)]
+    names = [model["model"], against["model"]]
+    curves = [_excess_errors(evidence, name) for name in names]
     low, high = max(curve.index.min() for curve in curves), min(curve.index.max() for curve in curves)
     shared = [curve.loc[low:high] for curve in curves]
     if min(map(len, shared)) < 3:
-        raise NotMeasured(f"x0_by_sigma.csv has no three levels that {model.model} and {against.model} both know")
-    worst = [curve.max() for curve in shared]
-    return within(Figure.of(worst[1] / worst[0]), bounds), " against ".join(f"{number_text(one)}x" for one in worst)
+        raise NotMeasured(f"x0_by_sigma.csv has no three levels that {' and '.join(names)} both know")
+    own, other = (curve.max() for curve in shared)
+    return within(Figure.of(other / own), bounds), f"{number_text(own)}x against {number_text(other)}x"
 
 
 def gradient_growth(evidence: Evidence, model, bounds) -> Finding:
@@ -693,17 +567,7 @@ def gradient_growth(evidence: Evidence, model, bounds) -> Finding:
 
     A network that hardly looks at its noise has one gradient for all levels: it has to pass the gate.
     """
-    norms = np.log(_over_noise(evidence, "gradient_norm", model))
+    norms = np.log(_over_noise(evidence, "gradient_norm", model["model"]))
     third = len(norms) // 3
-    gain = Figure.of(np.exp(norms.iloc[-third:].mean()) / np.exp(norms.iloc[:third].mean()))
+    gain = Figure.of(np.exp(norms.iloc[-third:].mean() - norms.iloc[:third].mean()))
     return within(gain, bounds), f"{number_text(gain.value)}x from the lowest to the highest third of sigma"
-
-
-def kinds_of(module: str) -> dict[str, Callable[..., Finding]]:
-    """Return the kinds of judgement that a module defines: its public functions that return a finding, by name."""
-    functions = inspect.getmembers(sys.modules[module], inspect.isfunction)
-    return {name: one for name, one in functions if one.__annotations__.get("return") == "Finding" and name[0] != "_"}
-
-
-KINDS = kinds_of(__name__)
-"""Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""

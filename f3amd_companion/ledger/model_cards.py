@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import jax
-import numpy as np
 import pandas as pd
 
 from f3amd_companion.ledger.gate import LEAST_SHARE
@@ -39,6 +38,7 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR
 log = logging.getLogger("f3amd")
 
 _CARDS = read_toml(Path(__file__).with_name("cards.toml"))
+_OF_HANDS = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
 _OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
 
 
@@ -46,23 +46,21 @@ def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
     """Return the table of a model's figures beside real motion's."""
     shown = SHOWN["card"]
     columns = {"figure": ["Dir. (degrees)" if metric.name == "direction_error" else metric.title for metric in shown]}
-    for steps in sorted(measured["steps"].unique(), reverse=True):
-        rows = measured[measured["steps"] == steps]
+    for steps, rows in reversed([*measured.groupby("steps")]):
         columns[f"{steps} steps" if steps > 1 else "1 step"] = figure_column(rows, shown)
     return pd.DataFrame(columns | {"real motion": figure_column(real, shown)})
 
 
 def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     """Return sentences on what a model does badly with most steps, as far as its figures say so."""
-    value = measured[measured["steps"] == measured["steps"].max()].set_index("metric")["value"]
-    real = real.set_index("metric")["value"]
+    most = measured[measured["steps"] == measured["steps"].max()]
+    both = pd.DataFrame({name: rows.set_index("metric")["value"] for name, rows in (("value", most), ("real", real))})
     limits = []
     for limit in _CARDS["limit"]:
-        figure, source = value.get(limit["metric"], np.nan), real.get(limit["metric"], np.nan)
-        bound = limit["bound"] * (source if limit.get("of_real") else 1.0)
-        # What was not measured is beyond no bound.
-        if figure > bound if limit["sign"] == ">" else figure < bound:
-            limits.append(limit["says"].format(value=figure, real=source))
+        found = both.reindex([limit["metric"]]).iloc[0]  # what was not measured is NaN, and beyond no bound
+        over = found["value"] / (limit["bound"] * (found["real"] if limit.get("of_real") else 1.0))
+        if over > 1.0 if limit["sign"] == ">" else over < 1.0:
+            limits.append(limit["says"].format(**found))
     return limits
 
 
@@ -111,12 +109,6 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     Args:
       path: the weights.
       quality: from `committed_quality`, or None; rows of other weights are not used.
-
-    Returns:
-      Markdown.
-
-    Raises:
-      ValueError: if the file is broken.
     """
     trained = load_model(path)
     training, figures, limits = _training(path, trained, trained.record["training"]), None, []
@@ -140,20 +132,13 @@ def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
     Args:
       path: the weights.
       hands: `records/hands.csv`, or None; rows of other weights are not used.
-
-    Returns:
-      Markdown.
-
-    Raises:
-      ValueError: if the file is broken.
     """
     trained = load_text_model(path)
     record, codec, counts = trained.record, trained.codec, None
     if hands is not None and (own := hands["weights"] == weights_digest(trained.params)).any():
-        columns = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
         shown = hands[own | (hands["model"] == "real clips")].fillna({"wording": "clips"})
-        counts = shown.groupby(["model", "wording"], sort=False)[columns].sum()
-        counts = counts.rename(columns=lambda name: name.replace("_", " ")).reset_index()
+        counts = shown.groupby(["model", "wording"], sort=False)[_OF_HANDS].sum().reset_index()
+        counts.columns = counts.columns.str.replace("_", " ")
     state = "positions of joints" + (" and redundant features" if codec.redundancy else "")
     if codec.frames_per_state > 1:
         state = f"latent of {codec.autoencoder.latent_channels} numbers a joint, four frames at a time"
@@ -170,20 +155,12 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     Args:
       path: the weights.
       tables: `records/text_pcm*.csv` by name, those that there are.
-
-    Returns:
-      Markdown.
-
-    Raises:
-      ValueError: if the file is broken.
     """
     trained, wide = load_text_model(path), None
     rows = [table[table["trained"] == trained.name] for table in tables.values() if "steps" in table]
     if any(map(len, rows)):
         own = pd.concat(rows).drop_duplicates(["steps", "metric"])
-        wide = own.assign(value=own["value"].map("{:.3g}".format)).pivot(
-            index="steps", columns="metric", values="value"
-        )
+        wide = own.pivot(index="steps", columns="metric", values="value").map("{:.3g}".format, na_action="ignore")
         titles = {name: METRICS[name].title for name in [*_OF_JUDGE, "sampling_seconds"] if name in wide}
         wide = wide[list(titles)].fillna("–").rename(columns=titles).reset_index()
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
@@ -205,29 +182,15 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     Args:
       path: its file.
       seen: `records/text_judge.csv` with its record, or None; figures of another judge are not used.
-
-    Returns:
-      Markdown.
-
-    Raises:
-      ValueError: if the file is broken.
     """
     judge, wide, fields = load_judge(path), None, {}
     digest = weights_digest(judge.params)
     if seen is not None and seen[1]["judge_weights"] == digest:
-        wide = (
-            seen[0].pivot(index="system", columns="metric", values="value").loc[seen[0]["system"].unique(), _OF_JUDGE]
-        )
-        wide = wide.rename(columns={name: METRICS[name].title for name in _OF_JUDGE}).reset_index()
+        systems, titles = seen[0]["system"].unique(), {name: METRICS[name].title for name in _OF_JUDGE}
+        wide = seen[0].pivot(index="system", columns="metric", values="value").loc[systems, _OF_JUDGE]
+        wide = wide.rename(columns=titles).reset_index()
         fields["repeats"] = seen[1]["settings"]["repeats"]
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
-
-
-def checksums(folder: Path) -> str:
-    """Return lines for `sha256sum --check` of all weights below a folder."""
-    files = sorted(folder.rglob("*.safetensors"))
-    digest = lambda file: hashlib.sha256(file.read_bytes()).hexdigest()
-    return "".join(f"{digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files)
 
 
 def committed_quality(dataset: str) -> pd.DataFrame | None:
@@ -270,7 +233,7 @@ def card_of(path: Path) -> str:
 
 
 def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
-    """Write the card beside every weights file below a folder, and `checksums.txt`.
+    """Write the card beside every weights file below a folder, and `checksums.txt`, lines for `sha256sum --check`.
 
     Args:
       folder: with a folder for each data set.
@@ -279,28 +242,16 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
       The cards.
     """
     weights = sorted(folder.rglob("*.safetensors"))
-    cards = [write_whole(path.with_suffix(".md"), card_of(path)) for path in weights]
-    write_whole(folder / "checksums.txt", checksums(folder))
-    return cards
-
-
-def write_measured_table(path: Path, quality: pd.DataFrame) -> None:
-    """Put the table of measured figures between its two marks on a page.
-
-    Args:
-      path: of the page; all other text stays.
-      quality: from `committed_quality`.
-
-    Raises:
-      ValueError: if the marks are not there.
-    """
-    page = fill_tables(path.read_text(encoding="utf-8"), {"measured": measured_table(quality)}, str(path))
-    path.write_text(page, encoding="utf-8")
+    digests = {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in weights}
+    write_whole(folder / "checksums.txt", "".join(f"{digest}  {name}\n" for name, digest in digests.items()))
+    return [write_whole(path.with_suffix(".md"), card_of(path)) for path in weights]
 
 
 def main() -> int:
     """Write all cards and the table of docs/results.md; see the module's first lines."""
     for card in write_cards():
         log.info("%s", card)
-    write_measured_table(repository_root() / "docs" / "results.md", committed_quality("bandai"))
+    page = repository_root() / "docs" / "results.md"
+    table = measured_table(committed_quality("bandai"))
+    write_whole(page, fill_tables(page.read_text(encoding="utf-8"), {"measured": table}, str(page)))
     return 0

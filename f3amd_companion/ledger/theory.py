@@ -10,7 +10,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_companion.ledger.evidence import Figure
-from f3amd_companion.ledger.judgements import FAILS, HOLDS, TOLERANCE, Finding, equal_range, kinds_of, within
+from f3amd_companion.ledger.judgements import FAILS, HOLDS, TOLERANCE, Finding, equal_range, within
 from f3amd_lib.diffusion import samplers, schedules
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.networks.attention import TransformerBlock
@@ -116,7 +116,3 @@ def local_cost(_) -> Finding:
     share = local / (spectral - 8 * frames * modes * width)
     text = f"two convolutions cost {share:.2f} times the spectral product (T = 32, m = 17, k = 3)"
     return HOLDS if share <= TOLERANCE else FAILS, text
-
-
-KINDS = kinds_of(__name__)
-"""Kind of judgement, as `claims.toml` names it -> function of the (unused) evidence and its parameters."""
