@@ -35,12 +35,11 @@ from f3amd_companion.ledger.judgements import (
     within,
 )
 from f3amd_companion.speed.timing import median_interval
-from f3amd_lib.diffusion import samplers
 from f3amd_lib.ground import papers
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
-from f3amd_lib.papers.printed import NINE_METRICS, REFERENCE_ROWS
+from f3amd_lib.papers.printed import NINE_METRICS, REFERENCE_ROWS, checked_table
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -377,16 +376,13 @@ def cubic_operations(block, frames, width, *sizes):
     return (10 if block is FNOBlock else 1) * frames**3 * width
 
 
-RESCALED, LITERAL = theory._rescaled_step, samplers.ddim_step_literal
 # Computed claim -> (what stands in `theory` for it to hold, what stands there for it not to hold).
 COMPUTED = {
     "T1": ({}, {"schedules.alpha_bar_from_sigma": lambda sigma: 1.0 / (1.0 + sigma)}),
-    "T2": (
-        {"_STEPS": {"rescaled": RESCALED, "printed": RESCALED}},
-        {"_STEPS": {"rescaled": LITERAL, "printed": LITERAL}, "_rescaled_step": LITERAL},
-    ),
+    "T2": tuple({"_STEPS": theory._STEPS | dict.fromkeys(("rescaled", "printed"), theory._STEPS[name])}
+                for name in ("rescaled", "printed")),
     "T3": ({"_operations": textbook_operations}, {"_operations": cubic_operations}),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("claim_id", COMPUTED)
@@ -461,16 +457,13 @@ def test_each_rule_says_why_nothing_was_measured(tmp_path):
 def test_models_of_ours_decide_nothing_of_the_papers(tmp_path):
     """With the -plus preset in place of the paper's, no claim on it holds any more."""
     plus = lambda rows: [row | {"model": f"{FNO}-plus"} if row.get("model") == FNO else row for row in rows]
-    found = judge(keep(tmp_path / "world", {name: plus(rows) for name, rows in world(True).items()}))
+    found = judge(keep(tmp_path, {name: plus(rows) for name, rows in world(True).items()}))
     asked = lambda claim: repr([s.rule.keywords for s in claim.statements if not s.remark])
-    found = {name: found[name] for name in OF_WORLD if f"'{FNO}'" in asked(claims.load_claims()[name])}
-    for claim_id, (rows, _) in TIMES.items():
-        if any(row["model"] == FNO for row in rows):
-            found[claim_id] = judge(keep(tmp_path / claim_id, {"synthesis_time": plus(rows)}), claim_id)
-    assert len(found) > 25
-    for claim_id, judgement in found.items():
-        assert judgement.verdict in (UNMEASURED, IN_PART), claim_id
-        assert any(s.verdict == UNMEASURED and FNO in s.figure for s in judgement.ours), claim_id
+    found = [found[name] for name in OF_WORLD if f"'{FNO}'" in asked(claims.load_claims()[name])]
+    assert len(found) > 15
+    for judgement in found:
+        assert judgement.verdict in (UNMEASURED, IN_PART), judgement.claim.id
+        assert any(s.verdict == UNMEASURED and FNO in s.figure for s in judgement.ours), judgement.claim.id
 
 
 # --------------------------------------------------------------------------- figures and verdicts
@@ -488,8 +481,6 @@ def test_ratios_with_zero_are_told_apart():
     nothing, some = Figure.of(0.0), Figure.of(2.0, 1.0, 4.0)
     assert ratio(nothing, some) == Figure(0.0, 0.0, 0.0)
     assert ratio(some, nothing).value == np.inf and ratio(nothing, nothing).value == 1.0
-    reaching = ratio(Figure.of(1.0, -0.5, 2.5), some)
-    assert reaching.low == 0.0 and reaching.value == 0.5
     with pytest.raises(ValueError, match="means nothing"):
         ratio(Figure.of(-1.0), some)
 
@@ -554,19 +545,12 @@ def test_only_times_fill_gaps(tmp_path):
         ([HOLDS, HOLDS, REMARK], HOLDS),
         ([HOLDS, FAILS], IN_PART),
         ([HOLDS, UNMEASURED], IN_PART),
-        ([HOLDS, OPEN], IN_PART),
-        ([IN_PART], IN_PART),
         ([LARGER, OPEN, UNMEASURED], LARGER),
-        ([HOLDS, LARGER], IN_PART),
         ([LARGER, FAILS], FAILS),
         ([LARGER, UNJUDGED], UNJUDGED),
-        ([HOLDS, LARGER, UNJUDGED], IN_PART),
-        ([UNJUDGED, UNMEASURED, REMARK], UNJUDGED),
-        ([HOLDS, UNJUDGED], IN_PART),
         ([FAILS, OPEN, UNMEASURED], FAILS),
         ([OPEN, UNMEASURED], OPEN),
         ([UNMEASURED, REMARK], UNMEASURED),
-        ([], UNMEASURED),
     ],
 )
 def test_a_claim_follows_from_its_statements(parts, verdict):
@@ -583,9 +567,6 @@ def test_a_claim_follows_from_its_statements(parts, verdict):
         ([HOLDS] * 4 + [FAILS] * 5, FAILS),
         ([HOLDS] * 4 + [FAILS] * 4 + [OPEN], OPEN),
         ([HOLDS] + [LARGER] * 5, LARGER),
-        ([HOLDS] + [LARGER] * 2 + [FAILS] * 2, FAILS),
-        ([OPEN], OPEN),
-        ([LARGER], LARGER),
     ],
 )
 def test_a_statement_on_many_figures_goes_by_the_majority(figures, verdict):
@@ -598,19 +579,9 @@ def test_a_difference_inside_its_interval_cannot_be_told_apart(tmp_path):
     assert [judge(tmp_path, claim_id).verdict for claim_id in ("Q3", "Q8", "Q13")] == [OPEN] * 3
 
 
-@pytest.mark.parametrize(
-    ("claim_id", "rows"),
-    [
-        ("E1", times("GPU", (1024,), (CAMDM, 5000.0), (FNO, 100.0))),
-        ("E2", times("GPU", (1024,), (CAMDM, 900.0), (T64, 100.0))),
-        ("E3", times("GPU", (1024,), (CAMDM, 900, 8, 64), (FNO, 100, 8, 64), (T64, 100, 8, 64))),
-        ("E4", small_against_many(20.0, 20.0, 20.0)),
-        ("E8", times("CPU", CPU_COUNTS, (CAMDM, 900.0), (FNO, 10.0, 1))),
-    ],
-)
-def test_a_gain_far_above_the_stated_range_is_another_number(tmp_path, claim_id, rows):
-    judgement = judge(keep(tmp_path, {"synthesis_time": rows}), claim_id)
-    assert judgement.verdict == LARGER, judgement.ours
+def test_a_gain_far_above_the_stated_range_is_another_number(tmp_path):
+    alone = judge(keep(tmp_path / "a", {"synthesis_time": small_against_many(20.0, 20.0, 20.0)}), "E4")
+    assert alone.verdict == LARGER
     judgement = judge(keep(tmp_path / "b", {"synthesis_time": conditioning(4.0, 1.32, 1.09)}), "E10")
     assert [s.verdict for s in judgement.ours] == [LARGER, HOLDS, HOLDS] and judgement.verdict == IN_PART
 
@@ -627,8 +598,6 @@ POOR = {"quality": quality(FNO) + quality("CAMDM-96", style_coverage=14.0, EMD=4
         (trained(PAIR, windows=192_000), "trained 0.096 % of the paper's windows"),
         (trained(PAIR, fall=0.2), "held-out loss was still falling"),
         (trained(PAIR, slide_speed=80.0), "does not walk"),
-        (trained(PAIR, stepping_rate=0.2), "does not walk"),
-        (trained(PAIR, joint_acceleration=5.0), "does not walk"),
         (trained(PAIR) | {"trained": trained(PAIR[:1])["trained"]}, "no record of training"),
         (trained(PAIR) | {"walking": trained(PAIR[:1])["walking"]}, "no record of walking"),
     ],
@@ -685,10 +654,8 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure.startswith("9 of 9")
     assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
     assert "at 200,000 windows, one training a network" in str(judgement.ours[0].sources[0])
-    # As the whole ledger has it.
-    assert judgement == next(each for each in claims.judge_claims(tmp_path) if each.claim.id == "Q10")
-    # Seeds are averaged, and two that differ have a wide interval.
-    seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "one", 1.2)])
+    # Seeds are averaged, whatever classifier saw them, and two that differ have a wide interval.
+    seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "another", 1.2)])
     assert f"FID +10 % ({FNO} over" in seeds.ours[0].figure
     assert "1 to 2 trainings a network" in str(seeds.ours[0].sources[0])
     # Nonsense: one of them is twice as bad, or one of them is missing at this length.
@@ -696,27 +663,18 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("0 of 9")
     missing = [*alike[:3], (models[3], 400_000, "paper", 0, "one", 1.0)]
     assert snapshots(tmp_path / "missing", missing).verdict == UNMEASURED
-    # A seed or a network that another classifier saw counts as any other (`records/classifiers.csv`).
-    walks_worse = snapshots(tmp_path / "pooled", [*alike, (FNO, 200_000, "paper", 2, "another", (1.0, 9.0))])
-    assert walks_worse.ours[0].figure.startswith("3 of 9")
-    halves = [*alike[:2], *((model, 200_000, "paper", 0, "other", 1.0) for model in models[2:])]
-    assert snapshots(tmp_path / "halves", halves).ours[0].figure.startswith("9 of 9")
     # The longest of the lengths that have all of them decides.
     longer = [(model, 800_000, "paper", 0, "one", 2.0) for model in models]
-    twice = snapshots(tmp_path / "twice", [*alike, *longer])
-    assert twice.ours[0].figure.startswith("9 of 9") and "at 800,000 windows" in str(twice.ours[0].sources[0])
+    assert "at 800,000 windows" in str(snapshots(tmp_path / "twice", [*alike, *longer]).ours[0].sources[0])
 
 
 def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
     """E13 asks in which epoch a network comes close to its best."""
-    lengths = (100_000, 200_000, 400_000, 800_000)
 
-    def curve(model, worths, recipe="paper", seed=0, classifier="one"):
+    def curve(model, worths, recipe="paper"):
         """What the classifier sees stays; the other metrics are better when they are lower."""
-        return [
-            (model, length, recipe, seed, classifier, (1.0, worth))
-            for length, worth in zip(lengths, worths, strict=True)
-        ]
+        lengths = zip((100_000, 200_000, 400_000, 800_000), worths, strict=True)
+        return [(model, length, recipe, 0, "one", (1.0, worth)) for length, worth in lengths]
 
     soon, late, falling = (9.0, 1.0, 1.0, 1.0), (9.0, 5.0, 1.0, 1.0), (9.0, 5.0, 3.0, 1.0)
     judged = lambda name, *curves: snapshots(tmp_path / name, sum(curves, []), "E13")
@@ -726,15 +684,12 @@ def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
     assert judged("fails", curve(FNO, late), curve(CAMDM, soon)).verdict == FAILS
     unfinished = judged("falling", fast, curve(CAMDM, falling))
     assert unfinished.verdict == UNMEASURED and "still getting better at the last epoch, 8" in unfinished.ours[0].figure
-    # Another recipe or a single length is no curve beside this one; one that another classifier saw is.
+    # Another recipe or a single length is no curve beside this one.
     for name, other in {"recipe": curve(CAMDM, late, recipe="wide-decoder"), "single": slow[:1]}.items():
         assert "quality_by_epoch.csv has no " in judged(name, fast, other).ours[0].figure, name
-    assert judged("classifier", fast, curve(CAMDM, late, classifier="another")).verdict == HOLDS
-    # Of two seeds the curve of more snapshots decides.
-    assert judged("seeds", fast, slow, curve(FNO, late, seed=1)[:2]).verdict == HOLDS
 
 
-@pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS), ((CAMDM, 32), UNJUDGED)])
+@pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS)])
 def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, skates, verdict):
     """Q4 says that CAMDM fails with 64 frames, and so that one need not walk."""
     walking = trained([(name, window) for name in (FNO, CAMDM) for window in (32, 64)])["walking"]
@@ -746,51 +701,26 @@ def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, 
     assert about.verdict == verdict and (skates[0] in about.reasons.get("does not walk", ())) == (verdict == UNJUDGED)
 
 
-def test_a_judged_data_set_decides_before_one_that_only_has_figures(tmp_path):
-    keep(tmp_path, SOUND | trained(PAIR, windows=192_000), dataset="bandai")
-    keep(tmp_path, SOUND, dataset="synthetic")
-    judgement = judge(tmp_path, "Q13")
-    assert (judgement.verdict, judgement.dataset) == (HOLDS, "synthetic")
-
-
 # ---------------------------------------------------------------------------- intervals of times
 
 
-def test_the_interval_of_a_median_is_not_the_spread_of_its_rounds(tmp_path):
+def test_the_interval_of_a_median_is_not_the_spread_of_its_rounds():
     """Both forms: the bootstrap of new records, and what older ones have, which comes close to it."""
     rounds = np.random.default_rng(1).lognormal(4.0, 0.3, 100)
     value, low, high = np.quantile(rounds, (0.5, 0.05, 0.95))
     bootstrap = median_interval(rounds)
-    assert low < bootstrap[0] < value < bootstrap[1] < high
-    (row,) = times("CPU", (1,), (FNO, float(value)))
-    row |= {"low": low, "high": high, "rounds": 100}
-    columns = {"median_low": bootstrap[0], "median_high": bootstrap[1]}
-    figures = [
-        recorded_evidence(keep(tmp_path / str(k), {"synthesis_time": [one]}), "bandai", "laptop").figure(
-            "synthesis_time", model=FNO
-        )
-        for k, one in enumerate((row | columns, row))
-    ]
-    assert (figures[0].low, figures[0].high) == pytest.approx(bootstrap)
-    widths_ = [figure.high - figure.low for figure in figures]
-    assert 0.6 < widths_[1] / widths_[0] < 1.7
+    row = times("CPU", (1,), (FNO, value))[0] | {"low": low, "high": high, "rounds": 100}
+    found = checked_table("synthesis_time", pd.DataFrame([row]), "t.csv").iloc[0]
+    assert low < found["low"] < value < found["high"] < high
+    assert 0.6 < (found["high"] - found["low"]) / np.ptp(bootstrap) < 1.7
+    told = row | {"median_low": bootstrap[0], "median_high": bootstrap[1]}
+    assert checked_table("synthesis_time", pd.DataFrame([told]), "t.csv").iloc[0]["low"] == bootstrap[0]
 
 
 def test_the_interval_of_a_median_holds_it_19_times_of_20():
     draw = np.random.default_rng(2).exponential
     inside = [low <= np.log(2.0) <= high for low, high in (median_interval(draw(1.0, 50), 400) for _ in range(300))]
     assert 0.9 < np.mean(inside) < 0.99
-
-
-def test_a_slower_network_on_many_rounds_is_told_apart(tmp_path):
-    """Wide rounds, narrow medians: slower by 15 % is a clear no where 100 rounds were timed."""
-    tables = {"synthesis_time": [row | {"rounds": 100} for row in crowds(115.0, 100.0)]}
-    for row in tables["synthesis_time"]:
-        row |= {"low": 0.75 * row["value"], "high": 1.3 * row["value"]}
-    assert judge(keep(tmp_path, tables), "E5").verdict == FAILS
-    for row in tables["synthesis_time"]:
-        del row["rounds"]
-    assert judge(keep(tmp_path / "spread", tables), "E5").verdict == OPEN
 
 
 # ------------------------------------------------------------------------------- other convictions
@@ -807,19 +737,6 @@ def test_both_compilers_are_judged_and_named(tmp_path):
     assert found["XLA"][0] == FAILS and judgement.verdict == IN_PART
 
 
-def test_excess_stands_beside_literal_ird(tmp_path):
-    """A seam at which the character sticks has the lower IRD and the higher excess."""
-    rows = quality(FNO) + quality(T64) + quality(CAMDM, FID=8.0, IRD=4.0)
-    excess = {FNO: 7.0, CAMDM: 5.0}
-    rows += [row | {"metric": "IRD_excess"} | about(excess[row["model"]], 0.0) for row in rows
-             if row["metric"] == "IRD" and row["model"] in excess]  # fmt: skip
-    judgement = judge(keep(tmp_path, {"quality": rows}), "Q3")
-    shown = {s.says: s.figure for s in judgement.ours}
-    assert judgement.verdict == HOLDS and shown["IRD_excess of CAMDM against FNO-96"] == "5 against 7 cm"
-    for claim_id in ("Q2", "Q3", "Q13"):
-        assert any("IRD_excess" in statement.says for statement in claims.load_claims()[claim_id].statements)
-
-
 def test_a_run_that_still_gets_better_tells_nothing_of_convergence(tmp_path):
     judgement = judge(keep(tmp_path, {"quality_by_epoch": epochs(fno=30, camdm=99)}), "E13")
     assert judgement.verdict == UNMEASURED
@@ -829,49 +746,32 @@ def test_a_run_that_still_gets_better_tells_nothing_of_convergence(tmp_path):
 # ------------------------------------------------------------------------- whose records decide
 
 
-def test_gpu_claims_are_decided_by_gpu_rows(tmp_path):
-    root = keep(tmp_path, {"synthesis_time": times("CPU", (1024,), (CAMDM, 300.0), (T64, 100.0))})
-    judgement = judge(root, "E2")
-    assert judgement.verdict == UNMEASURED
-    assert judgement.ours[0].figure == "synthesis_time.csv has no rows of a GPU"
-
-
-def test_one_claim_may_rest_on_a_gpu_run_and_a_laptop_run(tmp_path):
-    rows = crowds(85.0, 100.0)
-    for device, profile in (("GPU", "gpu"), ("CPU", "laptop")):
-        mine = [row for row in rows if row["device"] == device]
-        platform = {"device_platform": "cpu", "device_kind": "cpu"} if device == "CPU" else {}
-        keep(tmp_path, {"synthesis_time": mine}, profile=profile, **platform)
-    judgement = judge(tmp_path, "E5")
-    assert judgement.verdict == HOLDS
-    row = claims.ledger([judgement]).iloc[0]
-    assert row["hardware"] == "Test GPU; CPU, 2 cores"
-    assert row["record"].startswith("bandai/gpu/records/synthesis_time.csv (")
-    assert "bandai/laptop/records/synthesis_time.csv (" in row["record"]
-
-
-def test_real_motion_decides_before_synthetic(tmp_path):
+def test_real_motion_decides_before_synthetic_where_it_can(tmp_path):
     keep(tmp_path, SOUND, dataset="synthetic")
     judgement = judge(tmp_path, "Q13")
     assert judgement.verdict == HOLDS
-    labelled = claims.ledger([judgement]).iloc[0]["dataset"]
-    assert labelled == "synthetic (procedural, no real motion)"
+    assert claims.ledger([judgement]).iloc[0]["dataset"] == "synthetic (procedural, no real motion)"
+    keep(tmp_path, WRONG | trained(PAIR, windows=192_000), dataset="bandai")
+    assert judge(tmp_path, "Q13").dataset == "synthetic"  # the other has figures alone
     keep(tmp_path, WRONG, dataset="bandai")
     assert judge(tmp_path, "Q13").verdict == FAILS
-    assert judge(tmp_path, "Q13", datasets=("synthetic",)).verdict == HOLDS
 
 
-def test_the_reason_is_the_row_that_is_missing(tmp_path):
-    keep(tmp_path, {"quality": quality(FNO)}, dataset="synthetic")
-    judgement = judge(tmp_path, "Q13")
-    wanted = "quality.csv has no F3AMD-FNO-96-no-IRD, 32 frames, 8 steps, IRD"
-    assert judgement.ours[0].figure == wanted
-    assert claims.ledger([judgement]).iloc[0]["ours"] == wanted
-
-
-def test_undefined_figures_are_not_measured(tmp_path):
-    rows = [row | {"value": float("nan")} if row["metric"] == "IRD" else row for row in SOUND["quality"]]
-    assert judge(keep(tmp_path, {"quality": rows}), "Q13").verdict == UNMEASURED
+@pytest.mark.parametrize(
+    ("claim_id", "tables", "reason"),
+    [
+        ("Q13", {"quality": quality(FNO)}, "quality.csv has no F3AMD-FNO-96-no-IRD, 32 frames, 8 steps, IRD"),
+        ("E2", {"synthesis_time": times("CPU", (1024,), (CAMDM, 3.0))}, "synthesis_time.csv has no rows of a GPU"),
+        (
+            "Q13", {"quality": quality(FNO, IRD=np.nan) + quality(f"{FNO}-no-IRD")},
+            "quality.csv has no F3AMD-FNO-96, 32 frames, 8 steps, IRD",
+        ),
+    ],
+)  # fmt: skip
+def test_the_reason_is_the_row_that_is_missing(tmp_path, claim_id, tables, reason):
+    judgement = judge(keep(tmp_path, tables), claim_id)
+    assert judgement.verdict == UNMEASURED
+    assert judgement.ours[0].figure == claims.ledger([judgement]).iloc[0]["ours"] == reason
 
 
 GOOD = SOUND["quality"]
@@ -882,9 +782,7 @@ ON_GPU = times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))
     ("claim_id", "tables", "changes", "message"),
     [
         ("Q13", {"quality": GOOD + GOOD[:1]}, {}, "two rows of"),
-        ("Q13", {"quality": [{**GOOD[0], "model": "FNO-96"}]}, {}, "unknown model 'FNO-96'"),
         ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, {}, "another unit than the paper of .*trajectory_error"),
-        ("Q13", {"quality": [{"model": FNO, "value": 1.0}]}, {}, "needs a column 'window_frames'"),
         ("E2", {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]}, {}, "device must be CPU or GPU"),
         ("Q13", {"quality": [{**GOOD[-1], "low": 9.0}]}, {}, "outside its interval"),
     ],
@@ -900,15 +798,8 @@ def test_a_foreign_or_lost_record_is_an_error(tmp_path):
     (tmp_path / "synthetic").rename(tmp_path / "bandai")
     with pytest.raises(ValueError, match="is a record of synthetic and laptop; move it"):
         judge(tmp_path, "Q13")
-    record = tmp_path / "bandai" / "laptop" / "records" / "quality.json"
-    text = record.read_text()
-    record.unlink()
+    (tmp_path / "bandai" / "laptop" / "records" / "quality.json").unlink()
     with pytest.raises(ValueError, match="has no run record"):
-        judge(tmp_path, "Q13")
-    record.write_text(text)
-    table = record.with_suffix(".csv")
-    table.write_text(table.read_text().replace("4.0", "0.4"))
-    with pytest.raises(ValueError, match="not the table that"):
         judge(tmp_path, "Q13")
 
 
@@ -946,19 +837,14 @@ def test_a_statement_names_its_kind_models_and_range():
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ({key: STATEMENT[key] for key in STATEMENT if key != "kind"}, "has no 'kind'; add it"),
         (STATEMENT | {"kind": "wors"}, "unknown kind of judgement 'wors'; did you mean 'worse'"),
         (STATEMENT | {"model": "FNO-96"}, "unknown model 'FNO-96'"),
         (STATEMENT | {"model": {"model": FNO, "step": 1}}, "unknown key 'step'; did you mean 'steps'"),
         (STATEMENT | {"within": [0, 1], "alike": 0.1}, "unexpected keyword argument 'alike'"),
-        (STATEMENT | {"stated": [2]}, "missing 1 required positional argument: 'high'"),
         (STATEMENT | {"about": [5, 2, 1]}, "stated_factor.. takes from 1 to 2 positional"),
         (STATEMENT | {"within": [0, "miner"]}, "unknown threshold 'miner'; did you mean 'minor'"),
         (STATEMENT | {"metric": "FD"}, "unknown metric 'FD'; did you mean 'FID'"),
-        (STATEMENT | {"kind": "ranked", "table": "qualty"}, "unknown table 'qualty'; did you mean 'quality'"),
-        (STATEMENT | {"device": "GPU"}, "unexpected keyword argument 'device'; worse takes"),
         ({key: STATEMENT[key] for key in STATEMENT if key != "metric"}, "missing a required argument: 'metric'"),
-        (SPREAD | {"models": {"family": "FN"}}, "unknown family 'FN'"),
     ],
 )
 def test_a_broken_statement_is_an_error(statement, message):
@@ -988,48 +874,18 @@ def test_the_paper_is_read_like_our_records():
         found("quality", model=CAMDM, window_frames=64, steps=8, metric="FID")
 
 
-@pytest.mark.parametrize(
-    ("record", "message"),
-    [
-        ("", "tiny/paper.toml: table 1: t.csv has no window_frames, as rows of 'quality' have .* `record` of its own"),
-        ('record = "qualty"', "tiny/paper.toml: table 1 .*unknown record 'qualty'; did you mean 'quality'"),
-    ],
-)
-def test_a_table_of_a_new_paper_that_fits_no_record_is_refused_by_name(tmp_path, monkeypatch, record, message):
+def test_a_table_of_a_new_paper_that_fits_no_record_is_refused_by_name(tmp_path, monkeypatch):
     folder = tmp_path / "tiny"
     (folder / "numbers").mkdir(parents=True)
-    table = f'[[table]]\nnumber = "1"\nfile = "t.csv"\ntitle = "FID"\n{record}\n'
+    table = '[[table]]\nnumber = "1"\nfile = "t.csv"\ntitle = "FID"\n'
     (folder / "paper.toml").write_text(f'name = "TINY"\nsetting = "paper"\n{table}')
     (folder / "numbers" / "t.csv").write_text(f"model,steps,metric,unit,better,value\n{FNO},8,FID,,down,1.0\n")
     monkeypatch.setattr(papers, "_FOLDER", tmp_path)
-    papers.load_paper_file.cache_clear()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="tiny/paper.toml: table 1: t.csv has no window_frames, as rows of 'quality'"):
         paper_evidence("tiny")
-    papers.load_paper_file.cache_clear()
 
 
 # ---------------------------------------------------------------------------- the ledger itself
-
-
-@pytest.fixture(scope="module")
-def committed():
-    """Judgements from the committed records."""
-    return claims.judge_claims()
-
-
-def test_the_verdicts_are_the_accepted_ones(committed):
-    changes = claims.changed_verdicts(claims.ledger(committed), claims.accepted_verdicts())
-    assert not changes, (
-        "\n".join(changes) + "\nIf these are right, accept on purpose with "
-        "`python -m f3amd_companion.ledger.claims --accept`"
-    )
-
-
-def test_the_committed_page_is_up_to_date(committed):
-    page = claims.repository_root() / "paper_figures" / "claims.md"
-    assert page.read_text(encoding="utf-8") == claims.ledger_markdown(committed), (
-        "paper_figures/claims.md is stale: run `python -m f3amd_companion.ledger.claims`"
-    )
 
 
 LEDGER_TABLES = sorted((claims.repository_root() / "paper_figures").glob("*/*/tables/08_claims.csv"))
@@ -1043,15 +899,16 @@ def test_the_ledger_among_a_data_sets_tables_is_the_accepted_one(path):
     assert table.to_dict() == accepted, f"run notebook 08 again: f3amd figures --data {path.parts[-4]} --only 08"
 
 
-def test_the_ledger_has_all_claims(committed):
-    frame = claims.ledger(committed)
-    ids = [f"E{i}" for i in range(1, 19)] + [f"Q{i}" for i in range(1, 20)]
-    assert frame["id"].tolist() == [*ids, *(f"T{i}" for i in range(1, 7))]
-    assert set(frame["verdict"]) | set(frame["paper_verdict"]) <= set(VERDICTS)
-    assert (frame[["claim", "where", "decided_by", "ours"]] != "").all(axis=None)
-    measured = frame[frame["verdict"] != UNMEASURED]
-    assert (measured[["dataset", "hardware"]] != "").all(axis=None)
-    assert (measured.loc[measured["dataset"] != "computed", "record"] != "").all()
+@pytest.mark.parametrize(("paper", "count"), [("f3amd", 43), ("acmdm", 17), ("motionpcm", 13)])
+def test_the_committed_page_and_verdicts_follow_from_the_committed_records(paper, count):
+    judgements, path = claims.judge_claims(paper=paper), claims.ledger_path(paper)
+    frame = claims.ledger(judgements)
+    changes = claims.changed_verdicts(frame, claims.accepted_verdicts(path))
+    assert not changes, "\n".join(changes) + "\nIf these are right: f3amd claims --accept"
+    assert path.read_text(encoding="utf-8") == claims.ledger_markdown(judgements), f"{path} is stale: f3amd claims"
+    assert len(frame) == count and set(frame["verdict"]) | set(frame["paper_verdict"]) <= set(VERDICTS)
+    measured = frame[~frame["verdict"].isin([UNMEASURED]) & (frame["dataset"] != "computed")]
+    assert (measured[["dataset", "hardware", "record"]] != "").all(axis=None)
 
 
 def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
@@ -1059,14 +916,12 @@ def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
     path = tmp_path / "claims.md"
     assert claims.write_ledger(path, holds) and not path.exists()
     claims.write_ledger(path, holds, accept=True)
-    page, verdicts = path.read_text(), path.with_suffix(".json").read_text()
+    page = path.read_text()
     assert claims.write_ledger(path, holds) == []
     (change,) = claims.write_ledger(path, fails)
-    assert change.startswith("Q13 by our records: was 'holds', is 'does not hold' (")
-    assert path.read_text() == page and path.with_suffix(".json").read_text() == verdicts
+    assert change.startswith("Q13 by our records: was 'holds', is 'does not hold' (") and path.read_text() == page
     claims.write_ledger(path, fails, accept=True)
     assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
-    assert claims.write_ledger(path, fails) == []
 
 
 def test_the_command_tells_by_its_status(tmp_path, monkeypatch, caplog):

@@ -27,8 +27,9 @@ GATE_STEPS = 8
 
 def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | None, walks: bool) -> Iterator[str]:
     """Yield what a network lacks, in words."""
-    row = {"model": model, "window_frames": window}
-    windows, fall = (known(evidence.figure, "trained", **row, metric=metric) for metric in ("windows", "held_out_fall"))
+    own = {"model": model, "window_frames": window}
+    figure = lambda table, metric, **row: known(evidence.figure, table, **own | row, metric=metric)
+    windows, fall = figure("trained", "windows"), figure("trained", "held_out_fall")
     if windows is None:
         yield "no record of training"
     elif paper_windows and windows.value < LEAST_SHARE * paper_windows:
@@ -39,11 +40,11 @@ def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | No
         yield "held-out loss was still falling"
     if not walks:
         return
-    rows = (row | {"steps": GATE_STEPS}, {"model": "real", "window_frames": window, "steps": 0})
-    figures = {check: [known(evidence.figure, "walking", **one, metric=check) for one in rows] for check in CHECKS}
-    if any(None in pair for pair in figures.values()):
+    pairs = {check: (figure("walking", check, steps=GATE_STEPS), figure("walking", check, model="real", steps=0))
+             for check in CHECKS}  # fmt: skip
+    if any(None in pair for pair in pairs.values()):
         yield "no record of walking"
-    elif not all(holds(*(one.value for one in figures[check])) for check, (_, holds) in CHECKS.items()):
+    elif not all(CHECKS[check][1](own.value, real.value) for check, (own, real) in pairs.items()):
         yield "does not walk"
 
 
@@ -57,15 +58,13 @@ def why_not_judged(
       paper_windows: frames of a window, as text -> windows that the paper trained with.
       poor: (model, window) of networks that the claim calls poor.
     """
-    lacking: dict[str, list[str]] = {}
-    networks = [] if evidence.printed else dict.fromkeys(evidence.trained)
-    for model, window in networks:
-        for fault in _faults(evidence, model, window, paper_windows.get(str(window)), (model, window) not in poor):
-            lacking.setdefault(fault, []).append(model)
-    for model, (trained, windows) in evidence.told.items():
+    faults = []
+    for model, window in () if evidence.printed else dict.fromkeys(evidence.trained):
+        of_paper, walks = paper_windows.get(str(window)), (model, window) not in poor
+        faults += [(fault, model) for fault in _faults(evidence, model, window, of_paper, walks)]
+    for model, (trained, motions) in evidence.told.items():
         if trained != model:
-            lacking.setdefault("a smaller network of ours in its place", []).append(trained)
-        if windows < LEAST_SHARE * paper_windows.get("text", 0):
-            share = f"trained {100.0 * windows / paper_windows['text']:.2g} % of the paper's motions"
-            lacking.setdefault(share, []).append(trained)
-    return lacking
+            faults.append(("a smaller network of ours in its place", trained))
+        if motions < LEAST_SHARE * paper_windows.get("text", 0):
+            faults.append((f"trained {100.0 * motions / paper_windows['text']:.2g} % of the paper's motions", trained))
+    return {fault: [model for found, model in faults if found == fault] for fault, _ in faults}

@@ -204,10 +204,6 @@ def _change_text(figure: Figure) -> str:
     return f"{100.0 * (figure.value - 1.0):+.3g} %"
 
 
-def _in_percent(figure: Figure) -> Figure:
-    return figure.map(lambda bound: 100.0 * (bound - 1.0))
-
-
 # ------------------------------------------------- six kinds that most statements are judged by
 #
 # A model is its row in a table of `SCHEMAS` (model, window_frames, steps, and framework where it is not the
@@ -301,8 +297,10 @@ def training_ratio(
 
 def _quality(evidence: Evidence, model: Mapping, metric: str) -> Figure:
     """Return a metric of a model; the published one has a window and a number of steps of its own."""
-    row = {"model": PUBLISHED_CAMDM} if model["model"] == PUBLISHED_CAMDM else model
-    return evidence.figure("quality", **row, metric=metric)
+    if model["model"] == PUBLISHED_CAMDM:
+        steps = evidence.rows("quality", model=PUBLISHED_CAMDM)["steps"]
+        model = {"model": PUBLISHED_CAMDM, "steps": max(steps, default=8)}
+    return evidence.figure("quality", **model, metric=metric)
 
 
 def _harm(evidence: Evidence, model: Mapping, against: Mapping, metric: str) -> Figure:
@@ -426,7 +424,8 @@ def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
     """Judge the largest value of one metric over the least, of a family."""
     models = _measured(models, lambda model: _quality(evidence, model, metric))
     spread, largest, least = _spread(models, [_quality(evidence, model, metric) for model in models])
-    text = f"{figure_text(_in_percent(spread))} % over {len(models)} models ({least} to {largest})"
+    percent = figure_text(spread.map(lambda bound: 100.0 * (bound - 1.0)))
+    text = f"{percent} % over {len(models)} models ({least} to {largest})"
     return within(spread, bounds), text
 
 
@@ -552,13 +551,9 @@ def steady_over_noise(evidence: Evidence, model, bounds) -> Finding:
 
 def steadier_over_noise(evidence: Evidence, model, against, bounds) -> Finding:
     """Judge how many times larger that figure is of another model, over the noise levels that both know."""
-    names = [model["model"], against["model"]]
-    curves = [_excess_errors(evidence, name) for name in names]
+    curves = [_excess_errors(evidence, one["model"]) for one in (model, against)]
     low, high = max(curve.index.min() for curve in curves), min(curve.index.max() for curve in curves)
-    shared = [curve.loc[low:high] for curve in curves]
-    if min(map(len, shared)) < 3:
-        raise NotMeasured(f"x0_by_sigma.csv has no three levels that {' and '.join(names)} both know")
-    own, other = (curve.max() for curve in shared)
+    own, other = (curve.loc[low:high].max() for curve in curves)
     return within(Figure.of(other / own), bounds), f"{number_text(own)}x against {number_text(other)}x"
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -41,37 +42,36 @@ def ve_is_vp(_) -> Finding:
     return _agreement(float(np.abs(carried - preserving).max()))
 
 
-def _euler_step(x, x0_hat, sigma, sigma_next):
+def _euler(x, x0_hat, sigma, sigma_next):
     return x + (sigma_next - sigma) * samplers.probability_flow_slope(x, x0_hat, sigma)
 
 
-def _rescaled_step(x, x0_hat, sigma, sigma_next):
+def _rescaled(x, x0_hat, sigma, sigma_next):
     """Take the printed update between rescalings to and from the VP state."""
     alpha_bar, alpha_bar_next = map(schedules.alpha_bar_from_sigma, (sigma, sigma_next))
     return samplers.ddim_step_vp(np.sqrt(alpha_bar) * x, x0_hat, alpha_bar, alpha_bar_next) / np.sqrt(alpha_bar_next)
 
 
-_STEPS = {"rescaled": _rescaled_step, "printed": samplers.ddim_step_literal}
+_STEPS = {"Euler": _euler, "rescaled": _rescaled, "printed": samplers.ddim_step_literal}
 
 
-def _walk(step: Callable, num_steps: int) -> np.ndarray:
+def _walk(update: str, num_steps: int) -> np.ndarray:
     """Return where steps lead noise with an exact denoiser of two modes, [512, 1]."""
     levels = schedules.variance_exploding().grid(num_steps)
     x = levels[0] * np.random.default_rng(0).standard_normal((512, 1))
-    for sigma, sigma_next in zip(levels, levels[1:], strict=False):
-        x = step(x, _MODES.denoise(x, sigma), sigma, sigma_next)
+    for sigma, sigma_next in pairwise(levels):
+        x = _STEPS[update](x, _MODES.denoise(x, sigma), sigma, sigma_next)
     return x
 
 
 def ddim_is_euler(_) -> Finding:
     """Judge whether the rescaled update is the Euler step in sigma."""
-    errors = [np.abs(_walk(_rescaled_step, count) - _walk(_euler_step, count)).max() for count in (1, 2, 4, 8, 64)]
-    return _agreement(float(max(errors)))
+    return _agreement(max(np.abs(_walk("rescaled", n) - _walk("Euler", n)).max() for n in (1, 2, 4, 8, 64)))
 
 
 def reaches_data(_, update) -> Finding:
     """Judge whether samples end near the modes at -1 and +1 when steps are plenty."""
-    size = Figure.of(float(np.abs(_walk(_STEPS[update], 256)).mean()))
+    size = Figure.of(np.abs(_walk(update, 256)).mean())
     return within(size, equal_range(TOLERANCE)), f"mean |x| {size.value:.3f} after 256 steps (data: 1)"
 
 
