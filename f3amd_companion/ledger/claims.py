@@ -27,14 +27,7 @@ import tyro
 
 from f3amd_companion.ledger import judgements as judging
 from f3amd_companion.ledger import theory
-from f3amd_companion.ledger.evidence import (
-    Evidence,
-    NotMeasured,
-    Source,
-    paper_evidence,
-    recorded_evidence,
-    snapshot_evidence,
-)
+from f3amd_companion.ledger.evidence import Evidence, NotMeasured, paper_evidence, recorded_evidence, snapshot_evidence
 from f3amd_companion.ledger.gate import LEAST_SHARE, why_not_judged
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
@@ -75,7 +68,7 @@ class Statement:
       verdict: of `VERDICTS`; "" for a remark, and before it is judged.
       figure: what was found, or why nothing was.
       reasons: why no verdict is drawn from it -> the models of which that is true.
-      sources: tables that it rests on.
+      sources: tables that it rests on, `evidence.Source`.
       known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
     """
 
@@ -86,7 +79,7 @@ class Statement:
     verdict: str = judging.REMARK
     figure: str = ""
     reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    sources: tuple[Source, ...] = ()
+    sources: tuple = ()
     known: int = 0
 
     def judge(self, evidence: Evidence, paper_windows: Mapping[str, int], poor) -> Statement:

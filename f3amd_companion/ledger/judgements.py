@@ -260,8 +260,8 @@ def _timed(evidence: Evidence, models: Mapping, device: str, characters) -> list
 
 
 def speedup(
-    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}", some=False,
-    mean=False,
+    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}",
+    some=False, mean=False,
 ) -> Finding:  # fmt: skip
     """Judge how many times as fast one model, or each of a family, is at some numbers of characters.
 
@@ -273,13 +273,14 @@ def speedup(
     models = _timed(evidence, fast, device, counts)
     figures = [_gain(evidence, slow, model, device, count) for model in models for count in counts]
     figures = [mean_figure(figures)] if mean else figures
-    saved = lambda one: one.map(lambda bound: 100.0 * (1.0 - 1.0 / bound))
-    figures = [saved(one) for one in figures] if unit == " %" else figures
-    verdict, inside = majority(verdicts := [within(one, bounds, gain=gain) for one in figures]), verdicts.count(HOLDS)
-    found = range_text(figures, unit)
-    if 1 < len(figures) != inside:
+    if unit == " %":
+        figures = [one.map(lambda bound: 100.0 * (1.0 - 1.0 / bound)) for one in figures]
+    verdicts = [within(one, bounds, gain=gain) for one in figures]
+    found, inside = range_text(figures, unit), verdicts.count(HOLDS)
+    if len(figures) > 1 and inside < len(figures):
         found += f", {inside} of {len(figures)} in the range"
-    return verdict, text.format(found) + (f" at {_list_text(counts)}" if mean or len(counts) < len(characters) else "")
+    at = f" at {_list_text(counts)}" if mean or len(counts) < len(characters) else ""
+    return majority(verdicts), text.format(found) + at
 
 
 def training_ratio(

@@ -150,22 +150,19 @@ def wide_rows(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
       Columns model, frames and steps where needed, source, and the nine figures; all text.
     """
-    made = rows[rows["steps"] > 0]
     headings = {"window_frames": "frames", "steps": "steps"}
-    varied = {column: heading for column, heading in headings.items() if made[column].nunique() > 1}
-    lines: list[dict] = []
-    for _, cells in rows.groupby("line", sort=False):
-        first = cells.iloc[0]
-        missing = (cells["printed"] == NOT_MEASURED).all()
-        if missing and first["steps"] > 0:
-            lines[-1]["source"] += f"; ours {NOT_MEASURED}"
-            continue
-        shown = {"model": first["model"]} | {heading: str(first[column] or "") for column, heading in varied.items()}
-        shown["source"] = first["source"] + (f": {NOT_MEASURED}" if missing else "")
-        for metric, better, text in cells[["metric", "better", "printed"]].itertuples(index=False):
-            shown[FIGURES[metric] + ARROWS[better]] = "" if missing else text
-        lines.append(shown)
-    return pd.DataFrame(lines)
+    varied = [column for column in headings if rows.loc[rows["steps"] > 0, column].nunique() > 1]
+    rows = rows.assign(figure=rows["metric"].map(FIGURES) + rows["better"].map(ARROWS))
+    figures = list(rows["figure"].unique())
+    wide = rows.pivot(index=["line", *_KEYS[:3], "source"], columns="figure", values="printed").reset_index()
+    missing = (wide[figures] == NOT_MEASURED).all(axis=1)
+    ours_missing = missing & (wide["steps"] > 0)
+    wide.loc[missing, "source"] += f": {NOT_MEASURED}"
+    wide.loc[missing, figures] = ""
+    wide.loc[ours_missing.shift(-1, fill_value=False), "source"] += f"; ours {NOT_MEASURED}"
+    wide[varied] = wide[varied].astype(str).replace("0", "")
+    wide = wide.loc[~ours_missing, ["model", *varied, "source", *figures]]
+    return wide.rename(columns=headings).rename_axis(columns=None).reset_index(drop=True)
 
 
 def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> str:
