@@ -71,10 +71,10 @@ def world(true=True):
     }  # fmt: skip
 
 
-def judged(root, tables):
+def judged(root, tables, paper=PAPER):
     keep(root, tables)
     evidence = {"bandai": [recorded_evidence(root, "bandai", "laptop")]}
-    return {name: claims.judge_claim(claim, evidence) for name, claim in claims.load_claims(PAPER).items()}
+    return {name: claims.judge_claim(claim, evidence) for name, claim in claims.load_claims(paper).items()}
 
 
 def test_every_claim_holds_in_the_papers_world_and_fails_in_the_other(tmp_path):

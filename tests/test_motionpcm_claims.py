@@ -1,10 +1,12 @@
 """The ledger of the MotionPCM paper: every claim with an oracle and a nonsense, the gate, the paper's own tables."""
 
+import functools
+
 import pytest
-from test_claims import keep
+from test_acmdm_claims import judged as judged_of
 
 from f3amd_companion.ledger import claims
-from f3amd_companion.ledger.evidence import paper_evidence, recorded_evidence
+from f3amd_companion.ledger.evidence import paper_evidence
 from f3amd_companion.ledger.judgements import FAILS, HOLDS, OPEN, UNJUDGED, UNMEASURED, combine
 
 PAPER, ENOUGH = "motionpcm", 5e7
@@ -46,10 +48,7 @@ def world(true=True, **about):
     return {"text_pcm1": one, "text_pcm2": two, "text_pcm4": four}
 
 
-def judged(root, tables):
-    keep(root, tables)
-    evidence = {"bandai": [recorded_evidence(root, "bandai", "laptop")]}
-    return {name: claims.judge_claim(claim, evidence) for name, claim in claims.load_claims(PAPER).items()}
+judged = functools.partial(judged_of, paper=PAPER)
 
 
 def test_every_claim_holds_in_the_papers_world_and_fails_in_the_other(tmp_path):
