@@ -43,7 +43,7 @@ from f3amd_companion.ledger.model_cards import card_of, committed_quality
 from f3amd_companion.ledger.quality_tables import QUALITY_TABLES, measured_table, of_queue, quality_markdown
 from f3amd_companion.measuring.consistency_task import distil
 from f3amd_companion.measuring.text_tables import PAPERS
-from f3amd_companion.serving.artefact import FEATURES, JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
+from f3amd_companion.serving.artefact import JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd
 from f3amd_companion.serving.export import export_model
 from f3amd_companion.serving.foot_locking import lock_rollout
@@ -355,7 +355,7 @@ def exports(path: Path, folder: Path) -> dict:
     trained = load_model(path)
     written = export_model(trained, folder / "round", num_steps=2, targets=())
     manifest = json.loads((written / MANIFEST).read_text(encoding="utf-8"))
-    made = {name: digest((written / name).read_bytes()) for name in (STABLEHLO, JAX_EXPORT, FEATURES)}
+    made = {name: digest((written / name).read_bytes()) for name in (STABLEHLO, JAX_EXPORT)}
     made["manifest"] = digest(json.dumps({k: v for k, v in manifest.items() if k not in ("record", "sha256", "files")}))
     program, random = load_artefact(written, runtime="jax"), np.random.default_rng(0)
     given = [random.standard_normal(shape, dtype=np.float32) for shape in program.input_shapes.values()]

@@ -94,23 +94,22 @@ def test_a_ddpm_round_takes_the_noise_that_the_sampler_would_draw(tmp_path):
     network = builders.network_of(builders.tiny_camdm())
     sigmas = variance_preserving_cosine(4).grid(3)
     exported = export_round(network, sigmas, BATCH, "ddpm")
-    assert exported.inputs["step_noise"] == (3, *exported.inputs["noise"])
     folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())
     condition, key = builders.make_condition(BATCH), jax.random.key(3)
     key_init, key_steps = jax.random.split(key)
-    shape = exported.inputs["noise"]
+    artefact = load_artefact(folder, runtime="jax")
+    shape = artefact.input_shapes["noise"]
+    assert artefact.input_shapes["step_noise"] == (3, *shape)
     noise = jax.random.normal(key_init, shape)
     step_noise = np.stack([jax.random.normal(k, shape) for k in jax.random.split(key_steps, 3)])
-    artefact = load_artefact(folder, runtime="jax")
     wanted = jax.jit(lambda: sample_round(network, condition, sigmas, key, sampler="ddpm"))()
     np.testing.assert_allclose(artefact(*condition, noise, step_noise), wanted, atol=1e-5)
-    refused("samples with 'ddpm' and needs step_noise", artefact, *condition, noise)
+    refused("takes history, path, style, noise, step_noise; it was given 4", artefact, *condition, noise)
 
 
 @needs_iree
 def test_iree_equals_jit_over_a_hundred_runs(iree_folder, jit_round):
     artefact = load_artefact(iree_folder)
-    assert artefact.runtime == "iree"
     runs = [inputs_of(artefact.input_shapes, seed) for seed in range(100)]
     answers = [artefact(*given) for given in runs]
     # Compared only now: an answer must outlive the runs after it.
@@ -126,13 +125,6 @@ def test_the_same_inputs_give_the_same_answer_again_and_again(iree_folder):
     first = artefact(*placed)
     for _ in range(100):
         np.testing.assert_array_equal(artefact(*placed), first)
-
-
-@needs_iree
-def test_one_thread_gives_the_numbers_of_many(iree_folder):
-    many, one = load_artefact(iree_folder), load_artefact(iree_folder, driver="local-sync")
-    given = inputs_of(many.input_shapes, 7)
-    np.testing.assert_allclose(one(*given), many(*given), atol=1e-5)
 
 
 _ALONE = """
@@ -180,12 +172,6 @@ def load_shapes(folder: Path) -> dict:
     return {item["name"]: item["shape"] for item in manifest["inputs"]}
 
 
-def test_a_program_with_a_loop_is_refused_and_an_unrolled_one_has_none(trained, exported):
-    looped = export_round(trained.network(), SIGMAS, BATCH, unroll=False)
-    refused(r"has a loop \(stablehlo\.while\).*unroll=True", compile_iree, looped.stablehlo, "llvm-cpu")
-    assert export_module._has_loop(looped.stablehlo) and not export_module._has_loop(exported.stablehlo)
-
-
 def test_a_program_does_not_say_which_files_made_it(exported):
     for program in (exported.stablehlo, exported.exported.serialize()):
         assert b".py" not in program
@@ -207,11 +193,12 @@ def test_scales_and_styles_travel_with_a_trained_model(trained, jax_folder):
     assert record["dataset"] == "tiny" and record["dataset_licence"] == "CC BY 4.0"
 
 
-def test_a_bare_network_has_no_scales(exported, tmp_path):
+def test_a_bare_network_takes_network_units(exported, tmp_path):
     folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())
-    artefact = load_artefact(folder, runtime="jax")
-    refused("exported from a bare network", artefact.normalise, np.zeros((1, 39)))
-    refused("exported from a bare network", artefact.one_hot, ["calm"])
+    artefact, numbers = load_artefact(folder, runtime="jax"), builders.draw(2, 39, seed=1)
+    for same in (artefact.normalise, artefact.denormalise, artefact.normalise_path):
+        np.testing.assert_array_equal(same(numbers), numbers)
+    refused("knows none", artefact.one_hot, ["calm"])
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
@@ -222,7 +209,7 @@ def test_a_wrong_input_is_named(runtime, request):
         for wrong in (given[number][:1], artefact.put(given[number][:1])):
             bad = [*given[:number], wrong, *given[number + 1 :]]
             refused(rf"{name} must have shape \(2, .*got \(1, ", artefact, *bad)
-    refused("samples with 'ddim' and takes no step_noise", artefact, *given, given[3][None])
+    refused("it was given 5 inputs", artefact, *given, given[3][None])
 
 
 @pytest.mark.parametrize(
@@ -230,8 +217,6 @@ def test_a_wrong_input_is_named(runtime, request):
     [
         ({"batch": 0}, "batch must be a whole number"),
         ({"batch": 1.0}, "batch must be a whole number"),
-        ({"sigmas": [1.0]}, "sigmas must be"),
-        ({"sigmas": [np.inf, 0.0]}, "sigmas must be"),
         ({"sampler": "ddin"}, "unknown sampler 'ddin'; did you mean 'ddim'"),
     ],
 )
@@ -239,8 +224,8 @@ def test_what_makes_no_round_is_refused(trained, settings, message):
     refused(message, export_round, trained.network(), **{"sigmas": SIGMAS, "batch": BATCH, **settings})
 
 
-@pytest.mark.parametrize("file", ["round.jax_export", "features.json"])
-def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path, file):
+def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path):
+    file = "round.jax_export"
     copy = shutil.copytree(jax_folder, tmp_path / "copy")
     content = (copy / file).read_bytes()
     (copy / file).write_bytes(content[:-1])
@@ -280,9 +265,9 @@ def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
     for number, (alter, message) in enumerate(
         (
             (change(iree_version="2.0.0"), r"compiled by IREE 2\.0\.0, .*iree-base-runtime==2\.0"),
-            (other_cpu, "another CPU .* lacks imaginary: compile it here"),
-            (other_machine, r"another CPU \(pdp11\)"),
-            (change(driver="abacus"), "IREE has no driver 'abacus' here"),
+            (other_cpu, "another CPU.* lacks imaginary: compile it here"),
+            (other_machine, "lacks pdp11"),
+            (change(driver="abacus"), "driver 'abacus' finds no device here"),
         )
     ):
         copy = altered(iree_folder, tmp_path / str(number), alter)
@@ -312,55 +297,29 @@ def test_nothing_of_a_user_is_overwritten(exported, tmp_path):
     save = lambda **settings: save_artefact(folder, exported, targets=(), **{"name": "tiny", **settings})
     save()
     refused("exists already; .*overwrite=True", save)
+    (folder / "notes.txt").write_text("mine")
     save(name="other", overwrite=True)
     assert load_artefact(folder, runtime="jax").manifest["model"] == "other"
-    (folder / "notes.txt").write_text("mine")
-    refused(r"holds notes\.txt, which is no part of the artefact", save, overwrite=True)
     (folder / "manifest.json").write_text("{}")
     refused("not the manifest of an artefact", save, overwrite=True)
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-def test_a_failure_leaves_the_old_artefact_and_nothing_else(exported, tmp_path, monkeypatch):
-    folder = save_artefact(tmp_path / "round", exported, name="old", targets=())
+def test_an_artefact_of_which_a_part_was_written_is_none_and_is_written_again(exported, tmp_path, monkeypatch):
+    write = export_module.write_whole
 
-    def no_space(self, content):
-        raise OSError("no space left")
+    def full_disk(path, content):
+        if path.name == "manifest.json":
+            raise OSError("no space left")
+        return write(path, content)
 
-    monkeypatch.setattr(Path, "write_bytes", no_space)
-    for target in (folder, tmp_path / "new"):
+    with monkeypatch.context() as patch:
+        patch.setattr(export_module, "write_whole", full_disk)
         with pytest.raises(OSError, match="no space left"):
-            save_artefact(target, exported, name="new", targets=(), overwrite=True)
-    assert load_artefact(folder, runtime="jax").manifest["model"] == "old"
-    assert [item.name for item in tmp_path.iterdir()] == ["round"]
-
-
-def test_the_old_artefact_comes_back_if_the_new_one_cannot_take_its_place(exported, tmp_path, monkeypatch):
-    folder = save_artefact(tmp_path / "round", exported, name="old", targets=())
-
-    def fails(*given):
-        raise OSError("cannot be moved")
-
-    monkeypatch.setattr(os, "replace", fails)
-    with pytest.raises(OSError, match="cannot be moved"):
-        save_artefact(folder, exported, name="new", targets=(), overwrite=True)
-    monkeypatch.undo()
-    assert load_artefact(folder, runtime="jax").manifest["model"] == "old"
-    assert [item.name for item in tmp_path.iterdir()] == ["round"]
-
-
-def test_a_link_to_an_artefact_stays_one(exported, tmp_path):
-    folder = save_artefact(tmp_path / "store" / "round", exported, name="old", targets=())
-    (tmp_path / "link").symlink_to(folder, target_is_directory=True)
-    save_artefact(tmp_path / "link", exported, name="new", targets=(), overwrite=True)
-    assert (tmp_path / "link").is_symlink() and load_artefact(folder, runtime="jax").manifest["model"] == "new"
-    assert [item.name for item in folder.parent.iterdir()] == ["round"]
-
-
-def test_weights_of_another_model_are_not_passed_off_as_a_trained_one(exported, tmp_path):
-    other = builders.tiny_trained(latent_width=8)
-    with pytest.raises(ValueError, match="does not hold the weights of the trained model"):
-        save_artefact(tmp_path / "round", exported, name="tiny", targets=(), trained=other)
+            save_artefact(tmp_path / "new", exported, name="new", targets=())
+    refused("no such file, so", load_artefact, tmp_path / "new", runtime="jax")
+    save_artefact(tmp_path / "new", exported, name="new", targets=())
+    assert load_artefact(tmp_path / "new", runtime="jax").manifest["model"] == "new"
 
 
 def test_a_trained_model_is_exported_with_its_own_schedule(trained, tmp_path):
@@ -408,7 +367,6 @@ def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatc
         return subprocess.CompletedProcess(command, int(tiled), "", "error: large vector sizes")
 
     monkeypatch.setattr(export_module.subprocess, "run", run)
-    monkeypatch.setattr(export_module, "_has_loop", lambda program: False)
     module, flags = compile_iree(b"program", "llvm-cpu")
     assert module == b"module" and len(seen) == 2
     assert not set(flags) & set(tiling)

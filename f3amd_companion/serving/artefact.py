@@ -25,12 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-FORMAT = "f3amd-artefact-1"
+FORMAT = "f3amd-artefact-2"
 MANIFEST = "manifest.json"
 STABLEHLO = "round.mlirbc"
 JAX_EXPORT = "round.jax_export"
-FEATURES = "features.json"
-RUNTIMES = ("iree", "jax")
 
 # IREE gives its worker threads 128 KiB of stack. Code that was compiled with data tiling needs more
 # and overruns it: the process dies, or the numbers are wrong. Address space is all that more costs.
@@ -44,113 +42,79 @@ class OnDevice(NamedTuple):
     value: Any
 
 
-class _Program(NamedTuple):
-    """A loaded program: how an array goes in, and how the program is run on such arrays."""
-
-    put: Callable[[np.ndarray], Any]
-    run: Callable[..., np.ndarray]
-
-
 class Artefact:
     """One round of synthesis for a fixed number of characters, from `load_artefact`.
 
     Attributes:
-      manifest: what the artefact is: model, config, steps, sampler, noise levels, batch, shapes,
-        compilers, checksums and provenance.
-      runtime: "iree" or "jax".
+      manifest: what the artefact is: model, config, steps, sampler, noise levels, batch, shapes, scales of features,
+        style names, compilers, checksums and provenance.
       styles: style names in the order of the one-hot vector; empty if it was not exported from a
-        trained model.
+        trained model. Without one, scales are 1 as well.
       input_shapes: shape of every input by name, in the order of a call.
     """
 
-    def __init__(self, manifest: dict, runtime: str, program: _Program, features: dict | None):
-        self.manifest = manifest
-        self.runtime = runtime
-        self.styles: tuple[str, ...] = tuple(features["styles"]) if features else ()
-        self._features = features
-        self._program = program
+    def __init__(self, manifest: dict, put: Callable[[np.ndarray], Any], run: Callable[..., np.ndarray]):
+        self.manifest, self._put, self._run = manifest, put, run
+        self.styles: tuple[str, ...] = tuple(manifest["styles"])
         self.input_shapes = {item["name"]: tuple(item["shape"]) for item in manifest["inputs"]}
+        self._scales = {name: np.asarray(value, np.float32) for name, value in manifest["normaliser"].items()}
 
     def put(self, array) -> OnDevice:
-        """Move an array to the runtime's device as float32, so that calls need not copy it.
-
-        Args:
-          array: any shape that the program takes.
-
-        Returns:
-          What a call takes in place of the array, as often as wanted.
-        """
+        """Move an array of any shape to the runtime's device as float32, so that calls need not copy it."""
         array = np.ascontiguousarray(array, np.float32)
-        return OnDevice(array.shape, self._program.put(array))
+        return OnDevice(array.shape, self._put(array))
 
-    def __call__(self, history, path, style, noise, step_noise=None) -> np.ndarray:
+    def __call__(self, *inputs) -> np.ndarray:
         """Run the round for B characters, B being the artefact's own.
 
         Args:
-          history: past motion features in network units, [B, H, C].
-          path: condition of the future root path, [B, T, 8]: displacement x, z from the last
-            history frame in network units, then the yaw as the first two columns of its rotation
-            matrix.
-          style: one-hot or a blend, [B, S].
-          noise: standard normal numbers to start from, [B, T, C].
-          step_noise: fresh standard normal numbers for every step, [N, B, T, C]; for artefacts that
-            sample with DDPM, and no others.
+          inputs: arrays, or what `put` made of them, in this order:
+            history: past motion features in network units, [B, H, C].
+            path: condition of the future root path, [B, T, 8]: displacement x, z from the last
+              history frame in network units, then the yaw as the first two columns of its rotation
+              matrix.
+            style: one-hot or a blend, [B, S].
+            noise: standard normal numbers to start from, [B, T, C].
+            step_noise: fresh standard normal numbers for every step, [N, B, T, C]; for artefacts that
+              sample with DDPM, and no others.
 
         Returns:
           Clean features in network units, [B, T, C]. Do not write to it: it may be the runtime's
           own memory.
 
         Raises:
-          ValueError: for a wrong shape, or step noise where none is wanted or the other way round.
+          ValueError: for a wrong number of inputs, or a wrong shape.
         """
-        given = [history, path, style, noise] + ([] if step_noise is None else [step_noise])
-        if len(given) != len(self.input_shapes):
-            wanted = "needs" if step_noise is None else "takes no"
-            raise ValueError(f"this artefact samples with {self.manifest['sampler']!r} and {wanted} step_noise")
-        values = []
-        for (name, shape), item in zip(self.input_shapes.items(), given, strict=True):
-            placed = item if isinstance(item, OnDevice) else self.put(item)
-            if placed.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {placed.shape}")
-            values.append(placed.value)
-        return self._program.run(*values)
+        if len(inputs) != len(self.input_shapes):
+            raise ValueError(f"this artefact takes {', '.join(self.input_shapes)}; it was given {len(inputs)} inputs")
+        placed = [item if isinstance(item, OnDevice) else self.put(item) for item in inputs]
+        for (name, shape), item in zip(self.input_shapes.items(), placed, strict=True):
+            if item.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {item.shape}")
+        return self._run(*(item.value for item in placed))
 
     def normalise(self, features) -> np.ndarray:
         """Map features [..., C] (metres and 6D rotations) to network units."""
-        scale = self._scales()
-        return (np.asarray(features, np.float32) - scale["mean"]) / scale["deviation"]
+        return (np.asarray(features, np.float32) - self._scales["mean"]) / self._scales["deviation"]
 
     def denormalise(self, x) -> np.ndarray:
         """Map network units [..., C] back to metres and 6D rotations."""
-        scale = self._scales()
-        return np.asarray(x, np.float32) * scale["deviation"] + scale["mean"]
+        return np.asarray(x, np.float32) * self._scales["deviation"] + self._scales["mean"]
 
     def normalise_path(self, path) -> np.ndarray:
         """Map a path condition [..., 8] from metres to network units; its yaw stays."""
         path = np.array(path, np.float32)
-        path[..., :2] /= self._scales()["path_scale"]
+        path[..., :2] /= self._scales["path_scale"]
         return path
 
     def one_hot(self, styles) -> np.ndarray:
-        """Return the style input for a list of style names, [len(styles), S].
-
-        Raises:
-          ValueError: for an unknown style, or an artefact that knows no names.
-        """
-        self._scales()
-        for style in styles:
-            if style not in self.styles:
-                raise ValueError(f"unknown style {style!r}; this artefact knows {', '.join(self.styles)}")
-        rows = [self.styles.index(style) for style in styles]
-        return np.eye(len(self.styles), dtype=np.float32)[rows]
-
-    def _scales(self) -> dict[str, np.ndarray]:
-        if self._features is None:
-            raise ValueError("no scales of features nor style names here: exported from a bare network")
-        return {name: np.asarray(value, np.float32) for name, value in self._features["normaliser"].items()}
+        """Return the style input for a list of style names, [len(styles), S]; ValueError for one that is unknown."""
+        if unknown := [style for style in styles if style not in self.styles]:
+            raise ValueError(f"unknown style {unknown[0]!r}; this artefact knows {', '.join(self.styles) or 'none'}")
+        return np.eye(len(self.styles), dtype=np.float32)[[self.styles.index(style) for style in styles]]
 
 
-def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu", driver: str | None = None) -> Artefact:
+def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu") -> Artefact:
     """Load an artefact and make its program ready to run.
 
     Args:
@@ -158,8 +122,6 @@ def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu", dr
       runtime: "iree" runs a compiled program of the folder; "jax" runs the exported one, compiled
         here and now by XLA for whatever device JAX finds.
       target: which compiled program; only with "iree".
-      driver: of IREE, instead of the one that belongs to the target: "local-sync" runs a CPU
-        program on the calling thread alone.
 
     Raises:
       ImportError: if the runtime is not installed, saying how to install it.
@@ -167,12 +129,11 @@ def load_artefact(folder, *, runtime: str = "iree", target: str = "llvm-cpu", dr
         target, or was compiled by another version of IREE or for another CPU.
     """
     folder = Path(folder)
-    if runtime not in RUNTIMES:
-        raise ValueError(f"unknown runtime {runtime!r} (one of {', '.join(RUNTIMES)})")
+    if runtime not in ("iree", "jax"):
+        raise ValueError(f"unknown runtime {runtime!r} (one of iree, jax)")
     manifest = read_manifest(folder)
-    features = json.loads(_read(folder, FEATURES, manifest)) if FEATURES in manifest["files"] else None
-    program = _load_jax(folder, manifest) if runtime == "jax" else _load_iree(folder, manifest, target, driver)
-    return Artefact(manifest, runtime, program, features)
+    program = _load_jax(folder, manifest) if runtime == "jax" else _load_iree(folder, manifest, target)
+    return Artefact(manifest, *program)
 
 
 def read_manifest(folder) -> dict:
@@ -213,7 +174,8 @@ def _read(folder: Path, name: str, manifest: dict) -> bytes:
     return content
 
 
-def _load_jax(folder: Path, manifest: dict) -> _Program:
+def _load_jax(folder: Path, manifest: dict) -> tuple[Callable, Callable]:
+    """Return what moves an array to the device, and what runs the program on such arrays."""
     try:
         import jax
         from jax import export
@@ -226,13 +188,13 @@ def _load_jax(folder: Path, manifest: dict) -> _Program:
         made_by = manifest["record"]["versions"]["jax"]
         what = f"JAX {jax.__version__} cannot read what JAX {made_by} exported ({error})"
         raise ValueError(f"{folder / JAX_EXPORT}: {what}; install that version, or export again") from None
-    inputs = [jax.ShapeDtypeStruct(tuple(item["shape"]), np.float32) for item in manifest["inputs"]]
     # Compiled ahead of the first call, so that a call does nothing but run.
-    compiled = jax.jit(exported.call).lower(*inputs).compile()
-    return _Program(jax.device_put, lambda *values: np.asarray(compiled(*values)))
+    compiled = jax.jit(exported.call).lower(*exported.in_avals).compile()
+    return jax.device_put, lambda *values: np.asarray(compiled(*values))
 
 
-def _load_iree(folder: Path, manifest: dict, target: str, driver: str | None) -> _Program:
+def _load_iree(folder: Path, manifest: dict, target: str) -> tuple[Callable, Callable]:
+    """Return what moves an array to the device, and what runs the program on such arrays."""
     targets = manifest["targets"]
     if target not in targets:
         known = ", ".join(targets) or "none: compile some, or pass runtime='jax'"
@@ -248,13 +210,16 @@ def _load_iree(folder: Path, manifest: dict, target: str, driver: str | None) ->
         what = f"target {target} was compiled by IREE {made_by}, and this is IREE {iree_version()}"
         how = f"install iree-base-runtime=={made_by}, compile it again, or pass runtime='jax'"
         raise ValueError(f"{folder}: {what}: {how}")
-    _check_cpu(folder, target, compiled.get("cpu"))
-    content = _read(folder, compiled["file"], manifest)
-    config = runtime.Config(device=_iree_device(driver or compiled["driver"]))
-    module = runtime.VmModule.copy_buffer(config.vm_instance, content)
+    # Instructions that this CPU lacks would kill the process.
+    if cpu := compiled["cpu"]:
+        lacks = set(cpu["features"]) - set(cpu_features()) | {cpu["machine"]} - {platform.machine()}
+        if lacks:
+            what = f"was compiled for another CPU, and this one lacks {', '.join(sorted(lacks))}"
+            raise ValueError(f"{folder}: target {target} {what}: compile it here, or pass runtime='jax'")
+    config = runtime.Config(device=_iree_device(compiled["driver"]))
+    module = runtime.VmModule.copy_buffer(config.vm_instance, _read(folder, compiled["file"], manifest))
     invoke = runtime.load_vm_module(module, config)[compiled["entry"]]
-    put = functools.partial(runtime.asdevicearray, config.device)
-    return _Program(put, lambda *values: invoke(*values).to_host())
+    return functools.partial(runtime.asdevicearray, config.device), lambda *values: invoke(*values).to_host()
 
 
 def iree_version() -> str:
@@ -265,12 +230,8 @@ def iree_version() -> str:
 @functools.cache
 def _iree_device(driver: str):
     """Return one device per driver: artefacts share its worker threads."""
-    import iree.runtime
     from iree.runtime import _binding, flags
 
-    available = iree.runtime.query_available_drivers()
-    if driver not in available:
-        raise ValueError(f"IREE has no driver {driver!r} here (one of {', '.join(available)})")
     # A driver reads this flag when it is made, and IREE's public call hands out one that may have
     # been made before.
     flags.parse_flags(f"--task_worker_stack_size={WORKER_STACK_BYTES}")
@@ -278,17 +239,6 @@ def _iree_device(driver: str):
         return _binding.create_hal_driver(driver).create_default_device()
     except Exception as error:  # IREE raises RuntimeError, ValueError and others
         raise ValueError(f"IREE's driver {driver!r} finds no device here: {error}") from None
-
-
-def _check_cpu(folder: Path, target: str, wanted: dict | None) -> None:
-    """Raise ValueError if a program uses instructions that this CPU lacks, which would kill it."""
-    if wanted is None:
-        return
-    machine, missing = platform.machine(), sorted(set(wanted["features"]) - set(cpu_features()))
-    if machine != wanted["machine"] or missing:
-        lacks = f"lacks {', '.join(missing)}" if missing else f"is {machine}"
-        what = f"target {target} was compiled for another CPU ({wanted['machine']}), and this one {lacks}"
-        raise ValueError(f"{folder}: {what}: compile it here, or pass runtime='jax'")
 
 
 @functools.cache

@@ -9,22 +9,19 @@ device, and has no loop of random bits. What is written here is loaded by `artef
 nothing of this library.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import importlib.util
 import json
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import uuid
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,17 +33,13 @@ from jax.extend.mlir.dialects import stablehlo
 
 from f3amd_companion.serving import artefact
 from f3amd_lib.diffusion.samplers import ddpm_step
-from f3amd_lib.ground.files import read_toml, whole_folder
+from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.checkpoints import TrainedModel
-
-_ENTRY = "main"
-"""What JAX calls the program's one public function."""
-
 
 TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
 """Targets by name. "cuda-sm_NN" is a generation of NVIDIA GPUs; 80, 86 and 89 are known to work."""
@@ -61,18 +54,15 @@ def _find_target(name: str) -> dict:
     return {"backend": name, **TARGETS[name]}
 
 
-@dataclass(frozen=True)
-class ExportedRound:
+class ExportedRound(NamedTuple):
     """One round of synthesis as a program.
 
     Attributes:
-      inputs: shapes by name, in the order of a call.
       manifest: what the program is, as `artefact` tells it: config, steps, sampler, noise levels, batch, shapes, and a
         digest that tells one set of weights from another.
       exported: the program, for JAX; without the places of its operations in source files.
     """
 
-    inputs: dict[str, tuple[int, ...]]
     manifest: dict
     exported: export.Exported
 
@@ -82,33 +72,29 @@ class ExportedRound:
         return self.exported.mlir_module_serialized
 
 
-def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: bool = True) -> ExportedRound:
+def export_round(network, sigmas, batch: int, sampler: str = "ddim") -> ExportedRound:
     """Export a whole round of synthesis with the weights inside.
 
     The program is `rounds.sample_round` with history, path, style and noise as inputs. DDPM draws
     fresh noise at every step; its program takes that as a fifth input, `step_noise` [N, B, T, C],
-    of which the step to sigma = 0 uses nothing.
+    of which the step to sigma = 0 uses nothing. Steps are written out one by one: IREE's local-task driver was
+    seen to return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
 
     Args:
       network: a denoiser of `models`, with its weights.
       sigmas: [N + 1], falling, from a noise schedule's `grid`.
       batch: B, characters of one call.
       sampler: a name of `samplers.SAMPLERS`.
-      unroll: write the steps out one by one. A program with a loop is smaller, and only the JAX
-        runtime is safe with it (see `compile_iree`).
 
     Returns:
       The program, in float32, lowered for the CPU without anything that only a CPU has.
 
     Raises:
-      ValueError: for less than one character, sigmas that make no step, or an unknown sampler.
+      ValueError: for less than one character, or an unknown sampler.
     """
     if type(batch) is not int or batch < 1:
         raise ValueError(f"batch must be a whole number of characters, at least 1, got {batch!r}")
     sigmas = np.asarray(sigmas, np.float64)
-    if sigmas.ndim != 1 or len(sigmas) < 2 or not np.isfinite(sigmas).all():
-        what = f"sigmas must be [N + 1] finite levels with at least one step, got {sigmas.tolist()}"
-        raise ValueError(f"{what}; take them from a noise schedule's grid")
     config = network.config
     shape = (batch, config.window, config.channels)
     inputs = {name: part.shape for name, part in config.condition_shapes(batch)._asdict().items()} | {"noise": shape}
@@ -121,7 +107,7 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         denoiser, condition = nnx.merge(graph, state), Condition(history, path, style)
         if step_noise is not None:
             return _sample_ddpm(denoiser, condition, sigmas, noise, step_noise)
-        return sample_round(denoiser, condition, sigmas, noise=noise, sampler=sampler, unroll=unroll)
+        return sample_round(denoiser, condition, sigmas, noise=noise, sampler=sampler, unroll=True)
 
     program = export.export(
         jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
@@ -137,7 +123,7 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim", *, unroll: 
         "output": {"name": "x0_hat", "shape": list(shape), "dtype": "float32"},
         "weights": weights_digest(state),
     }
-    return ExportedRound(inputs, manifest, program)
+    return ExportedRound(manifest, program)
 
 
 def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
@@ -151,30 +137,16 @@ def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
     return x_noisy
 
 
-@contextlib.contextmanager
-def _parsed(program: bytes) -> Iterator[ir.Module]:
-    with ir.Context() as context:
-        try:
-            module = stablehlo.deserialize_portable_artifact(context, program)
-        except Exception as error:  # the bindings promise no type
-            raise ValueError(f"not a portable StableHLO program: {error}") from None
-        yield module
-
-
 def _without_places(program: bytes) -> bytes:
     """Return a program that no longer says which lines of which files made it."""
-    with _parsed(program) as module:
+    with ir.Context() as context:
+        module = stablehlo.deserialize_portable_artifact(context, program)
         passmanager.PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
         # As `jax.export` does: readers of the last four weeks and later ones.
         version = stablehlo.get_version_from_compatibility_requirement(
             stablehlo.StablehloCompatibilityRequirement.WEEK_4
         )
         return stablehlo.serialize_portable_artifact(module, version)
-
-
-def _has_loop(program: bytes) -> bool:
-    with _parsed(program) as module:
-        return "stablehlo.while" in module.operation.get_asm(large_elements_limit=8)
 
 
 def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[str]]:
@@ -191,19 +163,13 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
 
     Raises:
       ImportError: if IREE's compiler is not installed, saying how to install it.
-      ValueError: for an unknown target, one that this release of IREE cannot compile for, or a
-        program with a loop for a target that runs on the CPU: IREE's local-task driver was seen to
-        return NaN or garbage now and then from programs with a loop, and never from unrolled ones.
+      ValueError: for an unknown target, or one that this release of IREE cannot compile for.
     """
     settings = _find_target(target)
-    if settings["driver"] == "local-task" and _has_loop(program):
-        what = f"the program has a loop (stablehlo.while), of which IREE makes NaN or garbage now and then on {target}"
-        raise ValueError(f"{what}: export it with unroll=True, and give it its noise instead of a random key")
     if importlib.util.find_spec("iree") is None or not importlib.util.find_spec("iree.compiler"):
         raise ImportError('compiling needs IREE: make bench-tools, or pip install "f3amd_lib[bench]"')
     # Tiles are faster, but some programs do not compile in them.
-    tiling = settings.get("tiling", [])
-    ways = [[*settings["flags"], *tiling], settings["flags"]] if tiling else [settings["flags"]]
+    ways = [[*settings["flags"], *settings.get("tiling", [])], settings["flags"]]
     with tempfile.TemporaryDirectory() as folder:
         source, compiled = Path(folder) / artefact.STABLEHLO, Path(folder) / "round.vmfb"
         source.write_bytes(program)
@@ -224,10 +190,10 @@ def save_artefact(
     folder, exported: ExportedRound, *, name: str, targets: Iterable[str] = ("llvm-cpu",),
     trained: TrainedModel | None = None, overwrite: bool = False,
 ) -> Path:  # fmt: skip
-    """Write a round as a folder that `artefact.load_artefact` runs, whole or not at all.
+    """Write a round as a folder that `artefact.load_artefact` runs.
 
-    The folder holds the program as StableHLO and for JAX, a compiled module per target, the scales
-    of the features and the style names of a trained model, and a manifest with checksums.
+    The folder holds the program as StableHLO and for JAX, a compiled module per target, and a manifest with checksums,
+    which is written last.
 
     Args:
       folder: to make; missing ones above it are made, too.
@@ -236,19 +202,20 @@ def save_artefact(
       targets: to compile for, see `compile_iree`; none leaves the program to JAX.
       trained: the model whose network was exported, so that real motion can be fed in; without it
         the artefact takes and returns network units only.
-      overwrite: replace an earlier artefact of that name; anything else is never replaced.
+      overwrite: replace an earlier artefact there. Other files of the folder stay.
 
     Returns:
       The folder.
 
     Raises:
-      ImportError, ValueError: as `compile_iree`; if the folder exists and `overwrite` is false, or
-        is not an artefact; or if the trained model is not the one that was exported.
+      ImportError, ValueError: as `compile_iree`; if the folder holds an artefact and `overwrite` is false, or the
+        manifest of something else.
     """
-    folder = Path(folder)
-    _check_free(folder, overwrite)
-    if trained is not None and weights_digest(trained.params) != exported.manifest["weights"]:
-        raise ValueError(f"the exported round does not hold the weights of the trained model {trained.name}")
+    folder, earlier = Path(folder), {}
+    if (folder / artefact.MANIFEST).exists():
+        earlier = artefact.read_manifest(folder)["files"]
+        if not overwrite:
+            raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
     files = {artefact.STABLEHLO: exported.stablehlo, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
     found, compiled = {target: _find_target(target) for target in targets}, {}
     for target, settings in found.items():
@@ -257,53 +224,32 @@ def save_artefact(
         host = {"machine": platform.machine(), "features": list(artefact.cpu_features())}
         compiled[target] = {
             "file": file,
-            "entry": _ENTRY,
+            "entry": "main",  # what JAX calls the program's one public function
             "driver": settings["driver"],
             "iree_version": artefact.iree_version(),
             "flags": flags,
             "compile_seconds": round(time.perf_counter() - started, 1),
             "cpu": host if settings["backend"] == "llvm-cpu" else None,
         }
+    scales, training = {"mean": 0.0, "deviation": 1.0, "path_scale": 1.0}, {}
     if trained is not None:
-        scales = trained.normaliser._asdict()
-        scales = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
-        features = {"normaliser": scales, "styles": list(trained.styles)}
-        files[artefact.FEATURES] = (json.dumps(features, ensure_ascii=False) + "\n").encode()
-    training = trained.record if trained else {}
+        scales, training = trained.normaliser._asdict(), trained.record
     record = run_record(
         profile="export", dataset=training.get("dataset", "none"), seed=training.get("seed", 0), training=training
     )
     record |= {key: training.get(key) for key in ("dataset_fingerprint", "dataset_licence", "dataset_credit")}
     sums = {name: {"bytes": len(file), "sha256": hashlib.sha256(file).hexdigest()} for name, file in files.items()}
     manifest = {"format": artefact.FORMAT, "model": name, **exported.manifest}
+    manifest["normaliser"] = {name: np.asarray(values, np.float32).tolist() for name, values in scales.items()}
+    manifest["styles"] = list(trained.styles) if trained else []
     manifest |= {"targets": compiled, "files": sums, "record": record}
     manifest["sha256"] = artefact.manifest_digest(manifest)
     files[artefact.MANIFEST] = (json.dumps(manifest, indent=2, ensure_ascii=False) + "\n").encode()
-    place = folder.resolve()  # of a link, what it points to
-    earlier = place.with_name(f".{place.name}.{uuid.uuid4().hex}.earlier")
-    try:
-        with whole_folder(place) as temporary:
-            for file, content in files.items():
-                (temporary / file).write_bytes(content)
-            if place.exists():  # an artefact, see `_check_free`; kept until the new one has its place
-                place.rename(earlier)
-    finally:
-        if earlier.exists() and not place.exists():
-            earlier.rename(place)
-    shutil.rmtree(earlier, ignore_errors=True)
+    for file in earlier.keys() - files.keys():
+        (folder / file).unlink(missing_ok=True)
+    for file, content in files.items():
+        write_whole(folder / file, content)
     return folder
-
-
-def _check_free(folder: Path, overwrite: bool) -> None:
-    """Raise ValueError if something lies there that may not be replaced."""
-    if not folder.exists():
-        return
-    if not overwrite:
-        raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
-    ours = {artefact.MANIFEST, *artefact.read_manifest(folder)["files"]}
-    others = sorted({item.name for item in folder.iterdir()} - ours)
-    if others:
-        raise ValueError(f"{folder}: holds {others[0]}, which is no part of the artefact; it is not overwritten")
 
 
 def export_model(

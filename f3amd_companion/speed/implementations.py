@@ -160,7 +160,7 @@ def _iree(workload: Workload) -> Round:
         artefact = load_artefact(save_artefact(Path(folder) / "artefact", exported, name=workload.model))
     seconds = time.perf_counter() - started
     given = [artefact.put(part) for part in random_condition(workload.config, workload.characters)]
-    shapes = [shape for name, shape in exported.inputs.items() if name.endswith("noise")]
+    shapes = [shape for name, shape in artefact.input_shapes.items() if name.endswith("noise")]
     rng = np.random.default_rng(0)
     draw = lambda shape: artefact.put(rng.standard_normal(shape, dtype=np.float32))
     return Round(lambda: artefact(*given, *map(draw, shapes)), seconds)
