@@ -483,7 +483,7 @@ def crowd(
     made = generate_crowd(
         generator, characters, num_frames, out, styles=list(style) or None,
         min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
-        overwrite=model.overwrite, finished_too=bool(drawn or formats), progress=True,
+        overwrite=model.overwrite, progress=True,
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     log.info("took         %.0f s", time.perf_counter() - started)

@@ -15,7 +15,7 @@ from builders import SKELETON, packed_from, refused, tiny_packed, tiny_trained, 
 
 from f3amd_companion.measuring.campaign import Run, queue
 from f3amd_companion.serving.artefact import read_manifest
-from f3amd_companion.serving.crowd import _open_array
+from f3amd_companion.serving.crowd import _open_rows
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import load_packed, pack, save_packed
 from f3amd_lib.data.sources import open_dataset
@@ -276,11 +276,11 @@ def test_a_manifest_nested_deeper_than_python_reads_is_refused_by_name(tmp_path)
 
 def test_an_array_of_a_crowd_with_a_damaged_head_is_refused_by_name(tmp_path):
     """numpy hands the head to Python's tokenizer, whose errors are of a kind of their own."""
-    path = tmp_path / "root.npy"
+    path = tmp_path / "crowd.npy"
     np.save(path, np.zeros((3, 40, 3), "<f4"))
     path.write_bytes(path.read_bytes().replace(b"(3, 40, 3), }", b"(3, 40, 3)(  "))
     settings = {"num_characters": 3, "num_frames": 40, "joints": ["a"]}
-    refused(r"root\.npy: is not a whole array", _open_array, tmp_path, "root", settings)
+    refused(r"crowd\.npy: is not a whole array", _open_rows, tmp_path, settings)
 
 
 # ------------------------------------------------------------------------- CAMDM's own orientation

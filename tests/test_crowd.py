@@ -21,7 +21,7 @@ from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.rollout.rollout import MotionGenerator
 
 FRAMES = WINDOW + 3
-FILES = ("root.npy", "rotations.npy", "path.npy", "styles.npy", "crowd.json")
+FILES = ("crowd.json", "crowd.npy")
 
 
 @pytest.fixture(scope="module")
@@ -285,14 +285,6 @@ def test_memory_does_not_grow_with_the_crowd(still, tmp_path):
     assert large < small + one_chunk
 
 
-def test_the_default_chunk_shrinks_with_the_length():
-    assert crowds.default_chunk(32, 129) == crowds.default_chunk(900, 129)
-    for num_frames in (20_000, 200_000, 2_000_000):
-        chunk = crowds.default_chunk(num_frames, 129)
-        assert chunk * num_frames * 129 * 4 <= 2**28 or chunk == 1
-        assert (chunk + 1) * num_frames * 129 * 4 > 2**28
-
-
 # --- files -------------------------------------------------------------------------------------
 
 
@@ -300,7 +292,8 @@ def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
     crowd = generate_crowd(generator, 5, FRAMES, tmp_path / "new" / "crowd", chunk=4, seed=3)
     folder = tmp_path / "new" / "crowd"
     assert sorted(item.name for item in folder.iterdir()) == sorted(FILES)
-    root, rotations, path, styles = (np.load(folder / name) for name in FILES[:4])
+    rows = np.load(folder / "crowd.npy")
+    root, rotations, path, styles = (rows[name] for name in rows.dtype.names)
     joints = SKELETON.num_joints
     assert (root.shape, root.dtype) == ((5, FRAMES, 3), np.float32)
     assert (rotations.shape, rotations.dtype) == ((5, FRAMES, joints, 6), np.float16)
@@ -332,28 +325,29 @@ def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
     np.testing.assert_array_equal(crowd.target(3).position, path[3, :, :2])
 
 
-@pytest.mark.parametrize("writes", [0, 1, 4, 5, 6, 7, 11])
+@pytest.mark.parametrize("writes", [0, 1, 2])
 def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(generator, eleven, tmp_path, monkeypatch, writes):
-    write, left = crowds._write_rows, [writes]
+    opened, left = crowds._open_rows, [writes]
 
-    def stop(out, name, settings, first, values):
-        left[0] -= 1
-        if left[0] < 0:
-            write(out, name, settings, first, values[: len(values) // 2])
+    def stop(out, settings, mode="r"):
+        rows = opened(out, settings, mode)
+        left[0] -= mode == "r+"
+        if left[0] < 0:  # half of a chunk is there already
+            rows["root"][4 * writes : 4 * writes + 2] = 7.0
+            rows.flush()
             raise KeyboardInterrupt
-        write(out, name, settings, first, values)
+        return rows
 
     call = functools.partial(generate_crowd, generator, 11, FRAMES, tmp_path, chunk=4)
     with monkeypatch.context() as patched:
-        patched.setattr(crowds, "_write_rows", stop)
+        patched.setattr(crowds, "_open_rows", stop)
         with pytest.raises(KeyboardInterrupt):
             call()
-    refused(f"only {writes // 4 * 4} of 11 characters", read_crowd, tmp_path)
+    refused(f"only {writes * 4} of 11 characters", read_crowd, tmp_path)
     made, make = [], crowds.crowd_paths
     monkeypatch.setattr(crowds, "crowd_paths", lambda *given, **how: made.append(given[0]) or make(*given, **how))
     resumed = call()
-    # What was finished is not made again; the first paths are looked at, to be the same ones.
-    assert [part.start for part in made] == sorted({0, *range(writes // 4 * 4, 11, 4)})
+    assert [part.start for part in made] == list(range(writes * 4, 11, 4))  # what was finished is not made again
     close(resumed, eleven)
     folder = tmp_path.with_name(tmp_path.name + "-whole")
     generate_crowd(generator, 11, FRAMES, folder, chunk=4)
@@ -366,75 +360,22 @@ def test_a_finished_crowd_is_replaced_only_if_asked(still, tmp_path):
 
     call(9)
     before = content(tmp_path / "here")
-    refused("here: holds this crowd already, finished.*overwrite", call, 9)
-    refused("made with num_characters 9, not 6", call, 6)
-    assert len(call(9, finished_too=True)) == 9 and content(tmp_path / "here") == before
+    refused("made with another num_characters", call, 6)
+    assert len(call(9)) == 9 and content(tmp_path / "here") == before
     call(6, overwrite=True)
     generate_crowd(still, 6, 5, tmp_path / "fresh", chunk=4)
     assert content(tmp_path / "here") == content(tmp_path / "fresh")
 
 
-@pytest.mark.parametrize(
-    ("changed", "named"),
-    [
-        ({"seed": 1}, "seed 0, not 1"),
-        ({"num_frames": 6}, "num_frames 5, not 6"),
-        ({"chunk": 3}, "chunk 2, not 3"),
-        ({"styles": ["calm"]}, "styles_in_turn"),
-    ],
-)
-def test_a_stopped_run_does_not_go_on_with_other_settings(still, tmp_path, monkeypatch, changed, named):
+@pytest.mark.parametrize("changed", [{"seed": 1}, {"num_frames": 6}, {"chunk": 3}, {"styles_in_turn": ["calm"]}])
+def test_a_stopped_run_does_not_go_on_with_other_settings(still, tmp_path, changed):
     settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
-    stopped = stop_after(still, 1)
     with pytest.raises(KeyboardInterrupt):
-        generate_crowd(stopped, **settings)
-    before = content(tmp_path)
-    refused(f"{tmp_path}: holds a crowd made with {named}", generate_crowd, still, **settings | changed)
+        generate_crowd(stop_after(still, 1), **settings)
+    before, (named,) = content(tmp_path), changed
+    changed = {named.removesuffix("_in_turn"): changed[named]}
+    refused(f"{tmp_path}: holds a crowd made with another {named}", generate_crowd, still, **settings | changed)
     assert content(tmp_path) == before
-
-
-def along(direction):
-    """Paths straight on in a direction."""
-
-    def paths(characters, pace, num_frames, seed):
-        line = np.arange(num_frames)[:, None] / 30.0 * direction
-        start = np.array(characters)[:, None, None] * [1.0, 1.0]
-        return start + line, np.zeros((len(characters), num_frames))
-
-    return paths
-
-
-@pytest.mark.parametrize("stopped_after", [0, 1])
-@pytest.mark.parametrize("min_distance", [None, 0.5])
-def test_a_stopped_run_does_not_go_on_with_other_paths(still, tmp_path, monkeypatch, stopped_after, min_distance):
-    settings = {"num_characters": 6, "num_frames": 5, "out": tmp_path, "chunk": 2}
-    settings["min_distance"] = min_distance
-
-    def walk(generator, direction, **how):
-        monkeypatch.setattr(crowds, "crowd_paths", along(direction))
-        return generate_crowd(generator, **settings, **how)
-
-    with pytest.raises(KeyboardInterrupt):
-        walk(stop_after(still, stopped_after), [0.0, 1.0])
-    before = content(tmp_path)
-    refused(f"{tmp_path}: .* first character walks another path", walk, still, [1.0, 0.0])
-    assert content(tmp_path) == before
-    crowd = walk(still, [0.0, 1.0 + 1e-9])  # rounding is no path
-    np.testing.assert_array_equal(crowd.path[:, 0, 0], np.arange(6))
-    refused("holds this crowd already", walk, still, [1.0, 0.0])
-    crowd = walk(still, [1.0, 0.0], overwrite=True)
-    assert crowd.path[5, -1, 0] > 5.0
-
-
-def test_a_crowd_from_before_paths_were_told_apart_opens_and_goes_on(still, tmp_path):
-    call = functools.partial(generate_crowd, num_characters=4, num_frames=5, out=tmp_path, chunk=2)
-    with pytest.raises(KeyboardInterrupt):
-        call(stop_after(still, 1))
-    edit(tmp_path, drop="first_path")
-    assert len(call(still)) == 4
-    assert len(json.loads((tmp_path / "crowd.json").read_text())["first_path"]) == 12
-    edit(tmp_path, drop="first_path")
-    assert len(read_crowd(tmp_path)) == 4
 
 
 def stop_after(still, chunks):
@@ -453,11 +394,10 @@ def stop_after(still, chunks):
 def test_a_stopped_run_whose_files_were_cut_is_refused(still, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         generate_crowd(stop_after(still, 2), 6, 5, tmp_path, chunk=2)
-    path = tmp_path / "rotations.npy"
-    path.write_bytes(path.read_bytes()[:-1])
-    refused(r"rotations.npy: is not a whole array", generate_crowd, still, 6, 5, tmp_path, chunk=2)
-    path.unlink()
-    refused(r"rotations.npy: missing", generate_crowd, still, 6, 5, tmp_path, chunk=2)
+    cut(tmp_path / "crowd.npy")
+    refused(r"crowd.npy: is not a whole array", generate_crowd, still, 6, 5, tmp_path, chunk=2)
+    (tmp_path / "crowd.npy").unlink()
+    refused(r"crowd.npy: is not a whole array", generate_crowd, still, 6, 5, tmp_path, chunk=2)
     generate_crowd(still, 6, 5, tmp_path, chunk=2, overwrite=True)
     assert len(read_crowd(tmp_path)) == 6
 
@@ -465,11 +405,11 @@ def test_a_stopped_run_whose_files_were_cut_is_refused(still, tmp_path):
 def test_folders_with_other_things_are_left_alone(still, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     for overwrite in (False, True):
-        refused(r"holds other files \(thesis.txt\)", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
+        refused("holds something else", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
     (tmp_path / "crowd.json").write_text('{"format": "ours", "num_finished": 0}')
     for overwrite in (False, True):
-        refused(r"crowd.json: not written by this project", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
-    refused(r"thesis.txt: not a folder", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
+        refused(r"crowd.json: not written by this", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
+    refused("thesis.txt: holds something else", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
@@ -479,14 +419,13 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
     [
         (lambda folder: (folder / "crowd.json").unlink(), "holds no crowd"),
         (lambda folder: (folder / "crowd.json").write_text('{"format"'), r"crowd.json: "),
-        (lambda folder: (folder / "crowd.json").write_text("[]"), "not written by this project"),
-        (lambda folder: edit(folder, drop="offsets"), "crowd.json: offsets is missing"),
-        (lambda folder: edit(folder, num_finished=9), "says that 9 of 3 characters"),
-        (lambda folder: edit(folder, num_frames=6), r"root.npy: holds float32 \(3, 5, 3\)"),
-        (lambda folder: cut(folder / "root.npy"), r"root.npy: is not a whole array"),
-        (lambda folder: (folder / "styles.npy").write_bytes(b"\x93NUM"), r"styles.npy: "),
-        (lambda folder: (folder / "styles.npy").unlink(), r"styles.npy: missing"),
-        (lambda folder: np.save(folder / "rotations.npy", np.zeros((3, 5, 6, 6))), r"rotations.npy: holds float64"),
+        (lambda folder: (folder / "crowd.json").write_text("[]"), "not written by this"),
+        (lambda folder: edit(folder, drop="offsets"), "crowd.json: description lacks or garbles 'offsets'"),
+        (lambda folder: edit(folder, num_finished=9), "only 9 of 3 characters"),
+        (lambda folder: edit(folder, num_frames=6), "crowd.npy: is not a whole array .*not what crowd.json says"),
+        (lambda folder: cut(folder / "crowd.npy"), "crowd.npy: is not a whole array"),
+        (lambda folder: (folder / "crowd.npy").write_bytes(b"\x93NUM"), "crowd.npy: "),
+        (lambda folder: (folder / "crowd.npy").unlink(), "crowd.npy: is not a whole array"),
     ],
 )
 def test_damaged_and_foreign_crowds_are_refused(still, tmp_path, damage, message):
@@ -506,40 +445,14 @@ def cut(path):
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def test_too_small_a_disk_is_noticed_before_anything_is_written(still, tmp_path, monkeypatch):
-    row = 5 * (3 * 4 + SKELETON.num_joints * 6 * 2 + 3 * 4) + 4
-    asked = []
-
-    def disk(free):
-        def usage(path):
-            asked.append(path)
-            return SimpleNamespace(total=2 * free, used=free, free=free)
-
-        monkeypatch.setattr(crowds.shutil, "disk_usage", usage)
-
-    folder = tmp_path / "not" / "there"
-    disk(8 * row - 1)
-    refused(r"there: this crowd takes .* GB more, .* GB free", generate_crowd, still, 8, 5, folder)
-    assert asked == [folder.parent] and not folder.exists()  # beside it lay the lock
-    disk(8 * row)
-    generate_crowd(still, 8, 5, folder)
-    headers = 4 * 128
-    assert sum((folder / name).stat().st_size for name in FILES[:4]) == 8 * row + headers
-    # What a replaced crowd takes is there to be used again.
-    disk(0)
-    generate_crowd(still, 8, 5, folder, overwrite=True)
-    refused("GB more", generate_crowd, still, 10, 5, folder, overwrite=True)
-    assert len(read_crowd(folder)) == 8
-
-
 def test_all_room_is_taken_when_a_crowd_begins(still, tmp_path):
     # A disk that fills up halfway would kill a process that writes to mapped files.
     with pytest.raises(KeyboardInterrupt):
         generate_crowd(stop_after(still, 0), 400, 5, tmp_path, chunk=2)
-    begun = {name: (tmp_path / name).stat() for name in FILES[:4]}
-    assert all(512 * file.st_blocks >= file.st_size for file in begun.values())
+    begun = (tmp_path / "crowd.npy").stat()
+    assert 512 * begun.st_blocks >= begun.st_size
     generate_crowd(still, 400, 5, tmp_path, chunk=2)
-    assert {name: (tmp_path / name).stat().st_size for name in begun} == {k: v.st_size for k, v in begun.items()}
+    assert (tmp_path / "crowd.npy").stat().st_size == begun.st_size
 
 
 def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, tmp_path):
@@ -562,10 +475,10 @@ def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"num_characters": 0}, "num_characters must be a whole number of 1 or more, got 0"),
-        ({"num_characters": 2.5}, "num_characters .* got 2.5"),
-        ({"num_frames": 1}, "num_frames must be a whole number of 2 or more, got 1"),
-        ({"chunk": 0}, "chunk .* got 0"),
+        ({"num_characters": 0}, "a crowd has whole numbers of characters .* got 0, 5 and"),
+        ({"num_characters": 2.5}, "got 2.5"),
+        ({"num_frames": 1}, "got 3, 1 and"),
+        ({"chunk": 0}, "got 3, 5 and 0"),
         ({"seed": -1}, "seed .* got -1"),
         ({"styles": ["prowd"]}, "unknown style 'prowd'.*calm, proud"),
         ({"styles": "prowd"}, "unknown style 'prowd'; did you mean 'proud'"),
