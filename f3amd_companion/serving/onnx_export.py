@@ -27,6 +27,7 @@ What an autoencoder makes of a latent is not exported, nor is the text encoder: 
 import json
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -141,19 +142,18 @@ def _store_small(graph, weights: str) -> None:
     from onnx import TensorProto, helper, numpy_helper
 
     widening = []
-    for place, constant in enumerate(graph.initializer):
+    for constant in list(graph.initializer):
         value = numpy_helper.to_array(constant)
         if value.dtype != np.float32 or value.ndim < 2 or value.size < EIGHT_BITS_FROM:
             continue
         name, small = constant.name, f"{constant.name}_small"
         if weights == "float16":
-            graph.initializer[place].CopyFrom(numpy_helper.from_array(value.astype(np.float16), small))
+            constant.CopyFrom(numpy_helper.from_array(value.astype(np.float16), small))
             widening.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
             continue
         largest = np.abs(value).max(axis=-2, keepdims=True)
         scale = np.where(largest > 0, largest, 1.0).astype(np.float32) / np.float32(127)
-        rounded = np.clip(np.round(value / scale), -127, 127).astype(np.int8)
-        graph.initializer[place].CopyFrom(numpy_helper.from_array(rounded, small))
+        constant.CopyFrom(numpy_helper.from_array(np.rint(value / scale).astype(np.int8), small))
         graph.initializer.append(numpy_helper.from_array(scale, f"{name}_scale"))
         widening.append(helper.make_node("Cast", [small], [f"{name}_wide"], to=TensorProto.FLOAT))
         widening.append(helper.make_node("Mul", [f"{name}_wide", f"{name}_scale"], [name]))
@@ -181,18 +181,14 @@ class OnnxProgram:
 def seeded_inputs(config, batch: int) -> dict[str, np.ndarray]:
     """Return inputs to compare programs by, float32; of a mask the last quarter of each second sample is padding."""
     draw, shapes = np.random.default_rng(0), signature(config, batch).inputs
-    drawn = [name for name in shapes if name not in ("sigma", "style")]
-    inputs = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
-    inputs |= {name: draw.normal(size=shapes[name]).astype(np.float32) for name in drawn}
-    if "path" in inputs:
-        path = inputs["path"]
-        yaw = draw.uniform(-0.5, 0.5, path.shape[:2])
-        zero, one = np.zeros_like(yaw), np.ones_like(yaw)
-        path[..., 2:] = np.stack([np.cos(yaw), zero, -np.sin(yaw), zero, one, zero], axis=-1)
-        path[..., :2] = 0.03 * np.arange(1, config.window + 1)[None, :, None] * path[:, :1, :2]
+    inputs = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    for level in ("sigma", "time"):
+        if level in inputs:
+            inputs[level] = np.ones(batch, np.float32)
+    if "style" in inputs:
         inputs["style"] = np.eye(config.num_styles, dtype=np.float32)[np.arange(batch) % config.num_styles]
     if "mask" in inputs:
-        inputs["mask"][:] = 1
+        inputs["mask"] = np.ones(shapes["mask"], np.float32)
         inputs["mask"][1::2, -(shapes["mask"][1] // 4 or 1) :] = 0
     if "guidance" in inputs:
         inputs["guidance"] = np.linspace(5.0, 15.0, batch, dtype=np.float32)
@@ -213,14 +209,11 @@ def largest_difference(program: bytes, network, levels) -> float:
     state, level = list(run.input_shapes)[:2]
     fixed = run.input_shapes[level][0]
     inputs = seeded_inputs(network.config, fixed if isinstance(fixed, int) else 2)
-    noise, _, *given = inputs.values()
-    ask = lambda state, level: signature(network.config, len(noise)).ask(network, state, level, *given)
-    if level == "sigma":
-        ask = jax.jit(ask)
-    differences = []
+    ask, differences = jax.jit(partial(signature(network.config, 2).ask, network)), []
     for value in np.asarray(levels, np.float32):
-        asked = value * noise if level == "sigma" else noise, np.full(len(noise), value)
-        gap = np.abs(run(**inputs | dict(zip((state, level), asked, strict=True))) - np.asarray(ask(*asked)))
+        scale = value if level == "sigma" else np.float32(1)
+        asked = inputs | {state: scale * inputs[state], level: np.full_like(inputs[level], value)}
+        gap = np.abs(run(**asked) - np.asarray(ask(*asked.values())))
         differences.append((gap[inputs["mask"] > 0.5] if "mask" in inputs else gap).max())
     return float(max(differences))
 
@@ -259,24 +252,24 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
     """
     inputs, output, _ = signature(trained.config, "B")
     shapes = {name: {"shape": list(shape)} for name, shape in inputs.items()}
-    walks = isinstance(trained, TrainedModel)
+    walks, latent = isinstance(trained, TrainedModel), isinstance(trained, LatentModel)
+    record, counts = trained.record, sorted({1, num_steps})
     card = {
         "format": "f3amd-onnx-1" if walks else "f3amd-onnx-text-1",
         "model": trained.name,
-        "data": trained.record.get("dataset"),
-        "terms": trained.record.get("dataset_licence"),
-        "credit": trained.record.get("dataset_credit"),
+        "data": record.get("dataset"),
+        "terms": record.get("dataset_licence"),
+        "credit": record.get("dataset_credit"),
         "frames_per_second": 30 if walks else trained.fps,
         "inputs": shapes,
         "output": {output: next(iter(shapes.values()))},
     }
     skeleton = describe_skeleton(trained.skeleton) | {"offsets": np.asarray(trained.skeleton.offsets).tolist()}
-    counts, latent = sorted({1, num_steps}), isinstance(trained, LatentModel)
+    numbers = lambda scales, kind: {name: np.asarray(value, kind).tolist() for name, value in scales._asdict().items()}
     if walks:
-        scales = trained.normaliser._asdict()
         return card | {
             "about": ABOUT["walk"],
-            "normaliser": {name: np.asarray(value, np.float32).tolist() for name, value in scales.items()},
+            "normaliser": numbers(trained.normaliser, np.float32),
             "skeleton": skeleton,
             "styles": list(trained.styles),
             "sampler": trained.diffusion.sampler,
@@ -284,21 +277,20 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
         }
     if latent and trained.config.guidance_features:
         counts = [trained.training.get("num_phases", 1)]
-    decoded = latent or trained.codec.autoencoder is not None
-    explained = [*inputs, *([] if decoded else ["normaliser"])]
-    card |= {
+    told = {"decoder": None}
+    if latent or trained.codec.autoencoder is not None:
+        made = "motion is" if latent else "positions are"
+        told["decoder"] = f"the state is a latent: {made} what the model's autoencoder makes of it, not exported"
+    else:
+        told["normaliser"] = numbers(trained.codec.axes, float)
+    return card | {
         "predicts": trained.config.objective,
         "text_encoder": trained.text_encoder,
-        "about": {name: text for name, text in ABOUT["text"].items() if name in explained},
+        "about": {name: text for name, text in ABOUT["text"].items() if name in inputs or name in told},
         "skeleton": skeleton,
         "steps": {str(number): asked_at(trained, number) for number in counts},
+        **told,
     }
-    if decoded:
-        made = "motion is" if latent else "positions are"
-        told = f"the state is a latent: {made} what the model's autoencoder makes of it, not exported"
-        return card | {"decoder": told}
-    axes = {name: np.asarray(value, float).tolist() for name, value in trained.codec.axes._asdict().items()}
-    return card | {"decoder": None, "normaliser": axes}
 
 
 def export_onnx(
@@ -333,7 +325,6 @@ def export_onnx(
     program = denoiser_program(network, batch=batch, weights=weights)
     error = largest_difference(program, network, levels[:-1])
     card |= {"batch": batch or "any", "weights": weights, "bytes": len(program), "largest_error": error}
-    folder.mkdir(parents=True, exist_ok=True)
     files = {PROGRAM: program, CARD: (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode()}
     for path in EXAMPLES.glob("*.txt"):
         if walks:
