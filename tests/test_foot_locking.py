@@ -8,8 +8,20 @@ from builders import SKELETON as SHORT_LEGS
 from builders import refused, straight_motion
 from scipy.spatial.transform import Rotation
 
-from f3amd_companion.serving.foot_locking import DEEPEST, FARTHEST, leg_chains, lock_feet, lock_rollout, plan_contacts
-from f3amd_lib.data.features import world_frames
+from f3amd_companion.serving import foot_locking
+from f3amd_companion.serving.foot_locking import (
+    DEEPEST,
+    FARTHEST,
+    leg_chains,
+    lock_feet,
+    lock_frame,
+    lock_frames,
+    lock_rollout,
+    lock_rollout_online,
+    plan_contacts,
+    start_feet,
+)
+from f3amd_lib.data.features import motion_from_frames, world_frames
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.measures.walking import floor_penetration, slide_speed, stepping_rate, toe_positions
 from f3amd_lib.motion.root_paths import named_path
@@ -64,13 +76,6 @@ def toe_steps(motion: Motion) -> np.ndarray:
     """How far each toe moves over the ground in a frame, [T - 1, 2], metres."""
     toes = toe_positions(motion.positions, motion.skeleton)
     return np.linalg.norm(np.diff(toes, axis=0)[..., [0, 2]], axis=-1)
-
-
-def test_legs_are_found():
-    names = np.array(SYNTHETIC_SKELETON.names)[leg_chains(SYNTHETIC_SKELETON)]
-    assert names.tolist() == [
-        [f"{side}{part}" for part in ("Hip", "Knee", "Ankle", "Toe")] for side in ("Left", "Right")
-    ]
 
 
 @pytest.mark.parametrize("style", ["Neutral", "Crab", "Runner", "Tiptoe"])
@@ -198,10 +203,14 @@ def test_sunken_feet_come_up(walk):
     assert np.abs(lock_feet(sunken).positions - sunken.positions).mean() < 0.002
 
 
-def test_a_swing_is_lifted_over_the_floor_without_any_contact(walk):
+@pytest.fixture
+def no_contacts(monkeypatch):
+    monkeypatch.setattr(foot_locking, "plan_contacts", lambda positions, *_: np.zeros((len(positions), 2), bool))
+
+
+def test_a_swing_is_lifted_over_the_floor_without_any_contact(walk, no_contacts):
     dip = -0.04 * np.exp(-0.5 * ((np.arange(walk.num_frames) - 150) / 4.0) ** 2)
-    none = np.zeros((walk.num_frames, 2), bool)
-    locked = lock_feet(lifted(walk, dip), contacts=none, floor=FLOOR)
+    locked = lock_feet(lifted(walk, dip), floor=FLOOR)
     assert floor_penetration(locked.positions, walk.skeleton, FLOOR) < 0.05
     correction = locked.positions - lifted(walk, dip).positions
     assert np.linalg.norm(np.diff(correction, n=2, axis=0), axis=-1).max() < 0.012
@@ -209,17 +218,18 @@ def test_a_swing_is_lifted_over_the_floor_without_any_contact(walk):
     np.testing.assert_allclose(locked.positions[far], walk.positions[far], atol=1e-3)
 
 
-def test_without_contacts_nothing_changes(walk):
-    none = np.zeros((walk.num_frames, 2), bool)
-    locked = lock_feet(walk, contacts=none, floor=FLOOR - 0.01)
+def test_without_contacts_nothing_changes(walk, no_contacts):
+    locked = lock_feet(walk, floor=FLOOR - 0.01)
     np.testing.assert_allclose(locked.positions, walk.positions, atol=1e-9)
     np.testing.assert_allclose(locked.rotations, walk.rotations, atol=1e-9)
 
 
-def test_a_leg_that_cannot_reach_lets_go(walk):
+def test_a_leg_that_cannot_reach_lets_go(walk, monkeypatch):
     assert 0.0 < DEEPEST < 0.1
     high, contacts = lifted(walk, 0.12), plan_contacts(walk.positions, walk.skeleton)
-    locked = lock_feet(high, contacts, floor=FLOOR)
+    with monkeypatch.context() as patch:
+        patch.setattr(foot_locking, "plan_contacts", lambda *_: contacts)
+        locked = lock_feet(high, floor=FLOOR)
     np.testing.assert_allclose(bone_lengths(locked), bone_lengths(high), atol=1e-9)
     assert (high.root_position - locked.root_position).max() <= DEEPEST
     height = toe_positions(locked.positions, walk.skeleton)[..., 1]
@@ -270,9 +280,6 @@ def test_bad_input_is_refused(walk):
     positions[7, 3, 1] = np.nan
     refused("frame 7", plan_contacts, positions, walk.skeleton)
     refused(r"\[frame, 23, 3\]", plan_contacts, walk.positions[:, :-1], walk.skeleton)
-    refused("floor", lock_feet, walk, floor=np.nan)
-    refused("floor", plan_contacts, walk.positions, walk.skeleton, floor=np.inf)
-    refused("contacts", lock_feet, walk, contacts=np.zeros((walk.num_frames, 3), bool))
     refused("hip, knee, ankle, toe", lock_feet, straight_motion(20))
     refused("left_toe", leg_chains, Skeleton(("Hips", "LeftHip", "RightHip"), (-1, 0, 0), np.ones((3, 3))))
     assert SHORT_LEGS.toes  # known, yet too near to the hips
@@ -295,7 +302,7 @@ def test_all_characters_of_a_rollout_are_locked(walk):
     sinks = np.interp(np.arange(walk.num_frames), [40, 80], [0.0, -0.05])
     rollout = rollout_of(sliding(walk, 0.2), lifted(walk, sinks))
     locked = lock_rollout(rollout)
-    assert locked.frames.dtype == np.float32 and locked.frames.shape == rollout.frames.shape
+    assert locked.feet_locked and locked.frames.dtype == np.float32 and locked.frames.shape == rollout.frames.shape
     np.testing.assert_array_equal(locked.history, rollout.history)
     skeleton = rollout.skeleton
     assert slide_speed(rollout.motion(0).positions, skeleton) > 19.0
@@ -307,15 +314,134 @@ def test_all_characters_of_a_rollout_are_locked(walk):
     # Told of a floor 5 cm lower, the second one stays as it was.
     told = lock_feet(rollout.motion(1, with_history=True), floor=FLOOR - 0.05)
     assert floor_penetration(told.positions, skeleton, FLOOR) > 4.9
-
-
-def test_a_rollout_says_that_its_feet_are_locked(walk):
-    @dataclasses.dataclass(frozen=True)
-    class Marked(Rollout):
-        feet_locked: bool = False
-
-    rollout = rollout_of(walk)
-    fields = {field.name: getattr(rollout, field.name) for field in dataclasses.fields(Rollout)}
-    locked = lock_rollout(Marked(**{**fields, "feet_locked": False}))
-    assert locked.feet_locked is True
     refused("already", lock_rollout, locked)
+
+
+# --- frame by frame: nothing looks ahead --------------------------------------------------------
+
+PAST = 10
+
+
+def drifting(style: str, speed: float) -> np.ndarray:
+    """World frames of a walker of 8 s whose feet slide sideways, metres a second."""
+    return world_frames(sliding(synthesize(style, 8), speed))
+
+
+def held(frames, **options) -> np.ndarray:
+    feet = start_feet(SYNTHETIC_SKELETON, frames[:PAST])
+    return lock_frames(SYNTHETIC_SKELETON, feet, frames[PAST:], **options)[1]
+
+
+def motion_of(frames):
+    return motion_from_frames(SYNTHETIC_SKELETON, frames)
+
+
+def slide(frames) -> float:
+    return float(slide_speed(motion_of(frames).positions, SYNTHETIC_SKELETON))
+
+
+def toe_kicks(frames) -> np.ndarray:
+    """Largest acceleration of each toe, metres a frame squared."""
+    toes = toe_positions(motion_of(frames).positions, SYNTHETIC_SKELETON)
+    return np.linalg.norm(np.diff(toes, 2, axis=0), axis=-1).max(axis=0)
+
+
+@pytest.fixture(scope="module", params=["Neutral", "Old"])
+def drifted(request):
+    frames = drifting(request.param, 0.25)
+    return frames[PAST:], held(frames)
+
+
+def test_a_slide_is_cured_frame_by_frame(drifted):
+    raw, locked = drifted
+    assert slide(raw) > 18.0  # cm/s: the drift
+    assert slide(locked) < 2.0
+
+
+def test_a_clean_walk_hardly_changes():
+    """A toe that lifts is let go a frame or two late, which who looks ahead would not do."""
+    frames = drifting("Neutral", 0.0)
+    apart = motion_of(held(frames)).positions - motion_of(frames[PAST:]).positions
+    assert np.linalg.norm(apart, axis=-1).max() < 0.1
+    assert np.linalg.norm(apart, axis=-1).mean() < 0.005
+
+
+def test_without_locking_nothing_changes_frame_by_frame(drifted):
+    raw, _ = drifted
+    np.testing.assert_allclose(held(np.concatenate([raw[:PAST], raw]), locking=False), raw, atol=1e-6)
+
+
+def test_nothing_pops_frame_by_frame(drifted, monkeypatch):
+    """A toe is torn a little harder than in the walk itself, and far less than where it goes over at once."""
+    raw, locked = drifted
+    assert (toe_kicks(locked) < 3.0 * toe_kicks(raw)).all()
+    monkeypatch.setattr(foot_locking, "RUN_OUT", 1e3)
+    monkeypatch.setattr(foot_locking, "LET_GO", 1e3)
+    at_once = held(np.concatenate([raw[:PAST], raw]))
+    assert (toe_kicks(at_once) > 4.0 * toe_kicks(raw)).all()
+
+
+def test_the_switch_goes_over_smoothly():
+    frames = drifting("Neutral", 0.25)
+    feet, first = lock_frames(SYNTHETIC_SKELETON, start_feet(SYNTHETIC_SKELETON, frames[:PAST]), frames[PAST:110])
+    assert feet.carries.any()
+    _, second = lock_frames(SYNTHETIC_SKELETON, feet, frames[110:], locking=False)
+    both = np.concatenate([first, second])
+    assert (toe_kicks(both[80:140]) < 3.0 * toe_kicks(frames[PAST:])).all()
+    np.testing.assert_allclose(motion_of(second[60:]).positions, motion_of(frames[170:]).positions, atol=1e-3)
+
+
+def test_no_frame_hears_of_a_later_one():
+    frames = drifting("Neutral", 0.25)
+    other = frames.copy()
+    other[120:, :3] += 0.3
+    np.testing.assert_array_equal(held(frames)[: 120 - PAST], held(other)[: 120 - PAST])
+    assert np.abs(held(frames) - held(other))[120 - PAST :].max() > 0.1
+
+
+def test_only_legs_turn_bones_and_root_stay_and_feet_keep_their_orientation(drifted):
+    raw, locked = drifted
+    legs = leg_chains(SYNTHETIC_SKELETON)[:, :3].ravel()
+    others = [joint for joint in range(SYNTHETIC_SKELETON.num_joints) if joint not in legs]
+    before, after = motion_of(raw), motion_of(locked)
+    np.testing.assert_allclose(after.rotations[:, others], before.rotations[:, others], atol=1e-9)
+    np.testing.assert_array_equal(locked[:, :3], raw[:, :3])
+    turned = [global_rotations(SYNTHETIC_SKELETON, motion.rotations)[:, legs[2::3]] for motion in (before, after)]
+    np.testing.assert_allclose(*turned, atol=1e-6)
+    assert np.abs(after.rotations[:, legs] - before.rotations[:, legs]).max() > 0.05
+
+
+def test_a_foot_lets_go_where_its_point_is_too_far():
+    frames = drifting("Neutral", 2.5)  # nobody stands where the ground runs away
+    locked = held(frames)
+    toes = [toe_positions(motion_of(one).positions, SYNTHETIC_SKELETON) for one in (frames[PAST:], locked)]
+    assert np.linalg.norm(toes[0] - toes[1], axis=-1).max() < FARTHEST + 0.2
+
+
+def test_bad_input_is_refused_frame_by_frame():
+    frames = drifting("Neutral", 0.0)
+    refused("leg must be hip, knee, ankle, toe", start_feet, SHORT_LEGS, frames[:PAST])
+    refused("history must be", start_feet, SYNTHETIC_SKELETON, frames[:PAST, :-1])
+    frames[3, 0] = np.nan
+    refused("not finite at frame 3", start_feet, SYNTHETIC_SKELETON, frames[:PAST])
+
+
+def test_the_state_of_before_is_left_alone():
+    frames = drifting("Neutral", 0.25)
+    feet = start_feet(SYNTHETIC_SKELETON, frames[:PAST])
+    copy = [np.copy(value) for value in feet]
+    one = lock_frame(SYNTHETIC_SKELETON, feet, frames[PAST])[1]
+    for value, before in zip(feet, copy, strict=True):
+        np.testing.assert_array_equal(value, before)
+    np.testing.assert_array_equal(lock_frame(SYNTHETIC_SKELETON, feet, frames[PAST])[1], one)
+
+
+def test_a_rollout_is_settled_character_by_character_from_its_own_history():
+    made = rollout_of(*(sliding(synthesize(style, 2), 0.25) for style in ("Neutral", "Old")), past=PAST)
+    locked = lock_rollout_online(made)
+    for one, wanted in zip(locked.frames, np.concatenate([made.history, made.frames], axis=1), strict=True):
+        np.testing.assert_array_equal(one, held(wanted).astype(np.float32))
+    assert locked.feet_locked and not np.array_equal(locked.frames, made.frames)
+    swapped = dataclasses.replace(made, history=made.history[::-1])
+    assert not np.array_equal(lock_rollout_online(swapped).frames, locked.frames)
+    refused("locked already", lock_rollout_online, locked)

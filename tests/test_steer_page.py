@@ -18,8 +18,7 @@ from builders import refused
 from steering_oracle import Steering, Target, first_pose, move_target
 
 from f3amd_companion.serving import steer
-from f3amd_companion.serving.foot_locking import leg_chains
-from f3amd_companion.serving.online_feet import lock_frame, start_feet
+from f3amd_companion.serving.foot_locking import leg_chains, lock_frame, start_feet
 from f3amd_companion.serving.onnx_export import model_card
 from f3amd_companion.serving.steer import package_file, steer_page, write_steer
 from f3amd_companion.serving.web_page import FOLDER

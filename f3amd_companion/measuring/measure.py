@@ -35,8 +35,7 @@ from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.recipes import RECIPE_STEPS, RECIPES, train_recipe
 from f3amd_companion.measuring.runner import Records
-from f3amd_companion.serving.foot_locking import lock_rollout
-from f3amd_companion.serving.online_feet import lock_rollout_online
+from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
