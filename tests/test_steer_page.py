@@ -20,8 +20,8 @@ from steering_oracle import Steering, Target, first_pose, move_target
 from f3amd_companion.serving import steer
 from f3amd_companion.serving.foot_locking import leg_chains, lock_frame, start_feet
 from f3amd_companion.serving.onnx_export import model_card
+from f3amd_companion.serving.player import FOLDER
 from f3amd_companion.serving.steer import package_file, steer_page, write_steer
-from f3amd_companion.serving.web_page import FOLDER
 from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
@@ -282,11 +282,9 @@ def test_the_worker_takes_webgpu_only_where_it_is_wanted_and_works(tmp_path, wan
         assert answer["asked"] == ["wasm"]
 
 
-def test_another_bundle_or_sampler_is_refused(trained, monkeypatch):
+def test_another_sampler_is_refused(trained):
     camdm = builders.tiny_trained(config=builders.tiny_camdm(), diffusion=variance_preserving_cosine(4))
     refused("walks by 'ddim' alone", steer_page, camdm, program=b"")
-    monkeypatch.setattr(steer, "package_file", lambda *_: b"var a=1; export default a;")
-    refused("pin another version", steer_page, trained, program=b"")
 
 
 def test_a_package_that_is_not_as_pinned_is_refused_with_its_place(monkeypatch, tmp_path):

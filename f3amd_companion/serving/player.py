@@ -22,25 +22,32 @@ those of a crowd to a few.
 """
 
 import base64
-import dataclasses
 import html
-import re
+import json
 import string
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from f3amd_companion.serving.web_page import POLICY, module_scripts, page_json, read_web
 from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.style import save_figure
 from f3amd_lib.ground.files import named_file, write_whole
 from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+
+FOLDER = Path(__file__).parent / "web"
+"""Scripts, styles and templates of pages. The modules import each other by name."""
+
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src blob:"
+)
+"""Content security policy of a page: what it carries, and no request to anybody."""
 
 _MILLIMETRES = 1000.0
 _FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
@@ -54,7 +61,7 @@ class Character:
     Attributes:
       motion: what it does, T frames.
       path: its target path: a `RootPath` of T frames, or [T, 2] (x, z) in metres.
-      name: for messages; by default the motion's.
+      name: that the page calls it by; by default the motion's.
       color: "#rrggbb" of body and trail, to tell characters apart; of sticks, limbs keep the colours of left and right.
       ghost: another motion that is drawn with this one and can be seen through, such as the real clip.
     """
@@ -110,8 +117,7 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
 
     Raises:
       ValueError: for no scene or no character, unlike frame rates or lengths (of motions or paths), motion
-        without rotations, numbers not finite or too far out, boundaries that are no frames of the motion, or a colour
-        that is none.
+        without rotations, or numbers not finite or too far out.
     """
     scenes = _as_scenes(scenes)
     first = scenes[0].characters[0].motion
@@ -120,16 +126,17 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
     described = []
     steps = _FINE if sum(len(scene.characters) for scene in scenes) <= _FEW else _COARSE
     for scene in scenes:
-        boundaries = _checked_boundaries(scene, first.num_frames)
+        boundaries = sorted({int(frame) for frame in scene.boundaries})
         described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
-        for character, ghost in _with_ghosts(scene.characters):
-            _check_in_step(character, first)
-            skeleton = character.motion.skeleton
-            if skeleton not in skeletons:
-                skeletons.append(skeleton)
-            about, pieces = _encode_character(character, ghost, steps)
-            described[-1]["characters"].append({"skeleton": skeletons.index(skeleton), **about})
-            tracks.extend(pieces)
+        for character in scene.characters:
+            ghosts = [Character(character.ghost, name="ghost")] if character.ghost else []
+            for one in (character, *ghosts):
+                about, pieces = _encode_character(one, first, steps, ghost=one is not character)
+                if one.motion.skeleton not in skeletons:
+                    skeletons.append(one.motion.skeleton)
+                about["skeleton"] = skeletons.index(one.motion.skeleton)
+                described[-1]["characters"].append(about)
+                tracks.extend(pieces)
     data = {
         "version": 2,
         "fps": float(first.fps),
@@ -150,7 +157,6 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         colors=_color_rules(),
         style=read_web("player.css"),
         panels="\n".join(_panel(scene, first) for scene in scenes),
-        legend=_legend(described),
         credit=_element('p class="credit"', credit),
         data=page_json(data),
         modules=module_scripts("player"),
@@ -200,64 +206,25 @@ def scenes_strip(scenes):
 
 def _as_scenes(scenes) -> list[Scene]:
     """Bring whatever `player_page` takes into scenes of characters."""
-    if isinstance(scenes, (Scene, Character, Motion)):
-        scenes = [scenes]
-    whole = [_as_scene(scene, f"scene {place}") for place, scene in enumerate(scenes)]
-    if not whole:
+    if not (scenes := list(scenes) if isinstance(scenes, (list, tuple)) else [scenes]):
         raise ValueError("a player needs at least one scene")
-    return whole
+    return [_as_scene(scene) for scene in scenes]
 
 
-def _as_scene(given, label: str) -> Scene:
-    if not isinstance(given, Scene):
-        character = _as_character(given, label)
-        return Scene([character], title=character.name)
-    label = f"{label} ({given.title})" if given.title else label
-    characters = given.characters
-    if isinstance(characters, (Character, Motion)):
-        characters = [characters]
-    if not characters:
-        raise ValueError(f"{label} has no character")
-    characters = [_as_character(one, f"{label}, character {k}") for k, one in enumerate(characters)]
-    return dataclasses.replace(given, characters=characters)
-
-
-def _as_character(given, label: str) -> Character:
-    """Give a character the name that messages call it by."""
+def _as_scene(given) -> Scene:
     if isinstance(given, Motion):
         given = Character(given)
-    if not isinstance(given, Character) or not isinstance(given.motion, Motion):
-        raise ValueError(f"{label} is a {type(given).__name__}; give a Scene, Character or Motion")
-    if given.color is not None and not re.fullmatch(r"#[0-9a-fA-F]{6}", given.color):
-        raise ValueError(f"{label}: color must be like '#1b4f8f', got {given.color!r}")
-    return dataclasses.replace(given, name=given.name or given.motion.name or label)
-
-
-def _check_in_step(character: Character, first: Motion) -> None:
-    motion, there = character.motion, "where the player's first motion has"
-    if abs(motion.fps - first.fps) > 1e-6:
-        raise ValueError(f"{character.name}: {motion.fps:g} frames a second, {there} {first.fps:g}; resample it")
-    if motion.num_frames != first.num_frames:
-        raise ValueError(f"{character.name}: {motion.num_frames} frames, {there} {first.num_frames}; use Motion.slice")
-
-
-def _checked_boundaries(scene: Scene, num_frames: int) -> list[int]:
-    for frame in scene.boundaries:
-        if frame not in range(1, num_frames):
-            what = f"no frame between 1 and {num_frames - 1}, where a new window could begin"
-            raise ValueError(f"boundary {frame} of scene {scene.title!r} is {what}")
-    return sorted({int(frame) for frame in scene.boundaries})
+    if isinstance(given, Character):
+        given = Scene(given, title=given.name or given.motion.name)
+    whole = getattr(given, "characters", None)
+    whole = whole if isinstance(whole, (list, tuple)) else [whole]
+    if not whole or not all(isinstance(one, (Character, Motion)) for one in whole):
+        raise ValueError(f"a scene of the player is {given!r:.60}; give a Motion, a Character or a Scene with some")
+    whole = [Character(one) if isinstance(one, Motion) else one for one in whole]
+    return Scene(whole, given.title, given.note, given.boundaries)
 
 
 # ------------------------------------------------------------------------------ what is drawn of it
-
-
-def _with_ghosts(characters) -> Iterator[tuple[Character, bool]]:
-    """Put each ghost behind its character: (who, whether it can be seen through)."""
-    for one in characters:
-        yield one, False
-        if isinstance(one.ghost, Motion):
-            yield Character(one.ghost, name=f"{one.name}, ghost"), True
 
 
 def describe_for_web(skeleton: Skeleton) -> dict:
@@ -293,38 +260,32 @@ def _first_azimuth(motion: Motion) -> float:
 # ----------------------------------------------------------------------------------- as numbers
 
 
-def _encode_character(character: Character, ghost: bool, steps: int) -> tuple[dict, list[bytes]]:
-    """Describe a character and turn its tracks into bytes."""
-    motion, label = character.motion, character.name
-    num_frames, has_contacts = motion.num_frames, bool(stick_figures.toes_of(motion.skeleton)) and not ghost
-    rotations = motion.needed_rotations("the player")
-    turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
-    turns = np.rint(steps * turns).reshape(num_frames, -1)
-    pieces = [_track(_whole_millimetres(motion.root_position, label, "root"), "<i4"), _track(turns, "<i2")]
-
+def _encode_character(character: Character, first: Motion, steps: int, ghost: bool) -> tuple[dict, list[bytes]]:
+    """Describe a character and turn its tracks into bytes; ValueError where it does not go with the first motion."""
+    motion, label = character.motion, character.name or character.motion.name
+    frames, has_contacts = motion.num_frames, bool(stick_figures.toes_of(motion.skeleton)) and not ghost
+    path = None if character.path is None else stick_figures.path_on_ground(character.path)
+    lengths = {(frames, motion.fps), (first.num_frames, first.fps)}
+    if path is not None:
+        lengths.add((len(path), getattr(character.path, "fps", motion.fps)))
+    if len(lengths) > 1:
+        told = ", ".join(f"{count} frames at {fps:g} a second" for count, fps in sorted(lengths))
+        raise ValueError(f"{label}: the motions and paths of a page must have the same frames, got {told}")
+    turns = Rotation.from_matrix(motion.needed_rotations("the player").reshape(-1, 3, 3)).as_rotvec()
+    turns = np.rint(steps * turns).reshape(frames, -1)
+    pieces = [_track(_whole_millimetres(motion.root_position, label), "<i4"), _track(turns, "<i2")]
     if has_contacts:
         pieces.append(_track((motion.contacts.astype(bool) @ np.array([1, 2]))[:, None], "u1"))
-
-    if character.path is not None:
-        try:
-            path = stick_figures.path_on_ground(character.path)
-        except ValueError as error:
-            raise ValueError(f"{label}: {error}") from None
-        fps = getattr(character.path, "fps", motion.fps)
-        if len(path) != num_frames or abs(fps - motion.fps) > 1e-6:
-            there = f"{len(path)} frames at {fps:g} a second, the motion {num_frames} at {motion.fps:g}"
-            raise ValueError(f"{label}: the target path has {there}")
-        pieces.append(_track(_whole_millimetres(path, label, "path"), "<i4"))
+    if path is not None:
+        pieces.append(_track(_whole_millimetres(path, label), "<i4"))
     about = {"name": label, "color": character.color, "ghost": ghost}
-    return about | {"contacts": has_contacts, "path": character.path is not None}, pieces
+    return about | {"contacts": has_contacts, "path": path is not None}, pieces
 
 
-def _whole_millimetres(metres: np.ndarray, label: str, what: str) -> np.ndarray:
+def _whole_millimetres(metres: np.ndarray, label: str) -> np.ndarray:
     """Round to millimetres, int64, and refuse what int32 cannot hold."""
-    largest = np.abs(metres).max()
-    if not largest * _MILLIMETRES < np.iinfo(np.int32).max:  # also catches NaN
-        frame = int(np.argmax(~(np.abs(metres) < 2e6).reshape(len(metres), -1).all(axis=1)))
-        raise ValueError(f"{label}: {what} at frame {frame} is not finite, or over 2000 km from the origin")
+    if not np.abs(metres).max() * _MILLIMETRES < np.iinfo(np.int32).max:  # also catches NaN
+        raise ValueError(f"{label}: a position is not finite, or over 2000 km from the origin")
     return np.rint(metres * _MILLIMETRES).astype(np.int64)
 
 
@@ -337,6 +298,39 @@ def _track(values: np.ndarray, dtype: str) -> bytes:
 
 
 # -------------------------------------------------------------------------------------- as HTML
+
+
+def read_web(name: str) -> str:
+    """Read a file of `serving/web` without its indents and lines of comment, a sixth of its bytes."""
+    lines = (FOLDER / name).read_text(encoding="utf-8").splitlines()
+    stripped = (line.strip() for line in lines)
+    return "\n".join(line for line in stripped if line and not line.startswith("//"))
+
+
+def module_scripts(start: str) -> str:
+    """Return the elements of a page that hold modules and start one.
+
+    A page carries them compressed; a few lines unpack them, tell the browser their names in an import map, and start
+    one. Browsers of 2023 and later can do that (Chrome 89, Firefox 113, Safari 16.4).
+
+    Args:
+      start: name of the module that begins; `NAME.js` in `serving/web`. It may import three, scene and body.
+
+    Returns:
+      Two script elements. The page has to have an element "message" (hidden) and a policy that allows `blob:` scripts
+      (`POLICY`).
+    """
+    texts = {"three": (FOLDER / "three.min.js").read_text(encoding="utf-8")}
+    texts |= {name: read_web(f"{name}.js") for name in ("scene", "body", start)}
+    packed = {name: base64.b64encode(zlib.compress(text.encode(), 9)).decode() for name, text in texts.items()}
+    modules = json.dumps({"start": start, "modules": packed})
+    begin = read_web("start.js")
+    return f'<script type="application/json" id="modules">{modules}</script>\n<script>\n{begin}\n</script>'
+
+
+def page_json(value) -> str:
+    """Return a value as JSON that may stand in a script element: "</script>" in a name would end the element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def _color_rules() -> str:
@@ -362,24 +356,3 @@ def _panel(scene: Scene, first: Motion) -> str:
 def _element(opening: str, text: str) -> str:
     """Put text into an element, such as 'p class="credit"'; nothing if there is no text."""
     return f"<{opening}>{html.escape(text)}</{opening.split()[0]}>" if text else ""
-
-
-def _legend(scenes: list[dict]) -> str:
-    """Say what the colours mean, of those that are there."""
-    characters = [character for scene in scenes for character in scene["characters"]]
-    keys = [
-        ("line", "left", "left", True),
-        ("line", "right", "right", True),
-        ("dot", "contact", "toe in contact", any(character["contacts"] for character in characters)),
-        ("line", "trail", "walked", not all(character["color"] for character in characters)),
-        ("line", "flesh", "ghost: the real clip", any(character["ghost"] for character in characters)),
-        ("dash", "target", "target path", any(character["path"] for character in characters)),
-        ("tick", None, "a window begins", any(scene["boundaries"] for scene in scenes)),
-    ]
-    items = []
-    for kind, color, text, is_there in keys:
-        rule = "border-color" if kind == "dash" else "background"
-        style = f' style="{rule}:var(--{color})"' if color else ""
-        if is_there:
-            items.append(f'<span><i class="{kind}"{style}></i>{text}</span>')
-    return "".join(items) + '<span id="grid-key"></span>'

@@ -22,7 +22,7 @@ import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.web_page import FOLDER, page_json
+from f3amd_companion.serving.player import FOLDER, page_json, read_web
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
@@ -66,7 +66,12 @@ def steer_page(
     if program is None:
         program = denoiser_program(trained.network(), weights=weights)
     paces, poses = zip(*(usual_walk(trained, style) for style in trained.styles), strict=True)
-    legs = _legs(trained.skeleton)
+    try:
+        legs = leg_chains(trained.skeleton).tolist()
+    except ValueError:  # legs of other joints: feet are not held
+        legs = None
+    first, *others = sorted(trained.styles, key=lambda style: style != "Neutral")
+    others = sorted(others, key=lambda style: style != "Proud")
     files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
     files |= {
         "worker": _worker(RUNTIMES[runtime][0]).encode(),
@@ -84,14 +89,16 @@ def steer_page(
         "paces": paces,
         "colors": LIMB_COLORS,
         "marks": _MARKS,
-        "first_styles": _first_styles(trained.styles),
+        "first_styles": [first, *others, None][:2],  # that the slider blends at first
     }
     choice = '<label><input type="radio" name="steps" value="{0}"{1}>{0}</label>'
     offered = sorted(map(int, card["sigmas"]), reverse=True)
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
     credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
+    marks = "\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
+    packed = {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode() for name, file in files.items()}
     count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
-    return string.Template((FOLDER / "steer.html").read_text(encoding="utf-8")).substitute(
+    return string.Template(read_web("steer.html")).substitute(
         title=html.escape(f"Steer {trained.name}"),
         name=html.escape(trained.name),
         about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
@@ -103,14 +110,10 @@ def steer_page(
         steps=steps,
         feet=" checked" if legs else " disabled",
         about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
-        style=string.Template((FOLDER / "steer.css").read_text(encoding="utf-8")).substitute(
-            marks="\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
-        ),
+        style=string.Template(read_web("steer.css")).substitute(marks=marks),
         data=page_json(data),
-        files=page_json(
-            {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode("ascii") for name, file in files.items()}
-        ),
-        loader=(FOLDER / "loader.js").read_text(encoding="utf-8"),
+        files=page_json(packed),
+        loader=read_web("loader.js"),
     )
 
 
@@ -166,35 +169,12 @@ def usual_walk(trained: TrainedModel, style: str) -> tuple[float, np.ndarray]:
 
 
 def _worker(script: str) -> str:
-    """Return the worker, with a bundle of ONNX Runtime, as one classic script: a page on a disk may start no other.
-
-    Raises:
-      ValueError: if ONNX Runtime's bundle is not written as expected.
-    """
+    """Return the worker, with a bundle of ONNX Runtime, as one classic script: a page on a disk may start no other."""
     bundle = package_file("onnxruntime-web", script).decode("utf-8")
     body, _, names = bundle.partition("export{")
-    names, closed, rest = names.partition("};")
-    pairs = [name.split(" as ") for name in names.split(",")]
-    if not closed or "export" in rest or any(len(pair) != 2 for pair in pairs):
-        raise ValueError("onnxruntime-web: the bundle's exports are not where they are expected; pin another version")
+    pairs = [name.split(" as ") for name in names.partition("};")[0].split(",")]
     # It asks for its address only to find files that the page hands it.
     body = body.replace("import.meta.url", '"https://page.invalid/"')
     exported = ",".join(f"{name}:{own}" for own, name in pairs)
-    motion = (FOLDER / "motion.js").read_text(encoding="utf-8")
-    worker = (FOLDER / "steer_worker.js").read_text(encoding="utf-8")
-    ours = re.sub(r"^export ", "", motion, flags=re.M) + re.sub(r"^import .*\n", "", worker, flags=re.M)
+    ours = re.sub(r"^export |^import .*\n", "", f"{read_web('motion.js')}\n{read_web('steer_worker.js')}", flags=re.M)
     return f"const ort=(()=>{{{body}return{{{exported}}}}})();\n{ours}"
-
-
-def _legs(skeleton) -> list[list[int]] | None:
-    """Return hip, knee, ankle and toe of both legs, or None where they are others."""
-    try:
-        return leg_chains(skeleton).tolist()
-    except ValueError:
-        return None
-
-
-def _first_styles(styles) -> tuple[str, str]:
-    """Return the two styles that the slider blends at first."""
-    first = "Neutral" if "Neutral" in styles else styles[0]
-    return first, next((style for style in ("Proud", *styles) if style in styles and style != first), first)

@@ -206,26 +206,6 @@ def test_a_square_driven_by_keys(browser, page, trained, screenshots, capsys):
     assert FPS * np.linalg.norm(np.diff(last[:, [0, 2]], axis=0), axis=-1).mean() < 0.3
 
 
-def test_what_a_round_costs_at_1_8_and_32_characters(browser, page, screenshots, capsys):
-    """Times are printed for whoever wants them; a machine's speed is no test."""
-    opened(browser, page)
-    lines = []
-    for steps in (8, 1):
-        choose(browser, "steps", steps)
-        for count in (1, 8, 32):
-            choose(browser, "count", count)
-            browser.wait(f"return steer.state().count === {count} && steer.state().timed >= 3", 300)
-            state = browser.script("return steer.state()")
-            lines.append(f"{steps} steps, {count:2d} characters: {state['ms']:.0f} ms a round, hop {state['hop']}")
-            assert not state["frozen"] and len(state["targets"]) == count
-    browser.script("document.getElementById('made').click()")
-    browser.wait("return steer.state().rounds > 0")
-    browser.screenshot(screenshots / "steer_32.png")
-    with capsys.disabled():
-        print("", *lines, sep="\n")
-    assert browser.errors() == [] and browser.requests() == []
-
-
 def test_feet_stand_while_the_tick_is_there(browser, page, trained, screenshots, capsys):
     """The lower toe of one who walks straight on, with the tick and without."""
     opened(browser, page)

@@ -964,7 +964,13 @@ async function start() {
     mark.style.left = `${100 * boundary / (numFrames - 1)}%`;
     byId("ticks").append(mark);
   }
-  byId("ghost").hidden = !characters.some((character) => character.ghost);
+  const there = {
+    contacts: characters.some((one) => one.contacts), trail: !characters.every((one) => one.color),
+    ghost: characters.some((one) => one.ghost), path: characters.some((one) => one.path),
+    boundaries: boundaries.length > 0,
+  };
+  for (const key of document.querySelectorAll("[data-of]")) key.hidden = !there[key.dataset.of];
+  byId("ghost").hidden = !there.ghost;
   listPeople();
   stage.resize();
   show.body = characters.length <= CROWD;

@@ -1,4 +1,4 @@
-// Unpacks the modules of a page, tells the browser their names and starts one of them; `web_page.module_scripts`.
+// Unpacks the modules of a page, tells the browser their names and starts one of them; `player.module_scripts`.
 (async () => {
   const packed = JSON.parse(document.getElementById("modules").textContent);
   const imports = {};
