@@ -9,7 +9,6 @@ device, and has no loop of random bits. What is written here is loaded by `artef
 nothing of this library.
 """
 
-import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -28,8 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import export
-from jax.extend.mlir import ir, passmanager
-from jax.extend.mlir.dialects import stablehlo
 
 from f3amd_companion.serving import artefact
 from f3amd_lib.diffusion.samplers import ddpm_step
@@ -109,10 +106,14 @@ def export_round(network, sigmas, batch: int, sampler: str = "ddim") -> Exported
             return _sample_ddpm(denoiser, condition, sigmas, noise, step_noise)
         return sample_round(denoiser, condition, sigmas, noise=noise, sampler=sampler, unroll=True)
 
-    program = export.export(
-        jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
-    )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
-    program = dataclasses.replace(program, mlir_module_serialized=_without_places(program.mlir_module_serialized))
+    places = jax.config.jax_traceback_in_locations_limit
+    try:
+        jax.config.update("jax_traceback_in_locations_limit", 0)  # a program says not which files made it
+        program = export.export(
+            jax.jit(one_round), platforms=["cpu"], disabled_checks=[export.DisabledSafetyCheck.platform()]
+        )(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in inputs.values()))
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", places)
     manifest = {
         "config": config.to_dict(),
         "num_steps": len(sigmas) - 1,
@@ -135,18 +136,6 @@ def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
         x0_hat = network(x_noisy, sigma, context)
         x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
     return x_noisy
-
-
-def _without_places(program: bytes) -> bytes:
-    """Return a program that no longer says which lines of which files made it."""
-    with ir.Context() as context:
-        module = stablehlo.deserialize_portable_artifact(context, program)
-        passmanager.PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
-        # As `jax.export` does: readers of the last four weeks and later ones.
-        version = stablehlo.get_version_from_compatibility_requirement(
-            stablehlo.StablehloCompatibilityRequirement.WEEK_4
-        )
-        return stablehlo.serialize_portable_artifact(module, version)
 
 
 def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[str]]:
