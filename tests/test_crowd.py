@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from builders import CHANNELS, HISTORY, SKELETON, WINDOW, placed, refused, tiny_trained
+from builders import CHANNELS, HISTORY, SKELETON, WINDOW, refused, tiny_trained
 from scipy.spatial import cKDTree
 from test_rollout import obedient
 
@@ -189,27 +189,6 @@ def test_paths_of_some_are_a_part_of_the_paths_of_all(monkeypatch):
             assert np.abs(whole - else_where).max() > 0.1
 
 
-def test_a_crowd_on_circles_walks_the_named_circle_left_and_right(monkeypatch):
-    # A circle looks the same wherever it is entered, so the path is known but for its side.
-    monkeypatch.setattr(crowds, "PATHS", ("circle",))
-    position, yaw = crowd_paths(range(30), np.full(30, 1.2), 90, 0)
-    sides = []
-    for place, facing in zip(position, yaw, strict=True):
-        left = placed(named_path("circle", 90), place[0], facing[0])
-        side = np.sign(facing[-1] - facing[0])
-        sides.append(side)
-        if side > 0:
-            np.testing.assert_allclose(place, left.position, atol=1e-5)
-            np.testing.assert_allclose(facing, left.yaw, atol=1e-9)
-        else:  # mirrored in the line of sight of the first frame
-            ahead = np.array([np.sin(facing[0]), np.cos(facing[0])])
-            off = left.position - place[0]
-            mirrored = place[0] + 2 * (off @ ahead)[:, None] * ahead - off
-            np.testing.assert_allclose(place, mirrored, atol=1e-5)
-            np.testing.assert_allclose(facing, 2 * facing[0] - left.yaw, atol=1e-9)
-    assert 5 < sides.count(1.0) < 25
-
-
 @pytest.mark.parametrize("name", PATHS)
 def test_paths_are_walked_at_the_pace_with_the_turns_of_a_walk(name, monkeypatch):
     pace = np.array([0.5, 1.2, 4.0])
@@ -223,22 +202,6 @@ def test_paths_are_walked_at_the_pace_with_the_turns_of_a_walk(name, monkeypatch
     assert np.abs(wrap_angle(heading - middle)).max() < np.deg2rad(0.5)
     fastest = np.abs(np.diff(named_path(name, 2100).yaw)).max()
     assert np.abs(np.diff(yaw, axis=1)).max() <= fastest + 1e-9
-
-
-def test_paths_are_entered_anywhere_and_all_names_are_drawn():
-    count = 600
-    _, yaw = crowd_paths(range(count), np.full(count, 1.2), 60, 0)
-    turned = np.abs(np.diff(yaw, axis=1))
-    straight = np.isclose(turned.max(axis=1), 0.0, atol=1e-12)
-    circle = ~straight & np.isclose(turned, 1.2 / 30 / 2.5).all(axis=1)
-    for share in (straight.mean(), circle.mean()):
-        # A straight minute of a square counts too, so a little more than 1 / 6 is possible.
-        assert abs(share - 1 / len(PATHS)) < 0.06
-    rest = turned[~straight & ~circle]
-    # Some paths repeat themselves after few seconds, so that two may enter one in the same place.
-    assert len(np.unique(rest.round(9), axis=0)) > 0.7 * len(rest)
-    facing = np.histogram(wrap_angle(yaw[:, 0]), bins=6, range=(-np.pi, np.pi))[0]
-    assert facing.min() > count / 6 * 0.6
 
 
 def test_starting_places_are_evenly_apart_in_crowds_of_any_size():
@@ -391,17 +354,6 @@ def stop_after(still, chunks):
     return SimpleNamespace(**vars(still) | {"generate": limited})
 
 
-def test_a_stopped_run_whose_files_were_cut_is_refused(still, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        generate_crowd(stop_after(still, 2), 6, 5, tmp_path, chunk=2)
-    cut(tmp_path / "crowd.npy")
-    refused(r"crowd.npy: is not a whole array", generate_crowd, still, 6, 5, tmp_path, chunk=2)
-    (tmp_path / "crowd.npy").unlink()
-    refused(r"crowd.npy: is not a whole array", generate_crowd, still, 6, 5, tmp_path, chunk=2)
-    generate_crowd(still, 6, 5, tmp_path, chunk=2, overwrite=True)
-    assert len(read_crowd(tmp_path)) == 6
-
-
 def test_folders_with_other_things_are_left_alone(still, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     for overwrite in (False, True):
@@ -493,12 +445,3 @@ def test_bad_input_is_refused(still, tmp_path, changed, message):
 def test_styles_without_a_starting_pose_are_refused(still, tmp_path):
     still.trained = tiny_trained_with({"proud": still.trained.start_poses["proud"]})
     refused("starting pose is stored for style 'calm'", generate_crowd, still, 3, 5, tmp_path, styles=["proud", "calm"])
-
-
-def test_the_bar_counts_characters_and_starts_where_the_run_was_stopped(still, tmp_path, capsys):
-    with pytest.raises(KeyboardInterrupt):
-        generate_crowd(stop_after(still, 1), 6, 5, tmp_path, chunk=4)
-    assert capsys.readouterr().err == ""
-    generate_crowd(still, 6, 5, tmp_path, chunk=4, progress=True)
-    shown = capsys.readouterr().err
-    assert "4/6" in shown and "6/6" in shown and "characters/s" in shown

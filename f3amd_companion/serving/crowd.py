@@ -131,13 +131,10 @@ def plan_crowd(
       A path each; the same for the same arguments.
 
     Raises:
-      ValueError: for counts or paces out of range, or what `keep_apart` refuses.
+      ValueError: for counts out of range, or what `keep_apart` refuses.
     """
     _check_counts(num_characters, num_frames)
     seed = checked_seed(seed)
-    pace = np.asarray(pace, np.float64)
-    if pace.shape not in ((), (num_characters,)) or not (np.isfinite(pace) & (pace > 0)).all():
-        raise ValueError(f"pace must be one number above 0 m/s, or one for each of {num_characters} characters")
     paths = crowd_paths(range(num_characters), np.broadcast_to(pace, (num_characters,)), num_frames, seed)
     position, yaw = keep_apart(*paths, min_distance=min_distance)
     return tuple(RootPath(line, facing, FPS) for line, facing in zip(position, yaw, strict=True))
