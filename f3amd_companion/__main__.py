@@ -609,11 +609,11 @@ def bench(
       parts: time a round without each part.
     """
     _use_fast_flags()
-    from f3amd_companion.speed import measurements, speed_tables, synthesis
+    from f3amd_companion.speed import measurements, speed_tables
     from f3amd_lib.ground.records import read_table
     from f3amd_lib.ground.tables import markdown_table
 
-    suites = synthesis.check_suites(suite)
+    suites = measurements.check_suites(suite)
     prepared, profile = motion.open()
     if suites or not (training or parts):
         path = measurements.measure_synthesis_time(

@@ -14,7 +14,7 @@ from f3amd_companion.measuring import measure, sensitivity
 from f3amd_companion.measuring.recipes import RECIPES
 from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
 from f3amd_companion.measuring.text_tables import TABLES
-from f3amd_companion.speed import implementations, measurements, synthesis
+from f3amd_companion.speed import implementations, measurements
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile
@@ -47,7 +47,7 @@ def tables(run: str) -> dict[str, list[dict]]:
         named = {"window_frames": window, "device": "GPU", "batch_size": 512, "peak_memory_mib": 1.0}
         return {"training_time": [named | figure | {"model": model} for model in measurements._TRAINED]}
     if command == "bench":
-        candidates = [candidate for group in synthesis.plan(what).values() for candidate in group]
+        candidates = [candidate for group in measurements.plan(what).values() for candidate in group]
         rows = [
             figure
             | {

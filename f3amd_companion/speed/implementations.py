@@ -62,6 +62,11 @@ class Workload:
         return presets.find_preset(self.model).diffusion.sampler
 
     @property
+    def network(self):
+        """The network with random weights, in the workload's precision."""
+        return _network(self.config, self.precision)
+
+    @property
     def sigmas(self) -> np.ndarray:
         """Noise levels of the steps, [N + 1]."""
         return np.asarray(presets.find_preset(self.model).diffusion.grid(self.steps), np.float32)
@@ -100,16 +105,11 @@ def random_condition(config: NetworkConfig, characters: int, seed: int = 0) -> C
     )
 
 
-def _network(workload: Workload):
-    """Return the network with random weights, in the workload's precision."""
-    return _built_network(workload.config, PRECISIONS[workload.precision][1])
-
-
 @lru_cache(maxsize=64)
-def _built_network(config: NetworkConfig, dtype):
+def _network(config: NetworkConfig, precision: str):
     """Build a network once for all its numbers of steps and characters, on the CPU: a GPU compiles for each layer."""
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        return cast_network(presets.build_from_config(config, jax.random.key(0)), dtype)
+        return cast_network(presets.build_from_config(config, jax.random.key(0)), PRECISIONS[precision][1])
 
 
 def jit_round(workload: Workload, network, sample: Callable = sample_round, sharding=None) -> Round:
@@ -140,7 +140,7 @@ def _all_devices(workload: Workload) -> Round:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
     mesh = Mesh(np.array(devices), ("characters",))
     sharding = NamedSharding(mesh, PartitionSpec("characters"))
-    return jit_round(workload, _network(workload), partial(sample_round_on_devices, mesh=mesh), sharding)
+    return jit_round(workload, workload.network, partial(sample_round_on_devices, mesh=mesh), sharding)
 
 
 def _check_outside_of_jax(workload: Workload, framework: str) -> None:
@@ -155,7 +155,7 @@ def _iree(workload: Workload) -> Round:
     from f3amd_companion.serving.export import export_round, save_artefact
 
     started = time.perf_counter()
-    exported = export_round(_network(workload), workload.sigmas, workload.characters, workload.sampler)
+    exported = export_round(workload.network, workload.sigmas, workload.characters, workload.sampler)
     with tempfile.TemporaryDirectory() as folder:
         artefact = load_artefact(save_artefact(Path(folder) / "artefact", exported, name=workload.model))
     seconds = time.perf_counter() - started
@@ -172,27 +172,19 @@ def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas"
         _check_outside_of_jax(workload, "PyTorch")
     from f3amd_companion.speed import torch_camdm
 
-    started = time.perf_counter()
-    module = torch_camdm.torch_camdm(_network(workload), products=products)
-    condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters))
-    wait = lambda: None
-    if on_gpu:
-        module, condition, wait = torch_camdm.on_gpu(module, condition, tf32=workload.precision == "tf32")
-    run = torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime)
-
-    def call():
-        frames = run(condition)
-        wait()
-        return frames
-
+    started, device = time.perf_counter(), "cuda" if on_gpu else "cpu"
+    tf32 = workload.precision == "tf32"
+    module = torch_camdm.torch_camdm(workload.network, products=products, device=device, tf32=tf32)
+    condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters), device)
+    call = partial(torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime), condition)
     call()
     return Round(call, time.perf_counter() - started)
 
 
 IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Workload], Round]]] = {
-    "jit": ("jax", lambda workload: jit_round(workload, _network(workload))),
+    "jit": ("jax", lambda workload: jit_round(workload, workload.network)),
     "jit, all devices": ("jax", _all_devices),
-    "jit, FFT": ("jax", lambda workload: jit_round(workload, fft_reference(_network(workload)))),
+    "jit, FFT": ("jax", lambda workload: jit_round(workload, fft_reference(workload.network))),
     "IREE": ("iree", _iree),
     "PyTorch": ("torch", _torch),
     "PyTorch, oneDNN": ("torch", partial(_torch, products="onednn")),
@@ -226,7 +218,7 @@ def framework_probe(framework: str, precision: str):
     """Return a framework's own matrix product to time: (function that multiplies, its operations).
 
     Args:
-      framework: "jax" or "torch"; the latter on a CPU in float32, on a GPU as `torch_camdm.on_gpu` set it.
+      framework: "jax" or "torch"; the latter on a CPU in float32, on a GPU as `torch_camdm.torch_camdm` set it.
       precision: of `machine.PRECISIONS`.
     """
     if framework == "jax":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Hashable, Iterable
@@ -67,14 +66,12 @@ def _processor() -> str:
 
 def _graphics_clocks() -> str | None:
     """Return what nvidia-smi tells of clocks now and at most, in MHz; None where there is none."""
-    if shutil.which("nvidia-smi") is None:
-        return None
     asked = "--query-gpu=name,clocks.sm,clocks.max.sm,clocks.mem,power.limit"
-    done = subprocess.run(
-        ["nvidia-smi", asked, "--format=csv,noheader"],
-        capture_output=True, text=True, timeout=30, check=False,
-    )  # fmt: skip
-    return done.stdout.strip() or None
+    command = ["nvidia-smi", asked, "--format=csv,noheader"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False).stdout.strip() or None
+    except FileNotFoundError:
+        return None
 
 
 def describe_machine() -> dict:

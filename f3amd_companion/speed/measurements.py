@@ -1,33 +1,39 @@
-"""Speed as records: tidy tables of synthesis and training times, each with its run record."""
+"""Speed as records: tidy tables of synthesis and training times, each with its run record.
+
+Synthesis (Tables 1, 4, 7 and the times of Table 11; Figures 3 and 4): what belongs together is timed by turns in one
+process, all models, steps and implementations of one window length and one number of characters, and beside them the
+machine's own matrix product, so that every row can say which share of the machine's arithmetic it used.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import time
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pandas as pd
-from flax import nnx
 from tqdm import tqdm
 
+from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
 from f3amd_companion.speed.speed_tables import fastest_implementations
-from f3amd_companion.speed.synthesis import CANDIDATE_COLUMNS, Candidate, check_suites, plan, time_group
 from f3amd_companion.speed.timing import take_turns
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known, row_label
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.conditioning import Context
-from f3amd_lib.networks.f3amd import F3AMD
-from f3amd_lib.networks.spectral import FNOBlock, FrameLayer
+from f3amd_lib.networks.conditioning import ConditionEncoder, FiLM
+from f3amd_lib.networks.spectral import FNOBlock
 from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import compile_steps, initial_state, planned_memory
@@ -36,14 +42,15 @@ from f3amd_lib.training.recipe import short_recipe
 
 log = logging.getLogger("f3amd")
 
+SUITES: dict[str, list[dict]] = read_toml(Path(__file__).with_name("suites.toml"))
+"""What each suite times."""
+
 DEFAULT_SUITES = {"smoke": ["smoke"], "laptop": ["main", "family", "windows", "curve"], "gpu": ["gpu"]}
 """What a profile times."""
 
-_TURNS = {"smoke": {"min_rounds": 10, "min_seconds": 1.0, "fewest_rounds": 3}}
+# The slowest rounds take half a minute each: three of them are enough.
+_TURNS = {"smoke": {"min_rounds": 10, "min_seconds": 1.0}}
 """Settings of `take_turns` by profile; elsewhere its own: 100 rounds or 10 s."""
-
-_FEWEST_ROUNDS = 3
-"""For the slowest rounds, half a minute each."""
 
 _TRAINED = ("F3AMD-FNO-96", "F3AMD-Transformer-64", "CAMDM", "F3AMD-FNO-32", "F3AMD-FNO-128")
 _TRAINING = {"smoke": (4, 2, 8), "laptop": (200, 10, 64), "gpu": (200, 20, 512)}
@@ -53,11 +60,10 @@ _TRAINING = {"smoke": (4, 2, 8), "laptop": (200, 10, 64), "gpu": (200, 20, 512)}
 def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra) -> dict:
     """Return a record that tells the machine; another machine's rows do not belong in its table."""
     machine = describe_machine()
-    lasting = ("processor", "cores", "system")
+    lasting = {name: machine[name] for name in ("processor", "cores", "system")}
     return run_record(
         profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement,
-        timed_on={name: machine[name] for name in lasting} | {"device": jax.devices()[0].device_kind},
-        **extra,
+        timed_on=lasting | {"device": jax.devices()[0].device_kind}, **extra,
     )  # fmt: skip
 
 
@@ -68,16 +74,119 @@ def _circumstances() -> dict:
     return changing | {"xla_flags": machine["xla_flags"], "clocks": machine["graphics_clocks"]}
 
 
+def _path(profile: Profile, name: str) -> Path:
+    return results_dir(profile.dataset, profile.name) / "records" / f"{name}.csv"
+
+
+# ------------------------------------------------------------------------------------------------- synthesis
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A row of the table before it is timed: a model, how it is used, and in which implementation."""
+
+    model: str
+    steps: int
+    characters: int
+    implementation: str
+    window: int = 32
+    precision: str = "float32"
+
+    def __str__(self) -> str:
+        characters = f"{self.characters} character{'s' if self.characters > 1 else ''}, {self.window} frames"
+        return f"{row_label(self.model, self.steps)}, {characters}, {self.implementation}, {self.precision}"
+
+    @property
+    def group(self) -> tuple[int, int, str]:
+        """What a candidate shares with those that it is timed by turns with."""
+        return self.window, self.characters, self.precision
+
+
+CANDIDATE_COLUMNS = ["model", "steps", "characters", "way", "window_frames", "precision"]
+"""Columns of a table that name the candidate of a row, in the order of its fields."""
+
+
+def check_suites(names: Iterable[str]) -> list[str]:
+    """Return the names as a list; ValueError for an unknown one."""
+    for name in (names := list(names)):
+        check_known(name, SUITES, "suite")
+    return names
+
+
+def plan(suite: str) -> dict[tuple, list[Candidate]]:
+    """Return what a suite of `SUITES` times, by group, each candidate once."""
+    groups: dict[tuple, dict[Candidate, None]] = {}
+    for block in SUITES[suite]:
+        unusual = {key: block[key] for key in ("window", "precision") if key in block}
+        for implementation, counts in block["characters"].items():
+            for characters, model, steps in itertools.product(counts, block["models"], block["steps"]):
+                candidate = Candidate(model, steps, characters, implementation, **unusual)
+                groups.setdefault(candidate.group, {})[candidate] = None
+    return {group: list(candidates) for group, candidates in groups.items()}
+
+
+def time_group(
+    candidates: list[Candidate], build_config, *, progress: bool = False, **turns
+) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Time the candidates of one group by turns, with the matrix products of their frameworks.
+
+    Args:
+      candidates: of one group.
+      build_config: (model, window) -> `NetworkConfig`.
+      progress: show bars.
+      **turns: settings of `timing.take_turns`.
+
+    Returns:
+      (a row a candidate that worked: what it is, value, low and high in ms a round, rounds,
+      compile_seconds, flops and bytes_accessed of a round, gflops reached, peak_gflops of the
+      framework's own matrix product in the same turns, and their quotient share_of_peak;
+      candidate in words -> why it did not work).
+    """
+    ((window, characters, precision),) = {candidate.group for candidate in candidates}
+
+    def prepare(candidate: Candidate) -> tuple[Workload, implementations.Round]:
+        config = build_config(candidate.model, window)
+        workload = Workload(candidate.model, config, candidate.steps, characters, precision)
+        return workload, implementations.prepare_round(candidate.implementation, workload)
+
+    # PyTorch's compiler is not made for threads.
+    prepared = prepared_at_once(prepare, [one for one in candidates if one.implementation.startswith("jit")])
+    ready, failed = {}, {}
+    with tqdm(candidates, unit="compiled", disable=not progress) as bar:
+        for candidate in bar:
+            bar.set_postfix_str(str(candidate))
+            try:
+                ready[candidate] = prepared[candidate]() if candidate in prepared else prepare(candidate)
+            except implementations.NotPossible as reason:
+                failed[str(candidate)] = str(reason)
+    frameworks = {candidate: implementations.IMPLEMENTATIONS[candidate.implementation][0] for candidate in ready}
+    yardsticks = {candidate: "torch" if framework == "torch" else "jax" for candidate, framework in frameworks.items()}
+    probes = {name: implementations.framework_probe(name, precision) for name in dict.fromkeys(yardsticks.values())}
+    calls = {candidate: done.call for candidate, (_, done) in ready.items()}
+    timings = take_turns(calls | {name: call for name, (call, _) in probes.items()}, progress=progress, **turns)
+    rows = []
+    for candidate, (workload, done) in ready.items():
+        timing, yardstick, flops = timings[candidate], yardsticks[candidate], implementations.round_flops(workload)
+        reached, peak = flops / timing.median / 1e9, probes[yardstick][1] / timings[yardstick].median / 1e9
+        row = {"model": candidate.model, "window_frames": window, "steps": candidate.steps}
+        row |= {"sampler": workload.sampler, "framework": frameworks[candidate], "way": candidate.implementation}
+        row |= {"device": device_name(), "precision": precision, "characters": characters}
+        row |= timing.columns("ms", 1e3) | {"compile_seconds": round(done.compile_seconds, 2)}
+        row |= {"bytes_accessed": done.bytes_accessed, "flops": flops, "gflops": reached, "peak_gflops": peak}
+        rows.append(row | {"share_of_peak": reached / peak})
+    return pd.DataFrame(rows), failed
+
+
 def measure_synthesis_time(
     prepared: PreparedData, profile: Profile, suites: Iterable[str] | None = None, *,
     characters: Collection[int] | None = None, again: bool = False, stop_at: float | None = None,
 ) -> Path | None:  # fmt: skip
-    """Time rounds of the family in every implementation there is (see `speed.synthesis`).
+    """Time rounds of the family in every implementation there is.
 
     Args:
       prepared: its channels and styles are the networks'.
       profile: names the results' folder and, without `suites`, what is timed.
-      suites: keys of `synthesis.SUITES`.
+      suites: keys of `SUITES`.
       characters: time groups of these numbers of characters only.
       again: time groups anew that an earlier run with the same settings has timed.
       stop_at: begin no group after this time (`time.monotonic`).
@@ -91,13 +200,11 @@ def measure_synthesis_time(
       ValueError: for an unknown suite.
     """
     suites = check_suites(suites or DEFAULT_SUITES[profile.name])
-    folder = results_dir(profile.dataset, profile.name) / "records"
-    turns = {"fewest_rounds": _FEWEST_ROUNDS, **_TURNS.get(profile.name, {})}
-    path = folder / "synthesis_ways.csv"
+    turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
+    path, fastest = _path(profile, "synthesis_ways"), _path(profile, "synthesis_time")
     record = _record(prepared, profile, "synthesis_time", turns=turns)
-    kept = kept_rows(path, record)
+    kept, keys = kept_rows(path, record), ["suite", *CANDIDATE_COLUMNS]
     failed = {} if kept is None else read_table(path)[1].get("not_possible", {})
-    keys = ["suite", *CANDIDATE_COLUMNS]
     done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
 
     def is_done(suite: str, candidate: Candidate) -> bool:
@@ -116,9 +223,8 @@ def measure_synthesis_time(
                 return None
             bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *candidates[0].group))
             circumstances = _circumstances()
-            rows, not_possible = time_group(
-                candidates, lambda model, window: prepared.model_config(model, window=window), progress=True, **turns
-            )
+            config = lambda model, window: prepared.model_config(model, window=window)
+            rows, not_possible = time_group(candidates, config, progress=True, **turns)
             for label, reason in not_possible.items():
                 log.warning("not possible here: %s: %s", label, reason)
             failed |= not_possible
@@ -128,20 +234,22 @@ def measure_synthesis_time(
             kept = pd.concat([kept, rows.assign(suite=suite, **circumstances)]).drop_duplicates(keys, keep="last")
             record |= {"not_possible": failed}
             write_table(path, kept, record)
-            write_table(folder / "synthesis_time.csv", fastest_implementations(kept), record)
-    return folder / "synthesis_time.csv"
+            write_table(fastest, fastest_implementations(kept), record)
+    return fastest
+
+
+# -------------------------------------------------------------------------------------------------- training
 
 
 def measure_training_time(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None, *, precision: str = "float32",
-    again: bool = False, stop_at: float | None = None,
+    prepared: PreparedData, profile: Profile, *, precision: str = "float32", again: bool = False,
+    stop_at: float | None = None,
 ) -> Path | None:  # fmt: skip
-    """Time training steps by turns, all models in one run (Table 2).
+    """Time training steps by turns: the recommended models, the baseline, and two other widths (Table 2).
 
     Args:
       prepared: the data; an epoch is once over its training windows.
       profile: names the results' folder; says how large a batch is and how many steps are timed.
-      models: presets; by default the recommended ones, the baseline, and two other widths.
       precision: of matrix products, a key of `machine.PRECISIONS`.
       again: time them anew though an earlier run with the same settings has timed all of them.
       stop_at: do not begin after this time (`time.monotonic`).
@@ -150,41 +258,28 @@ def measure_training_time(
       The table `records/training_time.csv`: value, low and high in seconds a step, epoch_minutes,
       and peak_memory_mib as the compiler plans it. None where `stop_at` came first.
     """
-    names = [presets.find_preset(name).name for name in models or _TRAINED]
     steps, chunk, batch_size = _TRAINING[profile.name]
-    path = results_dir(profile.dataset, profile.name) / "records" / "training_time.csv"
     record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
-    kept, keys = kept_rows(path, record), ["model", "window_frames", "device", "batch_size"]
+    path, keys = _path(profile, "training_time"), ["model", "window_frames", "device", "batch_size"]
+    kept = kept_rows(path, record)
     done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
-    if done.issuperset((name, prepared.window, device_name(), batch_size) for name in names):
+    if done.issuperset((name, prepared.window, device_name(), batch_size) for name in _TRAINED):
         return path
     if stop_at is not None and time.monotonic() >= stop_at:
         return None
     recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
-    tasks = {name: prepared.task(name, recipe(name)) for name in names}
-    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk, precision), names)
+    tasks = {name: prepared.task(name, recipe(name)) for name in _TRAINED}
+    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk, precision), _TRAINED)
     compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
     calls = {name: _training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
-    windows = prepared.windows("train").num_windows
-    rows = [
-        {
-            "model": name,
-            "window_frames": prepared.window,
-            "device": device_name(),
-            "batch_size": batch_size,
-            "precision": precision,
-            **timing.columns("s/step", 1.0 / chunk),
-            "rounds": timing.rounds,
-            "steps_timed": timing.rounds * chunk,
-            "compile_seconds": round(compiled[name][1], 1),
-            "epoch_windows": windows,
-            "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0,
-            "peak_memory_mib": planned_memory(compiled[name][0]) / 2**20,
-            **_circumstances(),
-        }
-        for name, timing in timings.items()
-    ]
+    windows, circumstances, rows = prepared.windows("train").num_windows, _circumstances(), []
+    for name, timing in timings.items():
+        row = dict(zip(keys, (name, prepared.window, device_name(), batch_size), strict=True))
+        row |= {"precision": precision} | timing.columns("s/step", 1.0 / chunk)
+        row |= {"steps_timed": timing.rounds * chunk, "compile_seconds": round(compiled[name][1], 1)}
+        row |= {"epoch_windows": windows, "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0}
+        rows.append(row | {"peak_memory_mib": planned_memory(compiled[name][0]) / 2**20} | circumstances)
     # Rows of other windows and models stay.
     table = pd.concat([kept, pd.DataFrame(rows)]).drop_duplicates(keys, keep="last")
     return write_table(path, table, record)
@@ -214,74 +309,26 @@ def _training_call(task: DenoisingTask, program):
 # The round is timed again with one part left out at a time. Compilers mix parts, so that a stopwatch around each would
 # disturb what it measures. What a round saves without a part is what the part costs, as far as costs add up.
 
-PARTS = ("spectral branches", "local branches", "FiLM", "conditioning signal", "noise")
-"""What can be left out of a round of an F3AMD network with Fourier blocks and FiLM."""
+
+def _no_signal(encoder, context, sigma):
+    """Stand for c; what encoded the condition is then asked by nobody, and not compiled."""
+    return jnp.ones((len(context.keys), encoder.window, encoder.width), context.keys.dtype) * sigma
 
 
-class _OneBranch(FrameLayer):
-    """An `FNOBlock` that has lost one of its branches."""
-
-    def __init__(self, block: FNOBlock, lost: str):
-        self.spectral, self.lost = block.spectral, lost
-        self.local_first, self.local_second = block.local_first, block.local_second
-
-    def frames_first(self, z):
-        if self.lost == "local branches":
-            return self.spectral.frames_first(z)
-        return FNOBlock.local_frames_first(self, z)
+PARTS = {
+    "spectral branches": (FNOBlock, "frames_first", FNOBlock.local_frames_first),
+    "local branches": (FNOBlock, "frames_first", lambda block, z: block.spectral.frames_first(z)),
+    "FiLM": (FiLM, "__call__", lambda film, base, z, c: base(z)),
+    "conditioning signal": (ConditionEncoder, "__call__", _no_signal),
+}
+"""What can be left out of an F3AMD network of Fourier blocks with FiLM -> method, and what stands for it meanwhile."""
 
 
-class _NoFiLM(nnx.Module):
-    def __call__(self, base, z, c):
-        return base(z)
-
-
-class _NoSignal(nnx.Module):
-    """Gives the code of frames for c, and encodes a condition to nothing."""
-
-    def __init__(self, encoder):
-        self.window, self.width = encoder.window, encoder.width
-
-    def encode(self, condition):
-        return Context(condition.path, condition.path)
-
-    def __call__(self, context, sigma):
-        return jnp.ones((context.keys.shape[0], self.window, self.width), context.keys.dtype) * sigma
-
-
-def without(network: F3AMD, part: str) -> F3AMD:
-    """Return a copy of a network that lacks a part; its answers mean nothing.
-
-    Args:
-      network: of Fourier blocks with FiLM.
-      part: of `PARTS`, but "noise", which is no part of a network.
-
-    Raises:
-      ValueError: for another network or part.
-    """
-    config = network.config
-    if not isinstance(network, F3AMD) or config.base_block != "fno" or config.conditioning != "film":
-        raise ValueError("parts are known of F3AMD networks of Fourier blocks with FiLM only")
-    check_known(part, PARTS[:-1], "part")
-    left = nnx.clone(network)
-    if part == "FiLM":
-        left.conditionings = nnx.List([_NoFiLM() for _ in left.conditionings])
-    elif part == "conditioning signal":
-        left.condition = _NoSignal(left.condition)
-    else:
-        left.blocks = nnx.List([_OneBranch(block, part) for block in left.blocks])
-        if config.encoder_decoder == "fno":
-            left.encoder = _OneBranch(left.encoder, part)
-            left.decoder = _OneBranch(left.decoder, part)
-    return left
-
-
-def time_breakdown(workload: Workload, *, progress: bool = False, **turns) -> pd.DataFrame:
-    """Time a round whole and without each of its parts, by turns.
+def time_breakdown(workload: Workload, **turns) -> pd.DataFrame:
+    """Time a round whole, without each of `PARTS`, and without drawing noise, by turns.
 
     Args:
       workload: a model of Fourier blocks with FiLM, under jit on one device.
-      progress: show a bar.
       **turns: settings of `take_turns`.
 
     Returns:
@@ -292,40 +339,28 @@ def time_breakdown(workload: Workload, *, progress: bool = False, **turns) -> pd
     shape = workload.characters, workload.config.window, workload.config.channels
     given_noise = partial(sample_round, noise=jax.random.normal(jax.random.key(1), shape))
     ready = {"nothing": jit_round(workload, network)}
-    ready |= {part: jit_round(workload, without(network, part)) for part in PARTS[:-1]}
+    for part, replaced in PARTS.items():
+        with mock.patch.object(*replaced):  # while it is compiled
+            ready[part] = jit_round(workload, network)
     ready["noise"] = jit_round(workload, network, given_noise)
-    calls = {part: done.call for part, done in ready.items()}
-    timings = take_turns(calls, progress=progress, **turns)
-    whole = timings["nothing"].median
-    rows = [
-        {
-            "model": workload.model,
-            "steps": workload.steps,
-            "characters": workload.characters,
-            "device": device_name(),
-            "without": part,
-            **timing.columns("ms", 1e3),
-            "rounds": timing.rounds,
-            "saved": np.nan if part == "nothing" else 1.0 - timing.median / whole,
-        }
-        for part, timing in timings.items()
-    ]
-    return pd.DataFrame(rows)
+    timings = take_turns({part: done.call for part, done in ready.items()}, **turns)
+    named = {"model": workload.model, "steps": workload.steps, "characters": workload.characters}
+    named["device"] = device_name()
+    table = pd.DataFrame([named | {"without": part} | timing.columns("ms", 1e3) for part, timing in timings.items()])
+    return table.assign(saved=(1.0 - table["value"] / table["value"][0]).mask(table["without"] == "nothing"))
 
 
-def measure_round_parts(prepared: PreparedData, profile: Profile, counts: Iterable[int] = (1, 32)) -> Path:
-    """Time F3AMD-FNO-96 with 1 step whole and without each of its parts (see `time_breakdown`).
+def measure_round_parts(prepared: PreparedData, profile: Profile) -> Path:
+    """Time F3AMD-FNO-96 with 1 step, of 1 and 32 characters, whole and without each of its parts.
 
     Args:
       prepared: its channels and styles are the network's.
       profile: names the results' folder.
-      counts: numbers of characters.
 
     Returns:
-      The table `records/round_parts.csv`.
+      The table `records/round_parts.csv` (see `time_breakdown`).
     """
-    model, turns = "F3AMD-FNO-96", _TURNS.get(profile.name, {})
-    workloads = [Workload(model, prepared.model_config(model), 1, characters) for characters in counts]
-    table = pd.concat(time_breakdown(workload, progress=True, **turns) for workload in workloads)
-    path = results_dir(profile.dataset, profile.name) / "records" / "round_parts.csv"
-    return write_table(path, table, _record(prepared, profile, "round_parts", **_circumstances()))
+    config, turns = prepared.model_config("F3AMD-FNO-96"), {"progress": True, **_TURNS.get(profile.name, {})}
+    tables = [time_breakdown(Workload("F3AMD-FNO-96", config, 1, characters), **turns) for characters in (1, 32)]
+    record = _record(prepared, profile, "round_parts", **_circumstances())
+    return write_table(_path(profile, "round_parts"), pd.concat(tables), record)

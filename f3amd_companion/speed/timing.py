@@ -33,9 +33,9 @@ class Timing:
     rounds: int
 
     def columns(self, unit: str, scale: float) -> dict:
-        """Return unit, value and both pairs of bounds as a table has them; `scale` units are a second."""
+        """Return unit, value, both pairs of bounds and rounds as a table has them; `scale` units are a second."""
         bounds = {name: scale * getattr(self, name) for name in ("low", "high", "median_low", "median_high")}
-        return {"unit": unit, "value": scale * self.median} | bounds
+        return {"unit": unit, "value": scale * self.median} | bounds | {"rounds": self.rounds}
 
 
 def median_interval(rounds, draws: int = 2000) -> tuple[float, float]:

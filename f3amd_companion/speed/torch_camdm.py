@@ -32,11 +32,6 @@ except ImportError as error:
         f'PyTorch is not installed: make bench-tools, or pip install "f3amd_lib[bench]" (importing torch said: {error})'
     ) from error
 
-PRODUCTS = ("blas", "onednn")
-"""Libraries within PyTorch that can do the large products. "blas" is what everybody gets, and on
-x86 that is MKL, which need not be at its best on a processor of another make. "onednn" packs the
-kernels once and does bias, residual and GELU within the product."""
-
 _LAYER_NORM_EPSILON = 1e-5
 _MAX_COMPILED = 64
 _OPSET = 23  # the first with attention as one operator
@@ -85,6 +80,12 @@ class _PackedLinear(nn.Module):
         return torch.ops.mkldnn._linear_pointwise.binary(rows, residual, self.packed, self.bias, "add")
 
 
+PRODUCTS = {"blas": _Linear, "onednn": _PackedLinear}
+"""Libraries within PyTorch that can do the large products. "blas" is what everybody gets, and on
+x86 that is MKL, which need not be at its best on a processor of another make. "onednn" packs the
+kernels once and does bias, residual and GELU within the product."""
+
+
 def _rows_layer(kind: type, *layers):
     """Return JAX's linear layers side by side as one of a kind in PyTorch."""
     kernels, biases = zip(*((_tensor(layer.kernel), _tensor(layer.bias)) for layer in layers), strict=True)
@@ -124,25 +125,22 @@ class _Block(nn.Module):
 
 
 class TorchCAMDM(nn.Module):
-    """CAMDM in PyTorch: `encode` once a round, then `denoise` at each step (see `torch_camdm`).
+    """CAMDM in PyTorch: `encode` once a round, then a call at each step (see `torch_camdm`).
 
     Attributes:
       config: of the JAX network.
-      products: of `PRODUCTS`.
     """
 
     def __init__(self, network: CAMDM, products: str = "blas"):
         super().__init__()
-        config = network.config
-        self.config, self.products = config, products
-        packed = {"blas": _Linear, "onednn": _PackedLinear}[products]
+        self.config = config = network.config
         # Packing pays in the large products only.
         plain = lambda layer: _rows_layer(_Linear, layer)
         self.noise_first, self.noise_second = plain(network.noise_first), plain(network.noise_second)
         self.history, self.future, self.output = plain(network.history), plain(network.future), plain(network.output)
         self.style = nn.Parameter(_tensor(network.style.kernel))
         self.path = nn.ModuleList(map(plain, network.path))
-        self.blocks = nn.ModuleList([_Block(block, packed) for block in network.blocks])
+        self.blocks = nn.ModuleList([_Block(block, PRODUCTS[products]) for block in network.blocks])
         code = position_code(0, config.num_tokens, config.latent_width, base=POSITION_BASE)
         self.register_buffer("code", torch.tensor(code, dtype=torch.float32))
 
@@ -176,7 +174,7 @@ class TorchCAMDM(nn.Module):
         hidden = functional.silu(self.noise_first(features), inplace=True)
         return self.noise_second(hidden).add_(self.code[0])
 
-    def denoise(self, x_scaled, noise_token, context):
+    def forward(self, x_scaled, noise_token, context):
         """Estimate the clean features from what is the same at every step and what is not.
 
         Args:
@@ -199,7 +197,7 @@ class TorchCAMDM(nn.Module):
         return self.output(answered.reshape(-1, width)).view(batch, window, channels)
 
 
-def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
+def torch_camdm(network: CAMDM, *, products: str = "blas", device: str = "cpu", tf32: bool = False) -> TorchCAMDM:
     """Return CAMDM in PyTorch with a copy of a network's weights, float32, without dropout.
 
     PyTorch gets as many threads as there are usable cores.
@@ -207,8 +205,11 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     Args:
       network: CAMDM of any config.
       products: of `PRODUCTS`.
+      device: "cpu" or "cuda", which takes the products of BLAS alone.
+      tf32: whether matrix products on a GPU may have mantissas of 10 bits, as JAX has them there.
 
     Raises:
+      RuntimeError: where PyTorch sees no GPU.
       ValueError: for another network, unknown products, or a PyTorch without oneDNN's.
     """
     if not isinstance(network, CAMDM):
@@ -217,13 +218,13 @@ def torch_camdm(network: CAMDM, *, products: str = "blas") -> TorchCAMDM:
     if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     torch.set_num_threads(usable_cores())
-    return TorchCAMDM(network, products).eval().requires_grad_(False)
+    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    return TorchCAMDM(network, products).eval().requires_grad_(False).to(device)
 
 
-def torch_condition(condition: Condition) -> Condition:
+def torch_condition(condition: Condition, device: str = "cpu") -> Condition:
     """Return a condition as tensors of PyTorch, float32, contiguous."""
-    copied = (np.array(part, np.float32, order="C") for part in condition)
-    return Condition(*(torch.from_numpy(part) for part in copied))
+    return Condition(*(torch.from_numpy(np.array(part, np.float32, order="C")).to(device) for part in condition))
 
 
 def tell_levels(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
@@ -242,16 +243,16 @@ def tell_levels(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
 def _compiled(module: TorchCAMDM) -> Callable:
     # Every module and batch size is a variant of the same lines of code; eight are allowed.
     torch._dynamo.config.recompile_limit = _MAX_COMPILED
-    return torch.compile(module.denoise, fullgraph=True, dynamic=False)
+    return torch.compile(module.forward, fullgraph=True, dynamic=False)
 
 
 def _in_onnx(module: TorchCAMDM) -> Callable:
     """Return the denoiser run by ONNX Runtime; PyTorch exports it at the first call of each batch size."""
     import onnxruntime
 
-    class Denoiser(nn.Module):
+    class Denoiser(nn.Module):  # which has no parameters of its own: the program holds the weights as constants
         def forward(self, x_scaled, noise_token, context):
-            return module.denoise(x_scaled, noise_token, context)
+            return module(x_scaled, noise_token, context)
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = usable_cores(), 3
@@ -273,7 +274,7 @@ def _in_onnx(module: TorchCAMDM) -> Callable:
     return denoise
 
 
-RUNTIMES = {"eager": lambda module: module.denoise, "compiled": _compiled, "onnx": _in_onnx}
+RUNTIMES = {"eager": lambda module: module.forward, "compiled": _compiled, "onnx": _in_onnx}
 """Name -> function that makes a module's denoiser ready."""
 
 
@@ -293,8 +294,8 @@ def torch_round(
     Returns:
       `run(condition, generator=None, *, noise=None, step_noise=None) -> [B, T, C]`. The condition
       is one of `torch_condition`; the generator is PyTorch's. In place of drawn numbers `noise`
-      [B, T, C] starts the walk and `step_noise` [N, B, T, C] is added by DDPM's steps. It raises
-      ValueError for shapes that do not fit, and RuntimeError where `torch.compile` does not work.
+      [B, T, C] starts the walk and `step_noise` [N, B, T, C] is added by DDPM's steps. It waits for a GPU. It raises
+      ValueError for a condition that does not fit, and RuntimeError where `torch.compile` does not work.
 
     Raises:
       ImportError: if ONNX Runtime is asked for and not installed.
@@ -303,17 +304,12 @@ def torch_round(
     for given, known, what in ((sampler, ("ddim", "ddpm"), "sampler"), (runtime, RUNTIMES, "runtime")):
         check_known(given, known, f"PyTorch {what}")
     config, device, sigmas = module.config, module.code.device, np.array(sigmas, np.float32)
-    if sigmas.ndim != 1 or len(sigmas) < 2:
-        raise ValueError(f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}")
     scales, features = tell_levels(config, sigmas[:-1])
     denoise = RUNTIMES[runtime](module)
 
     @torch.inference_mode()
     def run(condition, generator=None, *, noise=None, step_noise=None):
         shape = (len(condition.history), config.window, config.channels)
-        for name, given, wanted in (("noise", noise, shape), ("step_noise", step_noise, (len(scales), *shape))):
-            if given is not None and given.shape != wanted:
-                raise ValueError(f"{name} must have shape {wanted}, got {tuple(given.shape)}")
         draw = lambda: torch.randn(shape, generator=generator, device=device)
         context, tokens = module.encode(condition), module.noise_tokens(torch.from_numpy(features).to(device))
         x_noisy = sigmas[0] * (draw() if noise is None else noise)
@@ -327,27 +323,11 @@ def torch_round(
             else:
                 fresh = draw() if step_noise is None else step_noise[number]
                 x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
         return x_noisy
 
     return run
-
-
-def on_gpu(module: TorchCAMDM, condition: Condition, *, tf32: bool) -> tuple[TorchCAMDM, Condition, Callable]:
-    """Move a network and a condition to the GPU.
-
-    Args:
-      module: from `torch_camdm`, with products by BLAS.
-      condition: of `torch_condition`.
-      tf32: whether matrix products may have mantissas of 10 bits, as JAX has them there.
-
-    Returns:
-      (network, condition, function that waits until all that was asked for is done).
-
-    Raises:
-      RuntimeError: where PyTorch sees no GPU.
-    """
-    torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    return module.to("cuda"), Condition(*(part.to("cuda") for part in condition)), torch.cuda.synchronize
 
 
 def torch_matmul_probe(device: str = "cpu", size: int | None = None) -> tuple[Callable[[], object], int]:
