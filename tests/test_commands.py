@@ -8,10 +8,10 @@ import pytest
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.ledger import claims
-from f3amd_companion.ledger.evidence import recorded_evidence
+from f3amd_companion.ledger.evidence import recorded_evidence, snapshot_evidence
 from f3amd_companion.ledger.judgements import UNJUDGED, UNMEASURED
-from f3amd_companion.measuring import measure, sensitivity
-from f3amd_companion.measuring.recipes import RECIPES
+from f3amd_companion.measuring import campaign, measure, sensitivity
+from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
 from f3amd_companion.measuring.text_tables import TABLES
 from f3amd_companion.speed import implementations, measurements
@@ -76,9 +76,15 @@ def tables(run: str) -> dict[str, list[dict]]:
             for one, metric, number in itertools.product(named, ("gap_m", "acceleration_cm"), range(1, 81))
         ]
         return {"quality": quality + extra, "quality_by_round": rounds}
-    if what == "quality_by_epoch":
-        pairs = itertools.product(("F3AMD-FNO-96", "CAMDM"), range(1, 11), [*units, "held_out_loss"])
-        return {what: [{"model": model, "epoch": epoch, "metric": one, "value": 1.0} for model, epoch, one in pairs]}
+    if command == "campaign":
+        named = {"recipe": "paper", "window_frames": 32, "seed": 0, "value": 1.0, "steps": 8}
+        rows = itertools.product(("F3AMD-FNO-96", "CAMDM"), range(1, 11), (units | {"held_out_loss": ""}).items())
+        return {
+            command: [
+                named | {"model": model, "run": model, "windows": n, "epochs": n, "metric": metric, "unit": unit}
+                for model, n, (metric, unit) in rows
+            ]
+        }
     if what == "trained":
         trained = {"windows": 1e9, "held_out_fall": 0.0}
         walks = {"stepping_rate": 1.8, "joint_acceleration": 1.0, "slide_speed": 5.0, "floor_penetration": 0.0}
@@ -123,6 +129,7 @@ def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
         write_table(tmp_path / data / profile / "records" / f"{name}.csv", pd.DataFrame(rows), record)
     # Times on a GPU and on a CPU come from two data sets: statements may rest on either.
     evidences = [recorded_evidence(tmp_path, *key) for key in dict.fromkeys(key[:2] for key in left)]
+    evidences += [one for key in left for one in snapshot_evidence(tmp_path, *key[:2])]
     evidences = evidences or [recorded_evidence(tmp_path, "bandai", "gpu")]
     judgement = claims.judge_claim(claim, {"bandai": evidences})
     beyond = OUT_OF_REACH.get(claim.id, ())
@@ -152,10 +159,14 @@ def test_a_command_is_understood(run, monkeypatch):
     monkeypatch.setattr(measurements, "measure_training_time", lambda _, profile, **__: called.append(profile.window))
     monkeypatch.setattr(measurements, "measure_synthesis_time", lambda *a, **k: called.append(a[2]) or 1 / 0)
     monkeypatch.setattr(claims, "main", lambda *words: called.append(words) or 0)
+    monkeypatch.setattr(measure, "protocol_of", lambda *_: (None, None, None))
+    monkeypatch.setattr(campaign, "run_campaign", lambda _, profile, *a, **k: iter([called.append(profile.name)][1:]))
     command, _, _, window, what, models = asked(run)
     status = main(shlex.split(run)[1:])
     if command == "claims":
         assert called == [(False, None)] and status == 0
+    elif command == "campaign":
+        assert called == ["gpu"] and status == 0
     elif what == "training":
         assert called == [window] and status == 0
     elif command == "bench":
@@ -213,7 +224,6 @@ SMALL = "F3AMD-FNO-32"
         (["measure", "quality", "--model", SMALL, "--window", "64"], "quality"),
         (["measure", "trained", "walking", "--model", SMALL], "walking"),
         (["measure", "trained", "walking", "--model", SMALL, "--window", "64"], "walking"),
-        (["measure", "quality_by_epoch", "--model", SMALL], "quality_by_epoch"),
         (["measure", "foot_spectrum", "--model", SMALL], "foot_spectrum"),
         (["measure", "sensitivity"], "corruptions"),
         (["measure", "noise_use", "--model", SMALL], "x0_by_sigma"),
@@ -230,7 +240,6 @@ def test_a_command_runs_at_smoke_size(words, table, tmp_path_factory, monkeypatc
     folder = tmp_path_factory.getbasetemp() / "rehearsal"
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(folder))
     monkeypatch.setattr(measurements, "_TRAINED", (SMALL,))
-    monkeypatch.setattr(measure, "SNAPSHOTS", 2)
     # A classifier of so short a training may not tell styles; what it says is of no interest here.
     for module in (protocol, sensitivity):
         monkeypatch.setattr(module, "require_telling_styles", lambda classifier: None)

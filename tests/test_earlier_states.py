@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders import packed_from, wandering_motion
 
-from f3amd_companion.measuring.recipes import find_recipe
+from f3amd_companion.measuring.campaign import find_recipe
 from f3amd_lib.networks import presets
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.optimise import optimise, restore_state

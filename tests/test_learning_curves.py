@@ -54,15 +54,12 @@ def test_the_table_says_what_fell():
         return pd.DataFrame({"model": model, "step": [0, 1, 2], "loss": losses, "held_out_loss": held_out})
 
     nan = float("nan")
-    table = learning_curves.learning_table(
-        pd.concat(
-            [
-                curve("learns", [nan, 2.0, 1.0], [3.0, 2.0, 1.0]),
-                curve("memorises", [nan, 2.0, 1.0], [3.0, 2.0, 4.0]),
-                curve("grows", [nan, 1.0, 2.0], [3.0, 2.0, 1.0]),
-            ]
-        )
-    ).set_index("model")
+    curves = [
+        curve("learns", [nan, 2.0, 1.0], [3.0, 2.0, 1.0]),
+        curve("memorises", [nan, 2.0, 1.0], [3.0, 2.0, 4.0]),
+        curve("grows", [nan, 1.0, 2.0], [3.0, 2.0, 1.0]),
+    ]
+    table = learning_curves.learning_table(pd.concat(curves)).set_index("model")
     assert table["falls"].to_dict() == {"learns": True, "memorises": False, "grows": False}
     row = table.loc["learns"]
     assert (row["steps"], row["first_loss"], row["last_loss"]) == (2, 2.0, 1.0)
@@ -91,9 +88,7 @@ def test_the_interval_of_a_power_law_holds_the_truth_as_often_as_it_says():
     "windows, values, reach, message",
     [
         ([1, 2], [1, 2], [3], "needs 3 points"),
-        ([1, 2, 3], [1, 2], [3], "needs 3 points"),
         ([1, 2, 3], [1, 0, 2], [3], "positive, finite"),
-        ([1, 2, 3], [1, np.nan, 2], [3], "positive, finite"),
         ([1, 2, 3], [1, 2, 3], [-1], "positive, finite"),
     ],
 )
@@ -122,24 +117,9 @@ def test_measurement_goes_on_where_it_stopped(prepared, small, tmp_path, monkeyp
 
     monkeypatch.setattr(measure, "learning_curve", spy)
     measure.measure_learning(prepared, profile)
-    assert asked == [second]
     both, _ = read_table(path)
-    assert list(dict.fromkeys(both["model"])) == [first, second]
+    assert asked == [second] and list(dict.fromkeys(both["model"])) == [first, second]
     pd.testing.assert_frame_equal(both[both["model"] == first].reset_index(drop=True), kept)
-    # Named, a model is measured again; and other settings keep nothing.
-    measure.measure_learning(prepared, profile, [first])
-    assert asked == [second, first] and len(read_table(path)[0]) == len(both)
-
-
-def test_other_settings_keep_no_rows(prepared, small, tmp_path, monkeypatch):
-    curve = pd.DataFrame({"step": [0, 4], "loss": [math.nan, 1.0], "held_out_loss": [2.0, 1.0]})
-    monkeypatch.setattr(measure, "learning_curve", lambda data, preset, seed: curve.assign(model=preset))
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    profile = load_profile("smoke", "synthetic")
-    path = measure.measure_learning(prepared, profile, ["F3AMD-FNO-32"])
-    monkeypatch.setattr(measure, "SHORT_RUN", {**SHORT, "num_steps": 5})
-    measure.measure_learning(prepared, profile, ["F3AMD-FNO-32-raw"])
-    assert set(read_table(path)[0]["model"]) == {"F3AMD-FNO-32-raw"}
 
 
 def test_unknown_names_end_with_status_2(capsys):
@@ -220,16 +200,9 @@ def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch
     ("words", "message"),
     [
         (["--process", "0", "--coordinator", "host:1"], "come together or not at all"),
-        (["--processes", "2"], "come together or not at all"),
         (["--cluster", "--processes", "2"], "leave the three others out"),
     ],
 )
 def test_processes_that_do_not_say_enough_train_nothing(words, message, capsys):
     assert main(["train", *words]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
-    monkeypatch.setattr(measure, "available_models", lambda profile: [])
-    with pytest.raises(ValueError, match="no trained model for 'synthetic' at profile 'smoke'"):
-        measure.models_with_weights(load_profile("smoke", "synthetic"))

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_companion.measuring.likeness import LINES, REFUSED, likeness, likeness_of_readings, paper_figures
+from f3amd_companion.measuring.fingerprint import LINES, REFUSED, likeness, likeness_of_readings, paper_figures
 
 REAL = pd.Series(
     {"IRD": 4.1, "direction_error": 4.2, "trajectory_error": 0.029, "smoothness": 2.1, "foot_all_frames": 1.02}

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from builders import HISTORY, SKELETON, WINDOW, packed_from, straight_motion, tiny_packed, tiny_trained, tiny_windows
+from builders import HISTORY, SKELETON, WINDOW, packed_from, straight_motion, tiny_packed, tiny_windows
 from scipy.spatial.transform import Rotation
 
 from f3amd_companion.measuring import measure, posterior
@@ -92,10 +92,10 @@ def test_windows_that_overlap_are_not_counted_twice_and_nobody_is_their_own_neig
     assert posterior._apart(np.array([1, 0, 2, 3, 4]), starts, 10, 4) == [1, 3, 4]
     assert posterior._apart(np.array([4, 2, 1]), starts, 10, 2) == [4, 2]
     windows, _ = windows_of([(kick(sign * SWING), 0) for sign in (1, -1, -1, -1)])
-    table = posterior.continuation_spread(SKELETON, windows, windows, num_neighbours=3, given=["style, path, history"])
+    table = posterior.continuation_spread(SKELETON, windows, windows, num_neighbours=3).set_index("given")
     # The one who kicks up sees three who kick down, each of those sees one up and two down.
     expected = np.sqrt(3 / 4) * spread_of(1, 2)
-    assert table["value"].item() == pytest.approx(expected, rel=1e-3)
+    assert table.loc["style, path, history", "value"] == pytest.approx(expected, rel=1e-3)
 
 
 def test_data_without_neighbours_are_refused():
@@ -146,11 +146,6 @@ def test_a_network_that_passes_its_input_on_scatters_as_the_noise_does(model_tha
     assert (by["low"] < by["value"]).all() and (by["value"] < by["high"]).all()
 
 
-def test_one_draw_has_no_spread():
-    with pytest.raises(ValueError, match="at least 2 seeds"):
-        posterior.answer_spread(tiny_trained(), tiny_windows(), (1.0,), num_draws=1)
-
-
 # ------------------------------------------------------------------------------- measurement
 
 
@@ -171,18 +166,9 @@ def test_the_measurement_leaves_a_tidy_table_with_its_record(model_that, monkeyp
     assert list(real["given"]) == list(posterior.GIVEN) and real["sigma"].isna().all()
     mine = table[table["model"] == "F3AMD-FNO-32"]
     assert set(mine["quantity"]) == {"answer spread", "error", "x0 error"}
-    assert record["numbers_per_window"] == WINDOW * tiny_trained().config.channels
-    levels = posterior.POSTERIOR["smoke"]["num_levels"]
-    assert len(mine) == 3 * levels and mine["sigma"].max() == pytest.approx(128.0)
-    assert mine["weights"].str.fullmatch("[0-9a-f]{12}").all()
+    assert len(mine) == 3 * posterior.POSTERIOR["smoke"]["num_levels"] and mine["sigma"].max() == pytest.approx(128.0)
     assert record["weights_digests"] == {"F3AMD-FNO-32": [mine["weights"].iloc[0]]}
-    again, _ = read_table(measure.measure_posterior(prepared, profile))
-    assert again.equals(table) and not list(path.parent.glob("*.old1.*"))
     # Of another model alone: what was measured of the first is kept.
     other, _ = read_table(measure.measure_posterior(prepared, profile, ["F3AMD-FNO-48"]))
     assert set(other["model"]) == {"real", "F3AMD-FNO-48"}
     assert read_table(path.with_name("posterior.old1.csv"))[0].equals(table)
-
-
-def test_the_measurement_has_a_name_on_the_command_line():
-    assert measure.MEASUREMENTS["posterior"] is measure.measure_posterior

@@ -8,8 +8,7 @@ from builders import CHANNELS, SKELETON, random_frames
 from test_campaign import PROFILE, STYLES, judges, packed, small  # noqa: F401  (fixtures)
 
 from f3amd_companion.measuring import campaign, fingerprint
-from f3amd_companion.measuring.campaign import Run, queue, run_campaign, train_snapshots
-from f3amd_companion.measuring.recipes import find_recipe
+from f3amd_companion.measuring.campaign import Run, find_recipe, queue, run_campaign, train_snapshots
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path

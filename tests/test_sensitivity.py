@@ -1,6 +1,5 @@
 """Measuring the measures: orders, settling, foot spectra; on motion and features made by hand."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,8 +24,6 @@ class PlainClassifier:
 
     config = SimpleNamespace(window=SPAN)
     accuracy = 1.0
-    held_out_accuracy = {"calm": 1.0, "proud": 1.0}
-
     styles = ("calm", "proud")
 
     def __init__(self, **clouds):
@@ -144,13 +141,7 @@ def test_claim_q18_rank_agreement_in_closed_form():
 
 
 def test_bad_input_to_graded_corruptions_is_refused(packed, classifier):
-    test = {"splits": ("test",)}
-    with pytest.raises(ValueError, match="unknown corruption 'noise'"):
-        graded_corruptions(packed, classifier, PROTOCOL, (0.0,), corruptions=("noise",), **test)
     refused("no validation clip of calm, proud", graded_corruptions, packed, classifier, PROTOCOL)
-    with pytest.raises(ValueError, match="13 windows of style 'calm' are wanted, of 12"):
-        wanted = dataclasses.replace(PROTOCOL, windows_per_style=13)
-        graded_corruptions(packed, classifier, wanted, (0.0,), **test)
     guessing = PlainClassifier()
     guessing.accuracy = 0.5
     refused("recognises 50.0 %", graded_corruptions, packed, guessing, PROTOCOL)

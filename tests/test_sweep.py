@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
 import os
@@ -20,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from builders import HISTORY, WINDOW, refused, same_tree, tiny_packed, tiny_trained
+from builders import HISTORY, WINDOW, refused, same_tree, tiny_packed
 
 from f3amd_companion import __main__ as command_line
-from f3amd_companion.measuring import campaign, measure, sweep
+from f3amd_companion.measuring import campaign, sweep
 from f3amd_companion.measuring.campaign import Run, run_campaign
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.measuring.sweep import Leg, Work, gather, plan, run_leg, run_sweep
@@ -71,30 +70,25 @@ def test_snapshots_of_one_run_follow_each_other_and_others_do_not():
 
 
 def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
-    legs = plan(["walking", "noise_use", "learning"], [A, "F3AMD-FNO-48", A], PROFILE, QUEUE)
-    assert len(legs) == len({leg.name for leg in legs}) == 2 + 3 * 2
+    legs = plan(["walking", "noise_use"], [A, "F3AMD-FNO-48", A], PROFILE, QUEUE)
+    assert len(legs) == len({leg.name for leg in legs}) == 2 + 2 * 2
     after = {leg.name: leg.after for leg in legs}
     assert after[f"walking-{A}"] == after[f"noise_use-{A}"] == f"train-{A}"
-    assert after[f"train-{A}"] is None is after[f"learning-{A}"]
+    assert after[f"train-{A}"] is None
 
 
 @pytest.mark.parametrize(
     ("names", "models", "told"),
     [
-        ([], [A], "name what to sweep: campaign, learning"),
+        ([], [A], "name what to sweep: campaign, precision"),
         (["wolking"], [A], "walking"),
-        (["recipes"], [A], "not measured by preset: f3amd measure recipes"),
+        (["recipes"], [A], "unknown measurement by preset 'recipes'"),
         (["walking"], ["F3AMD-FNO-33"], "F3AMD-FNO-32"),
         (["campaign"], ["CAMDM"], "unknown name in the queue 'CAMDM'"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(names, models, told):
     refused(told, plan, names, models, PROFILE, QUEUE)
-
-
-def test_nothing_with_weights_and_nothing_named_is_refused(monkeypatch):
-    monkeypatch.setattr(measure, "available_models", lambda profile: [])
-    refused("--preset", plan, ["walking"], [], PROFILE, QUEUE)
 
 
 # ------------------------------------------------------------------------------------ legs, with a measurement made up
@@ -233,28 +227,6 @@ def test_what_the_campaign_has_measured_is_not_trained_anew(work, monkeypatch):
     assert rows["value"].tolist() == [1.0, 2.0, 2.0, 2.0]
     assert not list(work.place(plan(["campaign"], [], PROFILE, QUEUE)[0]).rglob("campaign.*"))
     assert record["weights_digests"][QUEUE[0][0].name] == ["a", "b"]
-
-
-@pytest.mark.slow
-def test_a_real_measurement_leaves_the_table_of_one_process(tmp_path, monkeypatch):
-    """`walking` itself, of two small networks: what it draws depends on no model that was measured before."""
-    prepared = PreparedData(tiny_packed(), WINDOW, HISTORY)
-    models = {A: tiny_trained(), B: tiny_trained(latent_width=12)}
-    obtain = lambda *arguments, preset, **settings: (models[preset], None, "shipped")
-    for module in (sweep, measure):
-        monkeypatch.setattr(module, "obtain_model", obtain)
-    monkeypatch.setattr(sweep, "_opened", lambda profile, source: prepared)
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "one process"))
-    profile = dataclasses.replace(PROFILE, window=WINDOW)
-    here = measure.measure_walking(prepared, profile, [A, B])
-    work = Work(profile, None, tmp_path / "results", tmp_path / "folder")
-    legs, told = plan(["walking"], [A, B], profile, []), {}
-    for leg in sorted(legs, key=lambda leg: leg.preset, reverse=True):  # the other one first
-        told[leg.name] = run_leg(work, leg, told.get(leg.after))
-    gather(work, legs)
-    assert contents(where(work)) == contents(here)
-    table = read_table(here)[0]
-    assert list(dict.fromkeys(table["model"])) == ["real", A, B] and set(table["steps"]) == {0, 1, 8}
 
 
 # ------------------------------------------------------------------------------------ the engine

@@ -12,17 +12,21 @@ at hand for minutes stand in `gpu_plan.toml`; their weights are measured elsewhe
 A queue may take months and machines: each
 row names its commit and the style classifier that it was seen through (`records/classifiers.csv` has
 how little two of one recipe differ).
+
+Does the network use its noise? One that predicts clean motion can lower its loss by answering with the mean of what
+history, path and style allow, and never look at its noisy input; one step then does as well as eight. Recipes (ours,
+`papers/f3amd/recipes.toml`) differ from the paper's in one thing each; all see as many windows from the same seed.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections import ChainMap
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,13 +37,12 @@ import pandas as pd
 import f3amd_lib
 from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
 from f3amd_companion.measuring.learning_curves import snapshot
-from f3amd_companion.measuring.recipes import find_recipe
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.speed.machine import device_name, matmul_precision
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.ground.papers import check_entry
+from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import errors_name, weights_digest
@@ -53,7 +56,7 @@ from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import compile_steps, held_out_terms, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData
-from f3amd_lib.training.recipe import TrainingConfig
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
 log = logging.getLogger("f3amd")
 
@@ -73,6 +76,86 @@ QUEUES = {"campaign": _QUEUES / "campaign.toml", "readings": _QUEUES / "readings
 """Table of records -> its queue."""
 
 GPU_PLAN = _QUEUES / "gpu_plan.toml"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One way to train `F3AMD-FNO-96`, or another model.
+
+    Attributes:
+      name: of the row; fit for a folder.
+      change: what differs from the paper, in words.
+      source: where the idea comes from.
+      preset: what it starts from, unless a row of the queue names another.
+      network: fields of the network's config that differ.
+      training: fields of the training config that differ.
+    """
+
+    name: str
+    change: str
+    source: str
+    preset: str = "F3AMD-FNO-96"
+    network: Mapping = field(default_factory=dict)
+    training: Mapping = field(default_factory=dict)
+
+    def config(self, num_steps: int, batch_size: int, seed: int) -> TrainingConfig:
+        """Return the training config: the paper's, but for the row's change.
+
+        Args:
+          num_steps, batch_size, seed: the same for all rows that are compared; a row with a batch of its own sees as
+            many windows, in other steps, of which it takes one at least.
+        """
+        settings = {"batch_size": batch_size, "seed": seed, **self.training}
+        num_steps = max(1, num_steps * batch_size // settings["batch_size"])
+        tenth = max(1, num_steps // 10)
+        if settings.get("schedule") == "warmup_cosine":
+            settings["warmup_steps"] = tenth
+        if settings.get("schedule") == "warmup_inverse_square":
+            settings["warmup_steps"] = min(200, tenth)
+        return paper_recipe(self.preset, num_steps, **settings)
+
+    def on(self, preset: str) -> Recipe:
+        """Return the same change of another model, which keeps its own network, losses and noise.
+
+        Raises:
+          ValueError: if the row changes one of these.
+        """
+        if preset == self.preset:
+            return self
+        own = [*self.network, *(name for name in ("loss", "diffusion") if name in self.training)]
+        if self.training.get("loss") == {"raw_features": True}:  # units are any model's
+            own.remove("loss")
+        if own or self.preset != Recipe.preset:
+            what = f"its {', '.join(own)}" if own else "a recipe of its own"
+            raise ValueError(f"{self.name} changes {what} of {self.preset}, so that it is no change of {preset}")
+        return replace(self, preset=preset)
+
+
+RECIPES: dict[str, Recipe] = {name: Recipe(name, **row) for name, row in load_paper_file("recipes").items()}
+"""Rows by name, the paper's first."""
+
+
+def find_recipe(name: str) -> Recipe:
+    """Return a recipe by name, or several changes in one: "residual-prior+higher-learning-rate".
+
+    Raises:
+      ValueError: for an unknown name, with the nearest, or for changes of unlike networks or of the same thing.
+    """
+    parts = name.split("+")
+    for part in parts:
+        check_known(part, RECIPES, "recipe")
+    if len(parts) == 1:
+        return RECIPES[name]
+    rows = [RECIPES[part] for part in parts]
+    losses = [row.training.get("loss", {}) for row in rows]
+    changed = [name for row, loss in zip(rows, losses, strict=True) for name in (*row.network, *row.training, *loss)]
+    if len(set(changed) - {"loss"}) < len(changed) - changed.count("loss") or len({row.preset for row in rows}) > 1:
+        raise ValueError(f"{name}: these recipes change the same thing, or start from unlike networks; ask for each")
+    together = {field: dict(ChainMap(*(getattr(row, field) for row in rows))) for field in ("network", "training")}
+    if "loss" in together["training"]:
+        together["training"]["loss"] = dict(ChainMap(*losses))
+    words = [", ".join(getattr(row, field) for row in rows) for field in ("change", "source")]
+    return Recipe(name, *words, rows[0].preset, **together)
 
 
 @dataclass(frozen=True)
@@ -165,9 +248,7 @@ def chosen(snapshots: Iterable[tuple[Run, int]], only: Collection[str]) -> list[
 def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]:
     """Return the snapshots of a queue, longest runs first; those of a run stay in their order."""
     snapshots = list(snapshots)
-    longest: dict[Run, int] = {}
-    for run, windows in snapshots:
-        longest[run] = max(windows, longest.get(run, 0))
+    longest = dict(sorted(snapshots, key=lambda snapshot: snapshot[1]))
     return sorted(snapshots, key=lambda snapshot: -longest[snapshot[0]])
 
 
@@ -204,36 +285,41 @@ def run_campaign(
       found, or "unfinished", which is the last.
     """
     check_precision(precision)
-    protocol = dataclasses.replace(protocol, num_seeds=1)
+    protocol = replace(protocol, num_seeds=1)
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement=table,
-        batch_size=batch_size, protocol=dataclasses.asdict(protocol),
+        batch_size=batch_size, protocol=asdict(protocol),
     )  # fmt: skip
     folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {table: ["run", "windows"]}
     records = Records(folder_of_records, record, keys, known=known)
-    rows_of = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
     if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
         clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
         real = real_rows(prepared.packed, clips, window=prepared.window)
         records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
-    for run, windows in snapshots:
-        key = {"run": run.name, "windows": windows}
-        if records.has(table, key):
-            yield run.name, windows, "measured before"
-            continue
+    how = {"batch_size": batch_size, "precision": precision, "record": record, "folder": folder}
+    how |= {"stop_at": stop_at, "progress": progress}
+
+    def measure(run: Run, windows: int) -> str:
+        if records.has(table, key := {"run": run.name, "windows": windows}):
+            return "measured before"
         if found_alone and not _weights(folder, run, windows).exists():
-            yield run.name, windows, "not there"
-            continue
+            return "not there"
         if stop_at is not None and time.monotonic() >= stop_at:
-            yield run.name, windows, "unfinished"
-            return
-        how = batch_size, precision, record, folder, stop_at, progress
-        rows = _measured(prepared, classifier, protocol, run, windows, *how, rows_of=rows_of)
-        if rows is None:
-            yield run.name, windows, "unfinished"
-            return
+            return "unfinished"
+        if (rows := _measured(prepared, classifier, protocol, run, windows, table, **how)) is None:
+            return "unfinished"
         records.put(table, key, rows)
-        yield run.name, windows, "measured"
+        return "measured"
+
+    return _in_turn(snapshots, measure)
+
+
+def _in_turn(snapshots: Iterable[tuple[Run, int]], do: Callable[[Run, int], str]) -> Iterator[tuple[str, int, str]]:
+    """Yield (run, windows, state) as each snapshot is done, up to the first that is "unfinished"."""
+    for run, windows in snapshots:
+        yield run.name, windows, (state := do(run, windows))
+        if state == "unfinished":
+            return
 
 
 def train_snapshots(
@@ -261,19 +347,22 @@ def train_snapshots(
     if jax.config.jax_compilation_cache_dir:
         with ThreadPoolExecutor() as pool:
             list(pool.map(compiled, dict.fromkeys(run for run, _ in snapshots)))
-    for run, windows in snapshots:
-        state = "kept before"
-        if not _weights(folder, run, windows).exists():
-            done = _trained(prepared, run, windows, batch_size, precision, record, folder, stop_at, progress)
-            state = "unfinished" if done is None else "kept"
-        yield run.name, windows, state
-        if state == "unfinished":
-            return
+
+    def keep(run: Run, windows: int) -> str:
+        if _weights(folder, run, windows).exists():
+            return "kept before"
+        done = _trained(
+            prepared, run, windows, batch_size=batch_size, precision=precision, record=record, folder=folder,
+            stop_at=stop_at, progress=progress,
+        )  # fmt: skip
+        return "unfinished" if done is None else "kept"
+
+    return _in_turn(snapshots, keep)
 
 
 def _laid_out(prepared: PreparedData, run: Run, batch_size: int) -> tuple[PreparedData, DenoisingTask]:
     """Return the data in a run's windows, and what trains the run on them."""
-    data = prepared if run.window == prepared.window else dataclasses.replace(prepared, window=run.window)
+    data = prepared if run.window == prepared.window else replace(prepared, window=run.window)
     config = run.config(data.windows("train").num_windows, batch_size)
     return data, data.task(run.preset, config, network=find_recipe(run.recipe).network)
 
@@ -283,7 +372,7 @@ def _weights(folder, run: Run, windows: int) -> Path:
 
 
 def _trained(
-    prepared, run: Run, windows: int, batch_size: int, precision: str, record, folder, stop_at, progress
+    prepared, run: Run, windows: int, *, batch_size: int, precision: str, record, folder, stop_at, progress
 ) -> tuple[PreparedData, TrainedModel, float, TrainingConfig] | None:
     """Train a run to a snapshot and keep its weights, or take those that are there.
 
@@ -309,18 +398,15 @@ def _trained(
     return data, trained, loss, config
 
 
-def _measured(
-    prepared, classifier, protocol, run: Run, windows: int, batch_size: int, precision: str, record, *how,
-    rows_of: Callable,
-) -> pd.DataFrame | None:  # fmt: skip
+def _measured(prepared, classifier, protocol, run: Run, windows: int, table: str, **how) -> pd.DataFrame | None:
     """Train a run to a snapshot, keep its weights and return its rows; None where the time was over before."""
-    done = _trained(prepared, run, windows, batch_size, precision, record, *how)
-    if done is None:
+    if (done := _trained(prepared, run, windows, **how)) is None:
         return None
     data, trained, loss, config = done
     log.info("measuring %s after %s windows", run.name, f"{windows:,}")
     held_out, seed = data.windows(data.held_out_split), protocol.path_seed
-    rows = rows_of(trained, data, classifier, protocol, held_out)
+    measure = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
+    rows = measure(trained, data, classifier, protocol, held_out)
     use = input_use(trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=seed)
     use = use.assign(steps=STEPS_MEASURED[0])[["metric", "unit", "value", "steps"]]
     errors = [loss, held_out_error(trained, held_out, seed=seed)]
@@ -331,7 +417,7 @@ def _measured(
         "epochs": seen / data.windows("train").num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
         # Where it was trained, which may be elsewhere.
-        "device": trained.record["device_kind"], "precision": precision,
+        "device": trained.record["device_kind"], "precision": how["precision"],
         "commit": (trained.record["git_commit"] or "")[:10],
     }  # fmt: skip
     return pd.concat([rows, use, of_windows]).assign(**columns)

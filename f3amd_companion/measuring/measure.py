@@ -21,25 +21,23 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from f3amd_companion.measuring import sensitivity
+from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
-from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve, snapshot
+from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve
 from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
-from f3amd_companion.measuring.posterior import POSTERIOR, posterior_table
+from f3amd_companion.measuring.posterior import GIVEN, POSTERIOR, answer_spread, continuation_spread
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
-from f3amd_companion.measuring.recipes import RECIPE_STEPS, RECIPES, train_recipe
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
-from f3amd_companion.speed.timing import take_turns
+from f3amd_companion.speed.measurements import Candidate, time_group
 from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, set_aside_table, whole_table, write_table
@@ -56,7 +54,6 @@ from f3amd_lib.measures.protocol import (
     windows_that_fit,
 )
 from f3amd_lib.measures.real_clips import reference_clips, style_floor
-from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.measures.rollout_measures import measure_rollout
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
@@ -64,10 +61,8 @@ from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.networks import presets
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.rollout.rounds import sample_round
-from f3amd_lib.training.checkpoints import TrainedModel, network_with
-from f3amd_lib.training.denoising_task import network_inputs
-from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
+from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model, train
 from f3amd_lib.training.recipe import profile_recipe
 
 log = logging.getLogger("f3amd")
@@ -90,15 +85,15 @@ WALKING_SEEDS = 3
 PRECISION_SEEDS = 5
 """Seeds of path and noise in `measure_precision`."""
 
-SNAPSHOTS = 10
-"""Measurements on the way of a training in `measure_quality_by_epoch`."""
-
 ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-steady": (1,)}
 """Models that `measure_one_step` distils -> the numbers of phases, each a student of its own. A continuous schedule's
 grid of 2 steps does not visit the middle of its grid of 8, so that its student has one phase."""
 
 STUDENT_STEPS, STUDENT_BATCH = {"smoke": 4, "laptop": 300, "gpu": 20_000}, 32
 """Optimiser steps of a student by profile, and windows of each."""
+
+RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
+"""Optimiser steps of every row of recipes, by profile; of one with a batch of its own, as many windows."""
 
 _TIMED_CHARACTERS = 32
 
@@ -144,25 +139,33 @@ def _models(
     return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
+def _rows_of(profile: Profile, asked: Iterable[tuple[str, int]]) -> list[dict]:
+    """Return what names the rows of each (model, steps)."""
+    return [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in asked]
+
+
 def _digests(trained: Mapping[str, TrainedModel]) -> dict[str, str]:
     return {name: weights_digest(model.params) for name, model in trained.items()}
 
 
 def _measure(
-    profile: Profile, record: dict, keys: Mapping[str, list[str]], todo: Iterable[dict], measure: Callable, *,
+    profile: Profile, record: dict, tables: Iterable[str], todo: list[dict], measure: Callable, *,
     again: Iterable[str] | None, trained: Mapping[str, TrainedModel] | None = None, other: str = "",
-    summaries: Mapping[str, tuple[str, Callable]] = {},
+    summary: Callable | None = None,
 ) -> Path:  # fmt: skip
     """Measure what has no rows yet (see `Records.measure`), or is of models that are asked for `again` by name.
 
-    With `trained` models, what names a measurement holds the digest of its network's weights, `other` where it has no
-    network.
+    What is to do names its rows in all `tables`, of which the first says whether it was measured; the `summary` of a
+    table `<name>_by_seed` is the table `<name>`. With `trained` models, rows hold the digest of their network's
+    weights, `other` where they have no network.
     """
+    first, *_ = tables
+    keys = dict.fromkeys(tables, list(todo[0]) if todo else [])
     if trained is not None:
         digests = _digests(trained)
         todo = [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in todo]
-    records = Records(_records_dir(profile), record, keys, again=list(again or ()), summaries=summaries)
-    return records.measure(todo, measure)
+    summaries = {} if summary is None else {first.removesuffix("_by_seed"): (first, summary)}
+    return Records(_records_dir(profile), record, keys, again=again or (), summaries=summaries).measure(todo, measure)
 
 
 def _write_anew(
@@ -215,9 +218,9 @@ def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[
     def curve(row: Mapping) -> dict:
         return {"learning": learning_curve(prepared, row["model"], seed=profile.seed)}
 
-    record, todo = _record(prepared, profile, "learning", **SHORT_RUN), models or presets.of_paper()
-    todo = [{"model": name} for name in todo]
-    return _measure(profile, record, {"learning": ["model"]}, todo, curve, again=models)
+    record = _record(prepared, profile, "learning", **SHORT_RUN)
+    todo = [{"model": name} for name in models or presets.of_paper()]
+    return _measure(profile, record, ["learning"], todo, curve, again=models)
 
 
 def measure_quality(
@@ -260,12 +263,10 @@ def measure_quality(
             rows = measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
         return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
 
-    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in todo]
-    keys = dict.fromkeys(["quality_by_seed", "quality_by_round"], ["model", "window_frames", "steps"])
     # Real motion has no weights, but it is seen through the classifier's.
     return _measure(
-        profile, record, keys, rows, score, again=models, trained=trained, other=record["classifier_weights"],
-        summaries={"quality": ("quality_by_seed", summarise)},
+        profile, record, ["quality_by_seed", "quality_by_round"], _rows_of(profile, todo), score, again=models,
+        trained=trained, other=record["classifier_weights"], summary=summarise,
     )  # fmt: skip
 
 
@@ -291,7 +292,7 @@ def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[s
       The table, `records/walking.csv`: a row per model, window, steps, seed and style, with the digest
       of the weights.
     """
-    return _measure_walks(prepared, profile, models, "walking", {"window_frames": profile.window}, ["as made"])
+    return _measure_walks(prepared, profile, models, "walking", ["as made"])
 
 
 def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -303,14 +304,13 @@ def measure_feet(prepared: PreparedData, profile: Profile, models: Iterable[str]
       The table, `records/feet.csv`: a row per model, steps, treatment, seed and style; the row "real" is of held-out
       clips.
     """
-    return _measure_walks(prepared, profile, models, "feet", {}, TREATMENTS)
+    return _measure_walks(prepared, profile, models, "feet", TREATMENTS)
 
 
 def _measure_walks(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, also: dict,
-    treatments: Iterable[str],
-) -> Path:  # fmt: skip
-    """Measure rollouts on three short paths by `walking_figures`, each of them as treated; `also` names rows, too."""
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, treatments: Iterable[str]
+) -> Path:
+    """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
     packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
@@ -344,9 +344,10 @@ def _measure_walks(
         ]  # fmt: skip
         return {name: pd.DataFrame(rows)}
 
-    rows = [("real", 0), *itertools.product(trained, (8, 1))]
-    todo = [{"model": model, **also, "steps": steps} for model, steps in rows]
-    return _measure(profile, record, {name: list(todo[0])}, todo, measured, again=models, trained=trained)
+    todo = _rows_of(profile, [("real", 0), *itertools.product(trained, (8, 1))])
+    if name == "feet":
+        todo = [{"model": row["model"], "steps": row["steps"]} for row in todo]
+    return _measure(profile, record, [name], todo, measured, again=models, trained=trained)
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -371,9 +372,10 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
         return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
 
     todo = [{"model": name, "window_frames": profile.window} for name in found]
-    record, keys = _record(prepared, profile, "trained"), {"trained": ["model", "window_frames"]}
-    by_name = {name: model for name, (model, *_) in found.items()}
-    return _measure(profile, record, keys, todo, sum_up, again=models, trained=by_name)
+    trained = {name: model for name, (model, *_) in found.items()}
+    return _measure(
+        profile, _record(prepared, profile, "trained"), ["trained"], todo, sum_up, again=models, trained=trained
+    )
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -424,14 +426,27 @@ def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable
     Some minutes in all.
 
     Returns:
-      The table `records/posterior.csv` (see `posterior.posterior_table`), measured anew.
+      The table `records/posterior.csv`, measured anew: columns model ("real" for real motion), quantity
+      ("continuations", "answer spread", "error", "x0 error"), unit, given, sigma (NaN for real motion), value, low,
+      high, repeats, neighbours, history_apart, path_apart (see `measuring.posterior`), weights (which, for a model).
     """
     settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
-    trained = _models(prepared, profile, models)
-    table = posterior_table(prepared, trained, **settings, seed=profile.seed, progress=True)
+    how = {"num_windows": settings["num_windows"], "seed": profile.seed}
+    held_out, trained = prepared.windows(prepared.held_out_split), _models(prepared, profile, models)
+    skeleton, pool = prepared.packed.skeleton, prepared.windows("train")
+    real = continuation_spread(skeleton, held_out, pool, num_neighbours=settings["num_neighbours"], **how)
+    tables = [real.assign(model="real", quantity="continuations", unit="cm", weights="")]
+    sigmas, digests = np.geomspace(0.01, 128.0, settings["num_levels"]), _digests(trained)
+    for name, model in trained.items():
+        log.info("posterior of %s", name)
+        rows = answer_spread(model, held_out, sigmas, num_draws=settings["num_draws"], **how)
+        tables.append(rows.assign(model=name, given=list(GIVEN)[-1], weights=digests[name]))
+    columns = ["model", "quantity", "unit", "given", "sigma", "value", "low", "high", "repeats"]
+    columns += ["neighbours", "history_apart", "path_apart", "weights"]
+    table = pd.concat(tables, ignore_index=True).reindex(columns=columns)
     return _write_anew(
         prepared, profile, "posterior", table, trained, held_out_split=prepared.held_out_split, settings=settings,
-        numbers_per_window=prepared.window * num_channels(prepared.packed.skeleton),
+        numbers_per_window=prepared.window * num_channels(skeleton),
     )  # fmt: skip
 
 
@@ -453,12 +468,9 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
     classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
     held_out = prepared.windows(prepared.held_out_split)
     trained = _models(prepared, profile, models, at_least_one=True)
-    others = {name for name, model in trained.items() if model.diffusion.sampler != UPDATES["rescaled"]}
+    others = sorted(name for name, model in trained.items() if model.diffusion.sampler != UPDATES["rescaled"])
     if others and models:
-        raise ValueError(
-            f"{', '.join(sorted(others))}: another sampler than DDIM has no printed update: name models that sample by "
-            "DDIM in the VE state"
-        )
+        raise ValueError(f"{', '.join(others)}: has no printed update: name models that sample by DDIM")
     trained = {name: model for name, model in trained.items() if name not in others}
 
     def summary(rows: pd.DataFrame) -> pd.DataFrame:
@@ -482,11 +494,9 @@ def measure_literal_update(prepared: PreparedData, profile: Profile, models: Ite
         for name, spacing, update, steps in itertools.product(trained, SPACINGS, UPDATES, STEPS)
         if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
     ]
-    way, how = ["model", "spacing", "update", "steps"], {"again": models, "trained": trained}
-    _measure(profile, record, {"literal_update_windows": way[:2]}, windows, windows_of, **how)
-    summaries = {"literal_update": ("literal_update_by_seed", summary)}
-    keys = {"literal_update_by_seed": way}
-    return _measure(profile, record, keys, rollouts, walk_rollouts, summaries=summaries, **how)
+    how = {"again": models, "trained": trained}
+    _measure(profile, record, ["literal_update_windows"], windows, windows_of, **how)
+    return _measure(profile, record, ["literal_update_by_seed"], rollouts, walk_rollouts, summary=summary, **how)
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -513,9 +523,9 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
         }
 
     # The table that says what was measured is written last.
-    keys = dict.fromkeys(["noise_use", "x0_by_sigma", "input_use"], ["model"])
+    record, tables = _record(prepared, profile, "noise_use"), ["noise_use", "x0_by_sigma", "input_use"]
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
-    return _measure(profile, _record(prepared, profile, "noise_use"), keys, rows, ask, again=models, trained=trained)
+    return _measure(profile, record, tables, rows, ask, again=models, trained=trained)
 
 
 def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -537,38 +547,8 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     return _write_anew(prepared, profile, "gradient_norm", table.assign(model=trained.name), by_name)
 
 
-def measure_quality_by_epoch(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train anew by the profile's recipe, and measure on the way (claim E13); long.
-
-    Ten snapshots of each model, one rollout of each style at each, with the steps of the profile.
-
-    Returns:
-      The table `records/quality_by_epoch.csv`: the nine metrics of Table 3 and the held-out loss,
-      against epochs over the training windows. By default of `F3AMD-FNO-96` and `CAMDM`.
-    """
-    classifier, protocol, record = protocol_of(prepared, profile, "quality_by_epoch")
-    protocol = dataclasses.replace(protocol, num_seeds=1)
-    held_out = prepared.windows(prepared.held_out_split)
-    folder = runs_dir(profile.dataset, profile.name) / "by_epoch"
-
-    def score(row: Mapping) -> dict:
-        recipe = profile_recipe(profile, row["model"])
-        steps = max(1, round(recipe.num_steps * row["snapshot"] / SNAPSHOTS))
-        trained, loss = snapshot(prepared, row["model"], recipe, steps, record, folder=folder)
-        epoch = steps * recipe.batch_size / prepared.windows("train").num_windows
-        generator = MotionGenerator(trained, profile.num_steps)
-        rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out)
-        rows = rows[rows["metric"].isin([metric.name for metric in SHOWN["paper"]])][["metric", "value"]]
-        rows = pd.concat([rows, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])])
-        return {"quality_by_epoch": rows.assign(epoch=epoch, weights=weights_digest(trained.params))}
-
-    names = models or ["F3AMD-FNO-96", "CAMDM"]
-    todo = [{"model": name, "snapshot": number + 1} for name in names for number in range(SNAPSHOTS)]
-    return _measure(profile, record, {"quality_by_epoch": ["model", "snapshot"]}, todo, score, again=models)
-
-
 def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train `F3AMD-FNO-96` with one change each, for a short while (see `measuring.recipes`).
+    """Train `F3AMD-FNO-96` with one change each, for a short while (see `measuring.campaign`).
 
     Unfinished runs are gone on with; a row takes some minutes on 2 cores. Rows are recipes, and all
     are measured.
@@ -580,17 +560,20 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
       ValueError: if models are named.
     """
     _refuse_models(models, "recipes are rows of their own")
-    record = _record(prepared, profile, "recipes", num_steps=RECIPE_STEPS[profile.name], batch_size=profile.batch_size)
-    held_out = prepared.windows(prepared.held_out_split)
-    folder = runs_dir(profile.dataset, profile.name) / "recipes"
+    num_steps, held_out = RECIPE_STEPS[profile.name], prepared.windows(prepared.held_out_split)
+    record = _record(prepared, profile, "recipes", num_steps=num_steps, batch_size=profile.batch_size)
 
     def train_and_ask(row: Mapping) -> dict:
-        trained = train_recipe(prepared, profile, row["recipe"], folder=folder)
+        recipe = RECIPES[row["recipe"]]
+        config = recipe.config(num_steps, profile.batch_size, profile.seed)
+        folder = runs_dir(profile.dataset, profile.name) / "recipes" / recipe.name
+        how = {"config": config, "network": recipe.network, "folder": folder}
+        trained, _ = train(prepared, profile, preset=recipe.preset, **how)
         rows = denoising.window_row(trained, held_out, seed=profile.seed)
-        return {"recipes": rows.assign(**row, weights=weights_digest(trained.params))}
+        named = {"recipe": recipe.name, "change": recipe.change, "weights": weights_digest(trained.params)}
+        return {"recipes": rows.assign(**named)}
 
-    todo = [{"recipe": name, "change": recipe.change} for name, recipe in RECIPES.items()]
-    return _measure(profile, record, {"recipes": ["recipe"]}, todo, train_and_ask, again=None)
+    return _measure(profile, record, ["recipes"], [{"recipe": name} for name in RECIPES], train_and_ask, again=None)
 
 
 def compare_precisions(
@@ -651,7 +634,7 @@ def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable
         return {"precision": compare_precisions(trained[row["model"]], packed, styles, **settings)}
 
     todo = [{"model": name, "steps": steps} for name, steps in itertools.product(trained, (1, 8))]
-    return _measure(profile, record, {"precision": ["model", "steps"]}, todo, compare, again=models, trained=trained)
+    return _measure(profile, record, ["precision"], todo, compare, again=models, trained=trained)
 
 
 DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
@@ -689,10 +672,8 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
 
     todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
     walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
-    rows = [{"model": model, "window_frames": profile.window, "steps": steps} for model, steps in walks + todo]
-    keys = dict.fromkeys(["one_step_by_seed", "one_step_input_use"], ["model", "window_frames", "steps"])
-    summaries = {"one_step": ("one_step_by_seed", summarise)}
-    return _measure(profile, record, keys, rows, score, again=models, trained=trained, summaries=summaries)
+    tables, rows = ["one_step_by_seed", "one_step_input_use"], _rows_of(profile, walks + todo)
+    return _measure(profile, record, tables, rows, score, again=models, trained=trained, summary=summarise)
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -704,32 +685,18 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
       The table `records/round_times.csv`: model, steps, characters, milliseconds (the median) and their bounds.
     """
     trained = _models(prepared, profile, models, among=(*ONE_STEP_MODELS, "F3AMD-FNO-96"))
-    batch = spread_windows(prepared.windows(prepared.held_out_split), _TIMED_CHARACTERS)
-
-    def compiled(model: TrainedModel, steps: int) -> Callable:
-        sigmas, sampler = model.diffusion.grid(steps), model.diffusion.sampler
-        _, condition = network_inputs(batch, model.normaliser)
-
-        @jax.jit
-        def draw(params, condition, key):
-            return sample_round(network_with(model.config, params), condition, sigmas, key, sampler=sampler)
-
-        return lambda: draw(model.params, condition, jax.random.key(0)).block_until_ready()
-
-    rounds = {(name, steps): compiled(model, steps) for name, model in trained.items() for steps in STEPS}
-    rows = [
-        {"model": name, "steps": steps, "characters": _TIMED_CHARACTERS, "milliseconds": 1000.0 * timing.median}
-        | {f"milliseconds_{bound}": 1000.0 * getattr(timing, f"median_{bound}") for bound in ("low", "high")}
-        for (name, steps), timing in take_turns(rounds, min_rounds=30, min_seconds=5.0).items()
-    ]
-    return _write_anew(prepared, profile, "round_times", pd.DataFrame(rows), trained)
+    asked = [Candidate(name, steps, _TIMED_CHARACTERS, "jit") for name in trained for steps in STEPS]
+    times, _ = time_group(asked, lambda name, window: trained[name].config, min_rounds=30, min_seconds=5.0)
+    called = {"value": "milliseconds", "median_low": "milliseconds_low", "median_high": "milliseconds_high"}
+    table = times[["model", "steps", "characters", *called]].rename(columns=called)
+    return _write_anew(prepared, profile, "round_times", table, trained)
 
 
 MEASUREMENTS: dict[str, Callable] = {
     measure.__name__.removeprefix("measure_"): measure
     for measure in (
         measure_learning, measure_precision, measure_literal_update, measure_posterior, measure_noise_use,
-        measure_gradient_norm, measure_recipes, measure_quality, measure_quality_by_epoch, measure_walking,
+        measure_gradient_norm, measure_recipes, measure_quality, measure_walking,
         measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
         measure_round_times,
     )

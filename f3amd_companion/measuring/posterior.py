@@ -16,26 +16,21 @@ bound what is left open at the highest noise level from above.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from scipy.spatial.distance import cdist
-from tqdm import tqdm
 
 from f3amd_lib.data.features import frame_positions, frame_yaw
 from f3amd_lib.data.windows import WindowSet, gather_windows, spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.arrays import in_batches
-from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.denoising import CM, root_mean_square
 from f3amd_lib.measures.distributions import diversity_variance
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.denoising_task import network_inputs
-from f3amd_lib.training.pipeline import PreparedData
 
 GIVEN = {"style": (), "style, path": ("path",), "style, path, history": ("path", "history")}
 """What continuations have in common -> what is compared to find them, beside the style."""
@@ -92,8 +87,8 @@ def _apart(order: np.ndarray, starts: np.ndarray, gap: int, most: int) -> list[i
 
 
 def continuation_spread(
-    skeleton: Skeleton, windows: WindowSet, pool: WindowSet, *, given: Sequence[str] = tuple(GIVEN),
-    num_windows: int = 128, num_neighbours: int = 8, seed: int = 0,
+    skeleton: Skeleton, windows: WindowSet, pool: WindowSet, *, num_windows: int = 128, num_neighbours: int = 8,
+    seed: int = 0,
 ) -> pd.DataFrame:  # fmt: skip
     """Measure how far real motion goes apart that had style, path and history in common.
 
@@ -113,16 +108,15 @@ def continuation_spread(
         taken, spread evenly.
       pool: where neighbours are looked up, usually the training windows. If it is `windows` itself,
         a window is not its own neighbour, nor are those that overlap it.
-      given: keys of `GIVEN`. With "style" alone neighbours are drawn at random.
       num_windows: how many windows to take.
       num_neighbours: K, at least 2. Where a style has fewer, those there are; one with less than 2
         is left out.
       seed: of the random draws.
 
     Returns:
-      Columns given, value, low, high (cm; root mean square over windows with its 95 % interval),
-      repeats (windows), neighbours (mean number), history_apart and path_apart (root mean squares
-      of the distances to the neighbours, in cm).
+      Columns given (a key of `GIVEN`; with "style" alone neighbours are drawn at random), value, low, high (cm;
+      root mean square over windows with its 95 % interval), repeats (windows), neighbours (mean number),
+      history_apart and path_apart (root mean squares of the distances to the neighbours, in cm).
 
     Raises:
       ValueError: if no window has two neighbours in the pool.
@@ -137,7 +131,8 @@ def continuation_spread(
     asked = _conditions(skeleton, windows, chosen)
     styles, pool_styles = np.asarray(windows.styles)[chosen], np.asarray(pool.styles)
     gap = pool.window + pool.num_history
-    neighbours: dict[str, list] = {name: [] for name in given}
+    continuations = jax.jit(lambda pool, index: _facing_windows(skeleton, pool, index)[2])
+    found = []
     for style in np.unique(styles):
         candidates = np.flatnonzero(pool_styles == style).astype(np.int32)
         if not len(candidates):
@@ -151,32 +146,24 @@ def continuation_spread(
             if pool is windows:
                 own = int(np.asarray(windows.starts)[chosen[query]])
                 usable = usable[np.abs(starts - own) >= gap]
-            for name in given:
-                parts = [squares[part][row, usable] for part in GIVEN[name]]
+            for name, compared in GIVEN.items():
+                parts = [squares[part][row, usable] for part in compared]
                 order = np.argsort(sum(parts)) if parts else rng.permutation(len(usable))
                 near = _apart(usable[order], starts, gap, num_neighbours)
                 if len(near) > 1:
-                    apart = {part: float(squares[part][row, near].mean()) for part in squares}
-                    neighbours[name].append((candidates[near], apart))
-    if not any(neighbours.values()):
+                    # Of the same length for all, so that there is one compilation; copies are cut off again.
+                    joints = continuations(pool, np.resize(candidates[near], num_neighbours))[: len(near)]
+                    neighbours = {"neighbours": len(near)} | {part: squares[part][row, near].mean() for part in squares}
+                    found.append({"given": name, "variance": diversity_variance(np.asarray(joints))} | neighbours)
+    if not found:
         raise ValueError(f"no style has two windows of {gap} frames in the pool that do not overlap: take more data")
-
-    @jax.jit
-    def continuations(pool, index):
-        return _facing_windows(skeleton, pool, index)[2]
-
     rows = []
-    for name, of_windows in neighbours.items():
-        # Of the same length for all, so that there is one compilation; copies are cut off again.
-        variances = [
-            diversity_variance(np.asarray(continuations(pool, np.resize(near, num_neighbours)))[: len(near)])
-            for near, _ in of_windows
-        ]
-        row = {"given": name, **root_mean_square(variances)}
-        row["neighbours"] = float(np.mean([len(near) for near, _ in of_windows]))
-        for part in ("history", "path"):
-            row[f"{part}_apart"] = CM * float(np.sqrt(np.mean([apart[part] for _, apart in of_windows])))
-        rows.append(row)
+    for name, of_windows in pd.DataFrame(found).groupby("given", sort=False):
+        mean = {column: np.mean(of_windows[column].to_numpy()) for column in ("neighbours", "history", "path")}
+        apart = {f"{part}_apart": CM * np.sqrt(mean[part]) for part in ("history", "path")}
+        rows.append(
+            {"given": name, **root_mean_square(of_windows["variance"]), "neighbours": mean["neighbours"], **apart}
+        )
     return pd.DataFrame(rows)
 
 
@@ -253,40 +240,3 @@ def _levels_of(trained: TrainedModel, sigmas) -> list[float]:
     sigmas = [float(sigma) for sigma in sigmas]
     known = getattr(trained.config, "noise_levels", ())
     return [level for level in known if min(sigmas) <= level <= max(sigmas)] or [max(known)] if known else sigmas
-
-
-# ------------------------------------------------------------------------------------ both in one table
-
-
-def posterior_table(
-    prepared: PreparedData, models: Mapping[str, TrainedModel], *, num_windows: int, num_draws: int,
-    num_levels: int, num_neighbours: int, seed: int = 0, progress: bool = False,
-) -> pd.DataFrame:  # fmt: skip
-    """Put real continuations and models on one set of held-out windows into one table.
-
-    Args:
-      prepared: the data.
-      models: name -> trained model.
-      num_windows, num_draws, num_neighbours, seed: see `continuation_spread`, `answer_spread`.
-      num_levels: noise levels, evenly spaced in log sigma from 0.01 to 128 (section 4.5).
-      progress: show a progress bar.
-
-    Returns:
-      Columns model ("real" for real motion), quantity ("continuations", "answer spread", "error",
-      "x0 error"), unit, given, sigma (NaN for real motion), value, low, high, repeats, neighbours,
-      history_apart, path_apart (see there), weights (which, for a model).
-    """
-    held_out = prepared.windows(prepared.held_out_split)
-    pool = prepared.windows("train") if prepared.held_out_split != "train" else held_out
-    real = continuation_spread(
-        prepared.packed.skeleton, held_out, pool, num_windows=num_windows, num_neighbours=num_neighbours, seed=seed
-    )
-    tables = [real.assign(model="real", quantity="continuations", unit="cm")]
-    sigmas = np.geomspace(0.01, 128.0, num_levels)
-    for name, trained in tqdm(models.items(), unit="model", disable=not progress):
-        rows = answer_spread(trained, held_out, sigmas, num_windows=num_windows, num_draws=num_draws, seed=seed)
-        tables.append(rows.assign(model=name, given=list(GIVEN)[-1], weights=weights_digest(trained.params)))
-    columns = ["model", "quantity", "unit", "given", "sigma", "value", "low", "high", "repeats"]
-    columns += ["neighbours", "history_apart", "path_apart", "weights"]
-    table = pd.concat(tables, ignore_index=True).reindex(columns=columns)
-    return table.assign(weights=table["weights"].fillna(""))

@@ -39,18 +39,14 @@ from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model,
 
 log = logging.getLogger("f3amd")
 
-INSTALL = 'make sweep-tools, or pip install "f3amd_lib[sweep]"'
-
 CAMPAIGN, TRAIN = "campaign", "train"
 """Legs that are no measurement of `measure`: a snapshot of the queue, and the training of a preset."""
 
-NOT_BY_PRESET = ("recipes", "sensitivity", "gradient_norm")
-"""Measurements whose table is not one of presets side by side."""
+NOT_BY_PRESET = ("learning", "recipes", "sensitivity", "gradient_norm")
+"""Measurements whose table is not one of trained presets side by side."""
 
 CONNECT_S = 10
 """Seconds after which a scheduler counts as not reached."""
-
-_TRAIN_THEMSELVES = ("learning", "quality_by_epoch")
 
 _ALONE = threading.Lock()  # a process has one results folder: its legs run one after the other
 
@@ -129,9 +125,7 @@ def plan(
     if not names:
         raise ValueError(f"name what to sweep: {', '.join(swept)}")
     for name in names:
-        if name in NOT_BY_PRESET:
-            raise ValueError(f"{name} is not measured by preset: f3amd measure {name}")
-        check_known(name, swept, "measurement")
+        check_known(name, swept, "measurement by preset")
     asked = list(dict.fromkeys(presets.find_preset(model).name for model in models))
     legs, last = [], {}
     for name in dict.fromkeys(names):
@@ -140,8 +134,8 @@ def plan(
             legs.append(Leg(CAMPAIGN, run.preset, run, windows, last.get(run)))
             last[run] = legs[-1].name
         for model in (asked or models_with_weights(profile, "--preset")) if name != CAMPAIGN else ():
-            training = None if name in _TRAIN_THEMSELVES else Leg(TRAIN, model)
-            legs += [Leg(name, model)] if training is None else [training, Leg(name, model, after=training.name)]
+            training = Leg(TRAIN, model)
+            legs += [training, Leg(name, model, after=training.name)]
     return list(dict.fromkeys(legs))  # of two measurements of a preset the training is one leg
 
 
@@ -191,9 +185,8 @@ def run_leg(work: Work, leg: Leg, before: dict | None = None) -> dict:
 
 def _measured(work: Work, leg: Leg, prepared: PreparedData) -> str:
     """Measure a preset, unless it was with the same weights, data and profile."""
-    finished, weights = work.place(leg) / "finished.json", ""
-    if leg.after is not None:
-        weights = weights_digest(obtain_model(prepared, work.profile, preset=leg.preset)[0].params)
+    finished = work.place(leg) / "finished.json"
+    weights = weights_digest(obtain_model(prepared, work.profile, preset=leg.preset)[0].params)
     asked = {"profile": dataclasses.asdict(work.profile), "data": prepared.packed.fingerprint, "weights": weights}
     asked = json.dumps(asked, indent=1) + "\n"
     if finished.exists() and finished.read_text(encoding="utf-8") == asked:
@@ -216,13 +209,11 @@ def gather(work: Work, legs: Iterable[Leg]) -> list[Path]:
     Raises:
       ValueError: if a leg was measured with other settings than the first.
     """
-    left: dict[str, list[tuple[Leg, pd.DataFrame, dict]]] = {}
-    for leg in legs:
-        for path in sorted(work.records(work.place(leg)).glob("*.csv")):
-            if "." not in path.stem:  # what was set aside has a number there
-                left.setdefault(path.name, []).append((leg, *read_table(path)))
+    left = [(leg, path) for leg in legs for path in sorted(work.records(work.place(leg)).glob("*.csv"))]
     written = []
-    for name, parts in left.items():
+    # What was set aside has a number in its name.
+    for name in dict.fromkeys(path.name for _, path in left if "." not in path.stem):
+        parts = [(leg, *read_table(path)) for leg, path in left if path.name == name]
         record, target, tables, digests = parts[0][2], work.records(work.results) / name, [], {}
         for leg, _, its in parts:
             if record_hash(its) != record_hash(record):
@@ -273,31 +264,30 @@ def run_sweep(
         ) from None
     # What concerns the user comes back as a leg's state.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with contextlib.ExitStack() as held:
-        address = scheduler
-        if address is None:
-            # Dask would give each worker one thread of linear algebra: sums would end in other last digits.
-            held.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": {}}))
-            address = held.enter_context(
-                LocalCluster(
-                    n_workers=workers, threads_per_worker=1, memory_limit=None, dashboard_address=None,
-                    silence_logs=logging.CRITICAL, env={"TQDM_DISABLE": "1"},
-                )
-            )  # fmt: skip
+    cluster = contextlib.nullcontext(scheduler)
+    if scheduler is None:
+        # Dask would give each worker one thread of linear algebra: sums would end in other last digits.
+        dask.config.set({"distributed.nanny.pre-spawn-environ": {}})
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=1, memory_limit=None, dashboard_address=None,
+            silence_logs=logging.CRITICAL, env={"TQDM_DISABLE": "1"},
+        )  # fmt: skip
+    with cluster as address:
         try:
-            client = held.enter_context(Client(address, timeout=CONNECT_S))
+            client = Client(address, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
             raise ValueError(f"--scheduler {scheduler}: not reached ({error}); `dask scheduler` starts one") from None
-        client.forward_logging(log.name)
-        log.info("workers      %d now; legs wait for a free one", len(client.nthreads()))
-        futures, of_key = {}, {}
-        for leg in legs:
-            key = f"{leg.name}-{uuid.uuid4().hex}"  # a cluster may still hold an earlier sweep's
-            futures[leg.name] = client.submit(run_leg, work, leg, futures.get(leg.after), key=key, pure=False)
-            of_key[key] = leg
-        for future in as_completed(futures.values()):
-            try:
-                told = future.result()
-            except Exception as error:  # a failed leg is no reason to stop the others
-                told = {"state": f"failed, {error or type(error).__name__}"}
-            yield of_key[future.key], told
+        with client:
+            client.forward_logging(log.name)
+            log.info("workers      %d now; legs wait for a free one", len(client.nthreads()))
+            futures, of_key = {}, {}
+            for leg in legs:
+                key = f"{leg.name}-{uuid.uuid4().hex}"  # a cluster may still hold an earlier sweep's
+                futures[leg.name] = client.submit(run_leg, work, leg, futures.get(leg.after), key=key, pure=False)
+                of_key[key] = leg
+            for future in as_completed(futures.values()):
+                try:
+                    told = future.result()
+                except Exception as error:  # a failed leg is no reason to stop the others
+                    told = {"state": f"failed, {error or type(error).__name__}"}
+                yield of_key[future.key], told
