@@ -15,7 +15,7 @@ import collections
 import contextlib
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 
 import nbformat
@@ -35,48 +35,33 @@ from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 
 KERNEL = "python3"
-_SETTLED = 60.0
-"""Seconds at the usual pace that are taken for granted before a run's own pace counts."""
 
 
 class NotebookFailed(RuntimeError):
     """A notebook stopped; the message names the notebook, the cell, the error and the log."""
 
 
-def find_notebooks(folder) -> list[Path]:
+def find_notebooks(folder, only: Iterable[str] = ()) -> list[Path]:
     """Return the numbered notebooks of a folder in their order.
 
     Args:
       folder: where `00_....ipynb`, `01_....ipynb` and so on lie.
+      only: numbers ("03", "3") or names ("03_architecture", with or without ending) of some; empty is all.
 
     Raises:
-      ValueError: if there is none.
+      ValueError: if there is none, or something asked for is not there, with the nearest name.
     """
     found = sorted(Path(folder).glob("[0-9][0-9]_*.ipynb"))
     if not found:
         raise ValueError(f"{folder}: no numbered notebooks here; run this in a checkout of the repository")
-    return found
-
-
-def select_notebooks(notebooks: Sequence[Path], only: Iterable[str] = ()) -> list[Path]:
-    """Keep the notebooks that are asked for, in their own order.
-
-    Args:
-      notebooks: from `find_notebooks`.
-      only: numbers ("03", "3") or names ("03_architecture", with or without ending); empty keeps
-        all.
-
-    Raises:
-      ValueError: if something asked for is not there, with the nearest name.
-    """
     chosen = set()
     for wanted in only:
         stem = wanted.removesuffix(".ipynb")
-        hits = {path for path in notebooks if path.stem == stem or path.stem[:2] == stem.zfill(2)}
+        hits = {path for path in found if path.stem == stem or path.stem[:2] == stem.zfill(2)}
         if not hits:
-            raise ValueError(f"no notebook {wanted!r}{nearest_hint(stem, [path.stem for path in notebooks])}")
+            raise ValueError(f"no notebook {wanted!r}{nearest_hint(stem, [path.stem for path in found])}")
         chosen |= hits
-    return [path for path in notebooks if path in chosen] if chosen else notebooks
+    return sorted(chosen) or found
 
 
 def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
@@ -98,41 +83,20 @@ def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
                 raise ValueError(f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}")
 
 
-def written_since(folder: Path, start: float) -> dict[str, int]:
-    """Count the files under each folder of results that were written after a moment.
-
-    Args:
-      folder: results of one data set and profile.
-      start: seconds since the epoch.
-
-    Returns:
-      "figures", "tables", ... -> number of files, only where there are some; records beside tables
-      do not count.
-    """
-    files = (path for path in Path(folder).rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
-    written = (path.relative_to(folder).parts[0] for path in files if path.stat().st_mtime >= start)
-    return dict(collections.Counter(written))
+def _news(path: Path, seconds: float, wrote: str = "") -> str:
+    """Put into one line what a notebook took and wrote."""
+    return f"{path.stem:24s} {f'{seconds:.0f} s' if seconds < 90 else f'{seconds / 60:.1f} min':>11s}{wrote}"
 
 
-def _news(path: Path, seconds: float, wrote: Mapping[str, int], left: float | None) -> str:
-    """Put into one line what a notebook took and wrote, and how long the rest will take."""
-    files = ", ".join(f"{count} {kind}" for kind, count in sorted(wrote.items())) or "no file"
-    rest = "" if not left else f"; about {_duration(left)} left"
-    return f"{path.stem:24s} {_duration(seconds):>11s}   wrote {files}{rest}"
+def _wrote(folder: Path, start: float) -> str:
+    """Say how many files of each kind were written since a moment; records beside tables do not count."""
+    files = (path for path in folder.rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
+    kinds = collections.Counter(path.relative_to(folder).parts[0] for path in files if path.stat().st_mtime >= start)
+    return "   wrote " + (", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "no file")
 
 
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
-
-
-def _usual_seconds(results: Path) -> dict[str, float]:
-    """Return how long each notebook took in the last whole run, if there was one."""
-    summary = results / "tables" / "run_summary.csv"
-    return pd.read_csv(summary, index_col="notebook")["seconds"].to_dict() if summary.is_file() else {}
-
-
-def keep_once(folders: Iterable[Path]) -> list[Path]:
-    """Delete pictures that have the name and the bytes of one before, and return them.
+def keep_once(folders: Iterable[Path]) -> None:
+    """Delete pictures that have the name and the bytes of one before.
 
     Pictures of theory come out alike with every data set, so that each run leaves them again.
 
@@ -140,14 +104,11 @@ def keep_once(folders: Iterable[Path]) -> list[Path]:
       folders: results, those whose pictures stay first.
     """
     seen: set[tuple[str, bytes]] = set()
-    gone = []
     for path in (path for folder in folders for path in sorted(folder.rglob("*.png"))):
         known = path.name, path.read_bytes()
         if known in seen:
             path.unlink()
-            gone.append(path)
         seen.add(known)
-    return gone
 
 
 def what_to_open(results: Path) -> list[str]:
@@ -175,7 +136,7 @@ def reproduce(
     Args:
       dataset: one of `profiles.DATASETS`, passed to the notebooks as `data`.
       profile: one of `profiles.PROFILES`, passed as `profile`.
-      only: see `select_notebooks`.
+      only: see `find_notebooks`.
       parameters: more of them, passed to every selected notebook.
       say: called with each line of news.
 
@@ -189,43 +150,39 @@ def reproduce(
     """
     defaults = load_profile(profile, dataset)  # refuses unknown names before anything starts
     parameters = {"profile": profile, "data": dataset, **(parameters or {})}
-    available = find_notebooks(profiles.repository_root() / "notebooks")
-    selected = select_notebooks(available, only)
+    selected = find_notebooks(profiles.repository_root() / "notebooks", only)
     check_parameters(selected, parameters)
 
     own_folder, results = runs_dir(dataset, profile), results_dir(dataset, profile)
     executed_folder = own_folder / "notebooks"
     executed_folder.mkdir(parents=True, exist_ok=True)
     rows, failure = [], None
-    usual, took, usually = _usual_seconds(results), _SETTLED, _SETTLED
-    typical = sum(usual.values()) / len(usual) if usual else 0.0  # for a notebook that the last whole run did not have
-    # Bars are for people: a log file gets the lines of `say` instead.
-    alone = _alone_with(selected, executed_folder)
-    for number, path in enumerate(tqdm(alone, total=len(selected), desc="notebooks", disable=None)):
-        began, start = time.time(), time.monotonic()
-        try:
-            _execute(path, executed_folder / path.name, parameters)
-        except NotebookFailed as error:
-            failure = error
-        seconds = time.monotonic() - start
-        cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
-        rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": failure is None})
-        if failure:
-            break
-        if path.name in usual:
-            took, usually = took + seconds, usually + usual[path.name]
-        rest = sum(usual.get(later.name, typical) for later in selected[number + 1 :])
-        say(_news(path, seconds, written_since(results, began), rest * took / usually))
+    with contextlib.ExitStack() as held:  # no other process runs one of them into the same folder
+        for path in selected:
+            held.enter_context(locked(executed_folder / f".{path.stem}.lock", f"running {path.name}"))
+        # Bars are for people: a log file gets the lines of `say` instead.
+        for path in tqdm(selected, desc="notebooks", disable=None):
+            began, start = time.time(), time.monotonic()
+            try:
+                _execute(path, executed_folder / path.name, parameters)
+            except NotebookFailed as error:
+                failure = error
+            seconds = time.monotonic() - start
+            cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
+            finished = failure is None
+            rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": finished})
+            if failure:
+                break
+            say(_news(path, seconds, _wrote(results, began)))
 
     summary = pd.DataFrame(rows)
-    complete = failure is None and len(selected) == len(available)
     # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
     # its memory from the notebooks.
     record = run_record(
         profile=profile, dataset=dataset, seed=parameters.get("seed", defaults.seed), parameters=parameters,
         notebooks=[path.name for path in selected], machine=describe_machine(),
     )  # fmt: skip
-    write_table((results / "tables" if complete else own_folder) / "run_summary.csv", summary, record)
+    write_table((own_folder if failure or only else results / "tables") / "run_summary.csv", summary, record)
     if failure:
         raise failure
     if profile != "smoke":  # a check leaves its results where nobody commits them, all of them
@@ -234,19 +191,11 @@ def reproduce(
     return summary
 
 
-def _alone_with(notebooks: list[Path], folder: Path) -> Iterator[Path]:
-    """Yield notebooks while none of them is run into the same folder by another process."""
-    with contextlib.ExitStack() as held:
-        for path in notebooks:
-            held.enter_context(locked(folder / f".{path.stem}.lock", f"running {path.name}"))
-        yield from notebooks
-
-
 def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda line: None) -> list[Path]:
     """Run the notebooks of `notebooks/course/`, which take no parameters and write nothing; stop at one that fails.
 
     Args:
-      only: see `select_notebooks`.
+      only: see `find_notebooks`.
       say: called with each line of news.
 
     Returns:
@@ -257,14 +206,13 @@ def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda 
       NotebookFailed: if a notebook stops.
     """
     root = profiles.repository_root()
-    selected = select_notebooks(find_notebooks(root / "notebooks/course"), only)
-    copies = [root / "runs/course" / path.name for path in selected]
-    copies[0].parent.mkdir(parents=True, exist_ok=True)
-    for path, copy in zip(selected, copies, strict=True):
+    copies = {path: root / "runs/course" / path.name for path in find_notebooks(root / "notebooks/course", only)}
+    (root / "runs/course").mkdir(parents=True, exist_ok=True)
+    for path, copy in copies.items():
         start = time.monotonic()
         _execute(path, copy, {})
-        say(f"{path.stem:24s} {_duration(time.monotonic() - start):>11s}")
-    return copies
+        say(_news(path, time.monotonic() - start))
+    return list(copies.values())
 
 
 def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
@@ -283,30 +231,21 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
             extra_arguments=["--log-level=CRITICAL"],
             progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
         )
-    except PapermillExecutionError as error:
-        cell = f"cell In [{error.exec_count}], {_first_line(error.source)!r}"
-        cause, trace = f"{error.ename}: {error.evalue}", str(error)
-    except DeadKernelError as error:
-        # The kernel was killed (by the system, when memory runs out) and left no traceback.
-        cell, cause = _last_started_cell(copy), f"{error} (was the machine out of memory?)"
-        trace = f"{cell}\n{cause}\n"
-    else:
         return
+    except PapermillExecutionError as error:
+        number, source, cause, trace = error.exec_count, error.source, f"{error.ename}: {error.evalue}", str(error)
+    except DeadKernelError as error:
+        # The kernel was killed (by the system, when memory runs out) and left no traceback: its last cell stopped.
+        cells = [cell for cell in nbformat.read(copy, as_version=4).cells if cell.cell_type == "code" and cell.source]
+        started = [cell.source for cell in cells if cell.metadata.papermill.start_time]
+        number, source, cause = len(started), started[-1], f"{error} (was the machine out of memory?)"
+        trace = f"{source}\n{cause}\n"
     log.write_text(trace, encoding="utf-8")
+    first_line = source.strip().split("\n")[0]
     raise NotebookFailed(
-        f"{path.name} stopped in {cell}\n  {cause}\n  log: {_short(log)}\n  executed so far: {_short(copy)}"
+        f"{path.name} stopped in cell In [{number}], {first_line!r}\n  {cause}\n"
+        f"  log: {_short(log)}\n  executed so far: {_short(copy)}"
     )
-
-
-def _last_started_cell(copy: Path) -> str:
-    """Find where a notebook without a traceback stopped, from papermill's start times."""
-    cells = (cell for cell in nbformat.read(copy, as_version=4).cells if cell.cell_type == "code")
-    started = [cell for cell in cells if cell.source.strip() and cell.metadata.papermill.start_time]
-    return f"cell In [{len(started)}], {_first_line(started[-1].source)!r}"
-
-
-def _first_line(source: str) -> str:
-    return next((line for line in source.splitlines() if line.strip()), "")
 
 
 def _short(path: Path) -> str:

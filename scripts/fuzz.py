@@ -189,14 +189,12 @@ def _make_published(folder: Path) -> None:
 
     arrays = {"embed.weight": np.ones((3, 4), np.float32), "embed.bias": np.zeros(3)}
     save_file(arrays, folder / "a.safetensors")
-    np.savez(folder / "a.npz", **arrays)
 
 
 def _read_published(folder: Path) -> None:
     from f3amd_companion.measuring.published import published_arrays
 
-    for path in (folder / "a.safetensors", folder / "a.npz"):
-        published_arrays(path)
+    published_arrays(folder / "a.safetensors")
 
 
 READERS = {

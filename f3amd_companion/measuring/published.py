@@ -37,7 +37,7 @@ _UNUSED = re.compile(r"(.*\.)?(pe|style_feature_process\.(weight|bias))")
 """A table of sinusoids, which is computed here, and a layer that the released forward pass never calls."""
 
 _NAMES = load_paper_file("camdm_release")
-_BLOCK = "seqEncoder.layers.{}"
+_ROLES = ("query", "key", "value")
 
 
 class PublishedFeatures:
@@ -66,29 +66,21 @@ class PublishedFeatures:
 
 
 def published_arrays(path) -> dict[str, np.ndarray]:
-    """Read the arrays of a checkpoint that was converted to safetensors or npz.
+    """Read the arrays of a checkpoint that was converted to safetensors.
 
     Raises:
       ValueError: naming the file, if it is missing, damaged or of another kind, such as the pickle itself.
     """
     path = Path(path)
-    if path.suffix not in (".safetensors", ".npz"):
+    if path.suffix != ".safetensors":
         raise ValueError(
             f"{path}: a PyTorch checkpoint is a pickle, which may run code and is not opened here: "
-            "write its arrays to a .safetensors or .npz file first, as docs/training.md shows"
+            "write its arrays to a .safetensors file first, as docs/training.md shows"
         )
     try:
-        if path.suffix == ".safetensors":
-            arrays = load_file(path)
-        else:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
-    # What zip, numpy and Python's own tokenizer raise over damaged bytes is no closed list.
-    except Exception as error:
+        return load_file(path)
+    except Exception as error:  # what damaged bytes raise is no closed list
         raise ValueError(f"{path}: not a whole file of arrays ({error}); convert the checkpoint again") from error
-    if odd := [name for name, array in arrays.items() if getattr(array, "dtype", np.dtype(object)).kind not in "fiu"]:
-        raise ValueError(f"{path}: {odd[0]!r} holds no real numbers; convert the checkpoint again")
-    return arrays
 
 
 def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CAMDM:
@@ -110,25 +102,21 @@ def published_network(arrays: Mapping[str, np.ndarray], where: str = NAME) -> CA
 
     flat: dict[str, np.ndarray] = {"style.kernel": take("embed_style.action_embedding")}
 
-    def layer(ours: str, theirs: str, weight: str = "kernel") -> None:
-        flat[f"{ours}.{weight}"], flat[f"{ours}.bias"] = take(f"{theirs}.weight").T, take(f"{theirs}.bias")
+    def layers(names: Mapping[str, str], mine: str = "", block: str = "", weight: str = "kernel") -> None:
+        for ours, theirs in names.items():
+            flat[f"{mine}{ours}.{weight}"] = take(f"{block}{theirs}.weight").T
+            flat[f"{mine}{ours}.bias"] = take(f"{block}{theirs}.bias")
 
-    for ours, theirs in _NAMES["linear"].items():
-        layer(ours, theirs)
-    depth = 0
-    while any(name.startswith(f"{_BLOCK.format(depth)}.") for name in left):
-        mine, theirs = f"blocks.{depth}", _BLOCK.format(depth)
-        for ours, name in _NAMES["in_block"].items():
-            layer(f"{mine}.{ours}", f"{theirs}.{name}")
+    layers(_NAMES["linear"])
+    depth = max(1, len({name.split(".")[2] for name in left if name.startswith("seqEncoder.layers.")}))
+    for number in range(depth):
+        mine, block = f"blocks.{number}.", f"seqEncoder.layers.{number}."
+        layers(_NAMES["in_block"], mine, block)
+        layers(_NAMES["norms"], mine, block, "scale")
         # Query, key and value lie in one array, one below the other.
-        packed = (np.split(take(f"{theirs}.self_attn.in_proj_{part}"), 3) for part in ("weight", "bias"))
-        for role, weight, bias in zip(("query", "key", "value"), *packed, strict=True):
-            flat[f"{mine}.attention.{role}.kernel"], flat[f"{mine}.attention.{role}.bias"] = weight.T, bias
-        for ours, name in _NAMES["norms"].items():
-            layer(f"{mine}.{ours}", f"{theirs}.{name}", "scale")
-        depth += 1
-    if not depth:
-        take(f"{_BLOCK.format(0)}.linear1.weight")
+        for ours, theirs in (("kernel", "weight"), ("bias", "bias")):
+            parts = np.split(take(f"{block}self_attn.in_proj_{theirs}"), 3)
+            flat |= {f"{mine}attention.{role}.{ours}": part.T for role, part in zip(_ROLES, parts, strict=True)}
     if left:
         raise ValueError(f"{where}: has an array {min(left)!r} that the released network has not")
     num_styles, width = flat["style.kernel"].shape
@@ -160,13 +148,14 @@ def published_model(path, packed: PackedMotion) -> TrainedModel:
     """
     network = published_network(published_arrays(path), str(path))
     config, joints = network.config, packed.skeleton.num_joints
-    if config.channels != num_channels(packed.skeleton) + 3 or config.num_styles != len(packed.styles):
+    if (config.channels, config.num_styles) != (num_channels(packed.skeleton) + 3, len(packed.styles)) or (
+        list(packed.styles) != sorted(packed.styles)
+    ):
         raise ValueError(
-            f"{path}: moves {config.channels // 6 - 1} joints in {config.num_styles} styles, and the data set has "
-            f"{joints} joints and {len(packed.styles)} styles: it takes 100STYLE retargeted as the release does"
+            f"{path}: moves {config.channels // 6 - 1} joints in {config.num_styles} styles in the order of their "
+            f"names, and the data set has {joints} joints and {len(packed.styles)} styles: it takes 100STYLE "
+            "retargeted as the release does"
         )
-    if list(packed.styles) != sorted(packed.styles):
-        raise ValueError(f"{path}: numbers the styles in the order of their sorted names; the data set does not")
     return TrainedModel(
         name=NAME, config=config, params=nnx.state(network), normaliser=PublishedFeatures(),
         skeleton=packed.skeleton, styles=packed.styles, diffusion=presets.find_preset("CAMDM-K4").diffusion,

@@ -3,20 +3,20 @@
 `f3amd_lib.text.data.humanml3d` says what lies in such a folder, and reads it.
 """
 
-import csv
 import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
 from f3amd_lib.ground.files import whole_folder
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
-from f3amd_lib.text.data.humanml3d import SPLIT_FILES, text_lines
+from f3amd_lib.text.data.humanml3d import SPLIT_FILES
 from f3amd_lib.text.data.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.text.data.text_motions import (
     FEWEST_FRAMES,
@@ -57,28 +57,27 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: exists already and is not empty; choose another folder")
-    data.members("train")
+    training = set(data.members("train"))
     if len(set(data.names)) != data.num_clips:
         raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
     with whole_folder(folder) as temporary:
         for part in ("new_joints", "new_joint_vecs", "texts"):
             (temporary / part).mkdir()
-        training = []
+        every = []
         for number, name in enumerate(data.names):
             clip = data.clip(number)
             vectors = redundant_from_positions(data.skeleton, clip, contact_step=data.contact_step).astype(np.float32)
             np.save(temporary / "new_joints" / f"{name}.npy", clip[:-1])
             np.save(temporary / "new_joint_vecs" / f"{name}.npy", vectors)
             _write(temporary / "texts" / f"{name}.txt", map(write_caption_line, data.captions[number]))
-            if data.splits[number] == "train":
-                training.append(vectors)
-        for file, numbers in zip(("Mean.npy", "Std.npy"), grouped_statistics(np.concatenate(training)), strict=True):
+            every += [vectors] if number in training else []
+        for file, numbers in zip(("Mean.npy", "Std.npy"), grouped_statistics(np.concatenate(every)), strict=True):
             np.save(temporary / file, numbers)
         members = {split: [data.names[k] for k in np.flatnonzero(np.equal(data.splits, split))] for split in SPLITS}
-        for split, file in SPLIT_FILES.items():
-            _write(temporary / file, members[split])
-        _write(temporary / "train_val.txt", members["train"] + members["validation"])
-        _write(temporary / "all.txt", data.names)
+        lists = {file: members[split] for split, file in SPLIT_FILES.items()}
+        lists |= {"train_val.txt": members["train"] + members["validation"], "all.txt": data.names}
+        for file, names in lists.items():
+            _write(temporary / file, names)
         skeleton = data.skeleton
         described = {"joints": skeleton.names, "parents": skeleton.parents, "offsets": skeleton.offsets.tolist()}
         described |= {name: getattr(data, name) for name in ("fps", "name", "licence", "credit")}
@@ -98,25 +97,19 @@ def read_caption_table(path) -> dict[str, tuple[str, ...]]:
       Name of a motion file, without folder and ending -> its captions.
 
     Raises:
-      ValueError: naming the file and the line, for a missing column, an empty cell or a # in a caption.
+      ValueError: naming the file and the row, for a missing column, an empty cell or a # in a caption.
     """
-    path = Path(path)
     try:
-        reader = csv.DictReader(text_lines(path, "choose a CSV file in UTF-8"))
-        rows = [(reader.line_num, row) for row in reader]
-    except csv.Error as error:
-        raise ValueError(f"{path}: is not a CSV file ({error}); write it anew") from error
-    captions: dict[str, list[str]] = {}
-    for line, row in rows:
-        file, caption = ((row.get(column) or "").strip() for column in ("file", "caption"))
-        if not file or not caption:
-            raise ValueError(f"{path}, line {line}: needs a file and a caption, under headings of these names")
-        if "#" in caption:
-            raise ValueError(f"{path}, line {line}: # parts the fields of HumanML3D's texts; write it out")
-        captions.setdefault(Path(file).stem if file.lower().endswith(".bvh") else Path(file).name, []).append(caption)
-    if not captions:
-        raise ValueError(f"{path}: holds no caption; it needs lines under the headings file,caption")
-    return {name: tuple(dict.fromkeys(several)) for name, several in captions.items()}
+        table = pd.read_csv(path, dtype=str, keep_default_na=False, index_col=False)[["file", "caption"]]
+    except (OSError, LookupError, ValueError) as error:
+        raise ValueError(f"{path}: is no CSV file with columns file and caption ({error}); write it anew") from error
+    table = table.apply(lambda column: column.str.strip())
+    bad = table.eq("").any(axis=1) | table["caption"].str.contains("#")
+    if bad.any() or table.empty:
+        row = f"row {bad.argmax() + 1}" if bad.any() else "no row"
+        raise ValueError(f"{path}, {row}: needs a file and a caption; a # parts the fields of HumanML3D's texts")
+    names = table["file"].map(lambda file: Path(file).stem if file.lower().endswith(".bvh") else Path(file).name)
+    return {name: tuple(said.unique()) for name, said in table["caption"].groupby(names, sort=False)}
 
 
 def _has_twins(skeleton: Skeleton) -> bool:
@@ -127,9 +120,7 @@ def _has_twins(skeleton: Skeleton) -> bool:
         return False
 
 
-def captioned_motions(
-    dataset: Dataset, captions: Mapping[str, Sequence[str]], *, fps: float = FPS, progress: bool = True
-) -> TextMotions:
+def captioned_motions(dataset: Dataset, captions: Mapping[str, Sequence[str]], *, fps: float = FPS) -> TextMotions:
     """Put the motions of a data set, such as a folder of BVH files, together with captions.
 
     Each clip of 24 frames or more is brought to `fps`, moved to the canonical start, and cut to 199; its mirror image
@@ -139,33 +130,26 @@ def captioned_motions(
       dataset: from `open_dataset`.
       captions: clip name, or the last part of one -> captions.
       fps: wanted rate.
-      progress: show a progress bar.
 
     Raises:
       ValueError: for a caption without a motion, no motion with a caption, a name that two motions
         share, or skeletons that differ.
     """
-    by_name: dict[str, str] = {}
-    for clip in dataset.clips:
-        short = clip.name.rsplit("/", 1)[-1]
-        if short in by_name and short in captions:
-            raise ValueError(f"captions of {short!r}: {by_name[short]} and {clip.name} are both called so; rename one")
-        by_name[short] = clip.name
-    if missing := [name for name in captions if name not in by_name]:
-        hint = nearest_hint(missing[0], by_name)
-        raise ValueError(f"{len(missing)} captions have no motion, such as those of {missing[0]!r}{hint}")
+    shorts = [clip.name.rsplit("/", 1)[-1] for clip in dataset.clips]
+    for name in captions:
+        if shorts.count(name) != 1:
+            raise ValueError(f"captions of {name!r} have {shorts.count(name)} motions{nearest_hint(name, set(shorts))}")
     splits = assign_splits(((name, "all") for name in captions), percent=HELD_OUT_PERCENT)
     skeleton, clips, skipped = None, [], []
-    for clip in tqdm(dataset.clips, desc=f"reading {dataset.name}", unit="clip", disable=not progress):
-        short = clip.name.rsplit("/", 1)[-1]
+    every = zip(shorts, dataset.clips, strict=True)
+    for short, clip in tqdm(every, f"reading {dataset.name}", len(shorts), unit="clip", disable=None):
         if short not in captions:
             skipped.append((clip.name, "no caption"))
             continue
         motion = resample(clip.loader(), fps)
-        if skeleton is None:
-            skeleton, first = motion.skeleton, clip.name
+        skeleton = skeleton or motion.skeleton
         if motion.skeleton != skeleton:
-            raise ValueError(f"{clip.name}: its skeleton differs from that of {first}; a data set needs one")
+            raise ValueError(f"{clip.name}: its skeleton differs from the first clip's; a data set needs one")
         if motion.num_frames < FEWEST_FRAMES:
             skipped.append((clip.name, f"{motion.num_frames} frames, fewer than {FEWEST_FRAMES}"))
             continue

@@ -44,41 +44,29 @@ def read_caption_line(line: str, where: str) -> tuple[str, float, float]:
     Raises:
       ValueError: naming the place, for a line of another form, an empty caption or times that do not rise.
     """
-    parts = line.rstrip("\n").split("#")
-    if len(parts) != 4:
-        raise ValueError(f"{where}: has {len(parts)} parts where caption#words#begin#end has 4; mend the line")
     try:
-        begin, end = (0.0 if math.isnan(float(word)) else float(word) for word in parts[2:])
-    except ValueError:
-        raise ValueError(f"{where}: begin {parts[2]!r} and end {parts[3]!r} must be seconds; mend the line") from None
-    if not parts[0].strip():
-        raise ValueError(f"{where}: the caption is empty; write one or delete the line")
-    if (begin or end) and not 0.0 <= begin < end < math.inf:
-        raise ValueError(f"{where}: begin {begin} and end {end} must rise, or both be 0.0; mend the line")
-    return parts[0].strip(), begin, end
+        caption, _, *times = line.rstrip("\n").split("#")
+        begin, end = (0.0 if math.isnan(float(word)) else float(word) for word in times)
+        if not caption.strip() or not (begin == end == 0.0 or 0.0 <= begin < end < math.inf):
+            raise ValueError("the caption is empty, or times do not rise")
+    except ValueError as error:
+        form = "caption#words#begin#end, in seconds or 0.0 twice"
+        raise ValueError(f"{where}: {line!r} is not {form} ({error}); mend the line") from error
+    return caption.strip(), begin, end
 
 
-def _load(path: Path, fix: str) -> np.ndarray:
-    """Return a file's array of numbers; ValueError names one that holds none."""
+def _positions(path: Path, fix: str, joints: int | None = None) -> np.ndarray:
+    """Return a file's positions, [L, J, 3], float32; ValueError names one that holds none."""
     try:
         array = np.load(path, allow_pickle=False)
+        if array.dtype.kind not in "fiu":
+            raise ValueError("no real numbers")
+        array = array.reshape(-1, *array.shape[-2:])  # a clip of one frame is stored without a frame axis
+        if not array.size or array.shape[1:] != (joints or array.shape[1], 3) or not np.isfinite(array).all():
+            raise ValueError(f"shape {array.shape}, or not finite")
     # What numpy and Python's own tokenizer raise over damaged bytes is no closed list.
     except Exception as error:
-        raise ValueError(f"{path}: cannot be read as an array without pickles ({error}); {fix}") from error
-    if getattr(array, "dtype", np.dtype(object)).kind not in "fiu":
-        raise ValueError(f"{path}: holds no array of real numbers; {fix}")
-    return array
-
-
-def _positions(path: Path, joints: int, fix: str) -> np.ndarray:
-    """Return a file's positions, [L, J, 3], as float32."""
-    array = _load(path, fix)
-    if array.shape == (joints, 3):
-        array = array[None]  # a clip of one frame is stored without a frame axis
-    if array.shape != (len(array), joints, 3) or not array.size:
-        raise ValueError(f"{path}: has shape {array.shape} instead of {('L', joints, 3)}; {fix}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{path}: is not finite in frame {int(np.argwhere(~np.isfinite(array))[0][0])}; {fix}")
+        raise ValueError(f"{path}: holds no positions [L, {joints or 'J'}, 3] ({error}); {fix}") from error
     return array.astype(np.float32)
 
 
@@ -111,25 +99,21 @@ def read_humanml3d(folder) -> TextMotions:
     fix = "fetch or write the folder again"
     skeleton, described = _skeleton_of(folder, fix)
     fewest, fps = described["fewest_frames"], described["fps"]
-    clips, skipped, seen = [], [], {}
+    clips, skipped, seen = [], [], set()
     for split, file in SPLIT_FILES.items():
-        for number, name in enumerate(text_lines(folder / file, fix), 1):
-            name = name.strip()
+        for number, name in enumerate(map(str.strip, text_lines(folder / file, fix)), 1):
             if not name:
                 continue
-            where = f"{folder / file}, line {number}"
-            if name in seen:
-                raise ValueError(f"{where}: {name!r} is listed before, in {seen[name]}; keep one")
-            seen[name] = file
-            if Path(name).name != name or "\0" in name or len(name) > 200:
-                raise ValueError(f"{where}: {name!r} is no plain id; mend the line")
-            positions = _positions(folder / "new_joints" / f"{name}.npy", skeleton.num_joints, fix)
+            if name in seen or Path(name).name != name or "\0" in name or len(name) > 200:
+                raise ValueError(f"{folder / file}, line {number}: {name!r} is listed before, or no plain id; mend it")
+            seen.add(name)
+            positions = _positions(folder / "new_joints" / f"{name}.npy", fix, skeleton.num_joints)
             for clip, captions, part in _captioned(folder / "texts" / f"{name}.txt", name, fps, len(positions), fix):
                 length = len(positions[part])
                 if not fewest <= length <= MOST_FRAMES:
                     skipped.append((clip, f"{length} frames, not {fewest} to {MOST_FRAMES}"))
                     continue
-                pair = described.get("pairs", {}).get(clip, clip)
+                pair = described["pairs"].get(clip, clip)
                 clips.append((clip, captions, split, pair, positions[part]))
     if not clips:
         raise ValueError(f"{folder}: no clip of {fewest} to {MOST_FRAMES} frames; {fix}")
@@ -165,22 +149,20 @@ def _skeleton_of(folder: Path, fix: str) -> tuple[Skeleton, dict]:
     own = folder / "skeleton.json"
     if own.is_file():
         try:
-            described = json.loads(own.read_text(encoding="utf-8"))
+            described = {"fewest_frames": 1, "pairs": {}} | json.loads(own.read_text(encoding="utf-8"))
             skeleton = Skeleton(described["joints"], described["parents"], np.array(described["offsets"], np.float64))
-            described = {"fewest_frames": 1} | described | {"fps": float(described["fps"])}
-            if not (0.0 < described["fps"] <= 1000.0 and isinstance(described.get("pairs", {}), dict)):
-                raise ValueError("its rate or its pairs are none")
-            texts = [described.get(key, "") for key in ("name", "licence", "credit")]
-            pairs = described.get("pairs", {}).values()
-            if not all(isinstance(text, str) for text in [*skeleton.names, *texts, *pairs]):
-                raise ValueError("its names and terms must be text")
+            described["fps"] = float(described["fps"])
+            terms = [described.get(key, "") for key in ("name", "licence", "credit")]
+            texts = [*skeleton.names, *terms, *described["pairs"].values()]
+            if not 0.0 < described["fps"] <= 1000.0 or not all(isinstance(text, str) for text in texts):
+                raise ValueError("its rate is none, or its names and terms are no text")
         except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); {fix}") from error
         return skeleton, described | {"contact_step": CONTACT_STEP}  # its positions are in metres
-    ids = [line.strip() for line in text_lines(folder / "train.txt", fix) if line.strip()]
+    ids = " ".join(text_lines(folder / "train.txt", fix)).split()
     first = folder / "new_joints" / f"{ids[0] if ids else 'none'}.npy"
-    joints = (0, *_load(first, fix).shape)[-2]
+    joints = _positions(first, fix).shape[1]
     known = {len(described["joints"]): name for name, described in LAYOUTS.items()}
     if joints not in known:
         raise ValueError(f"{first}: has {joints} joints, HumanML3D has 22 and KIT-ML 21; a skeleton.json tells others")
-    return layout_skeleton(known[joints]), {"name": known[joints], **LAYOUTS[known[joints]]}
+    return layout_skeleton(known[joints]), {"name": known[joints], "pairs": {}, **LAYOUTS[known[joints]]}
