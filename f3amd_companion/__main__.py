@@ -644,7 +644,7 @@ def measure(
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
     """
     from f3amd_companion.measuring.measure import MEASUREMENTS
-    from f3amd_companion.measuring.text_probes import TEXT_MEASUREMENTS
+    from f3amd_companion.measuring.text_tables import TEXT_MEASUREMENTS
     from f3amd_lib.networks import presets
 
     for name in names:
@@ -672,7 +672,7 @@ def _measuring(name: str, profile):
 
 def _measure_text(names, motion: Data, models, minutes) -> int:
     """Measure text to motion; what a table's rows need is trained on the way."""
-    from f3amd_companion.measuring.text_probes import TEXT_MEASUREMENTS
+    from f3amd_companion.measuring.text_tables import TEXT_MEASUREMENTS
     from f3amd_lib.text.data.text_encoders import load_text_encoder
     from f3amd_lib.text.stages.text_models import open_text_motions
 

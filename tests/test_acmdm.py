@@ -8,18 +8,23 @@ from builders import stirred
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.attention import waves
 from f3amd_lib.text.networks.acmdm import (
     ACMDM,
     ACMDMConfig,
+    Control,
+    MaskedACMDM,
+    MaskedACMDMConfig,
     TextCondition,
     block_causal,
+    control_branch,
+    controlled,
+    draw_hidden,
+    frames_known,
     rotary_angles,
     rotary_base,
     rotated,
+    spoil,
 )
-from f3amd_lib.text.networks.acmdm_control import Control, control_branch, controlled
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, MaskedACMDMConfig, draw_hidden, frames_known, spoil
 
 SIZE = {"num_joints": 5, "channels": 4, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 6}
 BATCH = 2
@@ -94,13 +99,6 @@ def test_patches_put_together_again_are_the_state(patch):
     # Frame after frame, then patch; in a patch joint, then channel.
     joint = network.config.patch_joints - 1
     np.testing.assert_array_equal(tokens[:, network.config.num_patches, 4 * joint : 4 * joint + 4], STATE[:, 1, joint])
-
-
-def test_time_has_cosines_first():
-    features = waves(jnp.asarray([0.0, 0.5]), 256, 128)
-    assert features.shape == (2, 256)
-    np.testing.assert_allclose(features[0], np.repeat([1.0, 0.0], 128))
-    np.testing.assert_allclose(features[1, [0, 128]], [np.cos(0.5), np.sin(0.5)], rtol=1e-6)
 
 
 def test_rotary_code_depends_on_distance_alone():
@@ -335,13 +333,6 @@ def test_presets_are_found_across_papers_and_keep_to_their_own():
         assert preset.latent in ("", *presets.PRESETS), preset.name
 
 
-def test_windows_are_frames_of_the_latent_or_of_motion():
-    windows = {name: presets.find_preset(name).windows for name in presets.of_paper("acmdm")}
-    assert windows["ACMDM-XL-PS2"] == windows["ACMDM-S-PS22-eps"] == (49,)
-    assert windows["ACMDM-S-PS22-raw"] == windows["ACMDM-S-PS22-redundant-x0"] == (196,)
-    assert windows["ACMDM-S-PS2-prefix"] == (15,) and windows["ACMDM-n4-PS22-noisy-condition"] == (50,)
-
-
 def test_table_1_has_a_row_for_every_combination():
     size = {"num_joints": 22}
     base = presets.build_config("ACMDM-S-PS22", **size).to_dict()
@@ -410,9 +401,5 @@ def test_arrays_that_do_not_fit_are_refused():
     blocks = fresh(config_of(block_frames=4))
     with pytest.raises(ValueError, match="block_frames 0"):
         control_branch(blocks, 4, jax.random.key(0))
-    with pytest.raises(ValueError, match="control must be"):
-        control_branch(network, 4, jax.random.key(0)).control_tokens(
-            Control.of(jnp.ones((2, 30, 5, 3)), jnp.ones((2, 30, 5)))
-        )
     with pytest.raises(ValueError, match="masked autoregression"):
         config_of(MaskedACMDMConfig, block_frames=4)

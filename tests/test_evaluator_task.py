@@ -7,10 +7,16 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.text.data.text_encoders import TextEmbeddings
 from f3amd_lib.text.data.text_motions import ClipTable, draw_clips
-from f3amd_lib.text.judge.judge_network import HalvingConvolution, TextMotionConfig, TextMotionNetwork
-from f3amd_lib.text.judge.text_judge import EvaluatorTask, EvaluatorTraining, contrastive_loss, embedded_captions
+from f3amd_lib.text.judge.text_judge import (
+    Captions,
+    EvaluatorTask,
+    EvaluatorTraining,
+    HalvingConvolution,
+    TextMotionConfig,
+    TextMotionNetwork,
+    contrastive_loss,
+)
 from f3amd_lib.training.optimise import optimise
 
 SMALL = TextMotionConfig(
@@ -81,8 +87,7 @@ def toy(honest: bool, pairs=4, clips=64, seed=0) -> EvaluatorTask:
     told = np.repeat(kind if honest else generator.permutation(kind), 2)
     words = generator.normal(size=(pairs, 3, 6))
     tokens = (words[told] + 0.1 * generator.normal(size=(2 * clips, 3, 6))).astype(np.float32)
-    embedded = TextEmbeddings(tokens, np.ones((2 * clips, 3), bool), tokens.mean(axis=1))
-    captions = embedded_captions(embedded, [f"{k:02d}" for k in np.repeat(kind, 2)])
+    captions = Captions(*map(jnp.asarray, (tokens, np.ones((2 * clips, 3), bool), np.repeat(kind, 2))))
     return EvaluatorTask(SMALL, EvaluatorTraining(100, 16, 3e-3, seed, num_frames=48), table, captions, "toy")
 
 
@@ -115,5 +120,6 @@ def test_a_batch_carries_the_captions_of_its_clips():
 
 
 def test_a_training_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="at least 1 step and batches of 2"):
-        EvaluatorTraining(num_steps=0)
+    for settings, words in (({"num_steps": 0}, "num_steps must be"), ({"batch_size": 1}, "batches of 2 or more")):
+        with pytest.raises(ValueError, match=words):
+            EvaluatorTraining(**settings)

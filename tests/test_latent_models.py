@@ -11,7 +11,7 @@ import pytest
 from test_text_judge import OneVectorAWord
 
 from f3amd_companion import __main__ as command_line
-from f3amd_companion.measuring.text_probes import ONE_CAPTION, measure_one_caption
+from f3amd_companion.measuring.text_tables import ONE_CAPTION, measure_one_caption
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -151,8 +151,8 @@ def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, ca
 @pytest.mark.parametrize("steps, model, told", [
     ("3", "motionpcm", "students of MotionPCM are trained for 1, 2 or 4 steps, none for 3"),
     ("50", "motionpcm", "--model MotionPCM-teacher-small"),
-    ("4", "motionpcm", "no trained MotionPCM-M4-small for data set 'bandai'; train it: f3amd train"),
-    ("2", "MotionPCM-M1-small", "MotionPCM-M1-small takes 1 step, got 2"),
+    ("4", "motionpcm", "no trained MotionPCM-M4-small for data set 'bandai'; f3amd train"),
+    ("2", "MotionPCM-M1-small", "MotionPCM-M1-small takes 1 steps, got 2"),
 ])  # fmt: skip
 def test_steps_that_no_student_takes_are_refused(steps, model, told, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [SHIPPED])
@@ -253,8 +253,8 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
     for name, file, reason in (
-        ("tiny-VAE", "tiny-teacher", "tiny-VAE is no student"),
-        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, but tiny-M2 is distilled from tiny-teacher"),
+        ("tiny-VAE", "tiny-teacher", "tiny-VAE is distilled from nothing"),
+        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 is distilled from tiny-teacher"),
     ):
         with pytest.raises(ValueError, match=reason):
             from_file(name, teacher=files[file])
@@ -263,8 +263,9 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
         train_stage.train_stage(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
     # What is kept of one caption: the latent that each model makes in its own steps, from the noise of the seed.
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
-    asked = {"models": ["tiny-M2", "tiny-teacher"], "folder": tmp_path}
-    kept, told = read_table(measure_one_caption(data, OneVectorAWord(), PROFILE, **asked))
+    monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path])
+    asked = ["tiny-M2", "tiny-teacher"]
+    kept, told = read_table(measure_one_caption(data, OneVectorAWord(), PROFILE, models=asked))
     text = embed_captions([ONE_CAPTION], OneVectorAWord()).pooled
     start = jax.random.normal(jax.random.key(PROFILE.seed), (1, 2, 3))
     of_student = [network_with(student.config, student.params), student.schedule, text]

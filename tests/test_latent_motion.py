@@ -111,7 +111,7 @@ def test_recipes_are_the_papers_and_the_presets():
         part_recipe(LatentMotionTraining, "studnt", 10)
     for settings, message in (
         ({"consistency": "phase"}, "did you mean 'phased'"),
-        ({"consistency": "latent"}, "no phases and no discriminator"),
+        ({"consistency": "latent"}, "needs num_phases 1"),
         ({"batch_size": 0}, "batch_size"), ({"least_guidance": 16.0}, "least_guidance"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
@@ -164,11 +164,12 @@ def test_an_autoencoder_rehearses_and_hears_of_joints():
     )
     config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=12 * joints - 1, num_positions=40)
     statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
-    task = LatentAutoencoderTask(config, recipe(num_frames=16, learning_rate=1e-2, num_steps=60), clips, statistics)
+    settings = recipe(num_frames=16, learning_rate=1e-2, num_steps=60, joints_weight=0.5)
+    task = LatentAutoencoderTask(config, settings, clips, statistics)
     state, history = optimise(task, chunk=30, progress=False)
     assert history[1]["features"] < history[0]["features"] and history[1]["joints"] > 0
     row = history[1]
-    assert row["loss"] == pytest.approx(row["features"] + row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
+    assert row["loss"] == pytest.approx(row["features"] + 0.5 * row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
 
 
 @pytest.mark.long
@@ -194,17 +195,6 @@ def test_with_spans_a_short_training_keeps_movement():
         made = model.decode(model.encode(clips, mask)[0], mask)
         kept[path] = float(made.var(axis=1).sum() / clips.var(axis=1).sum())
     assert kept["spans"] > 0.3 > 0.05 > kept["attention"]
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.5])
-def test_joints_count_in_the_loss_as_much_as_is_said(weight):
-    config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=23, num_positions=40)
-    statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
-    task = LatentAutoencoderTask(config, recipe(joints_weight=weight), None, statistics)
-    clips = normal(4, 2, 8, 23), jnp.ones((2, 8), bool)
-    terms = jax.jit(task.held_out_terms)(task.init(jax.random.key(0))[0], None, clips, None)
-    assert terms["joints"] > 0.01
-    assert terms["loss"] == pytest.approx(terms["features"] + weight * terms["joints"] + 1e-4 * terms["divergence"])
 
 
 # ------------------------------------------------------------------------------------------------------------- teacher
@@ -475,14 +465,6 @@ def test_players_may_learn_by_turns(start):
                 for a, b in zip(*map(jax.tree.leaves, (before[branch], state.params[branch])), strict=True)
             )
             assert same == (branch != learner)
-    # The rate of each falls to 0 over its own turns.
-    for alternate, turns in ((True, 50), (False, 100)):
-        config = LatentMotionTraining(100, warmup_steps=1, alternate=alternate)
-        optimiser, weights = config.optimiser(), jnp.ones(1)
-        moments, last = optimiser.init(weights), None
-        for _ in range(turns):
-            last, moments = optimiser.update(jnp.ones(1), moments, weights)
-        assert abs(float(last[0])) < 0.01 * config.learning_rate
 
 
 @pytest.mark.slow

@@ -82,7 +82,9 @@ def test_reconstruction_is_judged_both_ways(data, monkeypatch):
 
     def figures(positions_of, vectors_of):
         monkeypatch.setattr(
-            text_tables, "reconstruction", lambda trained, given, mask: (vectors_of(given), positions_of(given))
+            text_tables.motionpcm_sampling,
+            "reconstruction",
+            lambda trained, given, mask: (vectors_of(given), positions_of(given)),
         )
         table = reconstruction_rows(bench, trained, {}, {}, None)
         return table.set_index("metric")["value"]

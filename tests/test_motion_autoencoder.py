@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.text.networks.motion_autoencoder import (
+from f3amd_lib.text.networks.autoencoders import (
     LOG_VARIANCE_RANGE,
     AutoencoderConfig,
     MotionAutoencoder,

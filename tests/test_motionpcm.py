@@ -205,7 +205,7 @@ def test_a_discriminator_reads_every_block_and_lets_the_gradient_through(teacher
     assert changed[0] > 1e-3 and not changed[1:].any()
 
 
-def test_positions_may_begin_as_waves_and_captions_be_louder():
+def test_positions_may_begin_as_waves():
     sizes = {"window": 2, "channels": 3, "latent_width": 8, "depth": 3, "num_heads": 2, "hidden_width": 8}
     coder = presets.build_config("MotionPCM-VAE", features=11, position_start="waves", **sizes)
     table = presets.build_from_config(coder, jax.random.key(0)).decoder_positions[...]
@@ -213,11 +213,3 @@ def test_positions_may_begin_as_waves_and_captions_be_louder():
     assert apart[1] < apart[2] < apart[3]  # neighbours in time are neighbours here
     with pytest.raises(ValueError, match="unknown position_start 'wave'; did you mean 'waves'"):
         presets.build_config("MotionPCM-VAE", features=11, position_start="wave", **sizes)
-    plain, loud = (
-        presets.build_from_config(
-            presets.build_config("MotionPCM-teacher", text_width=4, text_scale=scale, **sizes), key
-        )
-        for scale, key in ((1.0, jax.random.key(1)), (10.0, jax.random.key(1)))
-    )
-    text = jnp.ones((1, 4))
-    np.testing.assert_allclose(loud.encode(text), plain.encode(10.0 * text), rtol=1e-6)

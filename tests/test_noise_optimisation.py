@@ -10,10 +10,9 @@ from test_acmdm import BATCH, condition, config_of, fresh, normal
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight
 from f3amd_lib.text.data.text_motions import AxisNormaliser
-from f3amd_lib.text.networks.acmdm_control import Control
-from f3amd_lib.text.sampling.noise_optimisation import control_distance, correlation, optimise_noise
-from f3amd_lib.text.sampling.text_to_motion import sample_text
-from f3amd_lib.text.stages.motion_codec import MotionCodec
+from f3amd_lib.text.networks.acmdm import Control
+from f3amd_lib.text.sampling.text_to_motion import control_distance, correlation, optimise_noise, sample_text
+from f3amd_lib.text.stages.text_models import MotionCodec
 
 CODEC = MotionCodec(AxisNormaliser(np.array([0.5, 0.0, -1.0], np.float32), np.array([2.0, 1.0, 0.5], np.float32)))
 SHAPE = (BATCH, 8, 5, 3)

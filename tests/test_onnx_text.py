@@ -29,8 +29,7 @@ from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
 from f3amd_lib.text.sampling.motionpcm_sampling import sample_student, sample_teacher
 from f3amd_lib.text.sampling.text_to_motion import text_prediction
-from f3amd_lib.text.stages.motion_codec import MotionCodec
-from f3amd_lib.text.stages.text_models import LatentModel, TextModel, save_text_model
+from f3amd_lib.text.stages.text_models import LatentModel, MotionCodec, TextModel, save_text_model
 from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
 
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")

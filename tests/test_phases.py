@@ -253,14 +253,6 @@ def test_a_walk_is_its_jumps_and_draws_no_noise():
     assert error(50) < error(10) < error(2) and error(50) < 0.05
 
 
-def test_leading_times_ask_one_step_the_wrong_question():
-    """Asked at level 1, even an exact teacher leaves noise as it is: what one step of Table 4 may show."""
-    noise = normal(3, 256, 1)
-    leading = follow(exact_noise, SCHEDULE, noise, ddim_times(1000, 1, "leading"))
-    np.testing.assert_allclose(leading, noise, atol=0.5)
-    assert np.abs(leading - noise).mean() < 0.05
-
-
 def test_latent_consistency_samples_with_fresh_noise():
     noise, key = normal(3, 512, 1), jax.random.key(0)
     draw = lambda steps, key: sample_latent_consistency(

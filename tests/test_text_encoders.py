@@ -53,9 +53,8 @@ def test_many_captions_come_back_in_order(cache_dir):
 @pytest.mark.parametrize(
     "captions, words",
     [
-        (["a walk", "  "], "caption 2 of 2 is empty"),
-        (["..."], "holds no word"),
-        (["12 34"], "holds no word"),
+        (["a walk", "  "], "caption 2 of 2, .* has no word"),
+        (["12 34 ..."], "has no word"),
         ("a walk", "put it into a list"),
     ],
 )
@@ -132,7 +131,7 @@ def test_wordllama_tells_actions_apart(wordllama):
 def test_wordllama_refuses_what_it_cannot_read(wordllama):
     with pytest.raises(ValueError, match="characters unknown to wordllama"):
         wordllama(["a person \U0001f6b6 walks"])
-    with pytest.raises(ValueError, match="at most 32; say it shorter"):
+    with pytest.raises(ValueError, match="more than 32 word pieces"):
         wordllama(["a person walks " * 20])
 
 

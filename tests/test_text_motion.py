@@ -13,10 +13,15 @@ from flax import nnx
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable
-from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, branch_with
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
-from f3amd_lib.text.networks.motion_autoencoder import AutoencoderConfig
+from f3amd_lib.text.networks.acmdm import (
+    ACMDMConfig,
+    Control,
+    ControlBranch,
+    MaskedACMDMConfig,
+    TextCondition,
+    branch_with,
+)
+from f3amd_lib.text.networks.autoencoders import AutoencoderConfig
 from f3amd_lib.text.sampling.text_to_motion import sample_control
 from f3amd_lib.text.stages.acmdm_training import (
     AutoencoderTask,
@@ -30,9 +35,9 @@ from f3amd_lib.text.stages.acmdm_training import (
     frame_error,
     noisy_state,
 )
-from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
+from f3amd_lib.text.stages.text_models import MotionCodec, with_latent
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.optimise import initial_state, optimise
 from f3amd_lib.training.recipe import part_recipe
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
@@ -314,17 +319,6 @@ def test_every_form_takes_training_steps(family, network, training, schedule):
         before, after
     )
     json.dumps(task.identity())
-
-
-def test_a_task_resumes_where_it_belongs(tmp_path):
-    task = TextMotionTask(ACMDMConfig(**SIZE, channels=3, window=16), recipe(), RAW, straight(), POOLED)
-    state = initial_state(task)
-    save_state(tmp_path / "state.safetensors", task, state)
-    again = restore_state(tmp_path / "state.safetensors", task)
-    assert all((a == b).all() for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(state), strict=True))
-    other = dataclasses.replace(task, schedule=BETAS)
-    with pytest.raises(ValueError, match="diffusion"):
-        restore_state(tmp_path / "state.safetensors", other)
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import pytest
 from test_text_judge import OneVectorAWord
 
 from f3amd_companion.__main__ import main
-from f3amd_companion.measuring import text_probes
-from f3amd_companion.measuring.text_probes import counted_hands, measure_hands, mirrored_positions, probes_of
+from f3amd_companion.measuring import text_tables
+from f3amd_companion.measuring.text_tables import counted_hands, measure_hands, mirrored_positions, probes_of
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion import synthetic
@@ -84,7 +84,7 @@ def test_each_probe_is_wrong_in_the_way_it_says(data):
     assert all(np.ptp(motion, axis=0).max() == 0 for motion in shown["frozen"])
     assert np.array_equal(shown["backwards in time"][3][::-1], clips[3])
     off = np.std(np.stack(shown["trembling"]) - np.stack(clips))
-    assert off == pytest.approx(text_probes.TREMBLE, rel=0.05)
+    assert off == pytest.approx(text_tables.TREMBLE, rel=0.05)
 
 
 def test_hands_of_clips_and_of_models_are_kept_in_one_table(data, cache_dir, monkeypatch, tmp_path):
@@ -100,14 +100,14 @@ def test_hands_of_clips_and_of_models_are_kept_in_one_table(data, cache_dir, mon
         told["side"] = "left" if " left " in captions[0] else "right"
         return OneVectorAWord()(captions)
 
-    monkeypatch.setattr(text_probes, "draw_motions", captioned_motions)
-    monkeypatch.setattr(text_probes, "embed_captions", embedded)
-    monkeypatch.setattr(text_probes, "find_text_model", lambda data, name: name)
+    monkeypatch.setattr(text_tables, "draw_motions", captioned_motions)
+    monkeypatch.setattr(text_tables, "embed_captions", embedded)
+    monkeypatch.setattr(text_tables.text_models, "find_text_model", lambda data, name: name)
     straight = types.SimpleNamespace(kind="straight")
     model = lambda name: types.SimpleNamespace(
         name=name, skeleton=data.skeleton, schedule=straight, params=[np.ones(2)]
     )
-    monkeypatch.setattr(text_probes, "load_text_model", model)
+    monkeypatch.setattr(text_tables.text_models, "load_text_model", model)
     table, record = read_table(measure_hands(data, OneVectorAWord(), PROFILE, models=["as told", "always left"]))
     counts = table.groupby("model")[["motions", "asked_hand", "other_hand"]].sum()
     assert counts.loc["real clips"].tolist() == [8, 8, 0] and counts.loc["mirrored clips"].tolist() == [8, 0, 8]
@@ -123,4 +123,4 @@ def test_the_command_knows_them_and_refuses_what_makes_no_sense(capsys):
     assert main(["measure", "hands", "quality", "--data", "bandai"]) == 2
     assert "by a call of its own" in capsys.readouterr().err
     with pytest.raises(ValueError, match="leave --model out"):
-        text_probes.measure_judge(None, None, PROFILE, models=["ACMDM-S-PS22"])
+        text_tables.measure_judge(None, None, PROFILE, models=["ACMDM-S-PS22"])

@@ -1,15 +1,21 @@
-"""Tables of text to motion: `f3amd measure text_table1`, rows from `papers/PAPER/experiments.toml`.
+"""Measurements of text to motion: `f3amd measure text_table1` and its like, `text_judge`, `hands`, `text_one_caption`.
 
-Each row's model is trained first, if it is not, by `text.stages.train_stage`; then it makes a motion for each held-out
-clip's caption, and the judge looks. A row is kept as soon as it is measured; a leg that is out of time goes on there.
+Rows of tables stand in `papers/PAPER/experiments.toml`. Each row's model is trained first, if it is not, by
+`text.stages.train_stage`; then it makes a motion for each held-out clip's caption, and the judge looks. A row is kept
+as soon as it is measured; a leg that is out of time goes on there.
+
+What the judge itself sees, and which hand a model raises, is asked about real motion first, and about motion that is
+wrong on purpose: a judge that takes that for right, or a count of hands that does, would be worth nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -21,23 +27,22 @@ from f3amd_companion.measuring.runner import Records
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
-from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
-from f3amd_lib.text.data.text_motions import TextMotions, frame_mask, pad_motions
+from f3amd_lib.text.data.text_motions import TextMotions, caption_wordings, frame_mask, pad_motions
 from f3amd_lib.text.judge import text_metrics
 from f3amd_lib.text.judge.text_judge import EvaluatorTraining, TextJudge, judge_motions, judged_clips, train_judge
-from f3amd_lib.text.networks.acmdm import TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control
+from f3amd_lib.text.networks.acmdm import Control, TextCondition
+from f3amd_lib.text.sampling import motionpcm_sampling, text_to_motion
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
-from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions, latent_sampler, reconstruction
-from f3amd_lib.text.sampling.noise_optimisation import control_distance, optimise_noise
-from f3amd_lib.text.sampling.text_to_motion import continue_prefix, sample_control, sample_text
 from f3amd_lib.text.stages import text_models
-from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel, is_latent_preset
+from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel
 from f3amd_lib.text.stages.train_stage import train_stage
+from f3amd_lib.training.checkpoints import network_with
 
 PAPERS = {
     "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),
@@ -86,17 +91,13 @@ class Bench:
         told = [said[generator.integers(len(said))] for said in self.real.captions]
         return told, embed_captions(told, self.encoder).pooled
 
-    def quality(self, make: Callable | None) -> pd.DataFrame:
-        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3].
-
-        None makes the real clips themselves.
-        """
+    def quality(self, make: Callable) -> pd.DataFrame:
+        """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3]."""
         lengths = self.real.lengths
 
         def system(repeat: int):
             told, pooled = self.captions(repeat)
-            key = jax.random.fold_in(jax.random.key(self.seed), repeat)
-            made = map(self.real.clip, range(len(lengths))) if make is None else make(pooled, lengths, key)
+            made = make(pooled, lengths, jax.random.fold_in(jax.random.key(self.seed), repeat))
             return [motion[:length] for motion, length in zip(made, lengths, strict=True)], told
 
         return self._seen(system, self.settings["repeats"])
@@ -187,7 +188,7 @@ def prefix_drawer(trained: TextModel, most_frames: int, num_steps: int | None) -
     def draw(starts, pooled, key):
         prefix = codec.encode(codec.axes.normalise(starts[:, :frames]), jnp.ones((len(starts), frames), bool))
         captions = [pooled] * max(1, windows)
-        parts = continue_prefix(trained.network(), trained.schedule, prefix, captions, key, **how)
+        parts = text_to_motion.continue_prefix(trained.network(), trained.schedule, prefix, captions, key, **how)
         state = jnp.concatenate([prefix, *parts], axis=1)
         return codec.decode(state, jnp.ones((len(state), state.shape[1] * codec.frames_per_state), bool))
 
@@ -243,21 +244,19 @@ def asked_frames(generator: np.random.Generator, lengths, how_many) -> np.ndarra
 
 def _controlled_states(bench: Bench, trained: TextModel, section: str, condition, mask) -> Callable:
     """Return `states(noise, control)` of a section of Table 3: by the branch, by optimised noise, or by neither."""
-    schedule = trained.schedule
+    schedule, network = trained.schedule, trained.network()
     how = {"sampler": schedule.sampler, "num_steps": bench.settings["num_steps"]}
     if section == UNCONTROLLED:
-        return lambda noise, control: sample_text(trained.network(), schedule, condition, noise, **how)
+        return lambda noise, control: text_to_motion.sample_text(network, schedule, condition, noise, **how)
     if section != "noise optimisation":
-        branch = trained.control_branch()
-        return lambda noise, control: sample_control(
-            trained.network(), branch, schedule, condition, control, noise, **how
-        )
+        given = network, trained.control_branch(), schedule, condition
+        return lambda noise, control: text_to_motion.sample_control(*given, control, noise, **how)
 
     def optimised(noise, control):
-        network, how = trained.network(), {"sampler": schedule.sampler, "num_steps": _EULER_STEPS}
-        sample = lambda noise: sample_text(network, schedule, condition, noise, **how)
-        distance = control_distance(trained.codec, mask, control)
-        return optimise_noise(sample, distance, noise, num_steps=bench.settings["optimise_steps"]).state
+        few = how | {"num_steps": _EULER_STEPS}
+        sample = lambda noise: text_to_motion.sample_text(network, schedule, condition, noise, **few)
+        distance = text_to_motion.control_distance(trained.codec, mask, control)
+        return text_to_motion.optimise_noise(sample, distance, noise, num_steps=bench.settings["optimise_steps"]).state
 
     return optimised
 
@@ -300,16 +299,13 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
 
     def asked_of(joints, frames):
-        asked = np.zeros((*frames.shape, num_joints), bool)
-        asked[..., joints] = frames[..., None]
-        return asked
+        return frames[..., None] & np.isin(np.arange(num_joints), joints)
 
     if section == "upper-body edit":
         held = asked_of([joints[name] for name in HELD], np.arange(max(real.lengths)) < real.lengths[:, None])
 
-        def make(pooled, lengths, key):
-            return control_drawer(bench, trained, section, np.arange(len(lengths)), pooled)[0](held, key)
-
+        every = np.arange(real.num_clips)
+        make = lambda pooled, _, key: control_drawer(bench, trained, section, every, pooled)[0](held, key)
         return {"text_table3": bench.quality(make).assign(joint="pelvis and feet")}
     few = bench.settings["optimised_clips" if section == "noise optimisation" else "control_clips"]
     clips = np.arange(min(few, real.num_clips))
@@ -333,12 +329,20 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     each = table.groupby(["joint", "frames", "metric"], sort=False)["value"].mean().reset_index()
     draw, _ = control_drawer(bench, trained, section, clips[:1], pooled[:1])
     asked = asked_of([0], np.ones((1, lengths[0]), bool))
-    draw(asked, key)  # compiles
-    started = time.perf_counter()
-    draw(asked, jax.random.fold_in(key, 1))
-    taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": time.perf_counter() - started}
+    seconds = median_seconds(lambda number: draw(asked, jax.random.fold_in(key, number)), 1)
+    taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": seconds}
     means = each.groupby(["joint", "metric"], sort=False)["value"].mean().reset_index()
     return {"text_table3": pd.concat([means, pd.DataFrame([taken])]), "text_control": each}
+
+
+def median_seconds(ask: Callable, count: int) -> float:
+    """Return the median seconds of so many calls `ask(number)`, after one that compiles."""
+    times = []
+    for number in range(count + 1):
+        started = time.perf_counter()
+        jax.block_until_ready(ask(number))
+        times.append(time.perf_counter() - started)
+    return float(np.median(times[1:]))
 
 
 # ------------------------------------------------------------------------------------------------------------ MotionPCM
@@ -351,22 +355,17 @@ def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> floa
 
     The median of 30, after one that compiles; all are as long as the model's longest clip.
     """
-    told, times = bench.captions(0)[0], []
-    mask = frame_mask([trained.most_frames], trained.most_frames)
-    for number in range(_SENTENCES + 1):
-        started = time.perf_counter()
-        pooled = embed_captions([told[number % len(told)]], bench.encoder).pooled
-        jax.block_until_ready(draw(pooled, mask, jax.random.key(number)))
-        times.append(time.perf_counter() - started)
-    return float(np.median(times[1:]))
+    told, mask = bench.captions(0)[0], frame_mask([trained.most_frames], trained.most_frames)
+    embed = lambda number: embed_captions([told[number % len(told)]], bench.encoder).pooled
+    return median_seconds(lambda number: draw(embed(number), mask, jax.random.key(number)), _SENTENCES)
 
 
 def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: Mapping, first) -> pd.DataFrame:
     """Return the figures of a teacher or a student of MotionPCM in so many steps; without a model, of real motion."""
     if trained is None:
-        return bench.quality(None)
-    draw = latent_sampler(trained, row.get("steps"), row.get("guidance"))
-    made = bench.quality(lambda *asked: latent_motions(trained, *asked, draw=draw))
+        return bench.quality(lambda *asked: map(bench.real.clip, range(bench.real.num_clips)))
+    draw = motionpcm_sampling.latent_sampler(trained, row.get("steps"), row.get("guidance"))
+    made = bench.quality(lambda *asked: motionpcm_sampling.latent_motions(trained, *asked, draw=draw))
     if not about.get("timed"):
         return made
     taken = {"metric": "sampling_seconds", "value": sentence_seconds(bench, trained, draw)}
@@ -387,17 +386,15 @@ def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about:
     spread = lambda vectors: np.sum(np.var(vectors / np.asarray(trained.statistics.deviation), axis=0))
     for begin in range(0, len(clips), 64):
         padded = pad_motions(clips[begin : begin + 64], most)
-        made, positions = reconstruction(trained, padded.motion, padded.mask)
+        made, positions = motionpcm_sampling.reconstruction(trained, padded.motion, padded.mask)
         for number, length in enumerate(np.asarray(padded.length)):
             motions.append(positions[number, :length])
             away = (made[number, :length] - clips[begin + number]) / np.asarray(trained.statistics.deviation)
             apart.append(np.linalg.norm(away))
             moved.append([spread(made[number, :length]), spread(clips[begin + number])])
     local = lambda motion: motion - motion[:, :1]
-    errors = [
-        np.linalg.norm(local(motion) - local(real.clip(number)), axis=-1).mean(axis=-1)
-        for number, motion in enumerate(motions)
-    ]
+    pairs = zip(map(local, motions), map(local, map(real.clip, range(real.num_clips))), strict=True)
+    errors = [np.linalg.norm(ours - true, axis=-1).mean(axis=-1) for ours, true in pairs]
     made = np.asarray(pad_motions(motions, most).motion)
     own = pd.DataFrame([
         {"metric": "reconstruction_error", "value": 1000.0 * float(np.concatenate(errors).mean())},
@@ -493,7 +490,7 @@ def measure_text_table(
 
     def trained(preset: str) -> TextModel | LatentModel | None:
         base = text_models.preset_and_branch(preset)[0]
-        if is_latent_preset(base):  # these see clips of a length of their own
+        if text_models.is_latent_preset(base):  # these see clips of a length of their own
             return train_stage(data, encoder, profile, preset, folder=folder, **leg)
         form = presets.find_preset(base)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
@@ -530,3 +527,192 @@ def measure_text_table(
 
         records.measure([named], measured)
     return records.path(name)
+
+
+# --------------------------------------------------------------------------------------------------------- the probes
+
+TREMBLE = 0.02
+"""Deviation of the noise on every coordinate of every joint of trembling motion, metres."""
+
+SEEDS = {"smoke": 2}
+"""Motions of each caption in `measure_hands`, by profile; 50 in all others."""
+
+HAND_FRAMES, EULER_STEPS = 80, 20
+"""Length of the motions in `measure_hands`, four seconds, and the steps in which a flow makes them."""
+
+HAND_CONTENTS = [(f"{what}-{side}-hand", side) for what in ("raise-up", "wave") for side in ("left", "right")]
+"""What is told of a hand, and of which."""
+
+
+def mirrored_positions(skeleton: Skeleton, positions) -> np.ndarray:
+    """Return positions [L, J, 3] with left and right exchanged."""
+    return mirror(Motion.from_positions(skeleton, positions)).positions
+
+
+def probes_of(real: TextMotions, others: TextMotions, seed: int) -> dict:
+    """Return systems for `judge_motions` that are right or wrong on purpose.
+
+    Args:
+      real: the clips that are compared with.
+      others: clips of other splits, of the same pairs.
+      seed: of the noise and of what is drawn.
+    """
+    clips = [real.clip(number) for number in range(real.num_clips)]
+    of_pair = {pair: np.flatnonzero(np.equal(others.pairs, pair)) for pair in set(real.pairs)}
+    drawn = lambda repeat: np.random.default_rng([seed, repeat, 3])
+
+    def told(repeat: int, captions=real.captions, generator=None) -> list[str]:
+        generator = generator or drawn(repeat)
+        return [said[generator.integers(len(said))] for said in captions]
+
+    def others_shown(repeat: int):
+        generator = drawn(repeat)
+        chosen = [generator.choice(of_pair[pair]) for pair in real.pairs]
+        return list(map(others.clip, chosen)), told(repeat, [others.captions[number] for number in chosen], generator)
+
+    def trembling(repeat: int):
+        generator = drawn(repeat)
+        return [clip + TREMBLE * generator.normal(size=clip.shape) for clip in clips], told(repeat)
+
+    def changed(change: Callable) -> Callable:
+        return lambda repeat: (list(map(change, clips)), told(repeat))
+
+    return {
+        "other real clips": others_shown,
+        "captions of other clips": lambda repeat: (clips, list(drawn(repeat).permutation(told(repeat)))),
+        "left and right exchanged": changed(partial(mirrored_positions, real.skeleton)),
+        "backwards in time": changed(lambda clip: clip[::-1]),
+        "trembling": trembling,
+        "frozen": changed(lambda clip: np.repeat(clip[:1], len(clip), 0)),
+    }
+
+
+def measure_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, models=None, **leg) -> Path | None:
+    """Ask the judge about real motion and about motion that is wrong on purpose; it is trained if it is not.
+
+    Returns:
+      The table, `records/text_judge.csv`: system, metric, value, low, high; None where `stop_at` came first.
+    """
+    if models:
+        raise ValueError("text_judge judges real motion alone: leave --model out")
+    bench = bench_of(data, encoder, profile, **leg)
+    if bench is None:
+        return None
+    others = data.cut(bench.settings["most_frames"])
+    others = others.select(others.members("train"))
+    table = bench.judged(probes_of(bench.real, others, bench.seed), bench.settings["repeats"])
+    record = bench.record(profile, data, "text_judge", tremble=TREMBLE)
+    return write_table(results_dir(profile.dataset, profile.name) / "records" / "text_judge.csv", table, record)
+
+
+def counted_hands(skeleton: Skeleton, motions, side: str) -> dict[str, int]:
+    """Count motions by the hands that go up.
+
+    Args:
+      skeleton: of all of them.
+      motions: positions [L, J, 3] of each.
+      side: "left" or "right", which was asked for.
+
+    Returns:
+      motions, and of them `asked_hand` (it alone), `other_hand` (it alone), `both_hands`, `no_hand`.
+    """
+    up = np.array([text_metrics.raised_hands(skeleton, motion) for motion in motions])
+    asked, other = (up if side == "left" else up[:, ::-1]).T
+    kinds = {"asked_hand": asked & ~other, "other_hand": other & ~asked, "both_hands": asked & other}
+    counts = {name: int(those.sum()) for name, those in kinds.items()}
+    return {"motions": len(up), **counts, "no_hand": len(up) - sum(counts.values())}
+
+
+def _clip_rows(data: TextMotions, mirrored: bool) -> pd.DataFrame:
+    """Count the hands of held-out clips; of their mirror images, by what the clips themselves show, if asked."""
+    rows = []
+    shown = partial(mirrored_positions, data.skeleton) if mirrored else np.asarray
+    for content, side in HAND_CONTENTS:
+        of_content = [k for k in data.members("test") if data.pairs[k].partition(",")[0] == content]
+        clips = [shown(data.clip(k)[:HAND_FRAMES]) for k in of_content]
+        told = {"content": content, "side": side, "wording": "", "caption": ""}
+        rows.append(told | counted_hands(data.skeleton, clips, side))
+    return pd.DataFrame(rows)
+
+
+def _told_rows(trained, encoder: TextEncoder, profile: Profile) -> pd.DataFrame:
+    """Count the hands of motions that a model makes of captions with training's wordings and with others."""
+    rows, count = [], SEEDS.get(profile.name, 50)
+    steps = EULER_STEPS if trained.schedule.kind == "straight" else None
+    for (content, side), wording in itertools.product(HAND_CONTENTS, ("training", "held out")):
+        for action in caption_wordings(content, held_out=wording == "held out"):
+            told = {"content": content, "side": side, "wording": wording, "caption": f"a person {action}"}
+            pooled = np.repeat(embed_captions([told["caption"]], encoder).pooled, count, axis=0)
+            made = draw_motions(trained, pooled, HAND_FRAMES, jax.random.key(profile.seed), num_steps=steps)
+            rows.append(told | counted_hands(trained.skeleton, made, side))
+    return pd.DataFrame(rows)
+
+
+def measure_hands(
+    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, **leg
+) -> Path:
+    """Count which hand goes up where a caption says "left" or "right".
+
+    Held-out clips must all be right and their mirror images all wrong. A model makes 50 motions of each caption.
+
+    Args:
+      data, encoder, profile: captioned motion, what embeds captions, how much is measured.
+      models: presets that have weights; by default the one that `f3amd text` uses.
+
+    Returns:
+      The table, `records/hands.csv`: a row per model, content, side and caption.
+    """
+    asked = list(models or ())
+    record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="hands",
+                        text_encoder=encoder.identity, frames=HAND_FRAMES, raised_from=text_metrics.RAISED)  # fmt: skip
+    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {"hands": ["model"]}, again=asked)
+    rows = {"real clips": lambda: _clip_rows(data, False), "mirrored clips": lambda: _clip_rows(data, True)}
+    todo = [{"model": name, "weights": ""} for name in rows]
+    for name in asked or [None]:
+        trained = text_models.load_text_model(text_models.find_text_model(profile.dataset, name))
+        rows[trained.name] = lambda trained=trained: _told_rows(trained, encoder, profile)
+        todo.append({"model": trained.name, "weights": weights_digest(trained.params)})
+    return records.measure(todo, lambda row: {"hands": rows[row["model"]]()})
+
+
+ONE_CAPTION = "a person walks forward"
+"""The caption of `measure_one_caption`, and of notebook 21's strip."""
+
+
+def measure_one_caption(
+    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, **leg
+) -> Path:
+    """Keep the latent that a model makes of one caption in its own steps, from the noise of the profile's seed.
+
+    The autoencoder that ships decodes it, so that a picture needs no weights of the student.
+
+    Args:
+      data, encoder, profile: captioned motion, what embeds the caption, where results lie.
+      models: presets with weights; by default MotionLCM's, one step.
+
+    Returns:
+      The table, `records/text_one_caption.csv`: a row a token of the latent, its numbers in columns; `weights` are the
+      model's, `autoencoder` those that decode.
+    """
+    record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="text_one_caption",
+                        text_encoder=encoder.identity, caption=ONE_CAPTION)  # fmt: skip
+    text, rows = jnp.asarray(embed_captions([ONE_CAPTION], encoder).pooled), []
+    for name in models or ["MotionLCM-V2-small"]:
+        trained = text_models.load_text_model(text_models.find_text_model(profile.dataset, name), LatentModel)
+        network, key = network_with(trained.config, trained.params), jax.random.key(profile.seed)
+        noise = jax.random.normal(key, trained.config.state_shape(1))
+        latent = motionpcm_sampling.latent_walk(trained)(network, text, noise, key)
+        table = pd.DataFrame(np.asarray(latent[0]), columns=[f"channel_{n}" for n in range(latent.shape[-1])])
+        digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
+        steps = motionpcm_sampling.steps_of(trained)
+        rows.append(table.assign(model=trained.name, steps=steps, token=range(len(table)), **digests))
+    path = results_dir(profile.dataset, profile.name) / "records" / "text_one_caption.csv"
+    return write_table(path, pd.concat(rows), record)
+
+
+TEXT_MEASUREMENTS = {name: partial(measure_text_table, name) for name in TABLES} | {
+    "text_judge": measure_judge,
+    "hands": measure_hands,
+    "text_one_caption": measure_one_caption,
+}
+"""What `f3amd measure` knows of text to motion, by name: functions of captioned motion, encoder and profile."""

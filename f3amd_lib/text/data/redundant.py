@@ -103,15 +103,15 @@ def essential_features(skeleton: Skeleton, positions) -> np.ndarray:
 
     Source: ACMDM's released evaluation code ("essential" features).
     """
-    return _first_parts(skeleton, positions, FACING_SMOOTHING)[0]
+    return _first_parts(skeleton, positions)[0]
 
 
-def _first_parts(skeleton: Skeleton, positions, smoothing: float):
+def _first_parts(skeleton: Skeleton, positions):
     """Return (turn, velocity, height and local positions; matrices from the root's view into the world, [L, 3, 3])."""
     positions = finite_array("positions", positions, ("frame", skeleton.num_joints, 3))
     if len(positions) < 2:
         raise ValueError("redundant vectors need at least 2 frames: a step leads to the next one")
-    yaw = smoothed_yaw(skeleton, positions, smoothing)
+    yaw = smoothed_yaw(skeleton, positions, FACING_SMOOTHING)
     yaw[0] = 0.0
     turned = rotations.matrix_from_yaw(yaw)  # `rows @ turned` is the way from the world to the root's view
     velocity = (np.diff(positions[:, :1], axis=0) @ turned[1:])[:, 0, ::2]
@@ -121,15 +121,12 @@ def _first_parts(skeleton: Skeleton, positions, smoothing: float):
     return np.concatenate(parts, axis=-1), turned
 
 
-def redundant_from_positions(
-    skeleton: Skeleton, positions, *, smoothing: float = FACING_SMOOTHING, contact_step: float = CONTACT_STEP
-) -> np.ndarray:
+def redundant_from_positions(skeleton: Skeleton, positions, *, contact_step: float = CONTACT_STEP) -> np.ndarray:
     """Turn positions into redundant vectors.
 
     Args:
       skeleton: J joints; its offsets are the rest pose that rotations start from, in any length.
       positions: [L, J, 3], metres, from `canonical_start`.
-      smoothing: as in `smoothed_yaw`.
       contact_step: squared step below which a foot is in contact.
 
     Returns:
@@ -138,7 +135,7 @@ def redundant_from_positions(
     Raises:
       ValueError: for fewer than 2 frames, another shape, or positions that are not finite.
     """
-    first, turned = _first_parts(skeleton, positions, smoothing)
+    first, turned = _first_parts(skeleton, positions)
     step = np.diff(np.asarray(positions, np.float64), axis=0)
     parts = [
         first,

@@ -62,10 +62,8 @@ class TextEncoder:
     def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
         """Embed captions that `check_captions` has passed; ValueError for one that is too long."""
         pieces, pooled = self.embed(captions)
-        for caption, piece in zip(captions, pieces, strict=True):
-            if len(piece) > MOST_TOKENS:
-                what = f"has {len(piece)} word pieces of at most {MOST_TOKENS}"
-                raise ValueError(f"caption {caption!r} {what}; say it shorter")
+        if long := [caption for caption, piece in zip(captions, pieces, strict=True) if len(piece) > MOST_TOKENS]:
+            raise ValueError(f"caption {long[0]!r} has more than {MOST_TOKENS} word pieces; say it shorter")
         return _padded(pieces, pooled)
 
 
@@ -78,10 +76,8 @@ def check_captions(captions: Sequence[str]) -> None:
     if isinstance(captions, str):
         raise ValueError(f"captions must be a list of texts, got the one text {captions!r}; put it into a list")
     for number, caption in enumerate(captions, 1):
-        if not isinstance(caption, str) or not caption.strip():
-            raise ValueError(f"caption {number} of {len(captions)} is empty; say what the person does")
         if not re.search(r"[^\W\d_]", caption):
-            raise ValueError(f"caption {caption!r} holds no word; say what the person does")
+            raise ValueError(f"caption {number} of {len(captions)}, {caption!r}, has no word; say what the person does")
 
 
 def check_words(caption: str, known: Sequence[str]) -> None:
@@ -144,9 +140,8 @@ def load_wordllama() -> TextEncoder:
         encoded = [tokenizer.encode(caption, add_special_tokens=False) for caption in captions]
         for caption, pieces in zip(captions, encoded, strict=True):
             # What the vocabulary does not know is spelled out in bytes.
-            if strange := [piece for piece in pieces.tokens if re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece)]:
-                what = f"holds characters unknown to wordllama ({strange[0]})"
-                raise ValueError(f"caption {caption!r} {what}; use English")
+            if any(re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece) for piece in pieces.tokens):
+                raise ValueError(f"caption {caption!r} holds characters unknown to wordllama; use English")
         pieces = [vectors[pieces.ids] for pieces in encoded]
         return pieces, [piece.mean(axis=0) for piece in pieces]
 
@@ -155,55 +150,37 @@ def load_wordllama() -> TextEncoder:
 
 def _load_transformers(kind: str, folder) -> TextEncoder:
     """Read CLIP's or Sentence-T5's text side from a folder of the user; ValueError names what is missing."""
-    given, folder = folder, Path(folder or "").expanduser()
-    if not given or not (folder / "config.json").is_file():
-        raise ValueError(f"{kind}: {folder}/config.json is missing; give the folder of its weights (save_pretrained)")
+    folder = Path(folder or "").expanduser()
+    needed = [folder / "config.json", *([folder / "2_Dense" / "model.safetensors"] if kind == "t5" else [])]
+    if missing := [path for path in needed if not path.is_file()]:
+        raise ValueError(f"{kind}: {missing[0]} is missing; give the folder of its weights (save_pretrained)")
     if importlib.util.find_spec("transformers") is None or importlib.util.find_spec("torch") is None:
         raise ImportError(f"the text encoder {kind} needs transformers and torch: make bench-tools")
     import torch
     import transformers
+    from safetensors.torch import load_file
 
     offline = {"local_files_only": True, "use_safetensors": True}  # never a pickle
     tokenizer = transformers.AutoTokenizer.from_pretrained(folder, local_files_only=True)
-    if kind == "clip":
-        model, dense = transformers.CLIPTextModelWithProjection.from_pretrained(folder, **offline), None
-    else:
-        model = transformers.T5EncoderModel.from_pretrained(folder, **offline)
-        dense = torch.from_numpy(_sentence_layer(folder))
-    model.eval()
+    network = transformers.CLIPTextModelWithProjection if kind == "clip" else transformers.T5EncoderModel
+    model = network.from_pretrained(folder, **offline).eval()
+    dense = None if kind == "clip" else load_file(needed[1])["linear.weight"].float()
 
     def embed(captions):
         given = tokenizer(list(captions), padding=True, return_tensors="pt")
         with torch.no_grad():
             output = model(**given)
         mask, tokens = given["attention_mask"].bool(), output.last_hidden_state
-        pooled = output.text_embeds if dense is None else _sentence_vectors(torch, tokens, mask, dense)
+        if dense is None:
+            pooled = output.text_embeds
+        else:  # Sentence-T5: the mean of the tokens through one linear layer, of length 1
+            weights = mask[..., None].to(tokens.dtype)
+            pooled = torch.nn.functional.normalize((tokens * weights).sum(1) / weights.sum(1) @ dense.T, dim=-1)
         pieces = [row[kept] for row, kept in zip(tokens.float().numpy(), mask.numpy(), strict=True)]
         return pieces, pooled.float().numpy()
 
-    digest = hashlib.sha256()
-    for file in sorted(folder.glob("*.safetensors")):
-        digest.update(file.read_bytes())
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.safetensors"))))
     return TextEncoder(f"{kind}-{digest.hexdigest()[:12]}", model.config.hidden_size, embed)
-
-
-def _sentence_layer(folder: Path) -> np.ndarray:
-    """Read the linear layer that Sentence-T5 has after its mean."""
-    from safetensors.numpy import load_file
-
-    path = folder / "2_Dense" / "model.safetensors"
-    if not path.is_file():
-        raise ValueError(f"t5: {path} is missing; give the folder of a Sentence-T5, not of a plain T5")
-    return load_file(path)["linear.weight"].astype(np.float32)
-
-
-def _sentence_vectors(torch, tokens, mask, dense):
-    """Return Sentence-T5's vectors: the mean of the tokens through one linear layer, of length 1."""
-    weights = mask[..., None].to(tokens.dtype)
-    return torch.nn.functional.normalize((tokens * weights).sum(1) / weights.sum(1) @ dense.T, dim=-1)
-
-
-ENCODERS = ("wordllama", "clip", "t5")
 
 
 def load_text_encoder(name: str = "wordllama", folder=None) -> TextEncoder:
@@ -217,7 +194,7 @@ def load_text_encoder(name: str = "wordllama", folder=None) -> TextEncoder:
       ValueError: for an unknown name, or weights that are not there.
       ImportError: naming the package that is missing.
     """
-    check_known(name, ENCODERS, "text encoder")
+    check_known(name, ("wordllama", "clip", "t5"), "text encoder")
     return load_wordllama() if name == "wordllama" else _load_transformers(name, folder)
 
 

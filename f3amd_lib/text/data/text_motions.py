@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -20,10 +22,10 @@ import numpy as np
 
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS, assign_splits
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.names import check_known, nearest_hint
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 from f3amd_lib.text.data import redundant
-from f3amd_lib.text.data.captions import CAPTIONED, compose_captions, other_side, plain_style, shown_content
 
 FPS = 20.0
 """Frames per second of text-to-motion data (HumanML3D)."""
@@ -36,9 +38,6 @@ UNIT = 4
 
 HELD_OUT_PERCENT = (5, 15)
 """Of each pair's clips: validation and test."""
-
-CLASS_CLIPS = 5
-"""A pair of content and style with fewer clips is no class to evaluate on."""
 
 
 class AxisNormaliser(NamedTuple):
@@ -56,7 +55,7 @@ class AxisNormaliser(NamedTuple):
     def of(cls, numbers) -> AxisNormaliser:
         """Return that of numbers [..., C]."""
         flat = np.asarray(numbers).reshape(-1, np.shape(numbers)[-1])
-        mean, deviation = (getattr(flat, what)(axis=0, dtype=np.float64) for what in ("mean", "std"))
+        mean, deviation = flat.mean(axis=0, dtype=np.float64), flat.std(axis=0, dtype=np.float64)
         return cls(mean.astype(np.float32), np.maximum(deviation, 1e-6).astype(np.float32))
 
     def normalise(self, numbers):
@@ -209,13 +208,7 @@ def text_motions(clips, *, skeleton: Skeleton, **attributes) -> TextMotions:
     return TextMotions.joined(canonical, skeleton=dataclasses.replace(skeleton, end_sites=()), **attributes)
 
 
-def evaluation_classes(data: TextMotions, least: int = CLASS_CLIPS) -> list[str]:
-    """Return the pairs that have enough clips to evaluate on, sorted."""
-    pairs, counts = np.unique(data.pairs, return_counts=True)
-    return pairs[counts >= least].tolist()
-
-
-def bandai_text_motions(packed: PackedMotion, *, mirrored: bool = True, held_out_wording: bool = False) -> TextMotions:
+def bandai_text_motions(packed: PackedMotion) -> TextMotions:
     """Return the Bandai clips at 20 fps with composed captions.
 
     A clip's split follows from its name, within its content and style; its mirrored twin, in which
@@ -224,18 +217,15 @@ def bandai_text_motions(packed: PackedMotion, *, mirrored: bool = True, held_out
 
     Args:
       packed: the whole Bandai set (`open_dataset("bandai", locomotion_only=False)`).
-      mirrored: add each clip's mirror image.
-      held_out_wording: caption with the phrases that are never in training captions.
 
     Raises:
       ValueError: for another data set.
     """
     if packed.dataset != "bandai":
         raise ValueError(f"captions are composed for data set 'bandai', not for {packed.dataset!r}")
+    styles = [plain_style(packed.styles[style]) for style in packed.clip_style]
     labels = {
-        clip: (content, plain_style(packed.styles[packed.clip_style[clip]]))
-        for clip, content in enumerate(packed.clip_contents)
-        if content in CAPTIONED
+        clip: (content, styles[clip]) for clip, content in enumerate(packed.clip_contents) if content in CAPTIONED
     }
     strata = [(packed.clip_names[clip], pair) for clip, pair in labels.items()]
     splits = assign_splits(strata, percent=HELD_OUT_PERCENT)
@@ -246,14 +236,12 @@ def bandai_text_motions(packed: PackedMotion, *, mirrored: bool = True, held_out
             skipped.append((name, f"no words for content {packed.clip_contents[clip]!r}"))
             continue
         motion = resample(packed.motion(clip), FPS)
-        length = min(motion.num_frames, MOST_FRAMES) // UNIT * UNIT
-        motion = motion.slice(0, length)
+        motion = motion.slice(0, min(motion.num_frames, MOST_FRAMES) // UNIT * UNIT)
         content, style = shown_content(labels[clip][0], motion), labels[clip][1]
-        captions = compose_captions(name, content, style, motion, held_out=held_out_wording)
+        captions = compose_captions(name, content, style, motion)
         clips.append((name, motion, captions, splits[name], f"{content}, {style}"))
-        if mirrored:
-            swapped, seen = tuple(map(other_side, captions)), Motion.from_positions(motion.skeleton, motion.positions)
-            clips.append((f"M{name}", mirror(seen), swapped, splits[name], f"{other_side(content)}, {style}"))
+        swapped, seen = tuple(map(other_side, captions)), Motion.from_positions(motion.skeleton, motion.positions)
+        clips.append((f"M{name}", mirror(seen), swapped, splits[name], f"{other_side(content)}, {style}"))
     attributes = {name: getattr(packed, name) for name in ("skeleton", "licence", "credit")}
     return text_motions(clips, name="bandai", fps=FPS, skipped=tuple(skipped), **attributes)
 
@@ -283,15 +271,8 @@ def frame_mask(length, num_frames: int):
 
 
 def pad_motions(motions: Sequence[np.ndarray], num_frames: int = MOST_FRAMES // UNIT * UNIT) -> MotionBatch:
-    """Pad arrays [L, ...] with zeros to one length; longer ones are cut.
-
-    Raises:
-      ValueError: for no motion, or unlike shapes of a frame.
-    """
-    shapes = {np.shape(motion)[1:] for motion in motions}
-    if len(shapes) != 1:
-        raise ValueError(f"motions to pad must have frames of one shape, got {sorted(shapes) or 'none'}")
-    padded = np.zeros((len(motions), num_frames, *shapes.pop()), np.float32)
+    """Pad arrays [L, ...] with zeros to one length; longer ones are cut."""
+    padded = np.zeros((len(motions), num_frames, *np.shape(motions[0])[1:]), np.float32)
     for row, motion in zip(padded, motions, strict=True):
         row[: len(motion)] = motion[:num_frames]
     length = jnp.array([min(len(motion), num_frames) for motion in motions], jnp.int32)
@@ -358,3 +339,102 @@ def draw_clips(key, table: ClipTable, size: int, num_frames: int, unit: int = UN
     spread = lambda frames: mask.reshape(*mask.shape, *[1] * (frames.ndim - 1))
     motion = jax.tree.map(lambda frames: jnp.where(spread(frames), frames[rows], 0.0), table.frames)
     return MotionBatch(motion, length, mask, caption)
+
+
+# ----------------------------------------------------------------------------------------- captions
+#
+# A caption of a Bandai clip joins a subject or a manner (style), an action (content) and a detail that is measured on
+# the clip (how fast, how high the hands go). All words stand in `captions.toml`; which of them a clip gets follows from
+# its name alone. Some phrases are held out: no training caption has them.
+
+
+_WORDS = read_toml(Path(__file__).with_name("captions.toml"))
+
+CAPTIONED = tuple(_WORDS["content"])
+"""Contents that have words."""
+
+_SIDES = {"left": "right", "right": "left"}
+
+
+def other_side(text: str) -> str:
+    """Return a caption or a content's name with left and right exchanged, for a mirrored clip."""
+    return re.sub(r"\b(left|right)\b", lambda found: _SIDES[found[0]], text)
+
+
+def caption_wordings(content: str, *, held_out: bool = False) -> tuple[str, ...]:
+    """Return the actions that captions of a content name, such as "raises the left hand".
+
+    Args:
+      content: one of `CAPTIONED`.
+      held_out: those that training never sees, instead of the others.
+    """
+    return tuple(_WORDS["content"][content]["held_out" if held_out else "action"])
+
+
+def plain_style(style: str) -> str:
+    """Return a style of either part of the set without its number, by one name: "1-old" is "elderly"."""
+    style = style.partition("-")[2]
+    return _WORDS["same_style"].get(style, style)
+
+
+def shown_content(content: str, motion: Motion) -> str:
+    """Return a content with the side that the motion turns to, where its name tells another."""
+    if "-turn-" not in content:
+        return content
+    yaw = np.unwrap(motion.yaw)
+    turned = "left" if yaw[-1] > yaw[0] else "right"
+    return content if turned in content else other_side(content)
+
+
+def measured_detail(kind: str, motion: Motion) -> str:
+    """Say how fast somebody walks or runs, or how high hands go, in the words of `captions.toml`.
+
+    Args:
+      kind: "walk", "run", "hands", "left hand" or "right hand".
+      motion: a clip whose head and wrists are known.
+
+    Returns:
+      A phrase with a space in front, or nothing where the clip is neither fast nor slow.
+    """
+    positions, skeleton = motion.positions, motion.skeleton
+    if kind in ("walk", "run"):
+        steps = np.linalg.norm(np.diff(positions[:, 0, ::2], axis=0), axis=-1)
+        number = steps.mean() * motion.fps
+    else:
+        sides = ("left", "right") if kind == "hands" else (kind.partition(" ")[0],)
+        wrists = positions[:, [skeleton.role(f"{side}_wrist") for side in sides], 1].min(axis=1)
+        number = np.max(wrists - positions[:, skeleton.role("head"), 1])
+    words = _WORDS["detail"][kind]
+    return next(phrase for limit, phrase in zip(words["limits"], words["phrases"], strict=True) if number < limit)
+
+
+def compose_captions(name: str, content: str, style: str, motion: Motion, *, count: int = 4) -> tuple[str, ...]:
+    """Compose different captions of a clip.
+
+    Args:
+      name: of the clip, which decides the choice.
+      content: such as "walk-turn-left", one of `CAPTIONED`.
+      style: a style of `captions.toml`, from `plain_style`.
+      motion: the clip, for the details.
+      count: captions; fewer where words run out.
+
+    Returns:
+      Captions, a tuple of str, none twice; the same for the same clip, always.
+
+    Raises:
+      ValueError: for a content or a style without words.
+    """
+    for kind, known in (("content", content), ("style", style)):
+        if known not in _WORDS[kind]:
+            raise ValueError(f"no words for {kind} {known!r} in captions.toml{nearest_hint(known, _WORDS[kind])}")
+    content_words, style_words = _WORDS["content"][content], _WORDS["style"][style]
+    detail = measured_detail(content_words["detail"], motion) if "detail" in content_words else ""
+    every = [
+        pattern.format(subject=subject, action=action, detail=known_detail, manner=manner)
+        for pattern in _WORDS["patterns"]
+        for subject, manner in zip(style_words["subject"], style_words["manner"], strict=True)
+        for action in caption_wordings(content)
+        for known_detail in dict.fromkeys(("", detail))
+    ]
+    rank = lambda text: hashlib.sha256(f"{name}: {text}".encode()).digest()
+    return tuple(sorted(dict.fromkeys(every), key=rank)[:count])

@@ -18,24 +18,134 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pandas as pd
+from flax import nnx
 
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.measures.distributions import frechet_distance, intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.networks.attention import dropout
+from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 from f3amd_lib.text.data import text_motions
 from f3amd_lib.text.data.redundant import canonical_start, essential_features
 from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions
 from f3amd_lib.text.data.text_motions import MOST_FRAMES, UNIT, AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.text.judge import text_metrics
-from f3amd_lib.text.judge.judge_network import TextMotionConfig
 from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree, optimise
 from f3amd_lib.training.pipeline import ModelFiles
 from f3amd_lib.training.recipe import check_settings
 
+
+@dataclass(frozen=True, kw_only=True)
+class TextMotionConfig(CheckedConfig):
+    """Sizes of both encoders; those of the published evaluator are 512, 1024, 512 and 512.
+
+    Attributes:
+      features: of a frame of motion, 4 + 3 (J - 1).
+      token_width: of the caption's token vectors.
+      movement_width: of the convolutions, each of which halves the frames.
+      motion_hidden, text_hidden: of the recurrence, in each direction.
+      embedding_width: of the common space.
+      dropout: after each convolution, in training.
+    """
+
+    family: ClassVar[str] = "text-to-motion judge"
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+
+    features: int
+    token_width: int
+    movement_width: int = 128
+    motion_hidden: int = 128
+    text_hidden: int = 128
+    embedding_width: int = 64
+    dropout: float = 0.2
+
+
+class HalvingConvolution(nnx.Module):
+    """Convolution of 4 frames at every second one, a frame of zeros at both ends: half as many frames.
+
+    One matrix product, since XLA's gradient of a strided convolution is slow on a CPU.
+    """
+
+    def __init__(self, width_in: int, width_out: int, *, rngs: nnx.Rngs):
+        self.taps = nnx.Linear(4 * width_in, width_out, rngs=rngs)
+
+    def __call__(self, z):
+        """Map [B, F, C], F even, to [B, F / 2, D]."""
+        z = jnp.pad(z, ((0, 0), (1, 1), (0, 0)))
+        pairs = z.reshape(z.shape[0], z.shape[1] // 2, -1)
+        return self.taps(jnp.concatenate([pairs[:, :-1], pairs[:, 1:]], axis=-1))
+
+
+class _BothWays(nnx.Module):
+    """A gated recurrence forwards and backwards from a learned start; its last states become one vector."""
+
+    def __init__(self, width_in: int, hidden: int, width_out: int, *, rngs: nnx.Rngs):
+        self.inside = nnx.Linear(width_in, hidden, rngs=rngs)
+        self.start = nnx.Param(scaled_normal(rngs.params(), 0.1, (2, hidden)))
+        options = {"return_carry": True, "rngs": False}  # its start is given: nothing is drawn
+        self.forwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), **options)
+        self.backwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), reverse=True, **options)
+        self.middle = nnx.Linear(2 * hidden, hidden, rngs=rngs)
+        self.norm = nnx.LayerNorm(hidden, rngs=rngs)
+        self.output = nnx.Linear(hidden, width_out, rngs=rngs)
+
+    def __call__(self, z, length):
+        """Map [B, T, width_in], of which `length` [B] count, to [B, width_out]."""
+        z = self.inside(z)
+        start = jnp.broadcast_to(self.start[...][:, None], (2, len(z), z.shape[-1]))
+        last = [
+            recurrence(z, initial_carry=first, seq_lengths=length)[0]
+            for recurrence, first in zip((self.forwards, self.backwards), start, strict=True)
+        ]
+        return self.output(nnx.leaky_relu(self.norm(self.middle(jnp.concatenate(last, axis=-1))), 0.2))
+
+
+class TextMotionNetwork(nnx.Module):
+    """The motion encoder and the text encoder."""
+
+    def __init__(self, config: TextMotionConfig, *, rngs: nnx.Rngs):
+        width, out = config.movement_width, config.embedding_width
+        self.dropout = config.dropout
+        self.movement = nnx.List(
+            [HalvingConvolution(config.features, width, rngs=rngs), HalvingConvolution(width, width, rngs=rngs)]
+        )
+        self.movement_output = nnx.Linear(width, width, rngs=rngs)
+        self.motion = _BothWays(width, config.motion_hidden, out, rngs=rngs)
+        self.text = _BothWays(config.token_width, config.text_hidden, out, rngs=rngs)
+
+    def embed_motion(self, features, length, key=None):
+        """Return motions as vectors, [B, embedding_width].
+
+        Args:
+          features: [B, F, features], F a multiple of 4; 0 in the padding.
+          length: frames of each, [B]; at least 4.
+          key: random key of the dropout, in training.
+        """
+        z = features
+        for layer, convolution in enumerate(self.movement, 1):
+            key_layer = None if key is None else jax.random.fold_in(key, layer)
+            z = dropout(nnx.leaky_relu(convolution(z), 0.2), self.dropout, key_layer)
+            left = -(-length // 2**layer)
+            z = jnp.where((jnp.arange(z.shape[1]) < left[:, None])[..., None], z, 0.0)
+        return self.motion(self.movement_output(z), length // 4)
+
+    def embed_text(self, tokens, mask):
+        """Return captions as vectors, [B, embedding_width].
+
+        Args:
+          tokens: [B, T, token_width].
+          mask: true for tokens, which come first, [B, T].
+        """
+        return self.text(tokens, jnp.sum(mask, axis=1))
+
+
 _BATCH = 64
+
+CLASS_CLIPS = 5
+"""A pair of content and style with fewer clips is no class to evaluate on."""
 
 
 # ------------------------------------------------------------------------------------------ training
@@ -61,11 +171,9 @@ class EvaluatorTraining:
     num_frames: int = MOST_FRAMES // UNIT * UNIT
 
     def __post_init__(self):
-        if self.num_steps < 1 or self.batch_size < 2:
-            raise ValueError(f"a judge needs at least 1 step and batches of 2, got {self}")
-        if self.num_frames < UNIT:
-            raise ValueError(f"a judge needs at least {UNIT} frames, got {self}")
         check_settings(self)
+        if self.batch_size < 2 or self.num_frames < UNIT:
+            raise ValueError(f"a judge needs batches of 2 or more and at least {UNIT} frames, got {self}")
 
     def optimiser(self) -> optax.GradientTransformation:
         """Return Adam with a warm-up, gradients clipped."""
@@ -144,17 +252,6 @@ class EvaluatorTask(ClipsTask):
         return {"loss": loss, "accuracy": accuracy}
 
 
-def embedded_captions(embedded: TextEmbeddings, pairs) -> Captions:
-    """Return captions on the device.
-
-    Args:
-      embedded: C captions.
-      pairs: what each of them tells, [C] of str.
-    """
-    numbers = np.unique(np.asarray(pairs), return_inverse=True)[1]
-    return Captions(jnp.asarray(embedded.tokens), jnp.asarray(embedded.mask), jnp.asarray(numbers, jnp.int32))
-
-
 # ------------------------------------------------------------------------------------------ the judge
 
 
@@ -189,22 +286,19 @@ class TextJudge(CaptionedModel):
         Raises:
           ValueError: for another number of joints, fewer than 4 frames, or numbers not finite.
         """
-        for number, motion in enumerate(motions):
-            if len(motion) < UNIT:
-                raise ValueError(f"motion {number} has {len(motion)} frames; the judge needs {UNIT}")
+        if (least := min(map(len, motions))) < UNIT:
+            raise ValueError(f"a motion has {least} frames; the judge needs {UNIT}")
         canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
         features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
-        return in_batches(
-            lambda rows: _embed("motion", self.config, self.params, *pad_motions([features[row] for row in rows])[:2]),
-            len(features), _BATCH,
-        ).astype(np.float64)  # fmt: skip
+        return self._embed("motion", lambda rows: pad_motions([features[row] for row in rows])[:2], len(features))
 
     def embed_texts(self, embedded: TextEmbeddings) -> np.ndarray:
         """Return embedded captions as vectors, [N, D]."""
-        tokens, mask = embedded.tokens, embedded.mask
-        return in_batches(
-            lambda rows: _embed("text", self.config, self.params, tokens[rows], mask[rows]), len(tokens), _BATCH
-        ).astype(np.float64)
+        return self._embed("text", lambda rows: (embedded.tokens[rows], embedded.mask[rows]), len(embedded.tokens))
+
+    def _embed(self, what: str, given: Callable, count: int) -> np.ndarray:
+        embed = lambda rows: _embed(what, self.config, self.params, *given(rows))
+        return in_batches(embed, count, _BATCH).astype(np.float64)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -213,17 +307,14 @@ def _embed(what: str, config: TextMotionConfig, params, *given):
 
 
 def judged_features(data: TextMotions) -> tuple[np.ndarray, AxisNormaliser]:
-    """Return what a judge sees of a data set in its network's units, [N, C], and the normaliser.
+    """Return what a judge sees of training clips in its network's units, [N, C], and the normaliser.
 
-    Deviations are those of the training split, averaged over turn, velocity, height and positions.
+    Deviations are averaged over turn, velocity, height and positions.
     """
     features = data.essential_features()
-    training = np.isin(np.repeat(np.arange(data.num_clips), data.lengths), data.members("train"))
-    normaliser = AxisNormaliser.of(features[training])
-    grouped = normaliser.deviation.copy()
+    normaliser = AxisNormaliser.of(features)
     for part in (slice(0, 1), slice(1, 3), slice(3, 4), slice(4, None)):
-        grouped[part] = grouped[part].mean()
-    normaliser = AxisNormaliser(normaliser.mean, grouped)
+        normaliser.deviation[part] = normaliser.deviation[part].mean()
     return normaliser.normalise(features), normaliser
 
 
@@ -243,7 +334,8 @@ def judge_task(
     table, captions = text_motions.clip_table(training_split, features)
     pairs = [pair for pair, said in zip(training_split.pairs, training_split.captions, strict=True) for _ in said]
     network = TextMotionConfig(features=features.shape[-1], token_width=encoder.width, **sizes)
-    told = embedded_captions(embed_captions(captions, encoder), pairs)
+    tokens, mask, _ = embed_captions(captions, encoder)
+    told = Captions(*map(jnp.asarray, (tokens, mask, np.unique(pairs, return_inverse=True)[1].astype(np.int32))))
     about = {"text_encoder": encoder.identity, "dataset_fingerprint": data.fingerprint}
     return EvaluatorTask(network, training, table, told, **about), normaliser
 
@@ -288,8 +380,8 @@ def load_judge(path: Path) -> TextJudge:
 
 def judged_clips(data: TextMotions) -> TextMotions:
     """Return the test clips that can be judged: those of pairs with enough clips."""
-    classes = set(text_motions.evaluation_classes(data))
-    chosen = [clip for clip in data.members("test") if data.pairs[clip] in classes]
+    pairs, counts = np.unique(data.pairs, return_counts=True)
+    chosen = [clip for clip in data.members("test") if data.pairs[clip] in pairs[counts >= CLASS_CLIPS]]
     if not chosen:
         raise ValueError(f"data set {data.name!r} has no pair of content and style with enough clips to judge by")
     return data.select(chosen)
@@ -308,12 +400,10 @@ def text_figures(
       group: texts that are ranked together.
     """
     groups = text_metrics.groups_of_unlike_pairs(pairs, generator, group)
-    first, second, third = text_metrics.r_precision(text[groups], motion[groups])
+    precision = text_metrics.r_precision(text[groups], motion[groups])
     return {
         "text_FID": frechet_distance(motion, reference),
-        "R_precision_1": first,
-        "R_precision_2": second,
-        "R_precision_3": third,
+        **{f"R_precision_{k}": share for k, share in enumerate(precision, 1)},
         "matching_distance": text_metrics.matching_distance(text[groups], motion[groups]),
         "embedding_diversity": text_metrics.embedding_diversity(motion, generator),
         "CLIP_score": text_metrics.clip_score(text, motion),

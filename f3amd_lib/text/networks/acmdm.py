@@ -1,14 +1,26 @@
-"""The ACMDM network: a diffusion Transformer over patches of joints (ACMDM section 3.1, Figure 2a).
+"""The ACMDM network: a diffusion Transformer over patches of joints, with its control branch and its masked form.
 
     state [B, l, J, C] -> patches of joints -> n blocks under time and text -> [B, l, J, C]
+
+Source: ACMDM sections 3.1 and 3.2, Figure 2, and Appendix G (Meng et al. 2025).
 
 The joint axis stays an axis: raw positions have three channels a joint, the latent of a motion
 autoencoder has four, and a redundant feature vector is one joint with many. What the answer means
 (x0, eps or v) is the config's `objective`; `diffusion.predictions` turns it into a clean estimate.
+
+The control branch is a copy of the network beside the frozen one. It reads the same noisy state and, on top of it,
+where joints should be. What each of its blocks makes goes through a layer that starts at zero and is added to the
+frozen network behind the same block; an untrained branch therefore changes nothing.
+
+Of masked autoregression, where frames are revealed in a random order, each drawn given those before it, the paper
+gives results and no network. Ours follows the recipe of MARDM (Meng et al. 2024): the blocks of ACMDM look at the
+frames that are known, in both directions, and a small network beside them denoises the hidden ones, each token for
+itself.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -20,7 +32,7 @@ from flax import nnx
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES
 from f3amd_lib.networks.attention import check_num_heads, waves
-from f3amd_lib.networks.config import CheckedConfig, scaled_normal
+from f3amd_lib.networks.config import CheckedConfig, LayerKeys, scaled_normal
 
 TIME_FEATURES = 256
 
@@ -107,8 +119,7 @@ class ACMDMConfig(CheckedConfig):
     @property
     def patch_joints(self) -> int:
         """P, joints of a token."""
-        sizes = {"whole": self.num_joints, "half": math.ceil(self.num_joints / 2), "pair": min(2, self.num_joints)}
-        return sizes[self.patch]
+        return {"whole": self.num_joints, "half": -(-self.num_joints // 2), "pair": min(2, self.num_joints)}[self.patch]
 
     @property
     def num_patches(self) -> int:
@@ -127,10 +138,9 @@ class ACMDMConfig(CheckedConfig):
     def check_condition(self, condition: TextCondition) -> None:
         """Raise ValueError unless text and mask fit each other and the config."""
         pooled, mask = condition
-        if pooled.ndim != 2 or pooled.shape[1] != self.text_width:
-            raise ValueError(f"pooled text must be [B, {self.text_width}], got {pooled.shape}")
-        if mask.ndim != 2 or mask.shape[0] != pooled.shape[0] or not 0 < mask.shape[1] <= self.window:
-            raise ValueError(f"mask must be [{pooled.shape[0]}, at most {self.window} frames], got {mask.shape}")
+        if pooled.shape != (len(mask), self.text_width) or mask.ndim != 2 or not 0 < mask.shape[1] <= self.window:
+            wanted = f"[B, {self.text_width}], and its mask [B, at most {self.window} frames]"
+            raise ValueError(f"pooled text must be {wanted}, got {pooled.shape} and {mask.shape}")
 
 
 def rotary_base(num_tokens: int) -> int:
@@ -352,11 +362,10 @@ class ACMDM(Trunk):
         config = self.config
         before = 0 if past is None else past[0][0].shape[1]
         frames = state.shape[1] + before // config.num_patches
-        if state.ndim != 4 or state.shape[2:] != (config.num_joints, config.channels) or frames > config.window:
-            wanted = f"[B, at most {config.window}, {config.num_joints}, {config.channels}]"
-            raise ValueError(f"state must be {wanted}, got {state.shape} after {before // config.num_patches} frames")
-        if context.mask.shape != (state.shape[0], frames):  # B may be a name, when a program is made
-            raise ValueError(f"the mask must be [{state.shape[0]}, {frames}], got {context.mask.shape}")
+        fits = state.shape[2:] == (config.num_joints, config.channels) and frames <= config.window
+        if not fits or context.mask.shape != (state.shape[0], frames):  # B may be a name, when a program is made
+            wanted = f"[B, at most {config.window}, {config.num_joints}, {config.channels}] and the mask [B, {frames}]"
+            raise ValueError(f"state must be {wanted}, got {state.shape} and {context.mask.shape}")
         x = self.patch(self.tokens(state))
         num_tokens = x.shape[1]
         time = jnp.asarray(time, x.dtype)
@@ -376,3 +385,235 @@ class ACMDM(Trunk):
         if config.conditioning == "adaln":
             x = modulated(x, *jnp.split(self.output_modulation(jax.nn.silu(c)), 2, axis=-1))
         return self.from_tokens(self.output(x)), tuple(now)
+
+
+# ------------------------------------------------------------------------------------------------------- control branch
+
+
+class Control(NamedTuple):
+    """Where joints should be.
+
+    Attributes:
+      positions: normalised, zero where nothing is asked, [B, L, J, 3], in frames of motion (not of the latent).
+      asked: 1 where a joint is controlled in a frame, else 0, [B, L, J]. The branch is not shown it.
+      kept: 0 for samples whose control is dropped, else 1, [B].
+    """
+
+    positions: object
+    asked: object
+    kept: object
+
+    @classmethod
+    def of(cls, positions, asked) -> Control:
+        """Return the control of whole normalised positions at the places that `asked` marks."""
+        asked = jnp.asarray(asked, positions.dtype)
+        return cls(positions * asked[..., None], asked, jnp.ones(len(positions), positions.dtype))
+
+    def dropped(self) -> Control:
+        """Return a control that asks nothing of anybody."""
+        return self._replace(kept=jnp.zeros_like(self.kept))
+
+
+class ControlBranch(Trunk):
+    """The trained half of a controlled ACMDM.
+
+    Args:
+      config: of the network that it stands beside; it needs "adaln" and no blocks of frames.
+      frames_per_state: frames of motion for each frame of the state: 4 for a latent, 1 raw.
+
+    Raises:
+      ValueError: for a config that it cannot stand beside.
+    """
+
+    def __init__(self, config: ACMDMConfig, frames_per_state: int, *, rngs: nnx.Rngs):
+        super().__init__(config, rngs=rngs)
+        if config.conditioning != "adaln" or config.block_frames:
+            raise ValueError("a control branch stands beside a network with conditioning 'adaln' and block_frames 0")
+        self.frames_per_state, width = frames_per_state, config.latent_width
+        self.control_input = nnx.Linear(frames_per_state * config.patch_joints * 3, width, rngs=rngs)
+        self.control_norm = root_mean_square_norm(width, rngs)
+        self.control_output = linear(width, width, rngs, zero=True)
+        self.added = nnx.List([linear(width, width, rngs, zero=True) for _ in range(config.depth)])
+
+    def control_tokens(self, control: Control):
+        """Return one token for the frames and joints of each token of the state, [B, tokens, d]."""
+        config, frames = self.config, self.frames_per_state
+        batch, length = control.positions.shape[:2]
+        # Patches of each frame, then those of the frames of one state beside each other.
+        patches = self.tokens(control.positions).reshape(batch, length // frames, frames, config.num_patches, -1)
+        patches = jnp.swapaxes(patches, 2, 3).reshape(batch, -1, frames * config.patch_joints * 3)
+        tokens = self.control_output(self.control_norm(self.control_input(patches)))
+        return tokens * control.kept[:, None, None]
+
+    def __call__(self, state, time, condition: TextCondition, control: Control):
+        """Return what is added behind each block of the frozen network, [B, tokens, d] each.
+
+        Args:
+          state, time: as the frozen network gets them.
+          condition: text and mask; the branch has a text layer of its own.
+          control: where joints should be.
+        """
+        x = self.patch(self.tokens(state)) + self.control_tokens(control)
+        time = jnp.broadcast_to(jnp.asarray(time, x.dtype), state.shape[:1])
+        made = self.through(x, time, self.encode(condition))
+        return [layer(x) for x, layer in zip(made, self.added, strict=True)]
+
+
+def control_branch(base: ACMDM, frames_per_state: int, key) -> ControlBranch:
+    """Return a fresh branch whose blocks are copies of the base's; all else of it starts anew.
+
+    Args:
+      base: the trained network; left as it is.
+      frames_per_state: see `ControlBranch`.
+      key: JAX random key.
+    """
+    branch = ControlBranch(base.config, frames_per_state, rngs=LayerKeys(key))
+    nnx.update(branch.blocks, nnx.state(base.blocks))
+    return branch
+
+
+@functools.lru_cache(maxsize=8)
+def blank_branch(config: ACMDMConfig, frames_per_state: int) -> tuple:
+    """Return a branch's structure and the shapes of its weights, without building arrays."""
+    blank = lambda: ControlBranch(config, frames_per_state, rngs=LayerKeys(jax.random.key(0)))
+    return nnx.split(nnx.eval_shape(blank))
+
+
+def branch_with(config: ACMDMConfig, frames_per_state: int, params) -> ControlBranch:
+    """Return a control branch with the given weights."""
+    return nnx.merge(blank_branch(config, frames_per_state)[0], jax.tree.map(lambda leaf: leaf, params))
+
+
+def controlled(base: ACMDM, branch: ControlBranch, condition: TextCondition, control: Control):
+    """Return `predict(state, time)` of the network with its branch (ACMDM section 3.2)."""
+    context = base.encode(condition)
+    return lambda state, time: base(state, time, context, residuals=branch(state, time, condition, control))
+
+
+# ---------------------------------------------------------------------------------------------------------- masked form
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskedACMDMConfig(ACMDMConfig):
+    """An ACMDM config, and the head.
+
+    Attributes:
+      head_depth: layers of the network that denoises a token (ours).
+
+    Raises:
+      ValueError: as `ACMDMConfig`, and for concatenation or blocks of frames, which this form has no place for.
+    """
+
+    family: ClassVar[str] = "masked ACMDM"
+
+    head_depth: int = 3
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.conditioning != "adaln" or self.block_frames:
+            raise ValueError("masked autoregression needs conditioning 'adaln' and block_frames 0")
+
+
+class HeadLayer(nnx.Module):
+    """Two layers on a token, gated, shifted and scaled by c; the identity at first."""
+
+    def __init__(self, width: int, *, rngs: nnx.Rngs):
+        self.norm = root_mean_square_norm(width, rngs)
+        self.modulation = linear(width, 3 * width, rngs, zero=True)
+        self.hidden, self.output = linear(width, width, rngs), linear(width, width, rngs)
+
+    def __call__(self, x, c):
+        shift, scale, gate = jnp.split(self.modulation(jax.nn.silu(c)), 3, axis=-1)
+        return x + gate * self.output(jax.nn.silu(self.hidden(modulated(self.norm(x), shift, scale))))
+
+
+class MaskedACMDM(Trunk):
+    """A network that sees known frames (`look`) and denoises hidden ones (`__call__`)."""
+
+    def __init__(self, config: MaskedACMDMConfig, *, rngs: nnx.Rngs):
+        super().__init__(config, rngs=rngs)
+        width, numbers = config.latent_width, config.patch_joints * config.channels
+        self.hidden_token = nnx.Param(scaled_normal(rngs.params(), 0.02, (width,)))
+        self.head_input = linear(numbers, width, rngs)
+        self.head = nnx.List([HeadLayer(width, rngs=rngs) for _ in range(config.head_depth)])
+        self.output_norm = root_mean_square_norm(width, rngs)
+        self.output = linear(width, numbers, rngs, zero=True)
+
+    def look(self, state, hidden, context: TextContext):
+        """Return what the blocks make of the known frames, one vector a token, [B, tokens, d].
+
+        Args:
+          state: frames as they are known, [B, l, J, C].
+          hidden: True for frames that are not, [B, l]; their values are not looked at.
+          context: from `encode`.
+        """
+        x = self.patch(self.tokens(state))
+        hidden = jnp.repeat(hidden, self.config.num_patches, axis=1)[..., None]
+        x = jnp.where(hidden, self.hidden_token[...], x)
+        # What it looks at is clean: time 1.
+        *_, x = self.through(x, jnp.ones(len(state), x.dtype), context)
+        return x
+
+    def __call__(self, state, time, context):
+        """Predict x0, eps or v of noisy frames, each from what was seen of the others.
+
+        Args:
+          state: [B, l, J, C].
+          time: [B], or one for all.
+          context: of `look`, or a condition as `encode` made it, with which all frames are hidden.
+        """
+        if isinstance(context, TextContext):
+            context = self.look(jnp.zeros_like(state), jnp.ones(state.shape[:2], bool), context)
+        x = self.head_input(self.tokens(state))
+        time = jnp.broadcast_to(jnp.asarray(time, x.dtype), state.shape[:1])
+        nothing = TextContext(jnp.zeros((len(state), 1), x.dtype), jnp.ones(state.shape[:2], bool))
+        c = context + self.conditioned(time, nothing)[0]
+        for layer in self.head:
+            x = layer(x, c)
+        return self.from_tokens(self.output(self.output_norm(x)))
+
+
+def masked_share(uniform):
+    """Return which share of the frames is hidden, cos(pi u / 2) of a uniform draw u, in training and sampling."""
+    return jnp.cos(0.5 * jnp.pi * uniform)
+
+
+def draw_hidden(key, mask):
+    """Draw which frames are hidden in training, [B, l]: a random share of each sample's own, one at least.
+
+    Args:
+      key: JAX random key.
+      mask: frames that are motion, [B, l].
+    """
+    key_share, key_order = jax.random.split(key)
+    lengths = mask.sum(axis=1)
+    share = masked_share(jax.random.uniform(key_share, lengths.shape))
+    count = jnp.maximum(1, jnp.round(share * lengths))
+    order = jnp.argsort(jnp.argsort(jnp.where(mask, jax.random.uniform(key_order, mask.shape), 2.0), axis=1), axis=1)
+    return mask & (order < count[:, None])
+
+
+def spoil(key, state, hidden):
+    """Return (state, frames to hide) as the blocks get them in training.
+
+    Of the hidden frames a tenth is replaced by noise, 88 % of the others by the learned vector, and the rest left as
+    they are, so that the blocks cannot trust what they see.
+
+    Args:
+      key: JAX random key.
+      state: clean, [B, l, J, C].
+      hidden: from `draw_hidden`.
+
+    Source: MARDM's released code.
+    """
+    key_noise, key_choice, key_vector = jax.random.split(key, 3)
+    replaced = hidden & jax.random.bernoulli(key_choice, 0.1, hidden.shape)
+    spoilt = jnp.where(replaced[..., None, None], jax.random.normal(key_noise, state.shape), state)
+    return spoilt, hidden & ~replaced & jax.random.bernoulli(key_vector, 0.88, hidden.shape)
+
+
+def frames_known(lengths, num_rounds: int):
+    """Return how many frames of each motion are known after each round of sampling, [rounds, B], rising to all."""
+    left = masked_share(jnp.arange(1, num_rounds + 1) / num_rounds)
+    # Rounding may not keep the last frame hidden.
+    return lengths - jnp.floor(left[:, None] * lengths + 1e-4).astype(lengths.dtype)

@@ -15,9 +15,7 @@ from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.text.data.redundant import smoothed_yaw
 from f3amd_lib.text.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.text.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
-from f3amd_lib.text.networks.acmdm import TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, branch_with
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDMConfig
+from f3amd_lib.text.networks.acmdm import Control, MaskedACMDMConfig, TextCondition, branch_with
 from f3amd_lib.text.sampling import text_to_motion
 from f3amd_lib.text.sampling.motionpcm_sampling import latent_motions
 from f3amd_lib.text.stages.text_models import LatentModel, TextModel
@@ -156,15 +154,14 @@ def motion_drawer(
     if controlled:
         trained.control_branch()  # says how to train one if there is none
         weights["branch"] = trained.branch
-        asked = {{"guidance": "text_scale"}.get(name, name): value for name, value in asked.items()}
 
     @jax.jit
     def compiled(weights, codec, pooled, mask, noise, key, control):
         network, condition = network_with(config, weights["network"]), TextCondition(pooled, codec.state_mask(mask))
         if controlled:
             branch = branch_with(config, codec.frames_per_state, weights["branch"])
-            given = branch, schedule, condition, control, noise
-            state = text_to_motion.sample_control(network, *given, key=key, **asked)
+            given = network, branch, schedule, condition, control, noise
+            state = text_to_motion.sample_control(*given, key=key, **asked)
         elif isinstance(config, MaskedACMDMConfig):
             state = text_to_motion.sample_masked(network, schedule, condition, key, **asked)
         else:

@@ -121,16 +121,14 @@ def steps_of(trained: LatentModel, num_steps: int | None = None) -> int:
         raise ValueError(f"{trained.name} is an autoencoder alone: it needs a teacher or a student to make motion")
     levels, told = len(trained.schedule.levels), trained.training
     if not trained.config.guidance_features:
-        fits = range(1, levels + 1)
-        own = min(TEACHER_STEPS, levels)
+        fits, own = range(1, levels + 1), min(TEACHER_STEPS, levels)
     elif told["consistency"] == "latent":
         fits, own = tuple(phases.LATENT_CONSISTENCY_TIMES), 1
     else:
         fits, own = (told["num_phases"],), told["num_phases"]
     if (num_steps or own) not in fits:
         known = " or ".join(map(str, fits)) if len(fits) < 4 else f"1 to {levels}"
-        steps = "step" if known == "1" else "steps"
-        raise ValueError(f"{trained.name} takes {known} {steps}, got {num_steps}; see f3amd presets --paper motionpcm")
+        raise ValueError(f"{trained.name} takes {known} steps, got {num_steps}; see f3amd presets --paper motionpcm")
     return num_steps or own
 
 

@@ -1,20 +1,29 @@
 """From noise and a caption to a state of motion: guidance, control, and the three autoregressive forms of ACMDM.
 
 All of it is one call of `flow.solve` on a `predict(state, time)`; what differs is how that is put together. States are
-positions or latents in network units; `text.stages.motion_codec` makes metres of them.
+positions or latents in network units; `text.stages.text_models` makes metres of them.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.predictions import guided, guided_twice
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.text.networks.acmdm import ACMDM, TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, controlled
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, frames_known
+from f3amd_lib.text.networks.acmdm import (
+    ACMDM,
+    Control,
+    ControlBranch,
+    MaskedACMDM,
+    TextCondition,
+    controlled,
+    frames_known,
+)
+from f3amd_lib.text.stages.text_models import MotionCodec
 
 Predict = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -71,10 +80,10 @@ def sample_text(
 
 def sample_control(
     base: ACMDM, branch: ControlBranch, schedule: NoiseSchedule, condition: TextCondition, control: Control, noise, *,
-    text_scale: float = 2.5, control_scale: float = 1.75, **solver,
+    guidance: float = 2.5, **solver,
 ):  # fmt: skip
     """Draw motions whose joints go where a control asks; arguments as of `sample_text` and `control_prediction`."""
-    predict = control_prediction(base, branch, condition, control, text_scale, control_scale)
+    predict = control_prediction(base, branch, condition, control, guidance)
     return without_padding(solve(predict, base.config.objective, schedule, noise, **solver), condition.mask)
 
 
@@ -221,3 +230,91 @@ def sample_masked(
     keys = jax.random.split(key_rounds, num_rounds)
     state, _ = jax.lax.scan(reveal, state, (~before, known & ~before, keys))
     return without_padding(state, mask)
+
+
+class OptimisedNoise(NamedTuple):
+    """What came out.
+
+    Attributes:
+      noise: the noise that was found, [B, l, J, C].
+      state: what the sampler makes of it, [B, l, J, C].
+      distances: mean distance from the targets before each step, metres, [steps, B].
+    """
+
+    noise: jax.Array
+    state: jax.Array
+    distances: jax.Array
+
+
+def correlation(noise):
+    """Return how much neighbouring frames of noise go together, squared and summed over time scales, [B].
+
+    Zero on average for white noise. Each scale is made of sums of two frames of the last, over sqrt(2).
+
+    Args:
+      noise: [B, l, J, C].
+    """
+    total = jnp.zeros(len(noise))
+    while noise.shape[1] > 1:
+        product = noise[:, 1:] * noise[:, :-1]
+        total = total + product.reshape(len(noise), -1).mean(axis=1) ** 2
+        pairs = noise.shape[1] // 2
+        noise = (noise[:, 0 : 2 * pairs : 2] + noise[:, 1 : 2 * pairs : 2]) / jnp.sqrt(2.0)
+    return total
+
+
+def control_distance(codec: MotionCodec, mask, control: Control) -> Callable:
+    """Return `distance(state)`, mean distance of a state's joints from where they are asked to be, metres, [B].
+
+    Args:
+      codec: between states and motion.
+      mask: frames of motion, [B, L].
+      control: where joints should be; each sample asks for one at least.
+    """
+    wanted = codec.axes.restore(control.positions)
+
+    def distance(state):
+        apart = codec.axes.restore(codec.decode(state, mask)) - wanted
+        # The root of zero has no gradient.
+        length = jnp.sqrt(jnp.sum(apart**2, axis=-1) + 1e-12)
+        return jnp.sum(length * control.asked, axis=(1, 2)) / control.asked.sum(axis=(1, 2))
+
+    return distance
+
+
+def optimise_noise(
+    sample: Callable, distance: Callable, noise, *,
+    num_steps: int = 300, learning_rate: float = 0.05, warmup_steps: int = 50, decorrelation: float = 1000.0,
+) -> OptimisedNoise:  # fmt: skip
+    """Change noise by Adam until the motion made from it meets its targets.
+
+    Args:
+      sample: `sample(noise) -> state`, differentiable: of `flow.solve` any sampler but "dormand_prince".
+      distance: `distance(state) -> [B]`, metres; see `control_distance`.
+      noise: to begin with, standard normal, [B, l, J, C].
+      num_steps: optimiser steps.
+      learning_rate: after the warm-up; then it falls to 0 on a cosine.
+      warmup_steps: of a linear rise from 0.
+      decorrelation: weight of `correlation`, which keeps the noise like noise; 0 leaves it out.
+    """
+    warmup = min(warmup_steps, num_steps // 2)
+    adam = optax.adam(optax.warmup_cosine_decay_schedule(0.0, learning_rate, warmup, num_steps))
+
+    def loss(noise):
+        apart = distance(sample(noise))
+        return jnp.sum(apart + decorrelation * correlation(noise)), apart
+
+    def step(carry, _):
+        noise, state = carry
+        gradient, apart = jax.grad(loss, has_aux=True)(noise)
+        # Each sample's gradient has length 1, so that near targets count as much as far ones.
+        size = jnp.sqrt(jnp.sum(gradient**2, axis=(1, 2, 3), keepdims=True))
+        update, state = adam.update(gradient / jnp.maximum(size, 1e-12), state)
+        return (optax.apply_updates(noise, update), state), apart
+
+    @jax.jit
+    def run(noise):
+        (noise, _), distances = jax.lax.scan(step, (noise, adam.init(noise)), length=num_steps)
+        return OptimisedNoise(noise, sample(noise), distances)
+
+    return run(noise)

@@ -19,17 +19,25 @@ from flax import nnx
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.motion.body import make_body
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.body_mesh import BodyMesh, standing
 from f3amd_lib.text.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips, pad_motions
-from f3amd_lib.text.networks.acmdm import TextCondition
-from f3amd_lib.text.networks.acmdm_control import Control, ControlBranch, branch_with, control_branch, controlled
-from f3amd_lib.text.networks.masked_acmdm import MaskedACMDM, draw_hidden, spoil
-from f3amd_lib.text.networks.motion_autoencoder import smooth_l1, variational_loss
-from f3amd_lib.text.stages.motion_codec import MotionCodec, with_latent
-from f3amd_lib.text.stages.text_models import PELVIS, Asked, TextModel, controlled_joints
+from f3amd_lib.text.networks.acmdm import (
+    Control,
+    ControlBranch,
+    MaskedACMDM,
+    TextCondition,
+    branch_with,
+    control_branch,
+    controlled,
+    draw_hidden,
+    spoil,
+)
+from f3amd_lib.text.networks.autoencoders import smooth_l1, variational_loss
+from f3amd_lib.text.stages.text_models import PELVIS, Asked, MotionCodec, TextModel, controlled_joints, with_latent
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
 from f3amd_lib.training.recipe import check_settings
@@ -85,9 +93,7 @@ class TextMotionTraining:
     seed: int = 3407
 
     def __post_init__(self):
-        if not isinstance(self.drops, (tuple, list)):
-            raise ValueError(f"drops must be steps, got {self.drops!r}")
-        object.__setattr__(self, "drops", tuple(self.drops))
+        object.__setattr__(self, "drops", tuple(self.drops))  # files have lists
         check_settings(self)
 
     def rate(self, step):
@@ -122,16 +128,13 @@ def encoded_clips(codec: MotionCodec, data: TextMotions) -> np.ndarray:
         return np.concatenate([np.concatenate(clips), codec.redundancy.normalise(data.joint_features())], axis=-1)
     if codec.autoencoder is None:
         return np.concatenate(clips)
-    encode, longest, parts = jax.jit(lambda codec, *given: codec.encode(*given)), max(map(len, clips)), []
+    encode, longest = jax.jit(lambda codec, motion, _, mask, __: codec.encode(motion, mask)), max(map(len, clips))
     if codec.mesh is not None:  # frames do not see each other: nothing is padded
-        whole = np.concatenate(clips)[None]
-        return np.asarray(encode(codec, whole, np.ones(whole.shape[:2], bool)))[0]
-    for first in range(0, len(clips), _ENCODED_AT_ONCE):
-        part = clips[first : first + _ENCODED_AT_ONCE]
-        padded = pad_motions([*part, *[part[0]] * (_ENCODED_AT_ONCE - len(part))], longest)
-        states = np.asarray(encode(codec, padded.motion, padded.mask))
-        parts += [state[: len(clip) // frames] for state, clip in zip(states, part, strict=False)]
-    return np.concatenate(parts)
+        whole = np.concatenate(clips)
+        return np.asarray(encode(codec, *pad_motions([whole], len(whole))))[0]
+    of_rows = lambda rows: encode(codec, *pad_motions([clips[row] for row in rows], longest))
+    states = in_batches(of_rows, len(clips), _ENCODED_AT_ONCE)
+    return np.concatenate([state[: len(clip) // frames] for state, clip in zip(states, clips, strict=True)])
 
 
 def _captioned_states(asked: Asked, split: str | None):
@@ -155,8 +158,7 @@ def first_frames(codec: MotionCodec, data: TextMotions, count: int) -> dict[str,
     if not count:
         return {}
     frames = count * codec.frames_per_state
-    long_enough = [number for number in range(data.num_clips) if data.lengths[number] >= frames]
-    shown = {data.pairs[number]: number for number in reversed(long_enough)}.values()
+    shown = {data.pairs[number]: number for number in reversed(np.flatnonzero(data.lengths >= frames))}.values()
     clips = jnp.asarray(np.stack([codec.axes.normalise(data.clip(number)[:frames]) for number in shown]))
     states = np.asarray(codec.encode(clips, jnp.ones(clips.shape[:2], bool)))
     return {data.captions[number][0]: state for number, state in zip(shown, states, strict=True)}
@@ -177,9 +179,8 @@ class AutoencoderTask(ClipsTask):
         """Return the training on the clips of a split; ValueError for clips that are too short."""
         longest, config = asked.part(split).lengths.max(), asked.config
         if longest < config.window:
-            lengths = f"no {split or 'train'} clip has {config.window} frames, the longest has {longest}"
-            needs = f"{asked.preset.name} needs longer ones, or a larger --window"
-            raise ValueError(f"data set {asked.data.name!r}: {lengths}; {needs}")
+            what = f"no {split or 'train'} clip has {config.window} frames, the longest {longest}; a larger --window?"
+            raise ValueError(f"data set {asked.data.name!r}: {what}")
         return cls(presets.build_config(asked.preset.name), config, **cls._clips(asked, split))
 
     @staticmethod
@@ -194,9 +195,8 @@ class AutoencoderTask(ClipsTask):
         part = part[np.linspace(0, len(part) - 1, min(512, len(part))).astype(int)]
         frames, codec = self.model_config.frames_per_latent, getattr(self, "codec", asked.codec)
         clips = [codec.axes.normalise(asked.data.clip(number)) for number in part]
-        padded = pad_motions(clips, max(map(len, clips)) // frames * frames)
-        codec = with_latent(codec, self.model_config, state.averaged, padded.motion, padded.mask)
-        return TextModel(codec=codec, **about)
+        motion, _, mask, _ = pad_motions(clips, max(map(len, clips)) // frames * frames)
+        return TextModel(codec=with_latent(codec, self.model_config, state.averaged, motion, mask), **about)
 
     def draw(self, state: TrainingState, key):
         """Draw windows [B, window, J, 3] from clips of at least that length."""
@@ -226,15 +226,15 @@ class AutoencoderTask(ClipsTask):
             latent_mask = mask[:, :: self.model_config.frames_per_latent]
             loss = smooth_l1(model.decode(model.latent_of(positions, mask), latent_mask), positions, mask)
             return {"loss": loss, "smooth_l1": loss}
-        latent = model.encode(batch, key=jax.random.fold_in(key, 2))
-        if self.model_config.variational:
-            mean, log_variance = model.moments(latent)
-            latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
+        encoded = model.encode(batch, key=jax.random.fold_in(key, 2))
+        if not self.model_config.variational:
+            error = smooth_l1(model.decode(encoded, key=jax.random.fold_in(key, 3)), batch)
+            return {"loss": error, "smooth_l1": error}
+        mean, log_variance = model.moments(encoded)
+        latent = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
         positions_hat = model.decode(latent, key=jax.random.fold_in(key, 3))
-        loss = error = smooth_l1(positions_hat, batch)
-        if self.model_config.variational:
-            loss = variational_loss(positions_hat, batch, mean, log_variance)
-        return {"loss": loss, "smooth_l1": error}
+        loss = variational_loss(positions_hat, batch, mean, log_variance)
+        return {"loss": loss, "smooth_l1": smooth_l1(positions_hat, batch)}
 
 
 @frozen_tree("clips", "codec")
@@ -483,9 +483,9 @@ class ControlTask(TextMotionTask):
 
     def kept(self, asked: Asked, state: TrainingState, about: dict) -> TextModel:
         """Return the denoiser with its trained branch, told the guidance that it was told before."""
-        kept = {key: asked.before.record[key] for key in ("guidance",) if key in asked.before.record}
-        record = about["record"] | kept
-        return dataclasses.replace(asked.before, branch=state.averaged, name=about["name"], record=record)
+        guidance = {key: value for key, value in asked.before.record.items() if key == "guidance"}
+        about = {"name": about["name"], "record": about["record"] | guidance}
+        return dataclasses.replace(asked.before, branch=state.averaged, **about)
 
     def identity(self) -> dict:
         """Return all that decides the weights, as JSON has it."""

@@ -84,10 +84,8 @@ class LatentMotionTraining:
     def __post_init__(self):
         check_settings(self)
         if self.consistency == "latent" and (self.num_phases > 1 or self.adversarial_weight):
-            raise ValueError(
-                "consistency 'latent' has no phases and no discriminator: num_phases 1, adversarial_weight 0"
-            )
-        if not self.least_guidance <= self.most_guidance:
+            raise ValueError("consistency 'latent' needs num_phases 1 and adversarial_weight 0")
+        if self.least_guidance > self.most_guidance:
             raise ValueError("least_guidance must be no more than most_guidance")
 
     def optimiser(self, learning_rate: float | None = None, first_moment=0.9) -> optax.GradientTransformation:

@@ -1,13 +1,15 @@
 """Trained models of captioned motion as files, and where they are found.
 
-All kinds have one form of file: weights of one network or several, arrays, and a description that says the networks'
-configs. A preset's name with "+control" behind it stands for the branch beside the finished model of that name, with
-"+control-pelvis" for one that knows the pelvis alone.
+A state of ACMDM is positions, with redundant features or without, or a latent of positions or of the body's vertices:
+`MotionCodec`. All kinds have one form of file: weights of one network or several, arrays, and a description that says
+the networks' configs. A preset's name with "+control" behind it stands for the branch beside the finished model of that
+name, with "+control-pelvis" for one that knows the pelvis alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,11 +33,111 @@ from f3amd_lib.text.data.body_mesh import BodyMesh
 from f3amd_lib.text.data.humanml3d import read_humanml3d
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions, words_of
 from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, bandai_text_motions
-from f3amd_lib.text.networks.acmdm_control import ControlBranch, blank_branch, branch_with
-from f3amd_lib.text.stages.motion_codec import MotionCodec
+from f3amd_lib.text.networks.acmdm import ControlBranch, blank_branch, branch_with
+from f3amd_lib.text.networks.autoencoders import AutoencoderConfig, MeshAutoencoderConfig
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.checkpoints import network_with
+from f3amd_lib.training.optimise import frozen_tree
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
+
+
+@frozen_tree("axes", "params", "latent", "redundancy")
+class MotionCodec:
+    """How a state stands for motion.
+
+    Attributes:
+      axes: of positions in metres (ACMDM App. I). A shift of every joint by one vector is then a shift of every
+        joint's numbers by one vector.
+      autoencoder: config of the autoencoder, None where the state is positions.
+      params: its weights.
+      latent: of its latent's channels.
+      redundancy: of the features that a state has beside positions (`joint_features`), None where it has none.
+      mesh: the body whose vertices a mesh autoencoder sees, None for all others.
+    """
+
+    axes: AxisNormaliser
+    autoencoder: AutoencoderConfig | MeshAutoencoderConfig | None = None
+    params: Any = None
+    latent: AxisNormaliser | None = None
+    redundancy: AxisNormaliser | None = None
+    mesh: BodyMesh | None = None
+
+    @property
+    def frames_per_state(self) -> int:
+        """Frames of motion that one frame of a state stands for."""
+        return 1 if self.autoencoder is None else self.autoencoder.frames_per_latent
+
+    def state_mask(self, mask):
+        """Return which frames of the state are motion, [B, l], of a mask of motion frames [B, L]."""
+        return mask[:, :: self.frames_per_state]
+
+    def encode(self, normalised, mask):
+        """Return the state of normalised positions, zero in padding.
+
+        Args:
+          normalised: [B, L, J, 3]; L a multiple of `frames_per_state`.
+          mask: True where a frame is motion, [B, L], whole frames of the state.
+
+        Returns:
+          [B, l, J, C]; without redundant features, which are of a whole clip (`TextMotions.joint_features`).
+        """
+        state = normalised if self.autoencoder is None else self.latent.normalise(self.latent_of(normalised, mask))
+        return state * self.state_mask(mask)[..., None, None]
+
+    def decode(self, state, mask):
+        """Return normalised positions [B, L, J, 3] of a state [B, l, J, C]; mask [B, L]."""
+        if self.autoencoder is None:
+            return state[..., : len(self.axes.mean)]
+        if self.mesh is not None:
+            return _frame_by_frame(lambda frames: self.mesh.joints(self._vertices(frames)), state)
+        return network_with(self.autoencoder, self.params).decode(self.latent.restore(state), self.state_mask(mask))
+
+    def decode_vertices(self, state):
+        """Return normalised vertices [B, L, V, 3] of a mesh autoencoder's state [B, L, n, C]."""
+        return _frame_by_frame(self._vertices, state)
+
+    def _vertices(self, frames):
+        network = network_with(self.autoencoder, self.params)
+        return network.decode(self.latent.restore(frames), self.mesh.lists)
+
+    def vertices_of(self, frames):
+        """Return the body's normalised vertices [N, V, 3] of normalised positions [N, J, 3]."""
+        return self.axes.normalise(self.mesh.vertices(self.axes.restore(frames)))
+
+    def latent_of(self, normalised, mask):
+        """Return the autoencoder's own latent [B, l, J, C] of normalised positions; arguments as of `encode`."""
+        network = network_with(self.autoencoder, self.params)
+        if self.mesh is None:
+            return network.latent_of(normalised, mask)
+        return _frame_by_frame(lambda frames: network.encode(self.vertices_of(frames), self.mesh.lists), normalised)
+
+
+_FRAMES_AT_ONCE = 128
+"""Of meshes: all vertices of many clips at once would not fit into memory."""
+
+
+def _frame_by_frame(function, clips):
+    """Apply a function of frames [N, ...] to clips [B, L, ...]."""
+    count = clips.shape[0] * clips.shape[1]
+    size = min(_FRAMES_AT_ONCE, count)
+    frames = jnp.asarray(clips).reshape(count, *clips.shape[2:])
+    frames = jnp.pad(frames, ((0, -count % size), *[(0, 0)] * (frames.ndim - 1)), mode="edge")
+    made = jax.lax.map(function, frames.reshape(-1, size, *frames.shape[1:]))
+    return made.reshape(-1, *made.shape[2:])[:count].reshape(*clips.shape[:2], *made.shape[2:])
+
+
+def with_latent(codec: MotionCodec, config: AutoencoderConfig, params, normalised, mask) -> MotionCodec:
+    """Return a codec whose state is an autoencoder's latent, normalised by the mean and deviation of each channel.
+
+    Args:
+      codec: of positions.
+      config, params: of the trained autoencoder.
+      normalised, mask: motion to take the statistics from, [B, L, J, 3] and [B, L].
+    """
+    codec = dataclasses.replace(codec, autoencoder=config, params=params)
+    latent = codec.latent_of(normalised, mask)[codec.state_mask(mask)]
+    return dataclasses.replace(codec, latent=AxisNormaliser.of(latent))
+
 
 CONTROL = "+control"
 """Behind a preset's name: the model with its control branch."""
@@ -277,20 +379,18 @@ def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | Lat
         return known[said["kind"]].of(tree, configs.get("autoencoder"), said, about)
 
 
-def open_text_motions(name: str, source=None, *, held_out_wording: bool = False) -> TextMotions:
+def open_text_motions(name: str, source=None) -> TextMotions:
     """Open captioned motions by name.
 
     Args:
       name: "bandai", whose captions are composed; or "folder", one in HumanML3D's layout.
       source: the folder, or bandai's archive.
-      held_out_wording: of bandai: caption with the phrases that training never sees.
 
     Raises:
       ValueError: for a data set without captions, or a folder that is not given or broken.
     """
     if name == "bandai":
-        packed = packed_dataset(open_dataset("bandai", path=source, locomotion_only=False))
-        return bandai_text_motions(packed, held_out_wording=held_out_wording)
+        return bandai_text_motions(packed_dataset(open_dataset("bandai", path=source, locomotion_only=False)))
     if name != "folder":
         raise ValueError(f"data set {name!r} has no captions{nearest_hint(name, ('bandai', 'folder'))}")
     if source is None:
@@ -314,9 +414,10 @@ def text_model_files(profile: Profile, name: str, *, folder=None) -> ModelFiles:
 def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, *kinds: type[CaptionedModel]):
     """Return the model of this name that ships, if it was trained on these very motions with this encoder."""
     path = PRETRAINED_DIR / data.name / "text" / f"{name}.safetensors"
-    found = load_text_model(path, *kinds) if path.exists() else None
-    known = found and (found.record["dataset_fingerprint"], found.text_encoder) == (data.fingerprint, encoder.identity)
-    return found if known else None
+    if path.exists():
+        found = load_text_model(path, *kinds)
+        known = found.record["dataset_fingerprint"], found.text_encoder
+        return found if known == (data.fingerprint, encoder.identity) else None
 
 
 def text_model_folders(dataset: str) -> list[Path]:
@@ -339,11 +440,8 @@ def named_model(name: str, num_steps: int | None = None) -> str:
         base, branch = preset_and_branch(name)
         return presets.find_preset(base).name + branch
     if (steps := num_steps or 1) not in STUDENTS:
-        *some, last = STUDENTS
-        raise ValueError(
-            f"students of MotionPCM are trained for {', '.join(map(str, some))} or {last} steps, none for {steps}; "
-            "their teacher takes any number: --model MotionPCM-teacher-small"
-        )
+        others = "their teacher takes any number: --model MotionPCM-teacher-small"
+        raise ValueError(f"students of MotionPCM are trained for 1, 2 or 4 steps, none for {steps}; {others}")
     return STUDENTS[steps]
 
 
@@ -365,14 +463,12 @@ def find_text_model(
     branches = (branch,) if branch else (CONTROL, PELVIS) if control else ("",)
     denoisers = [name for name, known in presets.PRESETS.items() if known.family in DENOISERS]
     names = [wanted] if preset else [name + form for name in denoisers for form in ("", *presets.FORMS)]
-    for folder in text_model_folders(dataset):
-        for branch in branches:
-            files = (folder / f"{name}{branch}.safetensors" for name in names)
-            if found := [path for path in files if path.is_file()]:
-                return max(found, key=lambda path: path.stat().st_mtime)
+    for folder, branch in itertools.product(text_model_folders(dataset), branches):
+        files = (folder / f"{name}{branch}.safetensors" for name in names)
+        if found := [path for path in files if path.is_file()]:
+            return max(found, key=lambda path: path.stat().st_mtime)
     told = wanted + branches[0]
-    how = f"f3amd train --preset {told} --data {dataset}"
-    raise ValueError(f"no trained {told} for data set {dataset!r}; train it: {how}")
+    raise ValueError(f"no trained {told} for data set {dataset!r}: f3amd train --preset {told} --data {dataset}")
 
 
 # ------------------------------------------------------------------------------------------------------------ training

@@ -16,8 +16,7 @@ from f3amd_lib.text.data.redundant import NUM_JOINT_FEATURES
 from f3amd_lib.text.data.text_encoders import TextEncoder
 from f3amd_lib.text.data.text_motions import UNIT, AxisNormaliser, TextMotions
 from f3amd_lib.text.stages import acmdm_training, motionpcm_training, text_models
-from f3amd_lib.text.stages.motion_codec import MotionCodec
-from f3amd_lib.text.stages.text_models import LatentModel, TextModel, load_text_model, preset_and_branch
+from f3amd_lib.text.stages.text_models import LatentModel, MotionCodec, TextModel, load_text_model, preset_and_branch
 from f3amd_lib.training.optimise import differences
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
 from f3amd_lib.training.recipe import profile_part_recipe
@@ -62,18 +61,6 @@ def stands_on(name: str) -> str:
         return preset.latent
     fits = lambda other: other.latent == preset.latent and stage_of(other.name) == "latent denoiser"
     return next(name for name, other in presets.PRESETS.items() if fits(other))
-
-
-def _named_teacher(path, preset: Preset, data: TextMotions) -> LatentModel:
-    """Read the teacher of a student; ValueError for what is no student, no teacher, or knows other clips."""
-    if stage_of(preset.name) != "student":
-        raise ValueError(f"{preset.name} is no student and has no teacher: leave --teacher out")
-    before, wanted = load_text_model(path), stands_on(preset.name)
-    if before.name != wanted:
-        raise ValueError(f"{path}: holds {before.name}, but {preset.name} is distilled from {wanted}")
-    if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
-        raise ValueError(f"{path}: was trained on other clips than these; leave --teacher out to train one")
-    return before
 
 
 def _codec_of_positions(data: TextMotions, preset: Preset) -> MotionCodec:
@@ -121,11 +108,16 @@ def train_stage(
     data = data.cut(window) if acmdm and window and window < data.lengths.max() else data
     before = None
     if teacher is not None:
-        before = _named_teacher(teacher, preset, data)
+        before = load_text_model(teacher)
+        if stage_of(name) != "student" or before.name != earlier:
+            raise ValueError(f"{teacher}: holds {before.name}, and {name} is distilled from {earlier or 'nothing'}")
+        if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
+            raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
     elif earlier:
         lies = text_models.text_model_files(profile, earlier, folder=folder).model
-        before = load_text_model(lies) if acmdm and lies.exists() else None
-        if before is None and branch:
+        if acmdm and lies.exists():
+            before = load_text_model(lies)
+        elif branch:
             before = text_models.shipped_for(earlier, data, encoder)
         how = {"window": window, "batch_size": batch_size, "folder": folder, **leg}
         before = before or train_stage(data, encoder, profile, earlier, **how)
