@@ -148,19 +148,6 @@ def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, ca
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("steps, model, told", [
-    ("3", "motionpcm", "students of MotionPCM are trained for 1, 2 or 4 steps, none for 3"),
-    ("50", "motionpcm", "--model MotionPCM-teacher-small"),
-    ("4", "motionpcm", "no trained MotionPCM-M4-small for data set 'bandai'; f3amd train"),
-    ("2", "MotionPCM-M1-small", "MotionPCM-M1-small takes 1 steps, got 2"),
-])  # fmt: skip
-def test_steps_that_no_student_takes_are_refused(steps, model, told, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(text_models, "text_model_folders", lambda _: [SHIPPED])
-    words = ["text", "a person walks forward", "--model", model, "--steps", steps, "--out", str(tmp_path / "out")]
-    assert command_line.main(words) == 2
-    assert told in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
 def test_a_student_is_told_no_guidance_that_it_has_never_heard():
     student, teacher = (load_text_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher"))
     assert [guidance_of(student, 1, w) for w in (None, 5.0, 15.0)] == [14.0, 5.0, 15.0]

@@ -187,25 +187,6 @@ def test_drawn_clips_are_whole_pieces_of_clips_with_their_own_captions():
     assert starts.min() == 0 and starts.max() >= 12  # anywhere that it fits
 
 
-def test_a_table_may_have_rows_of_several_frames_and_several_things_of_each():
-    toy = data()
-    whole, _ = clip_table(toy, toy.positions)
-    rows = np.arange(int((toy.lengths // 4).sum()), dtype=np.float32)
-    fourth, _ = clip_table(toy, (rows, np.stack([rows, -rows], axis=-1)), 4)
-    assert np.array_equal(fourth.length, whole.length // 4) and fourth.start.tolist()[:2] == [
-        0,
-        int(whole.length[0] // 4),
-    ]
-    batch = draw_clips(jax.random.key(0), fourth, 50, 12, 1)
-    first, second = batch.motion
-    assert np.array_equal(first, second[..., 0]) and np.array_equal(first, -second[..., 1])
-    for row, length, caption in zip(np.asarray(first), batch.length, batch.caption, strict=True):
-        clip = int(np.searchsorted(np.asarray(fourth.caption), int(caption), side="right")) - 1
-        inside = row[:length] - float(fourth.start[clip])
-        assert np.array_equal(np.diff(row[:length]), np.ones(length - 1)) and 0 <= inside.min()
-        assert inside.max() < int(fourth.length[clip])
-
-
 # ----------------------------------------------------------------------------------------- Bandai
 
 
