@@ -68,14 +68,6 @@ def test_both_published_layouts_are_read(tmp_path, layout, joints, fps, clips):
     assert ("000003" in data.names) is (layout == "kit")  # 30 frames: KIT-ML begins at 24, HumanML3D at 40
 
 
-def test_vectors_and_positions_tell_the_same(tmp_path):
-    data = humanml3d.read_humanml3d(write_tree(tmp_path))
-    for number, name in enumerate(data.names):
-        if "@" not in name:
-            vectors = np.load(tmp_path / "new_joint_vecs" / f"{name}.npy").astype(np.float64)
-            assert np.abs(redundant.positions_from_redundant(vectors) - data.clip(number)).max() < 1e-5
-
-
 @pytest.mark.parametrize("layout, contact_step", [("humanml3d", 0.002), ("kit", 0.05)])
 def test_contacts_are_judged_by_the_step_of_the_folders_own_unit(tmp_path, layout, contact_step):
     data = humanml3d.read_humanml3d(write_tree(tmp_path, layout)).select([0])
