@@ -799,7 +799,7 @@ def test_a_foreign_or_lost_record_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="is a record of synthetic and laptop; move it"):
         judge(tmp_path, "Q13")
     (tmp_path / "bandai" / "laptop" / "records" / "quality.json").unlink()
-    with pytest.raises(ValueError, match="has no run record"):
+    with pytest.raises(ValueError, match="no readable run record"):
         judge(tmp_path, "Q13")
 
 

@@ -5,7 +5,6 @@ import time
 
 import pytest
 
-from f3amd_lib.ground import files
 from f3amd_lib.ground.files import whole_file, whole_folder
 
 
@@ -58,14 +57,10 @@ def test_a_folder_appears_when_it_is_whole_or_not_at_all(tmp_path):
     assert [item.name for item in path.rglob("*")] == ["all"]
 
 
-def test_a_folder_that_a_killed_process_left_goes_an_hour_after_its_last_file(tmp_path):
-    for name, age in ((".old.1.part", 7200), (".young.2.part", 60)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "half").touch()
-        for path in (tmp_path / name / "half", tmp_path / name):
-            os.utime(path, (time.time() - age,) * 2)
-    os.utime(tmp_path / ".young.2.part", (0, 0))  # begun long ago, and still written to
-    files._cleared.clear()
+def test_what_a_killed_process_left_unfinished_goes_after_an_hour(tmp_path):
+    for name, age in ((".a.csv.1.part", 7200), (".a.csv.2.part", 60), (".b.csv.3.part", 7200)):
+        (tmp_path / name).write_text("half")
+        os.utime(tmp_path / name, (time.time() - age,) * 2)
     with whole_file(tmp_path / "a.csv") as temporary:
         temporary.touch()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".young.2.part", "a.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.csv.2.part", ".b.csv.3.part", "a.csv"]

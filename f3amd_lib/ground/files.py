@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import os
 import shutil
@@ -12,16 +13,8 @@ import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # Windows: no locks of this kind
-    fcntl = None
-
 _LEFTOVER_S = 3600.0
 """Age from which an unfinished file belongs to a process that was killed."""
-
-_cleared: set[Path] = set()
-"""Folders that this process has looked through for unfinished files."""
 
 
 def read_toml(path) -> dict:
@@ -39,9 +32,6 @@ def whole_file(path, *, overwrite: bool = False) -> Iterator[Path]:
     Args:
       path: the file wanted; missing folders are made.
       overwrite: an existing file is replaced only if this is true.
-
-    Yields:
-      The path to write to.
 
     Raises:
       ValueError: if the file exists and `overwrite` is false.
@@ -78,7 +68,10 @@ def _unfinished(path: Path) -> Iterator[Path]:
     Says which file could not be written, where the system's own error, such as that of a full disk, does not.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    _clear_leftovers(path.parent)
+    for old in path.parent.glob(f".{path.name}.*.part"):
+        with contextlib.suppress(OSError):  # another process may be faster
+            if time.time() - old.stat().st_mtime > _LEFTOVER_S:
+                _remove(old)
     # Unique among threads, and among machines that share the folder.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
@@ -103,9 +96,6 @@ def whole_folder(path) -> Iterator[Path]:
     Args:
       path: the folder wanted, which must be empty or not there; missing folders above it are made.
 
-    Yields:
-      The folder to write into.
-
     Raises:
       OSError: if something has appeared at `path` meanwhile.
     """
@@ -114,24 +104,12 @@ def whole_folder(path) -> Iterator[Path]:
         yield temporary
 
 
-def _clear_leftovers(folder: Path) -> None:
-    """Remove, once per process, what killed processes left unfinished in a folder."""
-    folder = folder.resolve()
-    if folder in _cleared:
-        return
-    _cleared.add(folder)
-    for item in folder.glob(".*.part"):
-        with contextlib.suppress(OSError):  # another process may be faster
-            if time.time() - max(part.stat().st_mtime for part in (item, *item.rglob("*"))) > _LEFTOVER_S:
-                _remove(item)
-
-
 @contextlib.contextmanager
 def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a lock file while the block runs, so that no second process does the same work there.
 
-    The operating system frees the lock of a process that was killed. Where a file system (or Windows)
-    has no such locks, the block runs without one.
+    The operating system frees the lock of a process that was killed. The empty file stays: to remove it would
+    take the lock from whoever waits for it.
 
     Args:
       path: of the lock file; missing folders are made.
@@ -143,26 +121,14 @@ def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        file = path.open("a")
+    with path.open("a") as file:
         try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
-            file.close()
             raise ValueError(
                 f"{path.parent}: another process is {doing} there; wait for it, or name another folder (--out)"
             ) from None
-        except OSError:  # a file system without locks
-            break
-        file.close()  # whoever held the lock has removed its file: ours is another one
-    try:
         yield
-    finally:
-        path.unlink(missing_ok=True)
-        file.close()
 
 
 def set_aside(paths: Iterable[Path], name: str) -> str | None:
@@ -176,9 +142,10 @@ def set_aside(paths: Iterable[Path], name: str) -> str | None:
       What the names begin with now, such as "quality.old1"; None if there was no file.
     """
     present = [path for path in paths if path.exists()]
-    aside = lambda path, number: path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}")
-    free = (number for number in itertools.count(1) if not any(aside(path, number).exists() for path in present))
-    number = next(free)
-    for path in present:
-        path.rename(aside(path, number))
+    for number in itertools.count(1):
+        aside = [path.with_name(f"{name}.old{number}{path.name.removeprefix(name)}") for path in present]
+        if not any(path.exists() for path in aside):
+            break
+    for path, other in zip(present, aside, strict=True):
+        path.rename(other)
     return f"{name}.old{number}" if present else None

@@ -9,34 +9,17 @@ import numbers
 from collections.abc import Iterable, Mapping
 
 
-def nearest_names(name, known: Iterable[str]) -> list[str]:
-    """Return up to three known names that look like `name`, the likest first; case is ignored."""
-    by_lower = {item.lower(): item for item in known}
-    near = difflib.get_close_matches(str(name).lower(), by_lower, n=3, cutoff=0.5)
-    return [by_lower[item] for item in near]
+def nearest_hint(name, known: Iterable[str]) -> str:
+    """Return the end of an error message about an unknown name: "; did you mean 'laptop'? (one of smoke, laptop, gpu)".
 
-
-def nearest_hint(name, known: Iterable[str], *, most: int = 25) -> str:
-    """Return the end of an error message about an unknown name: the nearest one, and all of them.
-
-    Args:
-      name: what was given, of any type.
-      known: the names that exist.
-      most: with more names than this, only the three nearest are listed (or the first ones).
-
-    Returns:
-      "; did you mean 'laptop'? (one of smoke, laptop, gpu)", without the question where nothing is
-      near.
+    Case is ignored. The question is left out where nothing is near; of many names only the nearest are listed.
     """
-    known = list(known)
-    if not known:
-        return "; there is none to choose from"
-    near = nearest_names(name, known)
-    question = f"; did you mean {near[0]!r}?" if near else ""
-    if len(known) <= most:
-        return f"{question} (one of {', '.join(known)})"
-    listed = ", ".join(near or known[:3])
-    return f"{question} ({len(known)} are known, {'nearest' if near else 'such as'} {listed})"
+    by_lower = {item.lower(): item for item in known}
+    near = [by_lower[item] for item in difflib.get_close_matches(str(name).lower(), by_lower, n=3, cutoff=0.5)]
+    question, names = f"; did you mean {near[0]!r}?" if near else "", list(known)
+    if len(names) <= 25:
+        return f"{question} (one of {', '.join(names)})"
+    return f"{question} ({len(names)} are known, such as {', '.join(near or names[:3])})"
 
 
 def check_known(name, known: Iterable[str], what: str) -> None:
@@ -59,20 +42,13 @@ def checked_seed(seed) -> int:
     return int(seed)
 
 
-_are = lambda values, fits: isinstance(values, (list, tuple)) and all(map(fits, values))
-_is_whole = lambda value: isinstance(value, numbers.Integral) and not isinstance(value, bool)
-_is_name = lambda value: isinstance(value, str) and value != ""
 _KINDS = {
-    "int": (_is_whole, "a whole number", int),
-    "float": (lambda value: isinstance(value, numbers.Real) and math.isfinite(value), "a finite number", float),
-    "bool": (lambda value: isinstance(value, bool), "true or false", bool),
-    "str": (_is_name, "a name", str),
-    "tuple[str, ...]": (lambda values: _are(values, _is_name), "a list of names", tuple),
-    "tuple[int, ...]": (
-        lambda values: _are(values, lambda value: _is_whole(value) and value > 0), "whole numbers above 0", tuple
-    ),
-}  # fmt: skip
-"""Type of a field -> what its values are, what they are called, and what makes them of that type."""
+    "int": (int, numbers.Integral, "a whole number"),
+    "float": (float, numbers.Real, "a finite number"),
+    "bool": (bool, bool, "true or false"),
+    "str": (str, str, "a name"),
+}
+"""Type of a field -> what makes values of that type, what they are, and what they are called."""
 
 _LIMITS = {
     "above 0": lambda value: value > 0,
@@ -95,16 +71,22 @@ def checked_value(name: str, value, annotation: str, rule: str | Iterable[str] =
       ValueError: for a value of another type (True is no number, 8.0 no count), out of range or unknown.
     """
     kind, *rest = annotation.split(" | ")
-    if kind not in _KINDS or (value is None and rest):
+    if value is None and rest:
+        return None
+    if kind in ("tuple[int, ...]", "tuple[str, ...]"):
+        if not isinstance(value, (list, tuple)):
+            raise ValueError(f"{name} must be a list, got {value!r}")
+        return tuple(checked_value(f"each of {name}", item, kind[6:9], rule) for item in value)
+    if kind not in _KINDS:
         return value
     if name == "seed":
         return checked_seed(value)
     if not isinstance(rule, str):
         check_known(value, rule, name)
-    fits, called, convert = _KINDS[kind]
-    if (isinstance(value, bool) and kind != "bool") or not fits(value):
-        what = f"{called} or None" if rest else called
-        raise ValueError(f"{name} must be {what}, got {value!r} ({type(value).__name__})")
+    convert, wanted, called = _KINDS[kind]
+    fits = isinstance(value, wanted) and isinstance(value, bool) == (kind == "bool") and value != ""
+    if not fits or (kind == "float" and not math.isfinite(value)):
+        raise ValueError(f"{name} must be {called}{' or None' if rest else ''}, got {value!r} ({type(value).__name__})")
     if kind in ("int", "float") and not _LIMITS[rule](value):
         raise ValueError(f"{name} must be {rule}, got {value!r}")
     return convert(value)

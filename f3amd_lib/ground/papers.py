@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -34,16 +33,11 @@ def load_paper_file(name: str, paper: str = "f3amd") -> dict:
       paper: its folder, one of `paper_folders`.
 
     Raises:
-      ValueError: for an unknown paper, a missing file, or one that is no TOML.
+      ValueError: for an unknown paper.
+      FileNotFoundError: for a missing file.
     """
     check_known(paper, paper_folders(), "paper")
-    path = _FOLDER / paper / f"{name}.toml"
-    try:
-        return read_toml(path)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: is missing; write it as {_FOLDER / 'f3amd' / path.name} is written") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: is no TOML: {error}") from error
+    return read_toml(_FOLDER / paper / f"{name}.toml")
 
 
 def check_entry(entry: Mapping, where: str, required: Iterable[str], optional: Iterable[str] = ()) -> None:
@@ -54,12 +48,10 @@ def check_entry(entry: Mapping, where: str, required: Iterable[str], optional: I
       where: file and entry, for the message.
       required, optional: its keys.
     """
-    for key in required:
-        if key not in entry:
-            raise ValueError(f"{where}: has no {key!r}; add it")
+    if missing := [key for key in required if key not in entry]:
+        raise ValueError(f"{where}: has no {missing[0]!r}; add it")
     for key in entry:
-        if key not in (known := [*required, *optional]):
-            raise ValueError(f"{where}: unknown key {key!r}{nearest_hint(key, known)}")
+        find_entry(dict.fromkeys([*required, *optional]), key, "key", where)
 
 
 def find_entry(known: Mapping, name, what: str, where: str):
@@ -88,8 +80,7 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     description = load_paper_file("paper", paper)
     entries = {entry["number"]: entry for entry in description.get("table", ())}
     if number not in entries:
-        known = f"Tables {next(iter(entries))} to {next(reversed(entries))}" if entries else "no tables"
-        raise ValueError(f"the {description['name']} paper has {known}, not {number!r}")
+        raise ValueError(f"the {description['name']} paper has tables {', '.join(map(str, entries))}, not {number!r}")
     entry = entries[number]
     frame = pd.read_csv(_FOLDER / paper / "numbers" / entry["file"], dtype=str, keep_default_na=False)
     counts = [column for column in ("window_frames", "steps", "characters") if column in frame]
@@ -98,6 +89,6 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
         if column in entry:
             frame.insert(frame.columns.get_loc("printed"), column, entry[column])
     frame["value"] = pd.to_numeric(frame["printed"], errors="coerce")
-    about = {"title": entry["title"], "note": entry.get("note", ""), "setting": description["setting"]}
-    frame.attrs = {"table": number, **about}
+    frame.attrs = {"table": number, "title": entry["title"], "note": entry.get("note", "")}
+    frame.attrs["setting"] = description["setting"]
     return frame

@@ -16,7 +16,6 @@ from f3amd_lib.ground.names import check_known, checked_value
 
 PROFILES = ("smoke", "laptop", "gpu")
 DATASETS = ("synthetic", "bandai", "100style", "folder")
-RESULT_FOLDERS = ("records", "tables", "figures", "media")
 _NUMBERS = read_toml(Path(__file__).with_name("profiles.toml"))
 SHOWN_STYLES = tuple(_NUMBERS["on"]["synthetic"]["laptop"]["evaluation_styles"])
 """Styles of `synthetic` that differ in posture, arms, rhythm and symmetry: what figures show and
@@ -120,7 +119,7 @@ def runs_dir(dataset: str, profile: str) -> Path:
     return repository_root() / "runs" / dataset / profile
 
 
-def results_dir(dataset: str, profile: str, *, root=None) -> Path:
+def results_dir(dataset: str, profile: str) -> Path:
     """Return the folder that results of a data set and profile go to, and make it.
 
     Results go to the ignored `runs/` unless somebody asks otherwise: the committed `paper_figures/`
@@ -129,17 +128,15 @@ def results_dir(dataset: str, profile: str, *, root=None) -> Path:
     Args:
       dataset: one of `DATASETS`.
       profile: one of `PROFILES`.
-      root: folder above; wins over `F3AMD_RESULTS_DIR` and `runs/`.
 
     Returns:
-      `<root>/<data set>/<profile>`, an existing folder with those of `RESULT_FOLDERS` in it.
+      `<root>/<data set>/<profile>`, with folders for records, tables, figures and media in it.
 
     Raises:
       ValueError: for an unknown data set or profile.
     """
     _check_names(dataset, profile)
-    root = root or os.environ.get(RESULTS_DIR_VARIABLE) or repository_root() / "runs"
-    folder = Path(root) / dataset / profile
-    for name in RESULT_FOLDERS:
+    folder = Path(os.environ.get(RESULTS_DIR_VARIABLE) or repository_root() / "runs", dataset, profile)
+    for name in ("records", "tables", "figures", "media"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     return folder

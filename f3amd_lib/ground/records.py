@@ -15,9 +15,10 @@ import json
 import logging
 import os
 import platform
+import re
 import subprocess
 import tempfile
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -28,9 +29,8 @@ from f3amd_lib.ground.names import asked_network
 
 log = logging.getLogger("f3amd")
 
-_LIBRARY = Path(__file__).resolve().parents[1]
-_REPOSITORY = _LIBRARY.parent
-_BESIDE = ("f3amd_companion", "notebooks")
+_CHECKOUT = str(Path(__file__).resolve().parents[2])
+_CODE = ("f3amd_lib", "f3amd_companion", "notebooks")
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Before 3.1 pandas reads floats exactly only when asked to, from 3.1 on always.
 _EXACT_FLOATS = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
@@ -63,24 +63,20 @@ def run_record(*, profile, dataset, seed: int, **extra) -> dict:
       of the machine is told.
 
     Raises:
-      ValueError: for an extra whose name is taken, or a value that JSON cannot hold.
+      ValueError: for a value that JSON cannot hold.
     """
     import jax  # here, so that reading a table does not wait for JAX
 
-    devices = jax.devices()
+    device = jax.devices()[0]
     commit, dirty = _git_state()
-    asked = {"profile": _name(profile, "profile"), "dataset": _name(dataset, "dataset")}
-    asked |= {f"dataset_{key}": getattr(dataset, key, None) for key in ("fingerprint", "licence", "credit")}
+    record = {which: getattr(thing, "name", thing) for which, thing in (("profile", profile), ("dataset", dataset))}
+    record |= {f"dataset_{key}": getattr(dataset, key, None) for key in ("fingerprint", "licence", "credit")}
+    record |= {"seed": seed, "git_commit": commit, "git_dirty": dirty, "library_version": f3amd_lib.__version__}
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
-    code = {"git_commit": commit, "git_dirty": dirty, "library_version": f3amd_lib.__version__}
-    code["versions"] = {"python": platform.python_version(), **versions}
-    machine = {"device_platform": devices[0].platform, "device_kind": devices[0].device_kind}
-    machine |= {"num_devices": len(devices), "cores": usable_cores()}
-    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    record = asked | {"seed": seed} | code | machine | {"date_utc": now}
-    taken = sorted(set(extra) & (set(record) | {"table"}))
-    if taken:
-        raise ValueError(f"a run record already has {taken[0]!r}; name the extra value otherwise")
+    record["versions"] = {"python": platform.python_version(), **versions}
+    record |= {"device_platform": device.platform, "device_kind": device.device_kind}
+    record |= {"num_devices": len(jax.devices()), "cores": usable_cores()}
+    record["date_utc"] = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     return _plain(record | extra)
 
 
@@ -109,27 +105,27 @@ def write_table(path, frame: pd.DataFrame, record: dict) -> Path:
       The path of the CSV.
 
     Raises:
-      ValueError: if the name does not end in .csv, the table is empty or repeats a column, the
-        record lacks data set, profile or seed, or there is already a table (or a file without a
-        record) that is not of the same data set and profile.
+      ValueError: if the name does not end in .csv, the table is empty, or there is already a table (or a
+        file without a record) that is not of the same data set and profile.
     """
     path = named_file(path, ".csv", "tables")
-    if frame.empty or not frame.columns.is_unique:
-        raise ValueError(f"{path}: nothing to write: no rows, or two columns of one name")
-    for key in ("dataset", "profile", "seed"):
-        if key not in record:
-            raise ValueError(f"{path}: the record has no {key!r}; make it with run_record")
     record_path = path.with_suffix(".json")
+    if frame.empty:
+        raise ValueError(f"{path}: nothing to write: no rows")
     if path.exists() or record_path.exists():
-        _refuse_foreign(path, record)
-
+        there = _read_record(path)
+        for key in ("dataset", "profile"):
+            if there.get(key) != record[key]:
+                raise ValueError(
+                    f"{path}: holds results of {key} {there.get(key)!r} and is not overwritten with "
+                    f"those of {record[key]!r}; write to another folder"
+                )
     text = frame.to_csv(index=False, lineterminator="\n")
     description = {"file": path.name, "rows": len(frame), "columns": [str(column) for column in frame.columns]}
     described = _plain(record) | {"table": description | {"sha256": _text_hash(text)}}
     # Each file appears whole. Should the run die between the two, the checksum tells.
-    contents = {path: text, record_path: json.dumps(described, indent=2, ensure_ascii=False) + "\n"}
-    for file, content in contents.items():
-        write_whole(file, content)
+    write_whole(path, text)
+    write_whole(record_path, json.dumps(described, indent=2, ensure_ascii=False) + "\n")
     return path
 
 
@@ -157,37 +153,24 @@ def read_table(path) -> tuple[pd.DataFrame, dict]:
             f"{path}: not the table that {path.stem}.json describes (it was changed, or a run died while writing); "
             "measure it again"
         )
-    return pd.read_csv(io.StringIO(text), dtype=_DIGESTS, **_EXACT_FLOATS), record
+    return _rows(text), record
+
+
+def _rows(text: str) -> pd.DataFrame:
+    return pd.read_csv(io.StringIO(text), dtype=_DIGESTS, **_EXACT_FLOATS)
 
 
 def _read_record(path: Path) -> dict:
     """Return the record beside a table; ValueError if it is missing or broken."""
     record_path = path.with_suffix(".json")
-    if not record_path.exists():
-        raise ValueError(
-            f"{path}: has no run record {record_path.name} beside it, so nothing says what its numbers were measured on"
-        )
     try:
         record = json.loads(record_path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # broken JSON, bytes that are no text, or thousands of brackets
-        raise ValueError(f"{record_path}: not a readable run record ({error}); measure it again") from None
-    parts = [record] if not isinstance(record, dict) else [record.get("table"), record.get("weights_digests")]
-    if not all(part is None or isinstance(part, dict) for part in parts):
-        raise ValueError(f"{record_path}: not a run record (JSON objects are needed); measure it again")
+        if not all(isinstance(record.get(part) or {}, dict) for part in ("table", "weights_digests")):
+            raise ValueError("JSON objects are needed")
+    # Broken JSON, bytes that are no text, thousands of brackets, or no object.
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: has no readable run record {record_path.name} beside it ({error})") from None
     return record
-
-
-def _refuse_foreign(path: Path, record: dict) -> None:
-    """Let a table be written again only by a run on the same data set in the same profile."""
-    if not path.with_suffix(".json").exists():
-        raise ValueError(f"{path}: there is a file without a run record; move it away first")
-    there = _read_record(path)
-    for key in ("dataset", "profile"):
-        if there.get(key) != record[key]:
-            raise ValueError(
-                f"{path}: holds results of {key} {there.get(key)!r} and is not overwritten with "
-                f"those of {record[key]!r}; write to another folder"
-            )
 
 
 def _text_hash(text: str) -> str:
@@ -195,66 +178,39 @@ def _text_hash(text: str) -> str:
     return hashlib.sha256(text.replace("\r\n", "\n").encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _name(thing, what: str) -> str:
-    name = thing if isinstance(thing, str) else getattr(thing, "name", None)
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{what} must be a name or have one, got {thing!r}")
-    return name
-
-
-def _plain(value):
-    """Turn a value into what JSON holds, with the machine's folders shortened."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, PurePath):
-        text = _shorten(value.as_posix())
-        # A folder that is none of ours says nothing to others: keep the file's name.
-        return f".../{value.name}" if text.startswith("/") or value.drive else text
-    if isinstance(value, str):
-        return _shorten(value)
-    if isinstance(value, (np.generic, np.ndarray)) and type(plain := value.tolist()) is not type(value):
-        return _plain(plain)
-    if value is None or isinstance(value, (bool, int, float)):
-        # JSON has no NaN; a figure that is undefined is null.
-        return None if isinstance(value, float) and not np.isfinite(value) else value
-    raise ValueError(f"a run record cannot hold {value!r} of type {type(value).__name__}")
-
-
-def _shorten(text: str) -> str:
-    """Replace the folders of this machine: repository, temporary, working and home folder."""
-    folders = {
-        os.path.expanduser("~"): "~",
-        tempfile.gettempdir(): "<tmp>",
-        str(Path.cwd()): ".",
-        str(_REPOSITORY): ".",
-    }
+def _plain(record: dict) -> dict:
+    """Return what JSON holds of a record: no NaN, and the folders of this machine shortened."""
+    text = json.dumps(record, default=_as_json, ensure_ascii=False)
+    folders = {os.path.expanduser("~"): "~", tempfile.gettempdir(): "<tmp>"} | dict.fromkeys(
+        (os.getcwd(), _CHECKOUT), "."
+    )
     for folder, short in sorted(folders.items(), key=lambda pair: -len(pair[0])):
         if len(folder) > 1:
-            text = text.replace(f"{folder}{os.sep}", f"{short}/")
-            if text.endswith(folder):
-                text = text[: -len(folder)] + short
-    return text
+            text = re.sub(rf'{re.escape(folder)}(?=[/"])', short, text)
+    return json.loads(text, parse_constant=lambda name: None)
+
+
+def _as_json(value):
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise ValueError(f"a run record cannot hold {value!r} of type {type(value).__name__}")
 
 
 def _git_state() -> tuple[str | None, bool | None]:
     """Return the commit of the library's checkout and whether its code differs from it."""
 
-    def git(*arguments: str) -> str | None:
-        asked = ["git", "-C", str(_REPOSITORY), *arguments]
-        try:
-            return subprocess.run(asked, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            return None
+    def git(*arguments: str) -> str:
+        asked = ["git", "-C", _CHECKOUT, *arguments]
+        return subprocess.run(asked, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
 
-    # The library may be installed inside somebody else's checkout, whose commit says nothing.
-    if not git("ls-files", "--", str(Path(__file__).resolve())):
+    try:
+        # The library may be installed inside somebody else's checkout, whose commit says nothing.
+        if not git("ls-files", "--", "f3amd_lib/ground/records.py"):
+            return None, None
+        # Only code counts: results written by the run itself do not make it dirty.
+        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--", *_CODE))
+    except (OSError, subprocess.SubprocessError):
         return None, None
-    commit = git("rev-parse", "HEAD")
-    # Only code counts: results written by the run itself do not make it dirty.
-    status = git("status", "--porcelain", "--", str(_LIBRARY), *(str(_REPOSITORY / name) for name in _BESIDE))
-    return commit, None if commit is None or status is None else bool(status)
 
 
 def usable_cores() -> int:
@@ -264,13 +220,6 @@ def usable_cores() -> int:
 
 _OF_MEASURES = ("corruptions", "settling")
 """Tables that ask FID and EMD themselves: of a classifier's own, which they name, and compared with no model's."""
-
-
-def _digests_by_network(record: dict) -> dict[str, set[str]]:
-    digests = {}
-    for model, used in (record.get("weights_digests") or {}).items():
-        digests.setdefault(asked_network(model), set()).update(set(used) - {""})
-    return digests
 
 
 def stale_reason(name: str, record: dict, reference: dict) -> str:
@@ -284,7 +233,10 @@ def stale_reason(name: str, record: dict, reference: dict) -> str:
     Returns:
       The reason, such as "was measured with other weights of CAMDM (a1b2, now c3d4)"; "" if there is none.
     """
-    now, there = map(_digests_by_network, (reference, record))
+    now, there = ({}, {})
+    for digests, of in ((now, reference), (there, record)):
+        for model, used in (of.get("weights_digests") or {}).items():
+            digests.setdefault(asked_network(model), set()).update(set(used) - {""})
     if name in ON_WEIGHTS and now and not there:
         return "does not say which weights it was measured with"
     for model in now.keys() & there.keys() if name in ON_WEIGHTS else ():
@@ -336,29 +288,14 @@ def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
     try:
         return read_table(path)
     except (ValueError, FileNotFoundError) as error:
-        if (found := _described_rows(path)) is not None:
-            return found
-        log.warning("%s; kept as %s", error, set_aside_table(path).name)
-        return None
-
-
-def _described_rows(path: Path) -> tuple[pd.DataFrame, dict] | None:
-    """Go back to the rows that a table's record describes, where it has more: the run died before it wrote the record.
-
-    The table with all rows is kept under another name; None where its beginning is not what the record describes.
-    """
+        kept = set_aside_table(path)
+        log.warning("%s; kept as %s", error, kept.name)
     try:
-        record = _read_record(path)
-        rows, digest = record["table"]["rows"], record["table"]["sha256"]
-        text = "".join(f"{line}\n" for line in path.read_text(encoding="utf-8").split("\n")[: rows + 1])
+        record = _read_record(kept)
+        text = "".join(kept.read_text(encoding="utf-8").splitlines(keepends=True)[: record["table"]["rows"] + 1])
+        return (_rows(text), record) if _text_hash(text) == record["table"]["sha256"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    if _text_hash(text) != digest:
-        return None
-    kept = set_aside([path], path.stem)
-    write_whole(path, text, overwrite=False)
-    log.warning("%s: a run died while writing; its last rows lie in %s.csv and are made again", path, kept)
-    return read_table(path)
 
 
 def kept_rows(path, record: dict) -> pd.DataFrame | None:

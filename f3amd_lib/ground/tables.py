@@ -6,7 +6,6 @@ A tidy table has one number a row: columns that say what it is about (model, ste
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 
@@ -75,16 +74,13 @@ def metric_heading(metric: str, unit: str = "", better: str = "") -> str:
 
 
 def _cell(value, digits: int) -> str:
-    if value is None or (isinstance(value, float) and math.isnan(value)) or value == "":
+    if value is None or value == "" or value != value:  # no number equals itself but NaN
         return "–"
-    if isinstance(value, bool) or not isinstance(value, float):
+    if not isinstance(value, float):
         return _escape(str(value))
-    if math.isinf(value):
-        return str(value)
     if value and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.{max(digits - 1, 0)}e}"
-    whole = len(str(int(abs(value)))) if abs(value) >= 1 else 1
-    return f"{value:.{max(0, min(digits, digits + 1 - whole))}f}"
+    return f"{value:.{max(0, min(digits, digits + 1 - len(str(int(abs(value))))))}f}"
 
 
 def _escape(text: str) -> str:

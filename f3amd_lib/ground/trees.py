@@ -113,7 +113,7 @@ def load_tree(path: Path, template: Any, *, rest: bool = False) -> tuple[Any, di
         with errors_name(path):
             template = template(metadata)
     if rest:
-        template = _by_names(arrays) | template
+        template = _with_rest(template, arrays)
     wanted = _named_leaves(template)
     if wanted.keys() != arrays.keys():
         odd = sorted(wanted.keys() ^ arrays.keys())
@@ -125,17 +125,16 @@ def load_tree(path: Path, template: Any, *, rest: bool = False) -> tuple[Any, di
     return jax.tree.unflatten(jax.tree.structure(template), leaves), metadata
 
 
-def _by_names(arrays: dict) -> dict:
-    """Return arrays as dicts in dicts, of names such as "['axes']['mean']"."""
-    tree = {}
+def _with_rest(template: dict, arrays: dict) -> dict:
+    """Return a template with the parts that it lacks, as dicts in dicts, of names such as "['axes']['mean']"."""
+    tree, known = dict(template), tuple(f"[{part!r}]" for part in template)
     for name, array in arrays.items():
-        place, keys, node = tree, [], ast.parse(f"_{name}", mode="eval").body
-        while not isinstance(node, ast.Name):
-            keys.append(node.attr if isinstance(node, ast.Attribute) else node.slice.value)
-            node = node.value
-        for key in keys[:0:-1]:
-            place = place.setdefault(key, {})
-        place[keys[0]] = array
+        if not name.startswith(known):
+            *inner, last = (ast.literal_eval(key) for key in name[1:-1].split("]["))
+            place = tree
+            for key in inner:
+                place = place.setdefault(key, {})
+            place[last] = array
     return tree
 
 

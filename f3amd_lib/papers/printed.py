@@ -64,7 +64,7 @@ def checked_table(name: str, table: pd.DataFrame, where: str, others: Sequence[s
 
     `others` are models that are no presets.
     """
-    keys = list(SCHEMAS[name])
+    keys = SCHEMAS[name]
     table = table.rename(columns={_VALUES.get(name, "value"): "value"})
     if name == "walking" and set(keys) - set(table) == {"metric"}:  # a row per style and seed, its figures side by side
         means = table.groupby(keys[:-1])[[check for check in CHECKS if check in table]].mean()
@@ -124,13 +124,7 @@ def printed_tables(paper: str = "f3amd") -> dict[str, pd.DataFrame]:
         name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")
         printed["metric"] = printed["metric"].replace(about.get("metrics", {}))
         for which, rows in [(entry["record"], printed)] if "record" in entry else printed.groupby(name):
-            where = f"{paper}/paper.toml: table {entry['number']}"
-            columns = [*find_entry(SCHEMAS, which, "record", f"{where} (see papers/schemas.toml)"), "unit"]
-            if missing := [column for column in columns if column not in rows]:
-                raise ValueError(
-                    f"{where}: {entry['file']} has no {', '.join(missing)}, as rows of {which!r} have "
-                    "(papers/schemas.toml); add it, or give the table a `record` of its own"
-                )
+            find_entry(SCHEMAS, which, "record", f"{paper}/paper.toml, table {entry['number']}")
             parts.setdefault(which, []).append(rows)
     tables = {}
     for name, some in parts.items():
@@ -184,10 +178,8 @@ def judge_note(name: str) -> str:
 
     Judges of one recipe differ from training to training, so that their figures are on scales of their own.
     """
-    papers = [
-        load_paper_file("experiments", paper) for paper in paper_folders() if has_paper_file("experiments", paper)
-    ]
-    names = [other for about in papers for other in about if other != "settings"]
+    papers = [paper for paper in paper_folders() if has_paper_file("experiments", paper)]
+    names = [other for paper in papers for other in load_paper_file("experiments", paper) if other != "settings"]
     tables = {other: committed_table("bandai", other) for other in ("text_judge", *names)}
     judges = {other: found[1]["judge_weights"] for other, found in tables.items() if found}
     others = [f"`{other}`" for other, judge in judges.items() if judge != judges[name]]

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from f3amd_lib.ground.names import check_known, nearest_hint
-from f3amd_lib.ground.papers import check_entry, load_paper_file
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file
 from f3amd_lib.networks.presets import PRESETS
 
 
@@ -27,26 +27,20 @@ def fill_reading(reading: dict, where: str, configs: Mapping[str, str]) -> str:
       configs: classes of the file's `[configs]` -> where they are, "module:class".
 
     Raises:
-      ValueError: for a key that is missing or unknown, a field that is no setting, or a text that
-        has no place for it.
+      ValueError: for a key that is missing or unknown, or a field that is no setting.
     """
     where = f"{where}, {reading.get('point')!r}"
     check_entry(reading, where, ("topic", "point", "paper", "here", "why"), ("field",))
-    if ("field" in reading) != ("{" in reading["here"]):
-        raise ValueError(f"{where}: needs both, a field and a {{}} in `here` for its value, or neither")
     if "field" not in reading:
         return reading["here"]
     owner, *names = reading["field"].split(".")
-    preset = PRESETS.get(owner)
     value = {}
     if owner in configs:
         value = {field.name: field.default for field in dataclasses.fields(pkgutil.resolve_name(configs[owner]))}
-    if preset is not None:
+    elif preset := PRESETS.get(owner):
         value = {**preset.network, **preset.training, "diffusion": preset.diffusion.to_dict()}
     for name in names:
-        if name not in value:
-            raise ValueError(f"{where}: {reading['field']} is no setting; no {name!r}{nearest_hint(name, value)}")
-        value = value[name]
+        value = find_entry(value, name, f"setting of {owner}", where)
     return reading["here"].format(value)
 
 

@@ -92,7 +92,7 @@ def check_words(caption: str, known: Sequence[str]) -> None:
     """
     vocabulary = words_of(known)
     if unknown := [word for word in _words(caption) if word not in vocabulary]:
-        hint = nearest_hint(unknown[0], vocabulary, most=0)
+        hint = nearest_hint(unknown[0], vocabulary)
         raise ValueError(f"caption {caption!r}: the model never saw {', '.join(map(repr, unknown))}{hint}")
 
 
