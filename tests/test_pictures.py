@@ -9,7 +9,7 @@ from builders import refused, straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 
 from f3amd_lib.drawing.diagrams import arrow, boxes
-from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside, write_gif
+from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion
@@ -125,13 +125,9 @@ def test_motion_of_positions_alone_is_drawn_without_its_tips():
     poses_beside({"alone": alone}, frames)
 
 
-def test_frames_and_crowds_that_are_not_there_are_refused(tmp_path):
-    motion = wandering_motion(4)
-    refused("has frames 0 to 3; asked for 9 to 9", poses_beside, {"walk": motion}, [9])
-    refused("has frames 0 to 3; asked for -1 to -1", crowd_figure, {"": ([motion], ["#542788"])}, -1)
+def test_crowds_that_are_none_are_refused():
     refused("at least one crowd", crowd_figure, {}, 1)
     refused("at least one crowd, and somebody in each", crowd_figure, {"nobody": ([], [])}, 1)
-    refused("every must be a whole number of frames", write_gif, tmp_path / "walk.gif", motion, every=0)
 
 
 def test_a_kept_figure_names_its_data_set_and_its_light_copy_the_file_in_full_size(tmp_path):

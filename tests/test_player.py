@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from f3amd_companion.serving import player
 from f3amd_companion.serving.player import FOLDER, Character, Scene, player_page, rollout_scene, write_player
-from f3amd_lib.drawing.pictures import film_strip, write_film_strip, write_gif
+from f3amd_lib.drawing.pictures import film_strip, write_gif
 from f3amd_lib.drawing.stick_figures import limb_side
 from f3amd_lib.motion.body import body_capsules, make_body
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
@@ -324,7 +324,6 @@ def test_pictures_leave_out_contacts_and_facing_of_an_unknown_rig(tmp_path):
     assert Image.open(path.with_suffix(".png")).width > 500
     with Image.open(write_gif(tmp_path / "pole.gif", [pole, known])) as moving:
         assert moving.n_frames > 3
-    assert write_film_strip(tmp_path / "strip.png", pole).exists()
 
 
 def test_the_page_is_made_of_files_that_are_installed():

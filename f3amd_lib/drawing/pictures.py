@@ -20,19 +20,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 
-from f3amd_lib.drawing.stick_figures import (
-    CONTACT_COLOR,
-    LIMB_COLORS,
-    TARGET_COLOR,
-    TRAIL_COLOR,
-    Camera,
-    body_lines,
-    drawn_points,
-    path_on_ground,
-    toes_of,
-    yaw_of,
-)
-from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style, save_figure
+from f3amd_lib.drawing import stick_figures
+from f3amd_lib.drawing.stick_figures import Camera
+from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style
 from f3amd_lib.ground.files import named_file, whole_file
 from f3amd_lib.motion.skeleton import Motion
 
@@ -40,7 +30,7 @@ from f3amd_lib.motion.skeleton import Motion
 
 _THIN = {"left": 0.05, "right": 0.05, "middle": 0.05, "head": 0.18}  # metres
 _STOUT = {"left": 0.095, "right": 0.095, "middle": 0.147, "head": 0.22}  # as thick as people
-_COLORS = LIMB_COLORS | {"head": LIMB_COLORS["middle"]}
+_COLORS = stick_figures.LIMB_COLORS | {"head": stick_figures.LIMB_COLORS["middle"]}
 
 
 def _draw_body(
@@ -59,7 +49,7 @@ def _draw_body(
     shift = np.array([left, 0.0])
     shadow = camera.project(_on_ground(_CIRCLE + points[0, [0, 2]]))
     axis.fill(*(shadow[:, :2] + shift).T, color="#DFDFDF", linewidth=0, zorder=1)
-    lines, sides = body_lines(skeleton, points)
+    lines, sides = stick_figures.body_lines(skeleton, points)
     seen = camera.project(lines)
     towards = seen[:, :, 2].mean(axis=1)
     order = np.argsort(towards)
@@ -73,7 +63,7 @@ def _draw_body(
     if len(touching):
         dots = camera.project(points[touching])[:, :2] + shift
         look = {"markersize": 0.09 * scale, "markeredgecolor": "white", "markeredgewidth": 0.01 * scale}
-        axis.plot(*dots.T, "o", color=CONTACT_COLOR, zorder=9, **look)
+        axis.plot(*dots.T, "o", color=stick_figures.CONTACT_COLOR, zorder=9, **look)
 
 
 _TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -86,38 +76,25 @@ def _on_ground(xz: np.ndarray) -> np.ndarray:
 
 def _toes_down(motion: Motion, frames) -> list:
     """Toes in contact at each frame that is asked for."""
-    toes = np.array(toes_of(motion.skeleton))
+    toes = np.array(stick_figures.toes_of(motion.skeleton))
     return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]] if len(toes) else [()] * len(frames)
 
 
 def _beside_each_other(motions, paths, titles) -> list[tuple]:
     """(motion, path or None, title) of each; one path or title stands for all."""
     motions = [motions] if isinstance(motions, Motion) else list(motions)
-    if not motions or not all(isinstance(motion, Motion) for motion in motions):
-        raise ValueError("a picture needs a Motion, or a list of at least one")
-    columns = []
-    for what, value in (("paths", paths), ("titles", titles)):
-        columns.append(list(value) if isinstance(value, (list, tuple)) else [value] * len(motions))
-        if len(columns[-1]) != len(motions):
-            raise ValueError(f"{len(value)} {what} for {len(motions)} motions")
-    named = [motion.name if title is None else title for motion, title in zip(motions, columns[1], strict=True)]
-    return list(zip(motions, columns[0], named, strict=True))
-
-
-def _check_frames(motion: Motion, frames) -> None:
-    """Raise ValueError for frames that a motion does not have."""
-    first, last = int(np.min(frames)), int(np.max(frames))
-    if first < 0 or last >= motion.num_frames:
-        raise ValueError(f"{motion.name!r} has frames 0 to {motion.num_frames - 1}; asked for {first} to {last}")
+    if not motions:
+        raise ValueError("a picture needs at least one motion")
+    listed = lambda value: value if isinstance(value, (list, tuple)) else [value] * len(motions)
+    named = [each.name if title is None else title for each, title in zip(motions, listed(titles), strict=True)]
+    return list(zip(motions, listed(paths), named, strict=True))
 
 
 # --------------------------------------------------------------------------- film strips and poses
 
 
 @plot_style()
-def film_strip(
-    motions, *, paths=None, titles=None, num_poses: int = 8, frames: Sequence[int] | None = None, around_deg=60.0
-):
+def film_strip(motions, *, paths=None, titles=None, num_poses: int = 8, frames: Sequence[int] | None = None):
     """Draw poses side by side and the root's path from above, one row a motion.
 
     Each pose is seen from the character's own front right (its smoothed facing), so that gaits
@@ -130,25 +107,22 @@ def film_strip(
       titles: a title, or a list of one a motion; by default the motion's name.
       num_poses: poses a row, evenly spaced in time from the first frame to the last.
       frames: frame numbers to draw instead, the same for every row.
-      around_deg: 0 looks at the character from the front, 90 from its right side.
 
     Returns:
       A matplotlib Figure; `style.save_figure` writes it, `style.show_figure` shows it.
 
     Raises:
-      ValueError: for no motion, fewer than one pose, or frames that a motion does not have.
+      ValueError: for no motion.
+      IndexError: for frames that a motion does not have.
     """
     rows = _beside_each_other(motions, paths, titles)
     count = num_poses if frames is None else len(frames)
-    if count < 1:
-        raise ValueError("a film strip needs num_poses of 1 or more, or at least one of frames")
     widths = [0.96 * count, 2.9]
     figure, axes = new_figure(sum(widths), 2.45 * len(rows), len(rows), 2, squeeze=False, width_ratios=widths)
     for (poses, plan), (motion, path, title) in zip(axes, rows, strict=True):
         last = motion.num_frames - 1
         chosen = np.linspace(0, last, count).round().astype(int) if frames is None else np.asarray(frames)
-        _check_frames(motion, chosen)
-        _draw_poses(poses, motion, chosen, np.deg2rad(around_deg))
+        _draw_poses(poses, motion, chosen)
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
     # One scale for all rows, wide enough for the arms of the last pose.
@@ -156,9 +130,9 @@ def film_strip(
     for poses in axes[:, 0]:
         poses.set_xlim(ends[:, 0].min(), ends[:, 1].max())
     for side in ("left", "right"):
-        axes[0, 0].plot([], [], color=LIMB_COLORS[side], linewidth=3, label=side)
-    if any(toes_of(motion.skeleton) for motion, *_ in rows):
-        axes[0, 0].plot([], [], "o", color=CONTACT_COLOR, markersize=5, label="toe in contact")
+        axes[0, 0].plot([], [], color=stick_figures.LIMB_COLORS[side], linewidth=3, label=side)
+    if any(stick_figures.toes_of(motion.skeleton) for motion, *_ in rows):
+        axes[0, 0].plot([], [], "o", color=stick_figures.CONTACT_COLOR, markersize=5, label="toe in contact")
     small = {"fontsize": 8, "handlelength": 1.2, "columnspacing": 1.2, "borderaxespad": 0.2}
     # Below everything: titles may be as long as the strip.
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3, **small)
@@ -168,34 +142,18 @@ def film_strip(
     return figure
 
 
-def write_film_strip(path, motions, **options) -> Path:
-    """Write a film strip as a PNG file, in one call.
-
-    Args:
-      path: ends in .png; folders are made, a picture drawn before is replaced.
-      motions, options: as for `film_strip`.
-
-    Returns:
-      The path.
-
-    Raises:
-      ValueError: for a wrong suffix, or as `film_strip` does.
-    """
-    return save_figure(film_strip(motions, **options), path)
-
-
 SLOT = 1.15  # metres of page a pose
 
 
-def _draw_poses(axis, motion: Motion, chosen, around: float, *, scale: float = 60.0, numbered: bool = True) -> None:
-    points = drawn_points(motion, chosen)
-    yaw, touching = yaw_of(motion), _toes_down(motion, chosen)
+def _draw_poses(axis, motion: Motion, chosen, *, scale: float = 60.0, numbered: bool = True) -> None:
+    points = stick_figures.drawn_points(motion, chosen)
+    yaw, touching = stick_figures.yaw_of(motion), _toes_down(motion, chosen)
     facing = np.zeros(len(chosen))
     if yaw is not None:
         facing = gaussian_filter1d(np.unwrap(yaw), 0.3 * motion.fps, mode="nearest")[chosen]
     axis.axhline(0.0, color="#B8B8B8", linewidth=1.0, zorder=0)
     for place, frame in enumerate(chosen):
-        camera = Camera(facing[place] - around, np.deg2rad(6.0), points[place, 0] * [1.0, 0.0, 1.0])
+        camera = Camera(facing[place] - np.pi / 3, np.deg2rad(6.0), points[place, 0] * [1.0, 0.0, 1.0])
         _draw_body(axis, motion.skeleton, points[place], camera, scale, left=place * SLOT, touching=touching[place])
         center = {"ha": "center", "va": "top", "fontsize": 8 if numbered else 7}
         if numbered:
@@ -210,14 +168,14 @@ def _draw_poses(axis, motion: Motion, chosen, around: float, *, scale: float = 6
 
 def _draw_plan(axis, motion: Motion, chosen, path) -> None:
     root = np.asarray(motion.root_position, dtype=np.float64)[:, [0, 2]]
-    target = root if path is None else path_on_ground(path)
+    target = root if path is None else stick_figures.path_on_ground(path)
     if path is not None:
-        axis.plot(*target.T, color=TARGET_COLOR, linestyle="--", linewidth=1.6, label="target", zorder=3)
-    axis.plot(*root.T, color=TRAIL_COLOR, linewidth=1.6, label="walked")
+        axis.plot(*target.T, color=stick_figures.TARGET_COLOR, linestyle="--", linewidth=1.6, label="target", zorder=3)
+    axis.plot(*root.T, color=stick_figures.TRAIL_COLOR, linewidth=1.6, label="walked")
     everything = np.concatenate([root, target])
     extent = np.ptp(everything, axis=0).max()
     reach, side = 0.09 * max(extent, 1.0), max(1.25 * extent, 2.0)
-    yaw, numbered = yaw_of(motion), np.full(2, np.inf)
+    yaw, numbered = stick_figures.yaw_of(motion), np.full(2, np.inf)
     for place, frame in enumerate(chosen, start=1):
         angle = 0.0 if yaw is None else yaw[frame]
         ahead, beside = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
@@ -269,8 +227,7 @@ def poses_beside(
         axis.axis("off")
     for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
         if motion is not None:
-            _check_frames(motion, frames)
-            _draw_poses(axis, motion, np.asarray(frames), np.pi / 3, scale=72 * inches, numbered=False)
+            _draw_poses(axis, motion, np.asarray(frames), scale=72 * inches, numbered=False)
             axis.set_ylim(-below, 1.85)
             axis.set_title(title, color=model_style(title).color)
     return figure
@@ -291,7 +248,7 @@ def draw_toes(figure, motions: Mapping[str, Motion | None], frames: range) -> No
         height = motion.positions[every][:, list(motion.skeleton.toes), 1]
         height = 4.0 * (height - height.min()) - 1.0  # four times as high, below the poses
         for foot, side in enumerate(("left", "right")):
-            color = LIMB_COLORS[side]
+            color = stick_figures.LIMB_COLORS[side]
             axis.plot(along, height[:, foot], color=color, linewidth=0.9, label=f"{side} toe")
             axis.plot(along, np.where(motion.contacts[every, foot], height[:, foot], np.nan), color=color, linewidth=3)
     figure.axes[0].plot([], [], color=PALETTE["black"], linewidth=3, label="a toe rests")
@@ -333,12 +290,10 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, width: float = 12.0
       A matplotlib Figure.
 
     Raises:
-      ValueError: for no crowd, an empty one, or a frame that a motion does not have.
+      ValueError: for no crowd, or an empty one.
     """
     if not crowds or not all(motions for motions, _ in crowds.values()):
         raise ValueError("a picture of crowds needs at least one crowd, and somebody in each")
-    for motion in (motion for motions, _ in crowds.values() for motion in motions):
-        _check_frames(motion, frame)
     columns = min(2, len(crowds))
     rows, panel = -(-len(crowds) // columns), width / columns
     roots = np.array([motion.root_position[frame, [0, 2]] for motion in next(iter(crowds.values()))[0]], float)
@@ -349,9 +304,9 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, width: float = 12.0
     around = np.array(list(itertools.product((-0.8, 0.8), (0.0, 2.0), (-0.8, 0.8))))
     seen = camera.project(_on_ground(roots)[:, None] + around)[..., :2].reshape(-1, 2)
     (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
-    most_lines = max(len(title.splitlines()) for title in crowds)
+    lines = max(len(title.splitlines()) for title in crowds)
     # As high as its panels are at equal scale, and room for titles and for what may stand below all.
-    height = rows * (panel * (high - low) / (right - left) + (0.13 + 0.2 * most_lines if most_lines else 0.0)) + 0.2
+    height = rows * (panel * (high - low) / (right - left) + (0.13 + 0.2 * lines) * (lines > 0)) + 0.2
     figure, axes = new_figure(width, height, rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
@@ -377,7 +332,7 @@ def draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) 
       camera: with a distance that is finite.
       scale: of a metre, in 1/72 inch.
     """
-    bodies = [drawn_points(motion, np.array([frame]))[0] for motion in motions]
+    bodies = [stick_figures.drawn_points(motion, np.array([frame]))[0] for motion in motions]
     depths = camera.distance - camera.project([points[0] for points in bodies])[:, 2]
     axis.add_collection(_ground_lines(camera, 2.0, 8.0 * camera.distance, "#E6E6E6"))
     for k in np.argsort(-depths):
@@ -385,7 +340,8 @@ def draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) 
         paler = 0.4 * (depths[k] - depths.min()) / max(np.ptp(depths), 3.0)  # who walk abreast look alike
         tints = {"left": color + 0.22 * (1 - color), "right": 0.82 * color, "middle": color, "head": color}
         tints = {side: tint + paler * (1 - tint) for side, tint in tints.items()}
-        past = motion.positions[max(0, frame - round(1.5 * motion.fps)) : frame + 1, toes_of(motion.skeleton)]
+        first = max(0, frame - round(1.5 * motion.fps))
+        past = motion.positions[first : frame + 1, stick_figures.toes_of(motion.skeleton)]
         for foot in range(past.shape[1]):
             lower = past[:, foot, 1] <= past[..., 1].min(axis=1)
             prints = np.where(lower[:, None], past[:, foot][:, [0, 2]], np.nan)
@@ -413,7 +369,7 @@ def _ground_lines(camera: Camera, step: float, radius: float, color: str) -> Lin
 
 def write_gif(
     path, motions, *, target_paths=None, titles=None, every: int = 3, size: tuple[int, int] = (256, 256),
-    max_seconds: float | None = None,
+    max_seconds: float = np.inf,
 ) -> Path:  # fmt: skip
     """Write a small looping GIF of one motion, or of several in panels side by side.
 
@@ -425,32 +381,25 @@ def write_gif(
       motions: a `Motion`, or a list of them of one frame rate; shorter ones wait at their end.
       target_paths: a target path (`RootPath` or [T, 2]), or a list of one (or None) a motion.
       titles: a text, or a list of one a motion; by default the motion's name.
-      every: keep every n-th frame; 3 keeps 8 s near 200 kB. At most 30 kept frames a second.
+      every: keep every n-th frame; 3 keeps 8 s near 200 kB.
       size: pixels of one panel, width and height.
-      max_seconds: stop there; None shows everything.
+      max_seconds: stop there.
 
     Returns:
       The path.
 
     Raises:
-      ValueError: for a wrong suffix, no motion, unlike frame rates, or more than 30 frames a
-        second.
+      ValueError: for a wrong suffix, no motion, or unlike frame rates.
     """
     path = named_file(path, ".gif", "moving pictures")
-    if every < 1 or every != int(every):
-        raise ValueError(f"every must be a whole number of frames, 1 or more, got {every}")
     rows = _beside_each_other(motions, target_paths, titles)
     motions = [motion for motion, *_ in rows]
     rates = {motion.fps for motion in motions}
     if len(rates) > 1:
         raise ValueError(f"motions of one picture need one frame rate, got {sorted(rates)}")
     fps = rates.pop()
-    if fps / every > 30.0 + 1e-6:
-        raise ValueError(f"{fps / every:g} frames a second are too many here: raise every to {np.ceil(fps / 30.0):.0f}")
-    last = max(motion.num_frames for motion in motions)
-    if max_seconds is not None:
-        last = min(last, max(1, round(max_seconds * fps)))
-    frames = np.arange(0, last, every)
+    longest = max(motion.num_frames for motion in motions)
+    frames = np.arange(0, min(longest, max_seconds * fps), every, dtype=int)
     # Panels fill the picture: there is nothing for a layout to do, whatever style is in use.
     figure = Figure(figsize=(size[0] * len(rows) / 100, size[1] / 100), dpi=100, layout="none")
     canvas, pictures = FigureCanvasAgg(figure), []
@@ -483,10 +432,11 @@ _AROUND = np.deg2rad(50.0)
 def _gif_panel(axis, motion: Motion, target, title: str, frames, size):
     """Prepare a panel of a GIF; return what draws it at a place in `frames`, held at the motion's last."""
     frames = np.minimum(frames, motion.num_frames - 1)
-    points, touching, yaw = drawn_points(motion, frames), _toes_down(motion, frames), yaw_of(motion)
+    points, yaw = stick_figures.drawn_points(motion, frames), stick_figures.yaw_of(motion)
+    touching = _toes_down(motion, frames)
     root = np.asarray(motion.root_position, dtype=np.float64)
     follow = gaussian_filter1d(root, 0.25 * motion.fps, axis=0, mode="nearest")[frames]
-    walked, target = root[:, [0, 2]], None if target is None else path_on_ground(target)
+    walked, target = root[:, [0, 2]], None if target is None else stick_figures.path_on_ground(target)
     pixels = min(size[1] / 2.35, size[0] / 1.9)  # a metre: 2.3 m around the character fill the shorter side
     width, height = 0.5 * np.array(size) / pixels
     axis.set(xlim=(-width, width), ylim=(-height, height), xticks=[], yticks=[])
@@ -499,7 +449,7 @@ def _gif_panel(axis, motion: Motion, target, title: str, frames, size):
             old.remove()
         axis.add_collection(_ground_lines(camera, 1.0, 3.0, "#D9D9D9"))
         way = walked[: frames[place] + 1]
-        for line, color, thick in ((target, TARGET_COLOR, 2.2), (way, TRAIL_COLOR, 1.5)):
+        for line, color, thick in ((target, stick_figures.TARGET_COLOR, 2.2), (way, stick_figures.TRAIL_COLOR, 1.5)):
             if line is not None:
                 near = np.linalg.norm(line - [x, z], axis=-1, keepdims=True) < 3.0
                 seen = np.where(near, camera.project(_on_ground(line))[:, :2], np.nan)

@@ -58,10 +58,9 @@ class Camera:
 def limb_side(name: str) -> str:
     """Return "left", "right" or "middle" for a joint name of the usual conventions."""
     lowered = name.lower()
-    if "left" in lowered or lowered.endswith("_l"):
-        return "left"
-    if "right" in lowered or lowered.endswith("_r"):
-        return "right"
+    for side in ("left", "right"):
+        if side in lowered or lowered.endswith(f"_{side[0]}"):
+            return side
     return "middle"
 
 

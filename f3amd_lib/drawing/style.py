@@ -69,10 +69,7 @@ def system_line(label: str) -> dict:
     One step is dotted, with open markers.
     """
     name, _, steps = label.partition(", ")
-    line = model_style(name).line
-    if steps.strip() == "1 step":
-        line |= {"linestyle": ":", "markerfacecolor": "white"}
-    return line
+    return model_style(name).line | ({"linestyle": ":", "markerfacecolor": "white"} if steps == "1 step" else {})
 
 
 def shades(count: int) -> list[tuple]:
