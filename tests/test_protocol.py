@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import packed_from, refused
+from flax import nnx
 
 from f3amd_companion.measuring import measure
 from f3amd_lib.data.features import num_channels
@@ -72,25 +73,12 @@ def generator(packed, prepared):
     config = presets.build_config(
         "F3AMD-FNO-32", channels=num_channels(packed.skeleton), num_styles=2, depth=1, latent_width=8
     )
-    network = jax.jit(lambda key: module_state(config, key))(jax.random.key(0))
+    weights = jax.jit(lambda key: nnx.state(presets.build_from_config(config, key)))(jax.random.key(0))
     trained = TrainedModel(
-        "F3AMD-FNO-8",
-        config,
-        network,
-        prepared.normaliser,
-        packed.skeleton,
-        packed.styles,
-        variance_exploding(),
-        starting_poses(packed, num_history=10),
-        {},
-    )
+        "F3AMD-FNO-8", config, weights, prepared.normaliser, packed.skeleton, packed.styles, variance_exploding(),
+        starting_poses(packed, num_history=10), {},
+    )  # fmt: skip
     return MotionGenerator(trained, 1)
-
-
-def module_state(config, key):
-    from flax import nnx
-
-    return nnx.state(presets.build_from_config(config, key))
 
 
 @pytest.fixture(scope="module")
@@ -287,16 +275,20 @@ def test_classes_that_nobody_walks_do_not_count(generator, packed, prepared, cla
     assert one(rows, "FID") < one(both, "FID") + 1.0
 
 
-@pytest.mark.slow
-def test_the_measurement_keeps_its_rows_and_goes_on(prepared, classifier, generator, tmp_path, monkeypatch):
+@pytest.fixture
+def name(classifier, generator, tmp_path, monkeypatch):
+    """Name of the one model that there is to measure."""
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    profile = load_profile("smoke", "synthetic", rollout_rounds=3)
-    name = "F3AMD-FNO-32"
+    trained = dataclasses.replace(generator.trained, name="F3AMD-FNO-32")
     monkeypatch.setattr(measure, "obtain_classifier", lambda *a, **k: (classifier, "earlier run"))
     monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "earlier run"))
-    monkeypatch.setattr(measure, "available_models", lambda *a: [name])
+    monkeypatch.setattr(measure, "available_models", lambda *a: [trained.name])
     monkeypatch.setattr(measure, "STEPS", (1,))
-    trained = dataclasses.replace(generator.trained, name=name)
+    return trained.name
+
+
+def test_the_measurement_keeps_its_rows_and_goes_on(name, prepared, monkeypatch):
+    profile = load_profile("smoke", "synthetic", rollout_rounds=3)
     path = measure.measure_quality(prepared, profile)
     table, record = read_table(path)
     rows = set(zip(table["model"], table["steps"], strict=True))
@@ -320,7 +312,9 @@ def test_the_measurement_keeps_its_rows_and_goes_on(prepared, classifier, genera
     assert calls == [1]
     assert len(read_table(path)[0]) == len(table)
     # Other weights under the same name are another model.
+    trained, *origin = measure.obtain_model()
     trained = dataclasses.replace(trained, params=jax.tree.map(lambda leaf: 2 * leaf, trained.params))
+    monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, *origin))
     measure.measure_quality(prepared, profile)
     assert calls == [1, 1]
     # Other settings start anew, and lose nothing.
@@ -331,14 +325,8 @@ def test_the_measurement_keeps_its_rows_and_goes_on(prepared, classifier, genera
     pd.testing.assert_frame_equal(kept, before)
 
 
-def test_the_metrics_own_sensitivity_is_measured(prepared, classifier, generator, tmp_path, monkeypatch):
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+def test_the_metrics_own_sensitivity_is_measured(name, prepared, tmp_path, monkeypatch):
     profile = load_profile("smoke", "synthetic", rollout_rounds=3, num_steps=1)
-    name = "F3AMD-FNO-32"
-    trained = dataclasses.replace(generator.trained, name=name)
-    monkeypatch.setattr(measure, "obtain_classifier", lambda *a, **k: (classifier, "earlier run"))
-    monkeypatch.setattr(measure, "obtain_model", lambda *a, **k: (trained, None, "earlier run"))
-    monkeypatch.setattr(measure, "available_models", lambda *a: [name])
     graded, record = read_table(measure.measure_sensitivity(prepared, profile))
     assert set(graded["corruption"]) == set(REFERENCE_MODELS[1:])
     assert {0.0, 1.0} <= set(graded["strength"]) and record["measurement"] == "sensitivity"

@@ -212,8 +212,8 @@ def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.Data
     """Collect the figures of several systems, real motion first.
 
     Args:
-      real: from `rollout_measures.measure_clips`.
-      measured: (model, steps) -> what `rollout_measures.measure_rollout` returned.
+      real: from `real_clips.measure_clips`.
+      measured: (model, steps) -> what `real_clips.measure_rollout` returned.
 
     Returns:
       Tidy rows: label, model, steps (0 for real motion), metric, unit, better, value (mean over

@@ -26,8 +26,8 @@ from f3amd_lib.measures import real_clips
 from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.measures.metrics import foot_sliding
 from f3amd_lib.measures.protocol import classify_windows, distribution_figures, evaluation_paths, real_features
+from f3amd_lib.measures.real_clips import motion_figures
 from f3amd_lib.measures.registry import BY_KEY, METRICS
-from f3amd_lib.measures.rollout_measures import motion_figures
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.rollout.rollout import MotionGenerator, Rollout

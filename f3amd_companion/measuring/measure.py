@@ -53,8 +53,7 @@ from f3amd_lib.measures.protocol import (
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.measures.real_clips import reference_clips, style_floor
-from f3amd_lib.measures.rollout_measures import measure_rollout
+from f3amd_lib.measures.real_clips import measure_rollout, reference_clips, style_floor
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along

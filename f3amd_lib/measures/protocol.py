@@ -35,8 +35,8 @@ from f3amd_lib.measures.classifier import StyleClassifier, require_telling_style
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt
 from f3amd_lib.measures.denoising import noise_use
 from f3amd_lib.measures.metrics import camdm_metrics
+from f3amd_lib.measures.real_clips import by_round, motion_figures
 from f3amd_lib.measures.registry import BY_KEY, METRICS
-from f3amd_lib.measures.rollout_measures import by_round, motion_figures
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion, tangent_yaw
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.rollout.rollout import MotionGenerator, Rollout
@@ -74,13 +74,10 @@ class Protocol:
 
     def __post_init__(self):
         # What is scored is spread over styles and seeds; fewer would leave intervals and distances without meaning.
-        limits = {"num_seeds": 1, "num_diversity_seeds": 2}
-        limits["windows_per_style"] = 1 if len(self.styles) > 1 else 2
-        if not self.styles:
-            raise ValueError("a protocol needs at least one style")
-        for name, least in limits.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        least = {"styles": 1, "num_seeds": 1, "num_diversity_seeds": 2, "windows_per_style": 1 + (len(self.styles) < 2)}
+        for name, number in (dataclasses.asdict(self) | {"styles": len(self.styles)}).items():
+            if number < least.get(name, 0):
+                raise ValueError(f"{name} must be at least {least[name]}, got {number}")
 
 
 def evaluation_paths(packed: PackedMotion, styles: Sequence[str], num_frames: int, *, seed: int = 0) -> list[RootPath]:
@@ -303,14 +300,7 @@ def rollout_figures(
     return seeds
 
 
-def samples_of_one_start(
-    generator: MotionGenerator,
-    paths: Sequence[RootPath],
-    styles: Sequence[str],
-    *,
-    repeats: int,
-    seeds: tuple[int, int],
-) -> np.ndarray:
+def _samples_of_one_start(generator: MotionGenerator, paths, styles, repeats: int, seeds) -> np.ndarray:
     """Walk each style several times from one starting pose, with noise of its own each time.
 
     Args:
@@ -327,20 +317,6 @@ def samples_of_one_start(
     made = generator.rollout(again(paths), again(styles), seed=seeds[1], history=np.repeat(poses, repeats, axis=0))
     joints = np.stack([made.motion(place).positions for place in range(len(made.styles))])
     return joints.reshape(len(styles), repeats, *joints.shape[1:])
-
-
-def sample_figures(samples: np.ndarray, window: int) -> dict[str, float]:
-    """Diversity of Appendix C under one fixed condition a style: first round, and some rounds on.
-
-    `diversity` compares samples of the first round. `rollout_diversity` compares all frames of some rounds, each
-    walked from the sample's own history: it holds differences of phase.
-
-    Args:
-      samples: from `samples_of_one_start`.
-      window: frames of a round.
-    """
-    first, whole = distributions.diversity(samples[:, :, :window]), distributions.diversity(samples)
-    return {"diversity": first, "rollout_diversity": whole}
 
 
 def measure_model(
@@ -372,10 +348,13 @@ def measure_model(
         walked = rollout.paths[seed * len(styles) : (seed + 1) * len(styles)]
         paths = [path.slice(0, min(_DIVERSITY_ROUNDS * window, protocol.num_frames)) for path in walked]
         seeds = protocol.path_seed + seed, protocol.path_seed + seed + protocol.num_seeds
-        samples = samples_of_one_start(generator, paths, styles, repeats=protocol.num_diversity_seeds, seeds=seeds)
+        samples = _samples_of_one_start(generator, paths, styles, protocol.num_diversity_seeds, seeds)
         use = noise_use(generator, held_out, seed=seed)
         use = {name: use[METRICS[name].key] for name in ("x0_error_ratio", "seed_spread")}
-        rows += _rows(figures | sample_figures(samples, window) | use, **columns, varies="seed", seed=seed)
+        # Of the first round, and of some rounds, each walked from the sample's own history: differences of phase.
+        figures["diversity"] = distributions.diversity(samples[:, :, :window])
+        figures["rollout_diversity"] = distributions.diversity(samples)
+        rows += _rows(figures | use, **columns, varies="seed", seed=seed)
     # Long rollouts drift (claim Q16): the same walks round by round.
     rounds = by_round(rollout).melt(id_vars="round", var_name="metric").assign(**columns)
     return pd.DataFrame(rows), rounds[[*columns, "metric", "round", "value"]]
