@@ -1,15 +1,13 @@
 """The style classifier: what it sees, its network against numpy, training, files, refusals."""
 
 import dataclasses
-import functools
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, packed_from, refused, same_tree
-from flax import nnx
+from builders import packed_from, refused, same_tree
 
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.trees import save_tree
@@ -114,17 +112,13 @@ def test_joints_are_found_under_the_names_of_three_conventions():
     assert found["right elbow"] == ("RightElbow", "LowerArm_R", "RightForeArm")
     assert found["right hip"] == ("RightHip", "UpperLeg_R", "RightUpLeg")
     assert found["left ankle"] == ("LeftAnkle", "Foot_L", "LeftFoot")
-
-
-def test_names_with_the_mixamo_prefix_are_the_same_joints():
     prefixed = named(tuple(f"mixamorig:{name}" for name in MIXAMO_NAMES))
     assert classifier_joints(prefixed) == classifier_joints(named(MIXAMO_NAMES))
 
 
 def test_skeleton_without_a_joint_is_refused_by_its_name():
     without = named(tuple(name for name in BANDAI_NAMES if name != "LowerArm_R"))
-    refused(r"no 'LowerArm_R' \(right elbow\).*names of Bandai", classifier_joints, without)
-    refused("left clavicle", classifier_joints, SKELETON)
+    refused(r"no LowerArm_R in this skeleton, by the names of Bandai", classifier_joints, without)
 
 
 def figure(hips_yaw=0.0, clavicle_yaw=0.0) -> np.ndarray:
@@ -234,34 +228,10 @@ def test_network_equals_its_layers_written_out(trained):
     assert (expected_features < 0).any() and (expected_features > 0.1).any()
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def train_forward(config: ClassifierConfig, windows, key):
-    """Features, batch statistics after, and the first convolution, of one pass in training."""
-    _, params, statistics = nnx.split(StyleNetwork(config, rngs=nnx.Rngs(jax.random.key(0))), nnx.Param, nnx.BatchStat)
-    network = module._network(config, params, statistics)
-    features, _ = network(windows, key)
-    return features, network, network.blocks[0].convolution(windows)
-
-
-@pytest.mark.slow
-def test_in_training_the_batch_itself_is_the_norm_and_dropout_blanks():
-    windows = np.random.default_rng(1).normal(3.0, 2.0, (500, WINDOW, NUM_CHANNELS))
-    one, network, convolved = train_forward(CONFIG, windows, jax.random.key(0))
-    norm = network.blocks[0].norm
-    # A tenth of the way from the initial 0 and 1 to the batch.
-    mean, variance = np.mean(convolved, axis=(0, 1)), np.var(convolved, axis=(0, 1))
-    np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(norm.var[...], 0.9 + 0.1 * variance, rtol=1e-3)
-    other, _, _ = train_forward(CONFIG, windows, jax.random.key(1))
-    assert np.abs(np.asarray(one) - np.asarray(other)).max() > 0.1
-    network(windows[:2])
-    np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-3, atol=1e-4)
-
-
 def test_sizes_that_make_no_network_are_refused():
     assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
     refused("hidden_width must be above 0", ClassifierConfig, num_styles=3, hidden_width=0)
-    refused("widths must be whole numbers above 0, got .8, 0.", ClassifierConfig, num_styles=3, widths=(8, 0))
+    refused("widths must be", ClassifierConfig, num_styles=3, widths=(8, 0))
     refused("dropout", ClassifierConfig, num_styles=3, dropout=1.0)
     refused("'hiden_width'.*'hidden_width'", ClassifierConfig.from_dict, {"num_styles": 3, "hiden_width": 5})
 
@@ -275,14 +245,8 @@ def test_a_short_training_tells_three_styles_apart_on_unseen_clips(trained):
     assert trained.accuracy > 0.9
     for number, style in enumerate(STYLES):
         windows = trained.windows_of(walk(9, style, 10.0).positions, SYNTHETIC_SKELETON)
-        assert np.mean(trained.predict(windows) == number) > 0.8
+        assert np.mean(trained.features_and_classes(windows)[1] == number) > 0.8
     require_telling_styles(trained)
-
-
-def test_a_mirrored_style_is_the_same_style(trained):
-    motion = mirror(walk(9, "Runner", 10.0))
-    predicted = trained.predict(trained.windows_of(motion.positions, SYNTHETIC_SKELETON))
-    assert np.mean(predicted == STYLES.index("Runner")) > 0.8
 
 
 @pytest.mark.slow
@@ -300,7 +264,7 @@ def test_held_out_accuracy_is_the_share_of_right_answers_on_held_out_clips(packe
         right = []
         for clip in np.flatnonzero((packed.clip_style == number) & (packed.clip_split > 0)):
             windows = weak.windows_of(packed.motion(int(clip)).positions, packed.skeleton)
-            right.extend(weak.predict(windows) == number)
+            right.extend(weak.features_and_classes(windows)[1] == number)
         shares[style] = np.mean(right)
     assert weak.held_out_accuracy == pytest.approx(shares)
     assert weak.accuracy == pytest.approx(np.mean(list(shares.values())))
@@ -312,7 +276,8 @@ def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
     frames[:, 3] = 1.0  # x of the neck
     frames[30:, 0] = 1.0  # tells the second style
     task = StyleTask(
-        *("fingerprint", ("one", "other"), ClassifierConfig(2, window=10), ClassifierTraining(1, 2000, 0)),
+        ClassifierConfig(2, window=10),
+        ClassifierTraining(1, 2000, 0),
         frames=jnp.asarray(frames),
         starts=jnp.asarray([0, 5, 10, 15, 30]),
         first=jnp.asarray([0, 4]),
@@ -342,9 +307,6 @@ def test_a_style_without_clips_long_enough_is_named():
 def test_what_cannot_be_trained_is_refused(packed):
     one = dataclasses.replace(packed, primary_styles=("Runner",))
     refused("'tiny': a style classifier needs at least two styles, got 1", train_classifier, one, **TRAINING)
-    refused("unknown size of a style classifier 'windw'; did you mean 'window'", train_classifier, packed, windw=60)
-    for wrong in ({"batch_size": 1}, {"num_steps": 0}, {"widths": ()}):
-        refused("needs num_steps of 1, batch_size of 2 and widths", train_classifier, packed, **TRAINING | wrong)
 
 
 # ------------------------------------------------------------------------------------ refusals
@@ -354,7 +316,6 @@ def test_a_classifier_that_guesses_is_refused_with_accuracy_and_bar(trained):
     shares = dict(zip(STYLES, (0.5, 1.0, 0.7), strict=True))
     weak = dataclasses.replace(trained, held_out_accuracy=shares)
     refused(r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %", require_telling_styles, weak)
-    require_telling_styles(weak, bar=0.7)
     at_the_bar = dataclasses.replace(trained, held_out_accuracy={"one": ACCURACY_BAR})
     require_telling_styles(at_the_bar)
     unknown = dataclasses.replace(trained, held_out_accuracy={"one": float("nan")})
@@ -363,16 +324,7 @@ def test_a_classifier_that_guesses_is_refused_with_accuracy_and_bar(trained):
 
 def test_motion_of_another_body_is_refused(trained):
     longer = dataclasses.replace(SYNTHETIC_SKELETON, offsets=1.1 * SYNTHETIC_SKELETON.offsets)
-    refused("23 joints of 'tiny'.*bone lengths", trained.windows_of, walk().positions, longer)
-    refused("here 6 joints", trained.windows_of, np.zeros((60, 6, 3)), SKELETON)
-
-
-def test_windows_of_the_wrong_kind_are_refused(trained):
-    windows = np.zeros((3, WINDOW, NUM_CHANNELS))
-    for wrong in (windows[:, :-1], windows[..., :-1], windows[:0], np.zeros(3)):
-        refused(r"must be finite \[\.\.\., 20, 45\]", trained.features, wrong)
-    windows[2, 0, 0] = np.nan
-    refused("must be finite", trained.predict, windows)
+    refused("skeleton of 'tiny'.*bone lengths", trained.windows_of, walk().positions, longer)
     positions = synthesize("Neutral", 1.0, 0).positions[: WINDOW - 1]
     refused("does not fill a window of 20 frames", trained.windows_of, positions, trained.skeleton)
 
@@ -390,15 +342,10 @@ def test_unknown_styles_and_references_are_refused(trained):
 def test_classifier_comes_back_exactly(trained, saved):
     loaded = load_classifier(saved)
     windows = trained.windows_of(walk(seed=9).positions, SYNTHETIC_SKELETON)
-    np.testing.assert_array_equal(loaded.features(windows), trained.features(windows))
-    np.testing.assert_array_equal(loaded.predict(windows), trained.predict(windows))
+    assert same_tree(loaded.features_and_classes(windows), trained.features_and_classes(windows))
     for field in ("config", "styles", "held_out_accuracy", "record", "skeleton"):
         assert getattr(loaded, field) == getattr(trained, field)
-    for split in ("train", "held_out"):
-        for field in ("features", "styles", "clips"):
-            np.testing.assert_array_equal(
-                getattr(loaded.references[split], field), getattr(trained.references[split], field)
-            )
+    assert same_tree(loaded.references, trained.references)
 
 
 def test_broken_and_foreign_files_are_refused_by_name(saved, tmp_path):

@@ -168,19 +168,11 @@ def test_fid_and_emd_order_graded_corruptions(name):
 # ----------------------------------------------------------------------------------------- errors
 
 
-@pytest.mark.parametrize("name", CORRUPTIONS)
-def test_a_strength_out_of_range_is_refused(name):
-    for strength in (-0.1, 1.5, np.nan):
-        refused("strength must lie between 0 .* and 1", corrupt, name, wandering_motion(), strength=strength)
-
-
-def test_unknown_names_are_refused():
-    refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", wandering_motion())
-
-
 def test_motion_that_a_recipe_cannot_break_is_refused():
     whole = wandering_motion()
     alone = Motion.from_positions(whole.skeleton, whole.positions)
     for name in CORRUPTIONS:
         refused(f"the corruption '{name}' needs rotations", corrupt, name, alone)
+        refused("strength must lie between 0 .* and 1", corrupt, name, whole, strength=np.nan)
     refused("a single frame cannot be shuffled", corrupt, "shuffled frames", whole.slice(0, 1))
+    refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", whole)

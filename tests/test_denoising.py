@@ -144,11 +144,6 @@ def test_an_exact_denoiser_uses_its_input_and_not_the_level_alone(means):
     assert abs(over_levels) < 0.02 * over_noise
 
 
-def test_a_constant_uses_nothing():
-    constant = estimates_on_a_walk(lambda x, sigma: 0.0 * x + 0.3)
-    assert denoising.estimate_variances(constant) == pytest.approx((0.0, 0.0), abs=1e-20)
-
-
 def test_a_network_that_sees_sigma_alone_moves_with_it_though_it_ignores_its_input():
     # 0.5 below sigma 1 and 0.3 above: its samples are 0.5 from 2 steps on, and 0.3 at 1.
     answer = lambda x, sigma: 0.0 * x + jnp.where(sigma < 1.0, 0.5, 0.3)

@@ -182,10 +182,9 @@ def test_diversity_averages_variances_over_conditions():
 
 def test_diversity_needs_two_whole_samples():
     refused("at least 2 seeds", d.diversity, samples(1))
-    refused("num_seeds, T, J, 3", d.diversity, samples()[0])
     broken = samples()
     broken[2, 5, 1, 0] = np.nan
-    refused("finite positions", d.diversity, broken)
+    refused("needs finite", d.diversity, broken)
 
 
 # -------------------------------------------------------------------------------------- intervals
@@ -206,11 +205,6 @@ def test_interval_of_one_repeat_or_none():
     none = d.mean_and_interval([np.nan])
     assert np.isnan(none["value"]) and none["repeats"] == 0
     assert d.mean_and_interval([5.0, 5.0])["low"] == 5.0
-
-
-def test_intervals_of_what_is_no_list_are_refused():
-    refused("values must be", d.mean_and_interval, [1.0, np.inf])
-    refused("values must be", d.mean_and_interval, np.ones((2, 2)))
 
 
 def test_distances_settle_as_windows_are_added():
@@ -244,7 +238,6 @@ def test_clouds_that_are_none_are_refused(distance):
     broken[7, 3] = np.nan
     refused("features is not finite", distance, broken, good)
     refused("reference is not finite", distance, good, broken)
-    refused("features holds 1 of at least 2 windows", distance, good[:1], good)
-    refused("reference holds 0 of", distance, good, good[:0])
-    refused(r"features must be \[N, D\]", distance, good[0], good)
-    refused("6 dimensions and the reference 5: .* same classifier", distance, good, good[:, :5])
+    refused("at least 2 windows each", distance, good[:1], good)
+    refused(r"features must be \[window, feature\]", distance, good[0], good)
+    refused("of the same classifier", distance, good, good[:, :5])

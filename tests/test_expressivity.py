@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, refused
+from builders import SKELETON
 from f3amd_notebooks import expressivity as ex
 from flax import nnx
 
@@ -44,12 +44,6 @@ def test_beside_a_line_a_straight_walk_loses_nothing_and_others_cut_the_rest():
     line = np.linspace(x[0, 0], x[-1, 0], 16)[:, None]
     expected = line + ex.keep_modes(x - line, 3)
     np.testing.assert_allclose(ex.keep_modes(x, 3, "fourier beside a line"), expected, atol=1e-12)
-
-
-def test_unknown_bands_and_modes_are_refused_by_name():
-    refused("unknown band 'cosin'", ex.keep_modes, np.zeros((8, 1)), 2, "cosin")
-    refused("between 1 and 5", ex.keep_modes, np.zeros((8, 1)), 6)
-    refused("beside a line", ex.ramp_energy, 8, "fourier beside a line")
 
 
 # ------------------------------------------------------------------------------------- motion
@@ -151,18 +145,6 @@ def test_film_has_every_family_of_low_rank_exactly():
     signal = rng.standard_normal(12)
     expected = [circular(signal, kernel) for kernel in filters]
     np.testing.assert_allclose(through(base, film, signal, np.eye(5)), expected, atol=1e-4)
-
-
-def test_no_shared_kernels_do_better_than_the_share_foretold():
-    # Alternating least squares from random starts finds the bound and never goes below it.
-    rng = np.random.default_rng(2)
-    filters = rng.standard_normal((6, 9))
-    kernels = rng.standard_normal((2, 9))
-    for _ in range(500):
-        gains = filters @ np.linalg.pinv(kernels)
-        kernels = np.linalg.pinv(gains) @ filters
-    left = np.sum((filters - gains @ kernels) ** 2) / np.sum(filters**2)
-    np.testing.assert_allclose(left, ex.film_share(filters, 2), rtol=1e-6)
 
 
 def test_three_blocks_of_two_channels_have_all_eight_delays():

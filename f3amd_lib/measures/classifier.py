@@ -34,7 +34,7 @@ from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known, refuse_unknown
+from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
@@ -81,17 +81,12 @@ def classifier_joints(skeleton: Skeleton) -> tuple[int, ...]:
       ValueError: naming the joints that are missing.
     """
     names = [name.removeprefix("mixamorig:") for name in skeleton.names]
-    missing = {
-        convention: [
-            f"{name!r} ({joint})" for joint, name in zip(CLASSIFIER_JOINTS, wanted, strict=True) if name not in names
-        ]
-        for convention, wanted in _CONVENTIONS.items()
-    }
+    missing = {convention: set(wanted) - set(names) for convention, wanted in _CONVENTIONS.items()}
     nearest = min(missing, key=lambda convention: len(missing[convention]))
     if missing[nearest]:
         raise ValueError(
-            f"the style classifier finds no {', '.join(missing[nearest])} in this skeleton; by "
-            f"the names of {nearest}, the nearest convention, it has {', '.join(skeleton.names)}"
+            f"the style classifier finds no {', '.join(sorted(missing[nearest]))} in this skeleton, by the names of "
+            f"{nearest}, the nearest convention"
         )
     return tuple(names.index(name) for name in _CONVENTIONS[nearest])
 
@@ -252,7 +247,7 @@ class ReferenceFeatures(NamedTuple):
     """Features of real windows, cut side by side from the clips of a split.
 
     Attributes:
-      features: [N, feature_width], rounded to float16.
+      features: [N, feature_width], float16.
       styles: [N], index of each window's own style.
       clips: [N], number of the clip in the packed data set that it was cut from. Windows of one
         clip are alike: an interval from resampling must draw clips, not windows.
@@ -312,9 +307,8 @@ class StyleClassifier:
         """
         if skeleton != self.skeleton:
             raise ValueError(
-                f"this style classifier was trained on the {self.skeleton.num_joints} joints of "
-                f"{self.record['dataset']!r}, features of another skeleton (here {skeleton.num_joints} joints: "
-                "other names, parents or bone lengths) do not compare; train one on its data"
+                f"this style classifier was trained on the skeleton of {self.record['dataset']!r}; for another one "
+                "(other names, parents or bone lengths) train one on its data"
             )
         windows = side_by_side(classifier_frames(positions, skeleton), self.config.window)
         if windows.size == 0:
@@ -322,44 +316,22 @@ class StyleClassifier:
         return windows
 
     def features_and_classes(self, windows) -> tuple[np.ndarray, np.ndarray]:
-        """Return what `features` and `predict` return, with one run of the network for both."""
+        """Return the features of windows, for FID and EMD, and the class that each is taken for, for style coverage.
+
+        Args:
+          windows: from `windows_of`, [..., window, 45], metres.
+
+        Returns:
+          (features [..., feature_width], without unit; indices into `styles`, [...]).
+        """
         windows = np.asarray(windows, np.float32)
-        several, one = windows.shape[:-2], (self.config.window, NUM_CHANNELS)
-        if windows.shape[-2:] != one or windows.size == 0 or not np.isfinite(windows).all():
-            raise ValueError(f"windows must be finite [..., {one[0]}, {one[1]}], got {windows.shape}: see `windows_of`")
-        features, scores = _answers(self.config, self.params, self.statistics, windows.reshape(-1, *one))
+        several = windows.shape[:-2]
+        flat = windows.reshape(-1, self.config.window, NUM_CHANNELS)
+        features, scores = _answers(self.config, self.params, self.statistics, flat)
         return features.reshape(*several, -1), np.argmax(scores, axis=-1).reshape(several)
 
-    def features(self, windows) -> np.ndarray:
-        """Return the features of windows, for FID and EMD.
-
-        Args:
-          windows: from `windows_of`, [..., window, 45], metres.
-
-        Returns:
-          [..., feature_width], float32, without unit.
-
-        Raises:
-          ValueError: for another shape, or numbers not finite.
-        """
-        return self.features_and_classes(windows)[0]
-
-    def predict(self, windows) -> np.ndarray:
-        """Return the class that each window is taken for, for style coverage.
-
-        Args:
-          windows: from `windows_of`, [..., window, 45], metres.
-
-        Returns:
-          Indices into `styles`, [...].
-
-        Raises:
-          ValueError: for another shape, or numbers not finite.
-        """
-        return self.features_and_classes(windows)[1]
-
     def reference(self, split: str, style: str | None = None) -> np.ndarray:
-        """Return the features of real windows, [N, feature_width], float32.
+        """Return the features of real windows, [N, feature_width], float16.
 
         Args:
           split: "train" or "held_out".
@@ -370,12 +342,10 @@ class StyleClassifier:
         """
         check_known(split, self.references, "reference")
         known = self.references[split]
-        if style is None:
-            return known.features
-        return known.features[known.styles == self.style_index(style)]
+        return known.features if style is None else known.features[known.styles == self.style_index(style)]
 
 
-def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BAR) -> None:
+def require_telling_styles(classifier: StyleClassifier) -> None:
     """Refuse a classifier that cannot tell styles apart on clips it was not trained on.
 
     With as much real motion of each style, coverage is at least the accuracy a, so that up to 1 - a
@@ -383,20 +353,16 @@ def require_telling_styles(classifier: StyleClassifier, bar: float = ACCURACY_BA
     EMD take one style for another. The bar of 0.8 keeps that error within a fifth, and lies far
     from guessing (1 / S) and from what a whole training reaches (0.98 and more on our data sets).
 
-    Args:
-      classifier: a trained one.
-      bar: least accuracy, each style counting alike.
-
     Raises:
       ValueError: naming the accuracy, the bar and the styles that are confused most.
     """
     # Written so that an accuracy which is not a number is refused too.
-    if not classifier.accuracy >= bar:
+    if not classifier.accuracy >= ACCURACY_BAR:
         worst = sorted(classifier.held_out_accuracy.items(), key=lambda item: item[1])[:3]
         listed = ", ".join(f"{style} {100 * share:.0f} %" for style, share in worst)
         raise ValueError(
             f"the style classifier recognises {100 * classifier.accuracy:.1f} % of held-out real "
-            f"motion, under the bar of {100 * bar:.1f} % (worst: {listed}): FID, EMD and coverage "
+            f"motion, under the bar of {100 * ACCURACY_BAR:.1f} % (worst: {listed}): FID, EMD and coverage "
             "on its features would mean nothing. Train it longer or on more data"
         )
 
@@ -426,12 +392,6 @@ def _collect(
     labels, clips = np.array(chosen, np.int32).T
     positions = (packed.motion(int(clip)).positions for clip in clips)
     return [classifier_frames(each, packed.skeleton).astype(np.float32) for each in positions], labels, clips
-
-
-def _starts(lengths: list[int], window: int, stride: int) -> list[np.ndarray]:
-    """Return the first frames of each clip's windows, in the frames of all clips put end to end."""
-    clips = zip(np.cumsum(lengths), lengths, strict=True)
-    return [np.arange(end - length, end - window + 1, stride) for end, length in clips]
 
 
 @dataclass(frozen=True)
@@ -475,7 +435,7 @@ class StyleTask(Task):
     """A style classifier to train.
 
     Attributes:
-      dataset_fingerprint, styles, network, config: what decides the weights.
+      network, config: its sizes and its training.
       frames: that windows are cut from, [N, 45], metres.
       starts: first frame of each window, sorted by style, [W].
       first, count: each style's first window and number of windows, [S].
@@ -484,8 +444,6 @@ class StyleTask(Task):
 
     name = "style classifier"
 
-    dataset_fingerprint: str
-    styles: tuple[str, ...]
     network: ClassifierConfig
     config: ClassifierTraining
     frames: jax.Array
@@ -493,11 +451,6 @@ class StyleTask(Task):
     first: jax.Array
     count: jax.Array
     mirrored: jax.Array
-
-    def identity(self) -> dict:
-        """Return all that decides the weights."""
-        settings = _settings(self.styles, self.network, self.config)
-        return {"dataset_fingerprint": self.dataset_fingerprint, **settings}
 
     def init(self, key):
         """Return initial weights and batch statistics."""
@@ -536,10 +489,6 @@ def _asked_for(
         raise ValueError(
             f"data set {packed.dataset!r}: a style classifier needs at least two styles, got {len(styles)}"
         )
-    refuse_unknown(sizes, ClassifierConfig, "size of a style classifier")
-    if num_steps < 1 or batch_size < 2 or not sizes.get("widths", (1,)):
-        got = f"{num_steps}, {batch_size} and {sizes.get('widths', 'its own')}"
-        raise ValueError(f"a style classifier needs num_steps of 1, batch_size of 2 and widths at least, got {got}")
     return styles, ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
 
 
@@ -582,10 +531,12 @@ def train_classifier(
     window = config.window
     takes = {split: _collect(packed, styles, members, window) for split, members in _SPLITS.items()}
     frames, labels, _ = takes["train"]
-    starts = _starts([len(part) for part in frames], window, training.stride)
+    lengths = [len(part) for part in frames]
+    ends = zip(np.cumsum(lengths), lengths, strict=True)
+    starts = [np.arange(end - length, end - window + 1, training.stride) for end, length in ends]
     count = np.bincount(np.repeat(labels, [len(each) for each in starts]), minlength=len(styles))
     task = StyleTask(
-        packed.fingerprint, styles, config, training, frames=jnp.asarray(np.concatenate(frames)),
+        config, training, frames=jnp.asarray(np.concatenate(frames)),
         starts=jnp.asarray(np.concatenate(starts), jnp.int32), first=jnp.asarray(np.cumsum(count) - count, jnp.int32),
         count=jnp.asarray(count, jnp.int32), mirrored=jnp.asarray([style in packed.mirror_styles for style in styles]),
     )  # fmt: skip
@@ -596,7 +547,7 @@ def train_classifier(
         windows = [side_by_side(part, window) for part in frames]
         labels, clips = (np.repeat(each, [len(cut) for cut in windows]) for each in of_clips)
         features, scores = _answers(config, params, state.statistics, np.concatenate(windows))
-        references[split] = ReferenceFeatures(features.astype(np.float16).astype(np.float32), labels, clips)
+        references[split] = ReferenceFeatures(features.astype(np.float16), labels, clips)
     right = np.argmax(scores, axis=-1) == labels  # of the last split, held out
     accuracy = {style: float(right[labels == number].mean()) for number, style in enumerate(styles)}
     record = run_record(
@@ -659,10 +610,7 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
     tree = {
         "params": jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), classifier.params),
         "statistics": classifier.statistics,
-        "references": {
-            split: reference._replace(features=reference.features.astype(np.float16))._asdict()
-            for split, reference in classifier.references.items()
-        },
+        "references": {split: reference._asdict() for split, reference in classifier.references.items()},
         "offsets": jnp.asarray(skeleton.offsets, jnp.float32),
     }
     metadata = {
@@ -671,7 +619,6 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "styles": list(classifier.styles),
         **describe_skeleton(skeleton),
         "held_out_accuracy": classifier.held_out_accuracy,
-        "reference_windows": {split: len(reference.features) for split, reference in classifier.references.items()},
         "record": classifier.record,
     }
     save_tree(path, tree, metadata)
@@ -691,12 +638,8 @@ def load_classifier(path: Path) -> StyleClassifier:
 
     with errors_name(path):
         tree, metadata = load_tree(path, weights, rest=True)
-        references = {
-            split: ReferenceFeatures(**jax.tree.map(np.asarray, part))._replace(
-                features=np.asarray(part["features"], np.float32)
-            )
-            for split, part in tree["references"].items()
-        }
+        references = jax.tree.map(np.asarray, tree["references"])
+        references = {split: ReferenceFeatures(**part) for split, part in references.items()}
         return StyleClassifier(
             params=tree["params"], statistics=tree["statistics"], styles=tuple(metadata["styles"]),
             config=ClassifierConfig.from_dict(metadata["classifier"]), references=references,

@@ -23,24 +23,16 @@ from f3amd_lib.ground.arrays import finite_array
 _MOST_PIVOTS = 10_000_000  # of the network simplex; POT's own 100,000 stops short of 2,000 windows
 
 
-def _cloud(features, what: str) -> np.ndarray:
-    """Return a feature cloud as float64, or say what is wrong with it."""
-    features = np.asarray(features, dtype=np.float64)
-    if features.ndim != 2 or features.shape[1] == 0:
-        raise ValueError(f"{what} must be [N, D], one row of features a window, got {features.shape}")
-    if len(features) < 2:
-        raise ValueError(f"{what} holds {len(features)} of at least 2 windows: generate more, or pool styles")
-    return finite_array(what, features, ("window", "feature"))
-
-
-def _two_clouds(features, reference) -> tuple[np.ndarray, np.ndarray]:
-    features, reference = _cloud(features, "features"), _cloud(reference, "reference")
-    if features.shape[1] != reference.shape[1]:
+def _two_clouds(features, reference) -> list[np.ndarray]:
+    """Return feature clouds as float64, or say what is wrong with them."""
+    named = {"features": features, "reference": reference}
+    clouds = [finite_array(name, cloud, ("window", "feature")) for name, cloud in named.items()]
+    if min(map(len, clouds)) < 2 or clouds[0].shape[1] != clouds[1].shape[1]:
         raise ValueError(
-            f"features have {features.shape[1]} dimensions and the reference "
-            f"{reference.shape[1]}: both must come from the same classifier"
+            f"features {clouds[0].shape} and reference {clouds[1].shape} must be of the same classifier, with at "
+            "least 2 windows each: generate more, or pool styles"
         )
-    return features, reference
+    return clouds
 
 
 def draw_per_style(clouds: Mapping, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -245,12 +237,8 @@ def diversity_variance(positions) -> float:
     fixes.
     """
     positions = np.asarray(positions, dtype=np.float64)
-    if positions.ndim not in (4, 5) or positions.shape[-1] != 3 or 0 in positions.shape:
-        raise ValueError(
-            f"positions must be [num_seeds, T, J, 3] or [num_conditions, num_seeds, T, J, 3], got {positions.shape}"
-        )
-    if positions.shape[-4] < 2 or not np.all(np.isfinite(positions)):
-        raise ValueError("diversity needs finite positions of samples of at least 2 seeds")
+    if positions.ndim < 4 or positions.shape[-4] < 2 or not np.all(np.isfinite(positions)):
+        raise ValueError(f"diversity needs finite [..., num_seeds, T, J, 3] of at least 2 seeds, got {positions.shape}")
     relative = positions - positions[..., :1, :]
     return float(relative.var(axis=-4, ddof=1).sum(axis=-1).mean())
 

@@ -40,15 +40,8 @@ def checked_positions(positions, least: int = 1) -> np.ndarray:
     return positions
 
 
-def _checked_window(window: int, least: int = 1) -> int:
-    if int(window) != window or window < least:
-        raise ValueError(f"window must be a whole number of frames, {least} or more, got {window}")
-    return int(window)
-
-
 def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
     """Return the change of [..., T, C] since each whole window's first frame, [..., K, window, C]."""
-    window = _checked_window(window)
     count = signal.shape[-2] // window
     if count < 1:
         raise ValueError(f"{signal.shape[-2]} frames do not fill a window of {window}")
@@ -57,31 +50,27 @@ def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
     return windows - windows[..., :1, :]
 
 
-def _checked_target(target, num_frames: int, width: int) -> np.ndarray:
-    """Return a path's positions (width 2) or yaws (width 1) as float64, [..., T, width]."""
-    target = np.asarray(target, dtype=np.float64)
-    if target.ndim < 2 or target.shape[-2:] != (num_frames, width):
+def _checked_signal(what: str, signal, num_frames: int, width: int) -> np.ndarray:
+    """Return positions on the ground (width 2) or yaws (width 1) as float64, [..., T, width]."""
+    signal = np.asarray(signal, dtype=np.float64)
+    if signal.ndim < 2 or signal.shape[-2:] != (num_frames, width) or not np.all(np.isfinite(signal)):
         raise ValueError(
-            f"path must be a RootPath of {num_frames} frames or [..., {num_frames}, {width}], got {target.shape}"
+            f"{what} must be a RootPath of {num_frames} frames or finite [..., {num_frames}, {width}], "
+            f"got {signal.shape}"
         )
-    if not np.all(np.isfinite(target)):
-        raise ValueError(f"path is not finite at index {np.argwhere(~np.isfinite(target))[0]}")
-    return target
+    return signal
 
 
 def _root_and_target(positions, path, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the root on the ground and where it was wanted, [..., T, 2] each."""
     root = checked_positions(positions, least)[..., 0, [0, 2]]
-    return root, _checked_target(path.position if isinstance(path, RootPath) else path, root.shape[-2], 2)
+    return root, _checked_signal("path", getattr(path, "position", path), root.shape[-2], 2)
 
 
 def _shown_and_wanted_yaw(yaw, path) -> tuple[np.ndarray, np.ndarray]:
     """Return the facing and the wanted facing, [..., T, 1] each."""
-    yaw = np.asarray(yaw, dtype=np.float64)[..., None]
-    if not np.all(np.isfinite(yaw)):
-        raise ValueError("yaw is not finite")
-    wanted = path.yaw if isinstance(path, RootPath) else np.asarray(path, dtype=np.float64)
-    return yaw, _checked_target(wanted[..., None], yaw.shape[-2], 1)
+    shown, wanted = np.asarray(yaw)[..., None], np.asarray(getattr(path, "yaw", path))[..., None]
+    return _checked_signal("yaw", shown, shown.shape[-2], 1), _checked_signal("path", wanted, shown.shape[-2], 1)
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray):
@@ -122,7 +111,6 @@ def seam_frames(num_frames: int, window: int) -> np.ndarray:
     Raises:
       ValueError: if there is no boundary between two windows.
     """
-    window = _checked_window(window)
     frames = np.arange(window, num_frames, window)
     if len(frames) == 0:
         raise ValueError(
@@ -314,7 +302,9 @@ def ird_excess(positions, window: int):
     Source: ours. Eq. 10 compares with standing still; this compares with going on.
     """
     positions = checked_positions(positions)
-    seams = seam_frames(positions.shape[-3], _checked_window(window, least=2))
+    if window < 2:
+        raise ValueError(f"window must be 2 frames or more, got {window}")
+    seams = seam_frames(positions.shape[-3], window)
     before, last, first = (positions[..., seams - back, :, :] for back in (2, 1, 0))
     return 100.0 * np.linalg.norm(first - 2.0 * last + before, axis=-1).mean(axis=(-2, -1))
 
