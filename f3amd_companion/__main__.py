@@ -29,7 +29,6 @@ UNFINISHED = 3
 """Exit status of `train`, `measure` and `campaign` where the minutes were over first; a later call goes on."""
 
 Repeatable = UseAppendAction[tuple[str, ...]]
-Required = Annotated[str, tyro.conf.arg(metavar="NAME")]
 
 
 def _given(**options) -> dict:
@@ -48,6 +47,26 @@ def _use_fast_flags() -> None:
 
     if "XLA_FLAGS" not in os.environ:
         os.environ["XLA_FLAGS"] = fast_xla_flags()
+
+
+def _check_free(targets: Sequence[Path], overwrite: bool) -> None:
+    """Raise ValueError if one of the files is there and may not be replaced."""
+    taken = [str(target) for target in targets if target.exists()]
+    if taken and not overwrite:
+        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
+
+
+def _say_model(trained):
+    """Say what a model is, and return it."""
+    log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
+    log.info("terms        %s", trained.record.get("dataset_licence"))
+    return trained
+
+
+def _say_written(*files: Path) -> None:
+    """Name each file that was written."""
+    for file in files:
+        log.info("wrote        %s", file)
 
 
 @dataclass(frozen=True)
@@ -101,22 +120,13 @@ class Model:
         from f3amd_lib.training.checkpoints import load_model
         from f3amd_lib.training.pipeline import find_model
 
-        trained = load_model(self.weights or find_model(self.data))
-        log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
-        log.info("terms        %s", trained.record.get("dataset_licence"))
-        return trained
+        return _say_model(load_model(self.weights or find_model(self.data)))
 
     def generator(self):
         """Return what animates characters with the model."""
         from f3amd_lib.rollout.rollout import MotionGenerator
 
         return MotionGenerator(self.load(), self.steps, sampler=self.sampler)
-
-    def check_free(self, *targets: Path) -> None:
-        """Raise ValueError if one of the files is there and may not be replaced."""
-        taken = [str(target) for target in targets if target.exists()]
-        if taken and not self.overwrite:
-            raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
 
 
 def data(motion: Data) -> None:
@@ -125,18 +135,11 @@ def data(motion: Data) -> None:
 
     packed = motion.open()[0].packed
     splits = packed.clip_split.tolist()
-    facts = {
-        "data set": packed.dataset,
-        "terms": packed.licence,
-        "credit": packed.credit,
-        "clips": f"{packed.num_clips} ({len(packed.skipped)} left out)",
-        "frames": f"{packed.num_frames} at 30 fps",
-        "joints": packed.skeleton.num_joints,
-        "styles": ", ".join(packed.styles),
-        "split": ", ".join(f"{splits.count(number)} {split}" for number, split in enumerate(SPLITS)),
-    }
-    for name, fact in facts.items():
-        log.info("%-12s %s", name, fact)
+    split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(SPLITS))
+    log.info("data set     %s, %s; %s", packed.dataset, packed.licence, packed.credit)
+    log.info("clips        %d (%d left out): %s", packed.num_clips, len(packed.skipped), split)
+    log.info("frames       %d at 30 fps, of %d joints", packed.num_frames, packed.skeleton.num_joints)
+    log.info("styles       %s", ", ".join(packed.styles))
 
 
 def dataset(
@@ -156,14 +159,12 @@ def dataset(
 
     opened = sources.open_dataset(data, path=source)
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
-    folder = captioned_folder.write_humanml3d(out, written)
+    _say_written(captioned_folder.write_humanml3d(out, written))
     for clip, reason in written.skipped:
         log.info("left out     %s: %s", clip, reason)
-    joints, counts = written.skeleton.num_joints, [f"{written.splits.count(split)} {split}" for split in sources.SPLITS]
-    log.info("split        %s", ", ".join(counts))
-    log.info("joints       %d, so vectors of %d numbers", joints, 12 * joints - 1)
+    split = ", ".join(f"{written.splits.count(split)} {split}" for split in sources.SPLITS)
+    log.info("clips        %d of %d joints: %s", written.num_clips, written.skeleton.num_joints, split)
     log.info("terms        %s", written.licence)
-    log.info("wrote        %s: %d clips", folder, written.num_clips)
 
 
 def presets(
@@ -213,29 +214,27 @@ def train(
     from f3amd_companion.measuring.learning_curves import train_family
     from f3amd_lib.training import parallel, pipeline
 
-    if teacher is not None and not (preset and all(name.startswith(("MotionPCM", "MotionLCM")) for name in preset)):
+    of_latents = [name for name in preset if name.startswith(("MotionPCM", "MotionLCM"))]
+    if teacher is not None and not (preset and set(of_latents) == set(preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
-    together = (coordinator, processes, process)
-    named = any(value is not None for value in together)
-    if any(name == "judge" or "ACMDM" in name or name.startswith(("MotionPCM", "MotionLCM")) for name in preset):
-        if all_devices or cluster or named:
+    together = coordinator, processes, process
+    shared = cluster or together != (None, None, None)
+    if of_latents or any(name == "judge" or "ACMDM" in name for name in preset):
+        if all_devices or shared:
             what = "--all-devices, --processes, --process, --coordinator and --cluster"
             raise ValueError(f"models of captioned motion train on one device: leave {what} out")
         return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
-    if cluster and named:
+    if cluster and together != (None, None, None):
         raise ValueError("--cluster finds the processes itself: leave the three others out")
-    if cluster or named:
+    if shared:
         parallel.join_processes(*together)
     prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
-    budget = None if minutes is None else 60.0 * minutes
-    mesh = parallel.all_devices() if cluster or named or all_devices else None
-    runs = train_family(prepared, profile, list(preset) or [profile.preset], folder=out, budget_s=budget, mesh=mesh)
-    status = 0
-    for name, state in runs:
+    how = {"budget_s": None if minutes is None else 60.0 * minutes, "folder": out}
+    mesh, state = parallel.all_devices() if shared or all_devices else None, "finished"
+    for name, state in train_family(prepared, profile, preset or [profile.preset], mesh=mesh, **how):
         files = pipeline.model_files(profile, name, folder=out)
         log.info("%-12s %s", name, files.state if state == "unfinished" else files.model)
-        status = UNFINISHED if state == "unfinished" else status
-    return status
+    return UNFINISHED if state == "unfinished" else 0
 
 
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
@@ -247,14 +246,14 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     for name in names:
         if name != text_models.JUDGE:
             train_stage.stage_of(name)  # refuses those that need no captions
-    profile = motion.numbers(train_steps=steps, batch_size=batch_size, seed=seed)
+    own, stop_at = {"batch_size": batch_size, "seed": seed}, _stop_at(minutes)
+    profile = motion.numbers(train_steps=steps, **own)
     data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
-    stop_at = _stop_at(minutes)
     how = {"window": motion.window, "batch_size": batch_size, "folder": out, "teacher": teacher, "stop_at": stop_at}
     for name in names:
         files = text_models.text_model_files(profile, name, folder=out)
         if name == text_models.JUDGE:
-            training = text_judge.EvaluatorTraining(**_given(num_steps=steps, batch_size=batch_size, seed=seed))
+            training = text_judge.EvaluatorTraining(**_given(num_steps=steps, **own))
             done = text_judge.train_judge(data, encoder, training, files=files, stop_at=stop_at)
         else:
             done = train_stage.train_stage(data, encoder, profile, name, **how)
@@ -265,9 +264,8 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
 
 
 def rollout(
-    style: Required, model: Model, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0,
-    speed: float = 1.2, blend: int = 4, slide: bool = False, raw: bool = False, format: str = "bvh",
-    start: Path | None = None, out: Path = Path("out"),
+    style: str, model: Model, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0, speed: float = 1.2,
+    raw: bool = False, format: str = "bvh", start: Path | None = None, out: Path = Path("out"),
 ) -> None:  # fmt: skip
     """Animate one character: motion, film strip, GIF (its first 12 s), player.
 
@@ -277,46 +275,43 @@ def rollout(
       seed: of path and noise.
       seconds: length of a named path; a CSV has its own.
       speed: of a named path, m/s; a CSV has its own.
-      blend: so many frames after each window boundary.
-      slide: do not hold feet where they stand.
-      raw: as the network made it: no blending, no held feet.
+      raw: as the network made it: seams are not blended (over 4 frames), feet not held where they stand.
       format: of the motion: bvh, glb (glTF with a body) or csv; several with commas between.
       start: a BVH file to go on from: its last frames are the history; another humanoid's are retargeted.
       out: folder to write to.
     """
-    from f3amd_companion.serving.player import rollout_scene
+    from f3amd_companion.serving import player
+    from f3amd_companion.serving.foot_locking import lock_rollout
+    from f3amd_lib.motion.bvh import read_bvh
     from f3amd_lib.motion.root_paths import named_path, read_path_csv
+    from f3amd_lib.rollout.start_poses import start_history
 
-    name = f"{style}_{Path(path).stem}_seed{seed}"
-    formats = _motion_formats(format)
-    targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *formats)]
-    model.check_free(*targets)
+    named, history = f"{style}_{Path(path).stem}_seed{seed}", None
+    targets = _targets(out, named, format, model.overwrite)
     drawn = path.lower().endswith(".csv")
     line = read_path_csv(path) if drawn else named_path(path, _num_frames(seconds), speed=speed, seed=seed)
     generator = model.generator()
     trained = generator.trained
-    history = None
     if start is not None:
-        from f3amd_lib.motion.bvh import read_bvh
-        from f3amd_lib.rollout.start_poses import start_history
-
         history, note = start_history(trained, read_bvh(start), line)
         log.info("start        %s", note)
-    blend, lock = (0, False) if raw else (blend, not slide and _has_legs(trained.skeleton))
-    made = generator.rollout(line, style, seed=seed, history=history, blend_frames=blend)
-    if lock:
-        from f3amd_companion.serving.foot_locking import lock_rollout
-
-        made = lock_rollout(made)
+    made = generator.rollout(line, style, seed=seed, history=history, blend_frames=0 if raw else 4)
+    made = made if raw else _held(lock_rollout, made)
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
     title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
-    _write_shown(targets, rollout_scene(made, title), trained, overwrite=model.overwrite)
+    _write_shown(targets, player.rollout_scene(made, title), trained)
 
 
-def _write_shown(targets, scene, trained, *, overwrite: bool) -> None:
+def _targets(folder: Path, name: str, format: str, overwrite: bool) -> list[Path]:
+    """Return the files that `_write_shown` writes; ValueError where one is there already and may not be replaced."""
+    targets = [folder / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
+    _check_free(targets, overwrite)
+    return targets
+
+
+def _write_shown(targets, scene, trained) -> None:
     """Write a scene of one character as GIF (its first 12 s), player page with film strip, and in each format asked."""
-    from f3amd_companion.serving.motion_files import write_motion
-    from f3amd_companion.serving.player import write_player
+    from f3amd_companion.serving import motion_files, player
     from f3amd_lib.drawing.pictures import write_gif
     from f3amd_lib.rollout.generated import generated_credit
 
@@ -326,11 +321,10 @@ def _write_shown(targets, scene, trained, *, overwrite: bool) -> None:
     credit = generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
     every = max(1, round(motion.fps / 10))
     write_gif(gif, motion, target_paths=character.path, titles=[scene.title], every=every, max_seconds=12.0)
-    write_player(page, scene, credit=credit)  # the strip has its name
+    player.write_player(page, scene, credit=credit)  # the strip has its name
     for path in files:
-        write_motion(path, motion, credit=credit, overwrite=overwrite)
-    for target in targets:
-        log.info("wrote        %s", target)
+        motion_files.write_motion(path, motion, credit=credit, overwrite=True)
+    _say_written(*targets)
 
 
 def text(
@@ -366,35 +360,27 @@ def text(
     import numpy as np
 
     from f3amd_companion.serving import player
-    from f3amd_lib.ground.trees import file_kind
     from f3amd_lib.motion import inverse_kinematics, skeleton
     from f3amd_lib.text.data import text_encoders
     from f3amd_lib.text.sampling import captioned_motion
     from f3amd_lib.text.stages import text_models
 
-    captions = [caption, *then]
-    text_encoders.check_captions(captions)
-    seed = checked_seed(seed)
+    captions, seed = [caption, *then], checked_seed(seed)
     captioned_motion.check_solver(steps, guidance)
-    if weights is None:
-        latent = model is not None and (model.lower() == "motionpcm" or text_models.is_latent_preset(model))
-    else:
-        latent = file_kind(weights) == text_models.LatentModel.kind  # the file itself says whose it is
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
-    if latent and (then or control):
-        raise ValueError(f"{model or weights} makes whole motions of one caption: leave out --then and --control")
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
-    targets = [out / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
-    Model(overwrite=overwrite).check_free(*targets)
-    preset = model or (captioned_motion.STREAM_PRESET if then else None)
-    found = weights or text_models.find_text_model(data, preset, control=control is not None, num_steps=steps)
-    trained = text_models.load_text_model(found)
-    log.info("model        %s, trained on %s", trained.name, trained.record.get("dataset"))
-    log.info("terms        %s", trained.record.get("dataset_licence"))
+    targets = _targets(out, name, format, overwrite)
+    if weights is None:
+        preset = model or (captioned_motion.STREAM_PRESET if then else None)
+        latent = model and text_models.is_latent_preset(text_models.named_model(model, steps))
+        weights = text_models.find_text_model(data, preset, control=bool(control and not latent), num_steps=steps)
+    trained = _say_model(text_models.load_text_model(weights))
+    if isinstance(trained, text_models.LatentModel) and (then or control):
+        raise ValueError(f"{trained.name} makes whole motions of one caption: leave out --then and --control")
     encoder = text_encoders.load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
     pooled = captioned_motion.told_captions(trained, encoder, captions, any_words=any_words)
-    key, how, points, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, None, ()
+    key, how, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, ()
     if then or getattr(trained, "starts", ()):
         windows = captioned_motion.told_windows(trained, seconds)
         starts = text_encoders.embed_captions(list(trained.starts), encoder).pooled
@@ -411,35 +397,31 @@ def text(
         positions = captioned_motion.draw_motions(trained, pooled, num_frames, key, **how)[0]
     title = ", then ".join(captions)
     made = skeleton.Motion.from_positions(trained.skeleton, positions, trained.fps, title)
-    motion, residual = inverse_kinematics.fitted(made)
-    log.info("bones        joints moved by %.1f cm on average, %.1f cm at most, so that bones keep their lengths",
-             100 * residual.mean(), 100 * residual.max())  # fmt: skip
-    if points is not None:
-        missed = 100 * np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
-        log.info("control      %s is %.1f cm away on average, %.1f cm at most", joint, missed.mean(), missed.max())
+    motion, moved = inverse_kinematics.fitted(made)
+    far = lambda metres: f"{100 * metres.mean():.1f} cm on average, {100 * metres.max():.1f} cm at most"
+    log.info("bones        joints moved by %s, so that bones keep their lengths", far(moved))
+    if control is not None:
+        missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
+        log.info("control      %s is away by %s", joint, far(missed))
     scene = player.Scene([player.Character(motion, name=name)], title=title, boundaries=boundaries)
-    _write_shown(targets, scene, trained, overwrite=overwrite)
+    _write_shown(targets, scene, trained)
 
 
 def _motion_formats(given: str) -> list[str]:
-    """Return the file endings of `--format bvh,glb`; ValueError names one that is not known."""
-    wanted = list(dict.fromkeys(f".{name.strip().lower()}" for name in given.split(",")))
-    unknown = [name for name in wanted if name not in (".bvh", ".glb", ".csv")]
-    if unknown:
+    """Return the file endings of `--format bvh,glb`; ValueError for one that is not known."""
+    endings = [f".{name.strip().lower()}" for name in given.split(",")]
+    if not {*endings} <= {".bvh", ".glb", ".csv"}:
         raise ValueError(f"--format {given}: give bvh, glb or csv, or several with commas between")
-    return wanted
+    return endings
 
 
-def _has_legs(skeleton) -> bool:
-    """Say whether feet can be held: legs of hip, knee, ankle and toe."""
-    from f3amd_companion.serving.foot_locking import leg_chains
-
+def _held(lock, made):
+    """Return a motion or a rollout with its feet held where they stand, if its legs are hip, knee, ankle and toe."""
     try:
-        leg_chains(skeleton)
+        return lock(made)
     except ValueError as error:
         log.info("feet         slide as they come: %s", error)
-        return False
-    return True
+        return made
 
 
 def _num_frames(seconds: float) -> int:
@@ -474,43 +456,35 @@ def crowd(
     if plan is not None and len(plan) > 1:
         raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
     drawn = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")] if pictures else []
-    formats = _motion_formats(format) if format else []
-    motions = out.with_name(f"{out.name}_motions")
+    formats, motions = _motion_formats(format) if format else [], out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
-    model.check_free(*drawn, *([motions] if formats else []))
+    _check_free([*drawn, *([motions] if formats else [])], model.overwrite)
     generator = model.generator()
-    started = time.perf_counter()
     made = generate_crowd(
         generator, characters, num_frames, out, styles=list(style) or None,
         min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
         overwrite=model.overwrite, progress=True,
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
-    log.info("took         %.0f s", time.perf_counter() - started)
-    window = None if raw else generator.trained.config.window
-    lock = bool(drawn or formats) and not raw and _has_legs(made.skeleton)
-    shown = lambda character: _finished(made.motion(character), window, lock)
+    window = generator.trained.config.window
+    shown = made.motion if raw else lambda character: _finished(made.motion(character), window)
     credit = generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
     if formats:  # the longer part first: where it is stopped, nothing stands in the way of the same command
         _crowd_motions(made, shown, credit, motions, formats)
-        log.info("wrote        %s: everybody as %s", motions, ", ".join(formats))
+        _say_written(motions)
     if pictures:
         _crowd_pictures(made, shown, credit, *drawn)
-    for file in drawn:
-        log.info("wrote        %s", file)
+        _say_written(*drawn)
 
 
-def _finished(motion, window: int | None, lock: bool):
-    """Blend a motion's seams over 4 frames, unless `window` is None, and hold its feet, as where people look."""
+def _finished(motion, window: int):
+    """Blend a motion's seams over 4 frames and hold its feet, as where people look."""
     from f3amd_companion.serving.foot_locking import lock_feet
     from f3amd_lib.data.features import motion_from_frames, world_frames
     from f3amd_lib.rollout.blending import blend_seams
 
-    if window is None:
-        return motion
     frames = blend_seams(world_frames(motion), window, min(4, window))
-    motion = motion_from_frames(motion.skeleton, frames, motion.fps, motion.name)
-    return lock_feet(motion) if lock else motion
+    return _held(lock_feet, motion_from_frames(motion.skeleton, frames, motion.fps, motion.name))
 
 
 def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
@@ -562,9 +536,8 @@ def export(
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
         trained = (model.weights and onnx_export.load_text_or_latent(model.weights)) or model.load()
-        folder = onnx_export.export_onnx(
-            trained, out, num_steps=model.steps, batch=characters, weights=stored, overwrite=model.overwrite
-        )
+        how = {"batch": characters, "weights": stored}
+        made = onnx_export.export_onnx(trained, out, num_steps=model.steps, overwrite=model.overwrite, **how)
     else:
         from f3amd_companion.serving.export import export_model
 
@@ -572,12 +545,9 @@ def export(
             target = ("llvm-cpu",)
         elif not target:
             log.info("not compiled for this processor, since IREE is missing: make bench-tools")
-        folder = export_model(
-            model.load(), out, num_steps=model.steps, batch=1 if characters is None else characters,
-            sampler=model.sampler, targets=target, overwrite=model.overwrite,
-        )  # fmt: skip
-    for file in sorted(folder.iterdir()):
-        log.info("wrote        %s (%.1f MB)", file, file.stat().st_size / 1e6)
+        how = {"batch": 1 if characters is None else characters, "sampler": model.sampler, "targets": target}
+        made = export_model(model.load(), out, num_steps=model.steps, overwrite=model.overwrite, **how)
+    _say_written(*sorted(made.iterdir()))
 
 
 def steer(model: Model, stored: str = "int8", runtime: str = "wasm", out: Path = Path("out/steer.html")) -> None:
@@ -590,9 +560,8 @@ def steer(model: Model, stored: str = "int8", runtime: str = "wasm", out: Path =
     """
     from f3amd_companion.serving.steer import write_steer
 
-    model.check_free(out)
-    page = write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime)
-    log.info("wrote        %s (%.1f MB): open it in a browser", page, page.stat().st_size / 1e6)
+    _check_free([out], model.overwrite)
+    _say_written(write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime))
 
 
 def bench(
@@ -616,17 +585,16 @@ def bench(
     suites = measurements.check_suites(suite)
     prepared, profile = motion.open()
     if suites or not (training or parts):
-        path = measurements.measure_synthesis_time(
-            prepared, profile, suites, characters=characters or None, again=again
-        )
-        every = path.with_name("synthesis_ways.csv")
+        how = {"characters": characters or None, "again": again}
+        table = measurements.measure_synthesis_time(prepared, profile, suites, **how)
+        every = table.with_name("synthesis_ways.csv")
         bars = speed_tables.speed_bars(read_table(every)[0], suite="bars" if suites == ["bars"] else "main")
         log.info("\n%s\n", markdown_table(bars, digits=3))
-        log.info("all          %s\nfastest      %s", every, path)
+        _say_written(every, table)
     if parts:
-        log.info("parts        %s", measurements.measure_round_parts(prepared, profile))
+        _say_written(measurements.measure_round_parts(prepared, profile))
     if training:
-        log.info("training     %s", measurements.measure_training_time(prepared, profile, again=again))
+        _say_written(measurements.measure_training_time(prepared, profile, again=again))
 
 
 def measure(
@@ -646,46 +614,32 @@ def measure(
     from f3amd_companion.measuring.measure import MEASUREMENTS
     from f3amd_companion.measuring.text_tables import TEXT_MEASUREMENTS
     from f3amd_lib.networks import presets
+    from f3amd_lib.text.data.text_encoders import load_text_encoder
+    from f3amd_lib.text.stages.text_models import open_text_motions
 
     for name in names:
         check_known(name, [*MEASUREMENTS, *TEXT_MEASUREMENTS], "measurement")
     if of_text := [name for name in names if name in TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
-        return _measure_text(of_text, motion, model, minutes)
-    models = [presets.find_preset(name).name for name in model] or None
-    prepared, profile = motion.open()
-    other_window = profile.window != motion.numbers().window
-    of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
-    if (other_window or published) and not (names and set(names) <= of_windows):
-        raise ValueError("--window is for quality, trained and walking, --published for quality: measure these by name")
-    for name in names or MEASUREMENTS:
-        with _measuring(name, profile):
-            log.info("%-12s %s", name, MEASUREMENTS[name](prepared, profile, models, **_given(published=published)))
-    return 0
-
-
-def _measuring(name: str, profile):
-    """Hold the lock of a measurement's table."""
-    return locked(results_dir(profile.dataset, profile.name) / "records" / f".{name}.lock", f"measuring {name}")
-
-
-def _measure_text(names, motion: Data, models, minutes) -> int:
-    """Measure text to motion; what a table's rows need is trained on the way."""
-    from f3amd_companion.measuring.text_tables import TEXT_MEASUREMENTS
-    from f3amd_lib.text.data.text_encoders import load_text_encoder
-    from f3amd_lib.text.stages.text_models import open_text_motions
-
-    profile, encoder = motion.numbers(), load_text_encoder()
-    data = open_text_motions(motion.data, motion.source)
-    stop_at = _stop_at(minutes)
-    for name in names:
-        with _measuring(name, profile):
-            table = TEXT_MEASUREMENTS[name](data, encoder, profile, models=models, stop_at=stop_at)
+        profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
+        given = open_text_motions(motion.data, motion.source), load_text_encoder(), profile
+        measurements = TEXT_MEASUREMENTS
+    else:
+        models = [presets.find_preset(name).name for name in model] or None
+        prepared, profile = motion.open()
+        of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
+        if (profile.window != motion.numbers().window or published) and not (names and {*names} <= of_windows):
+            what = "--window is for quality, trained and walking, --published for quality"
+            raise ValueError(f"{what}: measure these by name")
+        given, how, measurements = (prepared, profile, models), _given(published=published), MEASUREMENTS
+    for name in names or measurements:
+        lock = results_dir(profile.dataset, profile.name) / "records" / f".{name}.lock"
+        with locked(lock, f"measuring {name}"):
+            table = measurements[name](*given, **how)
+        log.info("%-12s %s", name, table or "unfinished: call again to go on")
         if table is None:
-            log.info("%-12s unfinished: call again to go on", name)
             return UNFINISHED
-        log.info("%-12s %s", name, table)
     return 0
 
 
@@ -710,25 +664,20 @@ def campaign(
       package: train this package of papers/f3amd/gpu_plan.toml and keep its weights, unmeasured, for a GPU.
       measure: measure the weights of a package that lie in the folder, and train nothing.
     """
-    stop_at, timed = _stop_at(minutes), ()
+    stop_at = _stop_at(minutes)
     if times:
         _use_fast_flags()
-        from f3amd_companion.speed.measurements import measure_synthesis_time, measure_training_time
-
-        timed = (measure_synthesis_time, measure_training_time)
     from f3amd_companion.measuring import campaign as long_queue
-    from f3amd_companion.measuring.campaign import check_precision, chosen, longest_first
     from f3amd_companion.measuring.measure import protocol_of
+    from f3amd_companion.speed.measurements import measure_synthesis_time, measure_training_time
     from f3amd_lib.data.packed import load_packed
     from f3amd_lib.training.pipeline import PreparedData
 
     check_known(queue, long_queue.QUEUES, "queue")
-    if package is None:
-        snapshots = long_queue.queue(long_queue.QUEUES[queue])
-    else:
-        snapshots, queue = long_queue.queue(long_queue.GPU_PLAN, package), "readings"
-    snapshots = chosen(longest_first(snapshots) if times else snapshots, only)
-    check_precision(precision)
+    long_queue.check_precision(precision)
+    place, table = (long_queue.QUEUES[queue], queue) if package is None else (long_queue.GPU_PLAN, "readings")
+    snapshots = long_queue.queue(place, package)
+    snapshots = long_queue.chosen(long_queue.longest_first(snapshots) if times else snapshots, only)
     if packed is None:
         prepared, profile = motion.open()
     else:
@@ -737,19 +686,19 @@ def campaign(
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
     how = {"snapshots": snapshots, "batch_size": batch_size, "precision": precision, "stop_at": stop_at}
     with locked(folder / ".campaign.lock", "running the campaign"):
-        for measure_time in timed:
-            if (table := measure_time(prepared, profile, stop_at=stop_at)) is None:
-                log.info("%-12s times", "unfinished")
+        for measure_time in (measure_synthesis_time, measure_training_time) if times else ():
+            timed = measure_time(prepared, profile, stop_at=stop_at)
+            log.info("%-12s %s", "times", timed or "unfinished")
+            if timed is None:
                 return UNFINISHED
-            log.info("%-12s %s", "times", table)
         if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
             return UNFINISHED
         if package is not None and not measure:
             legs = long_queue.train_snapshots(prepared, profile, folder=folder, **how)
         else:
-            classifier, protocol, _ = protocol_of(prepared, profile, "campaign")
-            how |= {"table": queue, "found_alone": measure}
-            legs = long_queue.run_campaign(prepared, profile, classifier, protocol, folder=folder, **how)
+            judges = protocol_of(prepared, profile, "campaign")[:2]
+            how |= {"folder": folder, "table": table, "found_alone": measure}
+            legs = long_queue.run_campaign(prepared, profile, *judges, **how)
         for name, windows, state in legs:
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0
@@ -793,22 +742,20 @@ def sweep(
         if engine.CAMPAIGN in names or not THROUGH_CLASSIFIER.isdisjoint(names):  # trained once, before the legs
             measure.protocol_of(prepared, profile, "sweep")
         record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
-        costs, ended = runner.Records(results / "records", record, {"sweep": ["leg"]}), {}
+        costs, finished = runner.Records(results / "records", record, {"sweep": ["leg"]}), []
         try:
-            for leg, told in engine.run_sweep(work, legs, workers=workers, scheduler=scheduler):
-                ended[leg.name] = told["state"]
-                log.info("%s, %d of %d: %s", leg.name, len(ended), len(legs), told["state"])
+            for number, (leg, told) in enumerate(engine.run_sweep(work, legs, workers=workers, scheduler=scheduler), 1):
+                log.info("%s, %d of %d: %s", leg.name, number, len(legs), told["state"])
+                finished += [leg] if told["state"].startswith("done") else []
                 if told["state"] == "done":
                     cost = {key: told[key] for key in ("seconds", "state_bytes", "device")}
                     costs.put("sweep", {"leg": leg.name}, pd.DataFrame([cost | {"model": leg.preset}]))
         finally:
-            finished = [leg for leg in legs if ended.get(leg.name, "").startswith("done")]
-            for table in engine.gather(work, finished):
-                log.info("wrote        %s", table)
+            _say_written(*engine.gather(work, sorted(finished, key=legs.index)))
     return 0 if len(finished) == len(legs) else 1
 
 
-def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> int:
+def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable = (), set: Repeatable = ()) -> None:
     """Run the numbered notebooks in order; results go under paper_figures/.
 
     Args:
@@ -820,24 +767,14 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
     from f3amd_companion import reproduce
 
     parameters = dict(map(reproduce.parse_assignment, set))
-    logging.getLogger("papermill").setLevel(logging.WARNING)  # at INFO it names each notebook twice
     reproduce.set_folders(profile)
-    try:
-        summary = reproduce.reproduce(data, profile, only=only, parameters=parameters, say=log.info)
-    except reproduce.NotebookFailed as error:
-        print(f"Stopped: {error}", file=sys.stderr)
-        return 1
-    minutes = summary["seconds"].sum() / 60
-    log.info(
-        "%d notebooks finished in %.1f minutes (data %s, profile %s). To open first:",
-        len(summary), minutes, data, profile,
-    )  # fmt: skip
+    took = reproduce.reproduce(data, profile, only=only, parameters=parameters, say=log.info)["seconds"]
+    log.info("%d notebooks in %.1f minutes (data %s, profile %s)", len(took), took.sum() / 60, data, profile)
     for line in reproduce.what_to_open(results_dir(data, profile)):
         log.info("  %s", line)
-    return 0
 
 
-def course(only: Repeatable = ()) -> int:
+def course(only: Repeatable = ()) -> None:
     """Run the course on samplers, notebooks/course/; it needs no data, and copies go to runs/course/.
 
     Args:
@@ -845,13 +782,7 @@ def course(only: Repeatable = ()) -> int:
     """
     from f3amd_companion import reproduce
 
-    logging.getLogger("papermill").setLevel(logging.WARNING)
-    try:
-        reproduce.run_course(only, say=log.info)
-    except reproduce.NotebookFailed as error:
-        print(f"Stopped: {error}", file=sys.stderr)
-        return 1
-    return 0
+    reproduce.run_course(only, say=log.info)
 
 
 def claims(accept: bool = False, paper: str | None = None) -> int:
@@ -884,9 +815,8 @@ COMMANDS = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; what the user has to mend ends with one line and status 2."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    for noisy in ("jax", "absl", "matplotlib", "PIL"):
-        logging.getLogger(noisy).setLevel(logging.WARNING)
+    logging.basicConfig(format="%(message)s", stream=sys.stdout)  # of others' logs, warnings
+    log.setLevel(logging.INFO)
     os.environ.setdefault("MPLBACKEND", "Agg")
     # JAX multiplies in tf32 on a GPU, with 10 bits of mantissa, where nothing else is said.
     os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")

@@ -37,7 +37,7 @@ from f3amd_lib.ground.records import run_record, write_table
 KERNEL = "python3"
 
 
-class NotebookFailed(RuntimeError):
+class NotebookFailed(ValueError):
     """A notebook stopped; the message names the notebook, the cell, the error and the log."""
 
 

@@ -13,6 +13,7 @@ from f3amd_companion.ledger.judgements import UNJUDGED, UNMEASURED
 from f3amd_companion.measuring import campaign, measure, sensitivity
 from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
+from f3amd_companion.measuring.text_probes import TEXT_MEASUREMENTS
 from f3amd_companion.measuring.text_tables import TABLES
 from f3amd_companion.speed import implementations, measurements
 from f3amd_lib.ground.names import nearest_hint
@@ -152,8 +153,8 @@ def test_a_command_is_understood(run, monkeypatch):
     called = []
     monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path=None: profile)
     for name in measure.MEASUREMENTS:
-        note = lambda prepared, profile, models, name=name, **extra: called.append(
-            (name, profile.window, models, extra)
+        note = lambda prepared, profile, models, name=name, **extra: (
+            called.append((name, profile.window, models, extra)) or "table"
         )
         monkeypatch.setitem(measure.MEASUREMENTS, name, note)
     monkeypatch.setattr(measurements, "measure_training_time", lambda _, profile, **__: called.append(profile.window))
@@ -192,7 +193,9 @@ def told(part, key: str) -> set[str]:
 def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, claim_id, monkeypatch):
     """The tables that are measured for it, or the models that have a row there; nothing is done."""
     asked: list[str] = []
-    monkeypatch.setattr("f3amd_companion.__main__._measure_text", lambda names, *rest: asked.extend(names) or 0)
+    monkeypatch.setattr("f3amd_lib.text.stages.text_models.open_text_motions", lambda *_: None)
+    for name in TEXT_MEASUREMENTS:
+        monkeypatch.setitem(TEXT_MEASUREMENTS, name, lambda *_, name=name, **__: asked.append(name) or "table")
     monkeypatch.setattr(claims, "main", lambda *words: 0)
     for run in claims.load_commands(paper)[claim_id]:
         assert main(shlex.split(run, comments=True)[1:]) == 0

@@ -110,7 +110,7 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [SHIPPED])
     made, asked = [], []
 
-    def written(targets, scene, trained, *, overwrite):
+    def written(targets, scene, trained):
         made.append((trained.name, scene.characters[0].motion))
 
     def follow(predict, schedule, noise, times):

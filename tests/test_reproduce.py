@@ -79,7 +79,7 @@ def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):
 
     status = main(["figures", "--profile", "smoke"])
 
-    assert status == 1
+    assert status == 2
     message = capsys.readouterr().err
     # In [1] parameters, In [2] the injected ones, In [3] the culprit.
     assert "01_broken.ipynb stopped in cell In [3], 'speed = 3'" in message
