@@ -31,6 +31,11 @@ help: ## Show this list
 $(INSTALLED): requirements.lock pyproject.toml scripts/bootstrap.sh
 	@bash scripts/bootstrap.sh
 
+# An extra is installed once, and again where the lock is newer.
+$(VENV)/extra-%: $(INSTALLED) scripts/extra.sh
+	@bash scripts/extra.sh $*
+	@touch $@
+
 install: $(INSTALLED) ## Build .venv and nothing else
 
 figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DATA/PROFILE
@@ -49,6 +54,8 @@ PYTEST := env -u F3AMD_RESULTS_DIR JAX_PLATFORMS=cpu $(PYTHON) -m pytest --durat
 # The plugin for notebooks takes five seconds to load, in each process.
 NO_NOTEBOOKS := -p no:nbval
 SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
+# Test files with a marker: to collect the others as well takes each process ten seconds.
+MARKED = $(shell grep -l 'mark\.$(1)\b' tests/test_*.py) -m $(1)
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
@@ -59,14 +66,11 @@ bench: $(INSTALLED) ## Time synthesis and training on this machine (BENCH=option
 	  $(PYTHON) -m f3amd_companion bench --data $(DATA) --profile $(PROFILE) $(BENCH)
 
 # Optional: benchmarks and tests that need one of these say so and go on without.
-bench-tools: $(INSTALLED) ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more; docs/commands.md)
-	@bash scripts/extra.sh bench
+bench-tools: $(VENV)/extra-bench ## Add PyTorch, IREE and ONNX Runtime to .venv (about 1 GB more; docs/commands.md)
 
-onnx-tools: $(INSTALLED) ## Add jax2onnx and ONNX Runtime to .venv (about 150 MB more)
-	@bash scripts/extra.sh onnx
+onnx-tools: $(VENV)/extra-onnx ## Add jax2onnx and ONNX Runtime to .venv (about 150 MB more)
 
-sweep-tools: $(INSTALLED) ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
-	@bash scripts/extra.sh sweep
+sweep-tools: $(VENV)/extra-sweep ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
 
 test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
 	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
@@ -75,17 +79,17 @@ test: lint ## Lint, run the tests but the slow ones, check the notebooks' commit
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
 test-slow: $(INSTALLED) ## Run the slow tests that `make test` leaves out
-	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m slow --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,slow) $(PYTEST_OPTIONS)
 
 test-long: $(INSTALLED) ## Rehearse each command of the ledger at smoke size, and the notebooks with other seeds
-	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m long --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,long) $(PYTEST_OPTIONS)
 
 test-all: test test-slow test-long test-extras site test-web ## All tests there are, with the site and the browser
 
 # What `make test` had to skip in a plain install, and nothing else. A test says what it needs with
 # the marker `needs`.
 test-extras: bench-tools onnx-tools sweep-tools site-tools ## Test what needs PyTorch, IREE, ONNX Runtime, Dask or Sphinx
-	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m needs --ignore tests/web $(PYTEST_OPTIONS)
+	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,needs) $(PYTEST_OPTIONS)
 
 coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, the slow tests among them (long)
 	$(PYTHON) -m coverage erase
@@ -94,15 +98,13 @@ coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, th
 	$(PYTHON) -m coverage report
 
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
-web-tools: $(INSTALLED) ## Add selenium to .venv, and Chromium to the system if it is missing
+web-tools: $(VENV)/extra-web ## Add selenium to .venv, and Chromium to the system if it is missing
 	@bash scripts/browser.sh
-	@bash scripts/extra.sh web
 
 test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
 	$(PYTEST) $(NO_NOTEBOOKS) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
 
-site-tools: $(INSTALLED) ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
-	@bash scripts/extra.sh site
+site-tools: $(VENV)/extra-site ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
 
 # From nothing each time, so that no page outlives its source. A warning is an error.
 site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html

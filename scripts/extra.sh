@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Add an extra to .venv, in the versions of requirements.lock: bash scripts/extra.sh bench|onnx|site|sweep|web [options of pip]
 # What has hashes is checked against them, and nothing else is resolved or downloaded; bench and onnx have none (the lock
-# says why), so pip adds what they need.
+# says why), so pip adds what they need. Of thousands of modules few are ever imported; Python compiles those that are.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -18,4 +18,4 @@ fi
 options=()
 if grep -q -- --hash= "$wanted"; then options=(--require-hashes --no-deps); fi
 "${F3AMD_VENV:-.venv}/bin/python" -m pip install --disable-pip-version-check --progress-bar off --retries 1 --timeout 15 \
-  -q "${options[@]}" "${@:2}" -r "$wanted"
+  --no-compile -q "${options[@]}" "${@:2}" -r "$wanted"
