@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 import warnings
 import zipfile
 
@@ -67,13 +66,6 @@ def test_a_scale_that_makes_no_body_is_refused(scale):
     refused("scale must be positive", format_bvh, wandering_motion(3), scale=scale)
 
 
-def test_a_row_of_two_million_numbers_is_refused_in_a_moment():
-    head, _, _ = TEXT.partition("Frame Time: 0.0333333333\n")
-    started = time.perf_counter()
-    refused("frame 0 has 2000000 numbers", parse_bvh, f"{head}Frame Time: 0.0333333333\n{'0 ' * 2_000_000}\n", "a.bvh")
-    assert time.perf_counter() - started < 10.0
-
-
 def test_a_chain_of_5000_joints_is_written_and_read_again():
     count = 5000
     names, parents = tuple(f"j{k}" for k in range(count)), tuple(range(-1, count - 1))
@@ -103,13 +95,7 @@ def test_absurd_paths_are_refused_before_anything_is_made(tmp_path, rows, match)
     refused(f"path.csv: {match}", read_path_csv, file)
 
 
-def test_a_quoted_path_is_still_read(tmp_path):
-    file = tmp_path / "path.csv"
-    file.write_text('"x","z"\n"0","0"\n"0","0.1"\n')
-    assert read_path_csv(file).num_frames == 2
-
-
-def test_seeds_that_would_give_others_noise_are_refused():
+def test_seeds_that_would_give_others_noise_and_endless_steps_are_refused():
     assert checked_seed(np.int64(7)) == 7 and checked_seed(2**32 - 1) == 2**32 - 1
     for seed in (-1, 2**32, 2**63, 1.5, True, "1"):
         refused("seed must be", checked_seed, seed)
@@ -118,9 +104,6 @@ def test_seeds_that_would_give_others_noise_are_refused():
     refused("seed must be", TrainingConfig, num_steps=1, batch_size=1, seed=2**32)
     generator = MotionGenerator(tiny_trained(), num_steps=1)
     refused("seed must be", generator.rollout, named_path("straight", 8), "calm", seed=-1)
-
-
-def test_more_steps_than_anybody_needs_are_refused_at_once():
     refused("num_steps must be at most", MotionGenerator, tiny_trained(), MOST_STEPS + 1)
 
 
@@ -157,10 +140,6 @@ def test_a_member_without_a_name_is_no_file(tmp_path, name):
         member.filename = name
         file.writestr(member, b"nobody's")
     assert [clip.name for clip in open_dataset("folder", path=path).clips] == known
-
-
-def test_an_ordinary_zip_is_read(tmp_path):
-    assert len(open_dataset("folder", path=_zip(tmp_path / "a.zip", TEXT.encode())).clips) == 1
 
 
 def test_a_single_file_is_no_data_set(tmp_path, monkeypatch):

@@ -147,21 +147,12 @@ def repository_faults(paths, root: Path) -> list[str]:
     return faults
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", NOTEBOOKS + COURSE + STANDALONE, ids=lambda path: path.stem)
 def test_notebook_is_fit_to_be_read(path):
-    assert notebook_faults(path) == []
-
-
-@pytest.mark.parametrize("path", STANDALONE, ids=lambda path: path.stem)
-def test_standalone_notebook_is_fit_to_be_read(path):
-    assert notebook_faults(path, numbered=False) == []
-
-
-@pytest.mark.parametrize("path", COURSE, ids=lambda path: path.stem)
-def test_notebook_of_the_course_is_fit_to_be_read(path):
-    assert notebook_faults(path, numbered=False) == []
-    assert re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name)
-    assert not re.search(r"keep_figure|write_table", path.read_text(encoding="utf-8")), "the course stores nothing"
+    assert notebook_faults(path, numbered=path in NOTEBOOKS) == []
+    if path in COURSE:
+        assert re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name)
+        assert not re.search(r"keep_figure|write_table", path.read_text(encoding="utf-8")), "the course stores nothing"
 
 
 def test_notebooks_are_numbered_without_gaps():
