@@ -189,7 +189,6 @@ def presets(
 def train(
     motion: Data, preset: Repeatable = (), minutes: float | None = None, steps: int | None = None,
     batch_size: int | None = None, seed: int | None = None, out: Path | None = None, all_devices: bool = False,
-    processes: int | None = None, process: int | None = None, coordinator: str | None = None, cluster: bool = False,
     teacher: Path | None = None,
 ) -> int:  # fmt: skip
     """Train a model; a killed run goes on where it stopped.
@@ -205,32 +204,22 @@ def train(
       seed: of weights, batches and noise.
       out: folder for the model instead of runs/DATA/PROFILE/models.
       all_devices: share each batch among the devices JAX sees.
-      processes: train in so many processes together.
-      process: number of this one, from 0.
-      coordinator: HOST:PORT of process 0.
-      cluster: train in all processes of a job of Slurm, Open MPI or Kubernetes together.
       teacher: file of the teacher of a MotionPCM student, such as the one that ships, instead of training one.
     """
     from f3amd_companion.measuring.learning_curves import train_family
-    from f3amd_lib.training import parallel, pipeline
+    from f3amd_lib.training import pipeline
+    from f3amd_lib.training.optimise import all_devices as mesh_of_all
 
     of_latents = [name for name in preset if name.startswith(("MotionPCM", "MotionLCM"))]
     if teacher is not None and not (preset and set(of_latents) == set(preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
-    together = coordinator, processes, process
-    shared = cluster or together != (None, None, None)
     if of_latents or any(name == "judge" or "ACMDM" in name for name in preset):
-        if all_devices or shared:
-            what = "--all-devices, --processes, --process, --coordinator and --cluster"
-            raise ValueError(f"models of captioned motion train on one device: leave {what} out")
+        if all_devices:
+            raise ValueError("models of captioned motion train on one device: leave --all-devices out")
         return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
-    if cluster and together != (None, None, None):
-        raise ValueError("--cluster finds the processes itself: leave the three others out")
-    if shared:
-        parallel.join_processes(*together)
     prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
     how = {"budget_s": None if minutes is None else 60.0 * minutes, "folder": out}
-    mesh, state = parallel.all_devices() if shared or all_devices else None, "finished"
+    mesh, state = mesh_of_all() if all_devices else None, "finished"
     for name, state in train_family(prepared, profile, preset or [profile.preset], mesh=mesh, **how):
         files = pipeline.model_files(profile, name, folder=out)
         log.info("%-12s %s", name, files.state if state == "unfinished" else files.model)

@@ -143,7 +143,7 @@ def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, ca
     words += ["--teacher", str(SHIPPED / "MotionPCM-teacher-small.safetensors")]
     assert command_line.main(words) == 2
     assert "--teacher is for students of MotionPCM: leave it out" in capsys.readouterr().err
-    assert command_line.main(["train", "--preset", "ACMDM-causal-AE-w64", "--processes", "2"]) == 2
+    assert command_line.main(["train", "--preset", "ACMDM-causal-AE-w64", "--all-devices"]) == 2
     assert "models of captioned motion train on one device" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

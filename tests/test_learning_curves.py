@@ -196,13 +196,7 @@ def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch
     assert "CAMDM.state.safetensors" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--process", "0", "--coordinator", "host:1"], "come together or not at all"),
-        (["--cluster", "--processes", "2"], "leave the three others out"),
-    ],
-)
-def test_processes_that_do_not_say_enough_train_nothing(words, message, capsys):
-    assert main(["train", *words]) == 2
-    assert message in capsys.readouterr().err
+def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(measure, "available_models", lambda profile: [])
+    with pytest.raises(ValueError, match="no trained model for 'synthetic' at profile 'smoke'"):
+        measure.models_with_weights(load_profile("smoke", "synthetic"))

@@ -1,8 +1,6 @@
 """The road from a data set's name to a trained model, and the command line on top of it."""
 
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -163,14 +161,3 @@ def test_command_refuses_unknown_style_in_one_line(trained_once, same_runs, tmp_
     assert error.count("\n") == 1
     assert "unknown style 'Nobody'" in error
     assert not out.exists()
-
-
-@pytest.mark.slow
-def test_command_runs_as_a_module():
-    done = subprocess.run(
-        [sys.executable, "-m", "f3amd_companion", "presets", "--channels", "129", "--styles", "22"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "F3AMD-FNO-96-plus" in done.stdout

@@ -34,7 +34,6 @@ from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.measures import real_clips
 from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.rollout.start_poses import starting_poses
 from f3amd_lib.training import denoising_task as task_module
@@ -330,12 +329,3 @@ def test_a_facing_that_flips_and_comes_back_is_smoothed_the_short_way():
         np.testing.assert_allclose(np.hypot(variant[:, 2], variant[:, 3]), 1.0, atol=1e-9)
         # Six frames of a flip are outvoted by those around them.
         assert np.abs(np.rad2deg(np.arctan2(variant[:, 2], variant[:, 3]))).max() < 90.0
-
-
-def test_a_steady_turn_is_not_changed_by_smoothing():
-    motion = wandering(60, 0)
-    angle = 0.07 * np.arange(60)
-    rotations = np.broadcast_to(np.eye(3), (60, SKELETON.num_joints, 3, 3)).copy()
-    rotations[:, 0] = matrix_from_yaw(angle)
-    for variant in windows_module._path_variants(SKELETON, world_frames(motion.replace(rotations=rotations))):
-        np.testing.assert_allclose(np.unwrap(np.arctan2(variant[:, 2], variant[:, 3])), angle, atol=1e-6)

@@ -14,7 +14,6 @@ from jax.sharding import Mesh
 from scipy import stats
 
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise, restore_state
 from f3amd_lib.training.pipeline import (
@@ -66,7 +65,7 @@ def train_family(
         if finished_model(prepared, profile, preset, its) is not None:
             yield preset, "finished before"
             continue
-        if stop_at is not None and parallel.first_says(time.monotonic() >= stop_at):
+        if stop_at is not None and time.monotonic() >= stop_at:
             yield preset, "unfinished"
             return
         how = {"folder": folder, "mesh": mesh, "stop_at": stop_at, "progress": progress}

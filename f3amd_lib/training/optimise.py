@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,13 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from f3amd_lib.ground.trees import load_tree, save_tree
 from f3amd_lib.networks.config import CheckedConfig, with_fast_gradient
 from f3amd_lib.networks.presets import build_from_config
-from f3amd_lib.training import parallel
+
+SPREAD, EVERYWHERE = PartitionSpec("batch"), PartitionSpec()
+"""How arrays lie: over the devices along their first axis, or as a whole on each of them."""
 
 
 class TrainingDiverged(ArithmeticError):
@@ -144,6 +147,25 @@ def _copied(tree):
     return jax.tree.map(jnp.copy, tree)
 
 
+def all_devices() -> Mesh:
+    """Return a mesh of every device, one axis long, over which batches are spread.
+
+    Weights and windows lie on each device, and XLA adds up the gradients. Every random number belongs to a step and a
+    sample, not to a device, so that the weights are those of one device up to the order of sums.
+    """
+    return Mesh(np.array(jax.devices()), tuple(SPREAD))
+
+
+def replicate(tree, mesh: Mesh | None):
+    """Return copies of arrays on every device of a mesh; without one they stay as they are."""
+    return tree if mesh is None else jax.device_put(_copied(tree), NamedSharding(mesh, EVERYWHERE))
+
+
+def _laid(tree, mesh: Mesh | None, places: PartitionSpec):
+    """Ask, inside jit, that arrays lie on the devices of a mesh as `SPREAD` or `EVERYWHERE` says."""
+    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, places))
+
+
 def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
     """Return the state before the first step, on every device of the mesh."""
     # Not compiled as a whole: that takes seconds for each network, and the programs of its layers are few.
@@ -151,7 +173,7 @@ def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
     params = _copied(params)  # a student begins with weights that stay its teacher's
     ema = None if task.config.ema_decay is None else _copied(params)
     state = TrainingState(params, ema, task.optimiser.init(params), jnp.zeros((), jnp.int32), statistics)
-    return parallel.replicate(state, mesh)
+    return replicate(state, mesh)
 
 
 def _with_fast_gradients(params):
@@ -176,7 +198,7 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
 
     def one_step(state: TrainingState, _):
         batch, key = task.draw(state, jax.random.fold_in(base, state.step))
-        batch = parallel.laid(batch, mesh, parallel.SPREAD)
+        batch = _laid(batch, mesh, SPREAD)
         loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
         gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
         updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
@@ -184,7 +206,7 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
         ema = None if decay is None else optax.incremental_update(params, state.ema, 1.0 - decay)
         return TrainingState(params, ema, optimiser, state.step + 1, statistics), terms
 
-    return parallel.laid(jax.lax.scan(one_step, state, None, length=length), mesh, parallel.EVERYWHERE)
+    return _laid(jax.lax.scan(one_step, state, None, length=length), mesh, EVERYWHERE)
 
 
 def compile_steps(task: Task, length: int = 1):
@@ -218,15 +240,13 @@ def held_out_terms(task: Task, state: TrainingState, held_out, mesh: Mesh | None
       held_out: data of another split than the one trained on.
       mesh: devices that the state lies on.
     """
-    held_out = parallel.replicate(held_out, mesh)
-    terms = _held_out_terms(task, state.averaged, state.statistics, held_out, jax.random.key(7))
+    terms = _held_out_terms(task, state.averaged, state.statistics, replicate(held_out, mesh), jax.random.key(7))
     return {name: float(value) for name, value in terms.items()}
 
 
 def save_state(path: Path, task: Task, state: TrainingState) -> None:
     """Write the whole training state; an interrupted write leaves the old file whole."""
-    if parallel.is_first_process():
-        save_tree(path, state, {"kind": "training state", **task.identity()})
+    save_tree(path, state, {"kind": "training state", **task.identity()})
 
 
 def restore_state(path: Path, task: Task, mesh: Mesh | None = None) -> TrainingState:
@@ -243,7 +263,7 @@ def restore_state(path: Path, task: Task, mesh: Mesh | None = None) -> TrainingS
             )
         return jax.eval_shape(initial_state, task)
 
-    return parallel.replicate(load_tree(path, template)[0], mesh)
+    return replicate(load_tree(path, template)[0], mesh)
 
 
 def differences(identity: dict, description: dict) -> list[str]:
@@ -254,19 +274,15 @@ def differences(identity: dict, description: dict) -> list[str]:
       description: of the file; what it tells beside the task's identity does not matter, nor does a setting that one
         of the two does not know, as one younger than the file, if that is off (false, 0 or empty).
     """
-    # Files have lists where settings have tuples.
-    wanted, stored = (
-        json.loads(json.dumps({part: of.get(part) for part in identity})) for of in (identity, description)
-    )
     unlike = []
-    for part in (part for part in wanted if wanted[part] != stored[part]):
-        if isinstance(wanted[part], dict) and isinstance(stored[part], dict):
-            both = wanted[part], stored[part]
-            off = {name: value for settings in both for name, value in settings.items() if not value}
-            ours, theirs = (off | settings for settings in both)
-            changed = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
-            unlike += [f"{part} settings ({', '.join(changed)})"] if changed else []
-        else:
+    for part in identity:
+        # Files have lists where settings have tuples.
+        ours, theirs = (json.loads(json.dumps(of.get(part))) for of in (identity, description))
+        if isinstance(ours, dict) and isinstance(theirs, dict):
+            names = sorted(ours.keys() | theirs.keys())
+            if changed := [name for name in names if (ours.get(name) or None) != (theirs.get(name) or None)]:
+                unlike.append(f"{part} settings ({', '.join(changed)})")
+        elif ours != theirs:
             unlike.append(part.replace("_", " "))
     return unlike
 
@@ -287,8 +303,8 @@ def optimise(
       chunk: steps per jitted scan.
       stop_after: stop once this many steps are done in all.
       stop_at: stop, with a checkpoint, at the end of the first chunk after this time
-        (`time.monotonic`). Of processes that train together, the first one's clock counts.
-      mesh: devices to spread each batch over (`parallel.all_devices`); by default one does it all.
+        (`time.monotonic`).
+      mesh: devices to spread each batch over (`all_devices`); by default one does it all.
       on_chunk: called with each history row as it is made, before the state of its step is written.
       progress: show a progress bar.
 
@@ -302,7 +318,7 @@ def optimise(
     """
     if chunk < 1 or checkpoint_every < 1:
         raise ValueError(f"chunk and checkpoint_every must be at least 1, got {chunk} and {checkpoint_every}")
-    task = parallel.replicate(task, mesh)
+    task = replicate(task, mesh)
     if state is not None:
         # The chunk donates its input; what the caller holds must stay alive.
         state = _copied(state)
@@ -310,11 +326,9 @@ def optimise(
         state = restore_state(checkpoint, task, mesh)
     else:
         state = initial_state(task, mesh)
-    num_steps = task.config.num_steps
-    total = num_steps if stop_after is None else min(num_steps, stop_after)
+    total = min(task.config.num_steps, math.inf if stop_after is None else stop_after)
     done, history, late = int(state.step), [], False
-    hidden = not (progress and parallel.is_first_process())
-    with tqdm(total=total, initial=done, unit="step", desc=task.name, disable=hidden) as bar:
+    with tqdm(total=total, initial=done, unit="step", desc=task.name, disable=not progress) as bar:
         while done < total and not late:
             # Chunks end on multiples, so that a resumed run makes the same ones.
             length = min(chunk - done % chunk, total - done)
@@ -328,7 +342,7 @@ def optimise(
             passed = (done + length) // checkpoint_every > done // checkpoint_every
             done += length
             row = {"step": done, **{name: float(value.mean()) for name, value in terms.items()}}
-            late = stop_at is not None and parallel.first_says(time.monotonic() >= stop_at)
+            late = stop_at is not None and time.monotonic() >= stop_at
             due = passed or done == total or late
             if due and held_out is not None:
                 measured = held_out_terms(task, state, held_out, mesh)

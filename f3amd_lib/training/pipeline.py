@@ -9,10 +9,8 @@ project lies in `f3amd_lib/pretrained/<data set>/` in the same form.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import logging
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +30,6 @@ from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
 from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks import presets
-from f3amd_lib.networks.config import NetworkConfig
-from f3amd_lib.training import parallel
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task, weights_identity
 from f3amd_lib.training.optimise import Task, TrainingState, differences, optimise, restore_state
@@ -164,8 +160,8 @@ def train(
       preset: by default the profile's own.
       config: by default `profile_recipe`.
       network: fields of the preset's network to change.
-      folder: where files go instead of `runs/`; several processes must see the same one.
-      mesh: devices that share each batch (`parallel.all_devices`); by default one.
+      folder: where files go instead of `runs/`.
+      mesh: devices that share each batch (`optimise.all_devices`); by default one.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
@@ -180,7 +176,8 @@ def train(
     preset = presets.find_preset(preset or profile.preset).name
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
-    parallel.check_batch(config.batch_size, mesh)
+    if mesh is not None and config.batch_size % mesh.size:
+        raise ValueError(f"{mesh.size} devices cannot share a batch of {config.batch_size} equally: take another size")
     task = prepared.task(preset, config, network=network)
     if prepared.held_out_split == "train":
         log.warning("no clip is held out: 'held-out' losses are of clips that the model was trained on")
@@ -213,22 +210,12 @@ def train_and_keep(
         if int(state.step) < config.num_steps:
             return None, history
         weights = state.averaged if denoising is task else state.params
-        trained = as_trained(prepared, denoising, preset, weights, record)
-        if parallel.is_first_process():
-            save_model(files.model, trained)
-            trained = load_model(files.model)  # in the precision of the file
-        parallel.wait_for_all("wrote the model")
-    return trained, history
+        save_model(files.model, as_trained(prepared, denoising, preset, weights, record))
+    return load_model(files.model), history  # in the precision of the file
 
 
-def alone_with(files: ModelFiles) -> contextlib.AbstractContextManager:
-    """Hold the files of a run, so that no second run writes there; its other processes hold nothing.
-
-    Raises:
-      ValueError: if another process trains the same there.
-    """
-    if not parallel.is_first_process():
-        return contextlib.nullcontext()
+def alone_with(files: ModelFiles):
+    """Hold the files of a run, so that no second run writes there; ValueError if another process trains there."""
     return locked(files.model.with_suffix(".lock"), f"training {files.model.stem}")
 
 
@@ -255,7 +242,7 @@ def train_in_legs(
 
     def keep(row: dict) -> None:
         rows.append(row)
-        if "held_out_loss" in row and parallel.is_first_process():
+        if "held_out_loss" in row:
             write_table(files.history, pd.DataFrame(rows), record)
 
     state, _ = optimise(
@@ -275,21 +262,11 @@ def as_trained(prepared: PreparedData, task: DenoisingTask, preset: str, params,
 
 
 def _begun(files: ModelFiles, task: Task, mesh: Mesh | None) -> tuple[TrainingState | None, list[dict]]:
-    """Return the state and the rows to go on from, of which all processes must see the same."""
-    advice = "processes that train together need one folder that all of them see (--out)"
-    begun = files.state.exists()
-    parallel.wait_for_all("looked for a training state")
-    if not parallel.same_everywhere(int(begun)):
-        raise ValueError(f"{files.state}: one process sees it and another does not; {advice}")
-    if not begun:
-        if parallel.is_first_process():
-            set_aside_run(files)  # a finished model without its state cannot be gone on with
+    """Return the state and the rows to go on from."""
+    if not files.state.exists():
+        set_aside_run(files)  # a finished model without its state cannot be gone on with
         return None, []
     state = restore_state(files.state, task, mesh)
-    if not parallel.same_everywhere(int(state.step)):
-        raise ValueError(f"{files.state}: processes found different steps in it; {advice}")
-    if not parallel.is_first_process():
-        return state, []
     if (found := whole_table(files.history)) is None:
         log.warning("%s is missing or broken: losses of the first %d steps are lost", files.history, state.step)
         return state, []
@@ -316,24 +293,22 @@ def obtain_model(
       (model, history, origin), origin being "shipped", "earlier run" or "trained now".
     """
     preset = presets.find_preset(preset or profile.preset).name
-    wanted = prepared.model_config(preset)
-    if profile.name == "laptop":
-        shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
-        if shipped.model.exists():
-            trained = load_model(shipped.model)
-            theirs = (trained.config, trained.skeleton, trained.styles)
-            if theirs == (wanted, prepared.packed.skeleton, prepared.packed.styles):
-                return trained, read_table(shipped.history)[0], "shipped"
+    wanted, data = prepared.model_config(preset), prepared.packed
+    shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
+    if profile.name == "laptop" and shipped.model.exists():
+        trained = load_model(shipped.model)
+        if (trained.config, trained.skeleton, trained.styles) == (wanted, data.skeleton, data.styles):
+            return trained, read_table(shipped.history)[0], "shipped"
     files = model_files(profile, preset)
-    recipe = profile_recipe(profile, preset)
+    identity = weights_identity(wanted, profile_recipe(profile, preset), data.fingerprint)
     if files.model.exists() and files.history.exists():
         trained = load_model(files.model)
-        if not _unlike(trained, prepared, wanted, recipe):
+        if not _unlike(trained, identity):
             return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
     if files.model.exists() or not files.history.exists():
         set_aside_run(files)
-    set_aside_other_state(prepared, files, wanted, recipe)
+    set_aside_other_state(files, identity)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
@@ -357,8 +332,7 @@ def shown_model(prepared: PreparedData, profile: Profile, *, progress: bool = Tr
     shipped = shipped_weights(profile.dataset)
     if profile.name == "smoke" and shipped:
         trained = load_model(shipped)
-        known = set(prepared.packed.styles) <= set(trained.styles)
-        if known and trained.skeleton == prepared.packed.skeleton:
+        if set(prepared.packed.styles) <= set(trained.styles) and trained.skeleton == prepared.packed.skeleton:
             return trained, "shipped"
     trained, _, origin = obtain_model(prepared, profile, progress=progress)
     return trained, origin
@@ -390,8 +364,8 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     if not files.model.exists():
         return None
     trained = load_model(files.model)
-    unlike = _unlike(trained, prepared, prepared.model_config(preset), profile_recipe(profile, preset))
-    if unlike:
+    recipe = profile_recipe(profile, preset)
+    if unlike := _unlike(trained, weights_identity(prepared.model_config(preset), recipe, prepared.packed.fingerprint)):
         raise ValueError(
             f"{files.model}: a model with other {' and '.join(unlike)} lies there; move it away "
             "or name another folder (--out)"
@@ -399,24 +373,14 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     return trained
 
 
-def _unlike(trained: TrainedModel, prepared: PreparedData, model: NetworkConfig, config: TrainingConfig) -> list[str]:
+def _unlike(trained: TrainedModel, identity: dict) -> list[str]:
     """List in what a finished model is unlike the one that a run would make."""
-    wanted = weights_identity(model, config, prepared.packed.fingerprint)
-    return differences(wanted, {**trained.record, "model": trained.config.to_dict()})
+    return differences(identity, {**trained.record, "model": trained.config.to_dict()})
 
 
-def set_aside_other_state(
-    prepared: PreparedData, files: ModelFiles, model: NetworkConfig, config: TrainingConfig
-) -> None:
-    """Keep a training state under another name if it is of other data or settings.
-
-    Args:
-      prepared: the data.
-      files: of the run.
-      model, config: of the run that is to come.
-    """
-    wanted = weights_identity(model, config, prepared.packed.fingerprint)
-    if files.state.exists() and differences(wanted, describe(files.state)):
+def set_aside_other_state(files: ModelFiles, identity: dict) -> None:
+    """Keep a training state under another name if it is not of the run to come (`weights_identity`)."""
+    if files.state.exists() and differences(identity, describe(files.state)):
         set_aside_run(files)
 
 
@@ -426,12 +390,11 @@ def available_models(profile: Profile) -> list[str]:
     Args:
       profile: as for `obtain_model`.
     """
-    folders = [runs_dir(profile.dataset, profile.name) / "models"]
-    if profile.name == "laptop":
-        folders.append(PRETRAINED_DIR / profile.dataset)
+    folders = [runs_dir(profile.dataset, profile.name) / "models", PRETRAINED_DIR / profile.dataset]
     suffix = "" if profile.window == 32 else f"-{profile.window}frames"
     names = [name + end for end in ("", *presets.FORMS) for name in presets.of_paper()]
-    found = {path.name for folder in folders for path in folder.glob("*.safetensors")}
+    asked = folders if profile.name == "laptop" else folders[:1]
+    found = {path.name for folder in asked for path in folder.glob("*.safetensors")}
     return [name for name in dict.fromkeys(names) if f"{name}{suffix}.safetensors" in found]
 
 
@@ -449,7 +412,7 @@ def find_model(dataset: str) -> Path:
         ("laptop", PRETRAINED_DIR / dataset),
     ):
         first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
-        models = [path for path in folder.glob("*.safetensors") if not re.search(r"\.state\.|\.old\d+\.", path.name)]
+        models = [path for path in folder.glob("*.safetensors") if "." not in path.stem]  # no state, nothing set aside
         if models:
             return first if first in models else max(models, key=lambda path: path.stat().st_mtime)
     raise ValueError(
