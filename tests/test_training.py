@@ -16,7 +16,7 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import denoising_task
 from f3amd_lib.training.denoising_task import network_inputs, own_history_share
 from f3amd_lib.training.losses import LOSS_TERMS
-from f3amd_lib.training.optimise import advance, held_out_terms, initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise, restore_state, save_state
 from f3amd_lib.training.recipe import LossWeights, TrainingConfig, learning_rate_schedule, paper_recipe, short_recipe
 
 STEPS = 32
@@ -93,7 +93,8 @@ def test_config_survives_json(preset):
     ("settings", "message"),
     [
         ({"schedule": "invers_square"}, "'invers_square'.*'inverse_square'"),
-        ({"noise": "mixd"}, "'mixd'"),
+        ({"noise": "mixd"}, "'mixd'.*'mixed'"),
+        ({"noise_weighting": "low_nose"}, "'low_nose'.*'low_noise'"),
         ({"num_steps": 0}, "num_steps must be above 0"),
         ({"batch_size": -1}, "batch_size must be above 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be a finite number"),
@@ -112,9 +113,6 @@ def test_impossible_configs_are_refused(settings, message):
 def test_config_names_unknown_keys():
     with pytest.raises(ValueError, match="'learning_rat'; did you mean 'learning_rate'"):
         TrainingConfig.from_dict({"num_steps": 10, "learning_rat": 1e-3})
-    refused("needs num_steps", TrainingConfig.from_dict, {})
-    for name, value in (("loss", "literal"), ("diffusion", None)):
-        refused(f"'{name}' must be a table", TrainingConfig.from_dict, {"num_steps": 10, name: value})
 
 
 def test_network_inputs_by_hand(task):
@@ -314,20 +312,3 @@ def test_condition_dropout_hides_history_path_and_style_together():
     for part, before in zip(hidden, condition, strict=True):
         assert not np.any(np.asarray(part)[gone])
         np.testing.assert_array_equal(np.asarray(part)[~gone], np.asarray(before)[~gone])
-
-
-@pytest.mark.slow
-def test_weighted_noise_changes_training_but_not_the_held_out_loss():
-    plain, weighted = tiny_task(), tiny_task(noise_weighting="low_noise")
-    state = initial_state(plain)
-    assert held_out_terms(plain, state, tiny_windows()) == held_out_terms(weighted, state, tiny_windows())
-    one, _ = advance(plain, initial_state(plain), 2)
-    two, _ = advance(weighted, initial_state(weighted), 2)
-    assert largest_change(one.params, two.params) > 1e-5
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "hint"), [("noise", "mixd", "'mixed'"), ("noise_weighting", "low_nose", "'low_noise'")]
-)
-def test_misspelt_noise_is_refused(field, value, hint):
-    refused(f"unknown {field} '{value}'.*{hint}", TrainingConfig, 10, **{field: value})

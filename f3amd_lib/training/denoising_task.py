@@ -7,9 +7,8 @@ One step of training: `DenoisingTask.draw` cuts a batch of windows and noise lev
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +93,7 @@ def own_history_share(config: TrainingConfig, step):
     return config.own_history_share * jnp.clip((progress - 0.1) / 0.3, 0.0, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Constants:
     """What is known of the training windows as a whole, compiled into the step.
 
@@ -104,20 +103,16 @@ class Constants:
     Attributes:
       normaliser: of the features.
       mean_poses: of each style, [S, C - 9].
+      numbers: the bytes of both, by which constants are compared.
     """
 
-    normaliser: Normaliser
-    mean_poses: jax.Array
+    normaliser: Normaliser = field(compare=False)
+    mean_poses: jax.Array = field(compare=False)
+    numbers: bytes = field(init=False, repr=False)
 
-    @functools.cached_property
-    def _bytes(self) -> bytes:
-        return b"".join(np.asarray(leaf).tobytes() for leaf in (*self.normaliser, self.mean_poses))
-
-    def __eq__(self, other):
-        return isinstance(other, Constants) and self._bytes == other._bytes
-
-    def __hash__(self):
-        return hash(self._bytes)
+    def __post_init__(self):
+        arrays = map(np.asarray, (*self.normaliser, self.mean_poses))
+        object.__setattr__(self, "numbers", b"".join(array.tobytes() for array in arrays))
 
 
 @frozen_tree("windows")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from f3amd_lib.data.features import frame_positions
-from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.skeleton import CONTACT_SPEED, Skeleton
 from f3amd_lib.training.recipe import LossWeights
 
@@ -49,19 +48,12 @@ def loss_terms(
                           (ours)
         ird               E |FK(x0_hat)_first - FK(history)_last|       (Eq. 10), or another form
 
-    Raises:
-      ValueError: for an unknown `ird_form`.
-
     Source: paper section 4.1 and Appendix B. CAMDM's released code, which the paper builds on, differs in
     three ways: it leaves the root's position out of the feature velocity, its contact mask looks at the
     toes' end joints where ours looks at the toe joints, which every skeleton here has, and it counts a step of exactly
     1 cm as contact. The F3AMD text says none of the three; ours is the plain reading of Eq. 13.
     """
-    check_known(ird_form, ("literal", "squared", "excess"), "ird_form")
-
-    def mean_square(difference):
-        return _mean(difference * difference, weights)
-
+    mean_square = lambda difference: _mean(difference * difference, weights)
     positions_hat = frame_positions(skeleton, future_hat)
     real = frame_positions(skeleton, jnp.concatenate([last_history[:, None], future], axis=1))
     before, positions = real[:, 0], real[:, 1:]

@@ -162,17 +162,12 @@ class TrainingConfig:
     def from_dict(cls, values: dict) -> TrainingConfig:
         """Build a config from `to_dict`; an unknown key is an error that names the nearest."""
         refuse_unknown(values, cls, "training setting")
-        if "num_steps" not in values:
-            raise ValueError("a training needs num_steps")
-        for name, kind in (("loss", LossWeights), ("diffusion", NoiseSchedule)):
-            if not isinstance(values.get(name, {}), (dict, kind)):
-                raise ValueError(f"training setting {name!r} must be a table, got {values[name]!r}")
-        values = dict(values)
-        if isinstance(values.get("loss"), dict):
-            refuse_unknown(values["loss"], LossWeights, "loss setting")
-            values["loss"] = LossWeights(**values["loss"])
-        if isinstance(values.get("diffusion"), dict):
-            values["diffusion"] = schedule_from_dict(values["diffusion"])
+        loss, diffusion = values.get("loss"), values.get("diffusion")
+        if isinstance(loss, Mapping):
+            refuse_unknown(loss, LossWeights, "loss setting")
+            values = {**values, "loss": LossWeights(**loss)}
+        if isinstance(diffusion, Mapping):
+            values = {**values, "diffusion": schedule_from_dict(diffusion)}
         return cls(**values)
 
 
@@ -201,8 +196,8 @@ def short_recipe(preset: str, num_steps: int, **settings) -> TrainingConfig:
       preset, num_steps, **settings: as for `paper_recipe`.
     """
     short = {"batch_size": 128, "learning_rate": 2e-3, "schedule": "warmup_cosine", "gradient_clip": 1.0}
-    warm_up = {"warmup_steps": max(1, min(200, num_steps // 10))}
-    return paper_recipe(preset, num_steps, **{**short, **warm_up, **settings})
+    short["warmup_steps"] = max(1, min(200, num_steps // 10))
+    return paper_recipe(preset, num_steps, **short | settings)
 
 
 def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfig:
@@ -242,8 +237,7 @@ def part_recipe(training: type, part: str, num_steps: int, preset: str | None = 
 
 def profile_part_recipe(training: type, part: str, profile: Profile, preset: str | None, batch_size=None, **settings):
     """Return how a profile trains a part: by the paper's recipe on `gpu`, by the short one and its share elsewhere."""
-    if batch_size is not None:
-        settings["batch_size"] = batch_size
+    settings |= {} if batch_size is None else {"batch_size": batch_size}
     name = part if profile.name == "gpu" else f"short-{part}"
     share = load_paper_file("recipes", training.paper)[name].get("share", 1.0)
     num_steps = max(1, round(share * profile.train_steps))
