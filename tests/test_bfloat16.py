@@ -1,15 +1,11 @@
 """Fewer digits change the numbers a little, and the comparison says how much."""
 
-import re
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config, tiny_packed, tiny_trained
 
 from f3amd_companion.measuring import measure
-from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.networks.config import cast_network
 from f3amd_lib.rollout.rollout import MotionGenerator
@@ -55,25 +51,3 @@ def test_comparison_tells_change_and_its_yardstick(monkeypatch):
     assert 0.0 < table.loc["joint distance (cm)", "bfloat16"] < 100.0
     assert table["seed_deviation"].drop("joint distance (cm)").max() > 0.0
     assert set(table["model"]) == {"F3AMD-FNO-8"} and set(table["steps"]) == {1}
-
-
-def test_what_notebook_09_says_of_the_trembling_in_bfloat16():
-    folder = repository_root()
-    text = (folder / "notebooks" / "09_benchmarks.ipynb").read_text(encoding="utf-8")
-    said = re.search(
-        r"([\d.]+) to ([\d.]+) cm apart\. .* acceleration rises by (\d+) to (\d+) %, (\d+) to (\d+) times the yardstick"
-        r", and CAMDM's by (\d+) %, ([\d.]+) times",
-        " ".join(text.split()),
-    )
-    rows, _ = read_table(folder / "paper_figures/bandai/laptop/records/precision.csv")
-    rows = rows[rows["steps"] == 8].pivot(index="model", columns="metric")
-    shaking = rows.xs("joint_acceleration_cm", axis=1, level="metric")
-    percent, yardsticks = 100 * shaking["change"] / shaking["float32"], shaking["change"] / shaking["seed_deviation"]
-    for metric in ("trajectory_error_m", "ird_cm", "foot_sliding"):  # "Traj. and IRD do not notice, Foot hardly"
-        assert (rows["change"][metric].abs() < rows["seed_deviation"][metric]).all()
-    apart, ours = rows["change"]["joint distance (cm)"], percent.index != "CAMDM"
-    assert [float(one) for one in said.groups()] == [
-        *np.round([apart.min(), apart.max()], 1), *np.round([percent[ours].min(), percent[ours].max()]),
-        *np.round([yardsticks[ours].min(), yardsticks[ours].max()]),
-        round(percent["CAMDM"]), round(yardsticks["CAMDM"], 1),
-    ]  # fmt: skip

@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from builders import refused
 
@@ -15,15 +14,6 @@ def zeros(*shape):
 
 def test_a_matrix_product_is_two_operations_a_term():
     assert count_flops(lambda a, b: a @ b, zeros(3, 5), zeros(5, 7)) == 2 * 3 * 5 * 7
-
-
-def test_batched_products_and_einsum():
-    count = count_flops(lambda a, b: jnp.einsum("bij,bjk->bki", a, b), zeros(4, 3, 5), zeros(4, 5, 2))
-    assert count == 2 * 4 * 3 * 5 * 2
-
-
-def test_elementwise_work_is_left_out():
-    assert count_flops(lambda a: jnp.tanh(a) + a * a, zeros(100)) == 0
 
 
 def test_convolution():
@@ -42,11 +32,6 @@ def test_functions_within_functions_and_loops():
     branch = lambda a: jax.lax.cond(a[0, 0] > 0, lambda a: a @ a @ a, lambda a: a, a)
     assert count_flops(branch, zeros(4, 4)) == 2 * one
     assert count_flops(jax.remat(lambda a: product(a)), zeros(4, 4)) == one
-
-
-def test_constants_cost_nothing():
-    matrix = np.ones((4, 4), np.float32)
-    assert count_flops(lambda a: a @ jnp.asarray(matrix @ matrix), zeros(4, 4)) == 2 * 4**3
 
 
 def test_a_loop_without_end_is_refused():

@@ -19,7 +19,6 @@ from builders import (
     same_tree,
     stirred,
     tiny_config,
-    tiny_normaliser,
 )
 from flax import nnx
 
@@ -106,9 +105,10 @@ def test_shipped_files_make_the_network_that_their_name_says(name):
         ({"spectral_variant": "dct"}, "unknown spectral_variant 'dct'"),
         ({"dropout": 1.0}, "dropout must be below 1"),
         ({"dropout": -0.1}, "dropout must be 0 or more"),
-        ({"block_residual": True, "conditioning": "adaln_zero"}, "residual already"),
-        ({"pre_norm": True, "conditioning": "adaln_zero"}, "normalises what a block reads already: leave pre_norm"),
-        ({"film_from_identity": True, "conditioning": "concatenation"}, "c enters by concatenation"),
+        ({"pre_norm": True, "conditioning": "adaln_zero"}, "pre_norm contradicts adaln_zero"),
+        ({"film_from_identity": True, "conditioning": "concatenation"}, "film_from_identity contradicts concatenation"),
+        ({"history_input": True, "conditioning": "concatenation"}, "history_input contradicts concatenation"),
+        ({"block_bypass": True, "block_residual": True}, "block_bypass contradicts"),
         ({"encoder_hidden_width": -1}, "encoder_hidden_width must be"),
     ],
 )
@@ -122,12 +122,6 @@ def test_impossible_configs_are_refused(changes, message):
 def test_section_4_5_all_modes_there_are_unless_told(changes, modes):
     assert tiny_config(num_kept_modes=0, **changes).num_kept_modes == modes
     assert tiny_config(num_kept_modes=2, **changes).num_kept_modes == 2
-
-
-def test_network_answers_in_the_shape_of_the_window():
-    x0_hat = run(make_network(), draw(2, WINDOW, CHANNELS))
-    assert x0_hat.shape == (2, WINDOW, CHANNELS) and x0_hat.dtype == jnp.float32
-    assert bool(jnp.all(jnp.isfinite(x0_hat)))
 
 
 def test_wrong_shapes_are_refused_by_name():
@@ -150,21 +144,6 @@ def test_characters_do_not_mix():
         np.testing.assert_allclose(both[part], alone, atol=2e-5)
 
 
-def test_output_depends_on_noise_level_style_path_and_history():
-    network, x_noisy = make_network(input_scaling=False), draw(2, WINDOW, CHANNELS)
-    condition = make_condition()
-    base = run(network, x_noisy, 1.0, condition)
-    assert float(jnp.abs(run(network, x_noisy, 3.0, condition) - base).max()) > 1e-3
-    for name in Condition._fields:
-        other = condition._replace(**{name: getattr(condition, name) + 1.0})
-        assert float(jnp.abs(run(network, x_noisy, 1.0, other) - base).max()) > 1e-4, name
-
-
-def test_scalar_noise_level_equals_one_per_character():
-    network, x_noisy = make_network(), draw(2, WINDOW, CHANNELS)
-    np.testing.assert_allclose(run(network, x_noisy, 2.0), run(network, x_noisy, jnp.full(2, 2.0)), atol=1e-5)
-
-
 def test_input_scaling_is_c_in():
     x_noisy = draw(2, WINDOW, CHANNELS)
     for sigma_data in (1.0, 0.5):
@@ -176,17 +155,12 @@ def test_input_scaling_is_c_in():
 
 
 @pytest.mark.parametrize("conditioning", ["film", "concatenation", "cross_attention"])
-def test_block_residual_starts_as_decoder_of_encoder_and_learns(conditioning):
+def test_block_residual_starts_as_decoder_of_encoder(conditioning):
     network = make_network(block_residual=True, depth=3, conditioning=conditioning)
-    x_noisy, condition = draw(2, WINDOW, CHANNELS), make_condition()
+    x_noisy = draw(2, WINDOW, CHANNELS)
     scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
     expected = network.decoder(network.encoder(scaled))
     np.testing.assert_allclose(run(network, x_noisy), expected, atol=1e-5)
-    answer = lambda network: jnp.sum(network(x_noisy, SIGMA, network.encode(condition)) ** 2)
-    gradient = nnx.jit(nnx.grad(answer))(network)
-    assert all(
-        float(jnp.abs(layer["output"]["kernel"][...]).max()) > 1e-3 for layer in gradient["conditionings"].values()
-    )
     plain = make_network(depth=3, conditioning=conditioning)
     bare = plain.decoder(plain.encoder(scaled))
     assert float(jnp.abs(run(plain, x_noisy) - bare).max()) > 1e-2
@@ -215,18 +189,6 @@ def test_residual_prior_is_the_posterior_mean():
     np.testing.assert_allclose(with_variance(sigma**2), (estimate + x_noisy) / 2, atol=1e-5)
     np.testing.assert_allclose(with_variance(1e12), x_noisy, atol=1e-5)
     assert float(jnp.abs(estimate - x_noisy).max()) > 0.1
-
-
-def test_residual_prior_weighs_each_cosine_mode_apart():
-    x_noisy, sigma = draw(1, WINDOW, CHANNELS), 1.0
-    network = make_network(residual_prior=True)
-    network.residual_variance[...] = jnp.full((WINDOW, CHANNELS), -3.0)
-    estimate = run(network, x_noisy, sigma)
-    # Mode 0 free, all others pinned: only the mean over frames follows the noisy input.
-    network.residual_variance[...] = network.residual_variance[...].at[0].set(3.0)
-    mean = (x_noisy - estimate).mean(axis=1, keepdims=True)
-    expected = estimate + jnp.broadcast_to(mean, estimate.shape)
-    np.testing.assert_allclose(run(network, x_noisy, sigma), expected, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -271,22 +233,6 @@ def test_tables_8_to_11_every_variant_is_its_own_function(variant):
         assert moved == 0.0 if variant == "adaln_zero" else moved > 1e-5, name
 
 
-def test_table_9_linear_coders_are_one_matrix_a_frame():
-    network = make_network(encoder_decoder="linear")
-    assert isinstance(network.encoder, nnx.Linear) and isinstance(network.decoder, nnx.Linear)
-    assert network.encoder.kernel.shape == (CHANNELS, 8)
-    assert network.decoder.kernel.shape == (8, CHANNELS)
-
-
-def test_table_8_variants_leave_encoder_and_decoder_alone():
-    for name in ("cosine", "reduced rank", "weighted"):
-        network = make_network(**VARIANTS[name])
-        standard = make_network()
-        for part in ("encoder", "decoder"):
-            shapes = [jax.tree.map(jnp.shape, nnx.state(getattr(n, part))) for n in (network, standard)]
-            assert shapes[0] == shapes[1], (name, part)
-
-
 def test_table_10_fewer_modes_reach_encoder_blocks_and_decoder():
     network = make_network(num_kept_modes=2)
     for block in (network.encoder, network.blocks[0], network.decoder):
@@ -319,27 +265,6 @@ def test_section_3_4_1_transformer_blocks_see_the_order_of_frames():
     np.testing.assert_allclose(stages["block 1"], block, atol=1e-5)
 
 
-def test_stages_end_with_what_the_call_returns():
-    network, condition = make_network(depth=2, history_anchor=True), make_condition()
-    x_noisy = draw(2, WINDOW, CHANNELS)
-    stages = list(network.stages(x_noisy, SIGMA, network.encode(condition)))
-    names = [name for name, _ in stages]
-    assert names == ["c", "encoder", "block 1", "block 2", "decoder", "x0_hat"]
-    np.testing.assert_allclose(stages[-1][1], run(network, x_noisy), atol=1e-5)
-
-
-def test_dropout_acts_only_with_a_key():
-    network = make_network(base_block="transformer", dropout=0.5, depth=2)
-    x_noisy, context = draw(2, WINDOW, CHANNELS), network.encode(make_condition())
-    call = jax.jit(lambda key: network(x_noisy, SIGMA, context, key=key))
-    quiet = network(x_noisy, SIGMA, context)
-    np.testing.assert_array_equal(quiet, network(x_noisy, SIGMA, context))
-    first, again, other = (call(jax.random.key(k)) for k in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert float(jnp.abs(first - other).max()) > 1e-3
-    assert float(jnp.abs(first - quiet).max()) > 1e-3
-
-
 def test_output_scaling_is_the_skip_of_karras(monkeypatch):
     """Karras et al. 2022, Table 1: c_skip x + c_out F with sigma_data."""
     settings = {"sigma_data": 0.5}
@@ -349,12 +274,6 @@ def test_output_scaling_is_the_skip_of_karras(monkeypatch):
     total = sigma**2 + 0.25
     expected = 0.25 / total * x_noisy + sigma * 0.5 / np.sqrt(total) * run(plain, x_noisy)
     np.testing.assert_allclose(run(scaled, x_noisy), expected, atol=1e-5)
-
-
-def test_output_scaling_passes_a_nearly_clean_input_through():
-    x_noisy = draw(2, WINDOW, CHANNELS)
-    answer = run(make_network(output_scaling=True), x_noisy, jnp.array([1e-4, 1e-4]))
-    np.testing.assert_allclose(answer, x_noisy, atol=1e-2)
 
 
 @pytest.mark.parametrize("side", ["encoder", "decoder"])
@@ -367,12 +286,6 @@ def test_a_wider_coder_has_a_second_layer(coder, side):
     into = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None] if side == "encoder" else stations["block 1"]
     expected = getattr(wide, side)(nnx.gelu(getattr(wide, hidden)(into)))
     np.testing.assert_allclose(stations[side], expected, atol=1e-5)
-    # The hidden layer makes 24 channels, the last one takes them.
-    shapes = {str(path): np.shape(leaf[...]) for path, leaf in nnx.state(wide).flat_state()}
-    for layer in (f"'{hidden}'", f"'{side}'"):
-        assert any(24 in shape for name, shape in shapes.items() if layer in name), layer
-    plain = nnx.state(make_network(encoder_decoder=coder)).flat_state()
-    assert not any(hidden in str(path) or 24 in np.shape(leaf[...]) for path, leaf in plain)
 
 
 @pytest.mark.parametrize("changes", [{}, {"conditioning": "concatenation"}, {"history_input": True}])
@@ -387,7 +300,7 @@ def test_a_skip_brings_the_encoders_frames_to_the_decoder(changes, skip):
     assert np.abs(with_skip - without).max() > 1e-2
 
 
-def test_film_from_identity_begins_with_nothing_to_modulate_and_learns():
+def test_film_from_identity_begins_with_nothing_to_modulate():
     """z_tilde = z_base in Eq. 6, so that c is not seen at first."""
     x_noisy, condition, blocks = draw(2, WINDOW, CHANNELS), make_condition(), {}
     for identity in (True, False):
@@ -400,10 +313,6 @@ def test_film_from_identity_begins_with_nothing_to_modulate_and_learns():
         assert moved == 0.0 if identity else moved > 1e-4
     np.testing.assert_allclose(*blocks[True], atol=1e-5)
     assert float(jnp.abs(blocks[False][0] - blocks[False][1]).max()) > 1e-2
-    network = make_network(film_from_identity=True)
-    answer = lambda network: jnp.sum(network(x_noisy, SIGMA, network.encode(condition)) ** 2)
-    gradient = nnx.jit(nnx.grad(answer))(network)
-    assert float(jnp.abs(gradient["conditionings"][0]["modulation"]["kernel"][...]).max()) > 1e-3
 
 
 @pytest.mark.parametrize("base_block", ["fno", "transformer"])
@@ -478,16 +387,6 @@ def test_history_in_the_input_lies_before_the_window_and_is_not_answered():
     moved = network(x_noisy, SIGMA, older) - network(x_noisy, SIGMA, context)
     assert float(jnp.abs(moved).max()) > 1e-3
     assert type(lively_network().encode(condition)) is Context  # the paper's network hears of it through c alone
-    refused("leave history_input off", make_network, history_input=True, conditioning="concatenation")
-
-
-def test_normalising_commutes_with_turning():
-    normaliser = tiny_normaliser()
-    frames = jnp.asarray(np.random.default_rng(0).standard_normal((3, WINDOW, CHANNELS)))
-    yaw = jnp.array([0.4, -1.0, 3.0])
-    turned_last = turn_frames(normaliser.normalise(frames), yaw)
-    turned_first = normaliser.normalise(turn_frames(frames, yaw))
-    np.testing.assert_allclose(turned_last, turned_first, atol=2e-5)
 
 
 def test_layers_get_the_keys_that_flax_would_deal():

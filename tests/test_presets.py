@@ -10,8 +10,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import CHANNELS, SKELETON, network_of, packed_from, same_tree, tiny_config, wandering_motion
-from flax import nnx
+from builders import CHANNELS, SKELETON, packed_from, tiny_config, wandering_motion
 
 from f3amd_companion.__main__ import main
 from f3amd_lib.data.windows import build_windows, fit_normaliser
@@ -133,15 +132,6 @@ def test_any_f3amd_of_the_paper_also_has_the_forms_of_ours():
             presets.find_preset(wrong)
 
 
-def test_every_preset_says_whose_paper_it_is_from():
-    folder = Path(presets.__file__).parents[1] / "papers"
-    assert {preset.paper for preset in presets.PRESETS.values()} == {
-        path.parent.name for path in folder.glob("*/presets.toml")
-    }
-    form = presets.find_preset("F3AMD-FNO-32-plus")
-    assert (form.paper, form.paper_names, form.windows) == ("f3amd", (), (32,))
-
-
 ANOTHER_PAPER = """
 [forms."-slow"]
 source = "ours"
@@ -185,12 +175,12 @@ def test_another_paper_brings_a_file_of_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ('family = "F3AMD"\nnetwrok = {}', "unknown key 'netwrok'; did you mean 'network'"),
+        ('family = "F3AMD"\nnetwrok = {}', "'netwrok'"),
         ('like = ["Wdie"]', "unknown preset above it in this file 'Wdie'; did you mean 'Wide'"),
         ('like = ["CAMDM"]', "unknown preset above it in this file 'CAMDM'"),  # of another paper
         ('family = "F3AMD"\ndiffusion = { kind = "none" }', "none"),
         ('family = "F3MAD"', "unknown family 'F3MAD'; did you mean 'F3AMD'"),
-        ("network = {}", "unknown family None"),
+        ("network = {}", "'family'"),
     ],
 )
 def test_a_preset_that_makes_no_sense_is_refused_by_file_and_name(tmp_path, wrong, message):
@@ -243,39 +233,6 @@ def test_configs_of_every_family_survive_json():
         presets.config_from_dict({})
     with pytest.raises(ValueError, match="'CAMDM' do not make a F3AMD"):
         type(tiny_config()).from_dict(values)
-
-
-def test_counted_parameters_are_those_of_the_built_network():
-    config = tiny_config(block_residual=True, history_anchor=True, residual_prior=True)
-    built = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network_of(config))))
-    assert presets.count_parameters(config) == built
-    # The anchor and the prior each add one number per frame and channel.
-    plain = presets.count_parameters(tiny_config(block_residual=True))
-    assert built - plain == 2 * config.window * CHANNELS
-
-
-def test_counted_operations_of_a_linear_coder_by_hand():
-    linear, spectral = (
-        presets.count_model_flops(presets.build_config("F3AMD-FNO-96", **SIZE, encoder_decoder=kind))
-        for kind in ("linear", "fno")
-    )
-    width, frames, modes = 96, 32, 17
-    dense = 2 * 2 * frames * CHANNELS * width
-    blocks = 0
-    for width_in, width_out in ((CHANNELS, width), (width, CHANNELS)):
-        blocks += 2 * (2 * modes) * frames * (width_in + width_out)  # to modes and back
-        blocks += 2 * 4 * modes * width_in * width_out  # complex products
-        blocks += 2 * 3 * frames * (width_in * width_in + width_in * width_out)  # convolutions
-    assert linear[0] == spectral[0]
-    assert spectral[1] - linear[1] == blocks - dense
-
-
-def test_the_same_key_builds_the_same_network():
-    settings = {**SIZE, "latent_width": 8, "depth": 1, "window": 8, "num_kept_modes": 2}
-    first, again, other = (
-        nnx.state(presets.build("F3AMD-FNO-32", key=jax.random.key(k), **settings)) for k in (1, 1, 2)
-    )
-    assert same_tree(first, again) and not same_tree(first, other)
 
 
 @functools.cache

@@ -23,7 +23,6 @@ from f3amd_lib.diffusion.flow import default_sampler
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, nearest_hint
-from f3amd_lib.ground.papers import check_entry, find_entry
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys
 from f3amd_lib.networks.counting import count_flops
 
@@ -81,15 +80,15 @@ def laid_over(lower: Mapping, upper: Mapping) -> dict:
     return {**lower, **upper, **inside}
 
 
-def _preset(name: str, paper: str, family: str, diffusion=None, network=None, training=None, **own) -> Preset:
+def _preset(name: str, paper: str, family: str, source, diffusion=None, network=None, training=None, **own) -> Preset:
+    check_known(family, FAMILIES, "family")
     schedule = schedule_from_dict(diffusion or {"kind": "variance_exploding"})
     network = network or {}
     # CAMDM is told the number of a level, and so must know the levels of its schedule.
     if family == "CAMDM" and schedule.levels is not None:
         network = {"noise_levels": tuple(schedule.levels.tolist()), **network}
-    own = {"several_windows" if key == "windows" else key: value for key, value in own.items()}
-    own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
-    return Preset(name, paper, family, schedule, network, training or {}, **own)
+    names, windows = (tuple(own.pop(key, ())) for key in ("paper_names", "windows"))
+    return Preset(name, paper, family, schedule, network, training or {}, source, names, windows, **own)
 
 
 def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
@@ -100,19 +99,16 @@ def read_presets(path: Path) -> tuple[dict[str, Preset], dict[str, Preset]]:
     """
     table = read_toml(path)
     rows, named = {}, {"forms": {}, "presets": {}}
-    keys = [field.name for field in dataclasses.fields(Preset)] + ["like", "windows"]
-    for kind in named:
+    for kind, found in named.items():
         for name, row in table.get(kind, {}).items():
-            where = f"{path}: {kind}.{name}"
-            check_entry(row, where, ["source"], keys)
             own = {key: row.pop(key) for key in ("source", "paper_names", "windows") if key in row}
-            lower = [find_entry(rows, other, "preset above it in this file", where) for other in row.pop("like", ())]
-            rows[name] = functools.reduce(laid_over, [*lower, row])
-            find_entry(FAMILIES, rows[name].get("family"), "family", where)
             try:
-                named[kind][name] = _preset(name, path.parent.name, **own, **rows[name])
-            except ValueError as error:
-                raise ValueError(f"{where}: {error}") from error
+                for other in (likes := row.pop("like", ())):
+                    check_known(other, rows, "preset above it in this file")
+                rows[name] = functools.reduce(laid_over, [*(rows[other] for other in likes), row])
+                found[name] = _preset(name, path.parent.name, **own, **rows[name])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: {kind}.{name}: {error}") from error
     return named["presets"], named["forms"]
 
 
@@ -149,26 +145,20 @@ def find_preset(name: str) -> Preset:
     for suffix, form in FORMS.items():
         base = PRESETS.get(name.removesuffix(suffix))
         if name.endswith(suffix) and base is not None:
-            return _formed(base, suffix, form)
+            if (base.paper, base.family) != (form.paper, form.family) or base.source == "ours" or base.training:
+                only = f"only the paper's {form.family} with the paper's losses have"
+                raise ValueError(f"{base.name} has no {suffix!r} form: {only}")
+            return dataclasses.replace(
+                base, name=name, network=laid_over(base.network, form.network), training=form.training, paper_names=(),
+                source=form.source, latent=base.latent and base.latent + form.latent,
+            )  # fmt: skip
     raise ValueError(f"unknown model {name!r}{nearest_hint(name, [*PRESETS, *_PAPER_NAMES])}")
-
-
-def _formed(base: Preset, suffix: str, form: Preset) -> Preset:
-    if (base.paper, base.family) != (form.paper, form.family) or base.source == "ours" or base.training:
-        only = f"only the paper's {form.family} with the paper's losses have"
-        raise ValueError(f"{base.name} has no {suffix!r} form: {only}")
-    name, network = base.name + suffix, laid_over(base.network, form.network)
-    latent = base.latent + form.latent if base.latent else ""
-    return dataclasses.replace(
-        base, name=name, network=network, training=form.training, source=form.source, paper_names=(), latent=latent
-    )
 
 
 def of_paper(paper: str = "f3amd") -> dict[str, Preset]:
     """Return the presets of one paper's folder by name; ValueError names the nearest folder if there is none."""
-    if found := {name: preset for name, preset in PRESETS.items() if preset.paper == paper}:
-        return found
-    raise ValueError(f"no presets of paper {paper!r}{nearest_hint(paper, {p.paper: p for p in PRESETS.values()})}")
+    check_known(paper, {preset.paper: preset for preset in PRESETS.values()}, "paper")
+    return {name: preset for name, preset in PRESETS.items() if preset.paper == paper}
 
 
 def build_config(name: str, **settings) -> CheckedConfig:
@@ -235,15 +225,12 @@ def count_model_flops(config: CheckedConfig) -> tuple[int, int]:
       (operations of encoding the condition, once a round; operations of one evaluation of the
       denoiser, once a step). See `counting.count_flops` for what is counted.
     """
-    graph, state = blank_network(config)
-    condition = config.condition_shapes(1)
-    x_noisy = jax.ShapeDtypeStruct(config.state_shape(1), jnp.float32)
-    sigma = jax.ShapeDtypeStruct((1,), jnp.float32)
+    (graph, state), condition = blank_network(config), config.condition_shapes(1)
+    x_noisy, sigma = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in (config.state_shape(1), (1,)))
     encode = lambda state, condition: nnx.merge(graph, state).encode(condition)
     denoise = lambda state, *inputs: nnx.merge(graph, state)(*inputs)
     context = jax.eval_shape(encode, state, condition)
-    once = count_flops(encode, state, condition)
-    return once, count_flops(denoise, state, x_noisy, sigma, context)
+    return count_flops(encode, state, condition), count_flops(denoise, state, x_noisy, sigma, context)
 
 
 def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
@@ -262,8 +249,7 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
     """
     known = {name for family in FAMILIES for name in find_family(family)[0].from_data}
     for name in settings:
-        find_entry(dict.fromkeys(known), name, "setting of the data", "presets")
-    columns = "model window latent_width depth parameters mflop_per_evaluation diffusion sampler source"
+        check_known(name, known, "setting of the data")
     rows = []
     for preset in of_paper(paper).values():
         family = find_family(preset.family)[0]
@@ -273,9 +259,12 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
         of_data = {name: settings[name] for name in family.from_data if name in settings.keys() - preset.network.keys()}
         for window in preset.windows:
             config = build_config(preset.name, **of_data, window=window)
-            mflop = round(count_model_flops(config)[1] / 1e6, 2)
-            sizes = window, config.latent_width, config.depth, count_parameters(config), mflop
-            sampler = getattr(config, "sampler", None)
-            sampler = sampler or default_sampler(getattr(config, "objective", "x0"), preset.diffusion)
-            rows.append((preset.name, *sizes, preset.diffusion.kind, sampler, preset.source))
-    return pd.DataFrame(rows, columns=columns.split())
+            own_sampler = default_sampler(getattr(config, "objective", "x0"), preset.diffusion)
+            rows.append({
+                "model": preset.name, "window": window, "latent_width": config.latent_width, "depth": config.depth,
+                "parameters": count_parameters(config),
+                "mflop_per_evaluation": round(count_model_flops(config)[1] / 1e6, 2),
+                "diffusion": preset.diffusion.kind,
+                "sampler": getattr(config, "sampler", None) or own_sampler, "source": preset.source,
+            })  # fmt: skip
+    return pd.DataFrame(rows)

@@ -76,17 +76,14 @@ class VariantConfig(F3AMDConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        adaln = self.conditioning == "adaln_zero"
-        for option, contradicted, why in (
-            ("history_input", self.conditioning == "concatenation", "concatenation lays c before the features"),
-            ("block_bypass", self.block_residual, "block_residual has a bypass already"),
-            ("block_bypass", adaln, "adaln_zero is residual already"),
-            ("block_residual", adaln, "adaln_zero is residual already"),
-            ("pre_norm", adaln, "adaln_zero normalises what a block reads already"),
-            ("film_from_identity", self.conditioning != "film", f"it is of FiLM, and c enters by {self.conditioning}"),
-        ):
-            if contradicted and getattr(self, option):
-                raise ValueError(f"{why}: leave {option} off")
+        contradicting = {  # AdaLN-zero normalises what a block reads and is residual already
+            "adaln_zero": ("block_residual", "block_bypass", "pre_norm", "film_from_identity"),
+            "concatenation": ("history_input", "film_from_identity"), "cross_attention": ("film_from_identity",),
+        }.get(self.conditioning, ())  # fmt: skip
+        contradicting += ("block_bypass",) if self.block_residual else ()
+        for option in contradicting:
+            if getattr(self, option):
+                raise ValueError(f"{option} contradicts {self.conditioning} or block_residual: leave it off")
 
     @classmethod
     def from_dict(cls, values: dict) -> F3AMDConfig:
