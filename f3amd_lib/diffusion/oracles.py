@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from f3amd_lib.ground.arrays import array_module, check_positive
+from f3amd_lib.ground.arrays import array_module, finite_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,11 @@ class GaussianMixture:
     def __post_init__(self):
         means = np.array(self.means, dtype=np.float64)
         means = means[:, None] if means.ndim == 1 else means
-        if means.ndim != 2 or means.size == 0 or not np.all(np.isfinite(means)):
-            raise ValueError(f"means must be [K, D] and finite, got shape {np.shape(self.means)}")
+        finite_array("means", means, ("mode", "dimension"))
         weights = np.ones(len(means)) if self.weights is None else np.array(self.weights, float)
-        if weights.shape != (len(means),) or not np.all(weights > 0):
-            raise ValueError(f"weights must be {len(means)} positive numbers, got {self.weights!r}")
-        check_positive("width", self.width)
+        if weights.shape != (len(means),) or not (self.width > 0 and np.all(weights > 0)):
+            given = f"width {self.width} and weights {self.weights!r}"
+            raise ValueError(f"a mixture needs a positive width and {len(means)} positive weights, got {given}")
         object.__setattr__(self, "means", means)
         object.__setattr__(self, "weights", weights / weights.sum())
 

@@ -225,25 +225,14 @@ SAMPLERS: dict[str, Sampler] = {
 sampler by name; no schedule asks for it."""
 
 
-def _sampler(name: str) -> Sampler:
-    """Return a sampler by name; ValueError names the nearest one if there is none."""
+def _legs(name: str, x_init, sigmas, alphas, key) -> tuple[Sampler, tuple]:
+    """Return the sampler and all intervals at once; ValueError as `sample` says.
+
+    An interval has its two levels, the key of its noise (or None), and what is left of the signal at each end, if that
+    is told.
+    """
     check_known(name, SAMPLERS, "sampler")
-    return SAMPLERS[name]
-
-
-class _Leg(NamedTuple):
-    """One interval of the walk: its two levels, the key of its noise, and what is left of the signal at each end."""
-
-    sigma: jax.Array
-    sigma_next: jax.Array
-    key: jax.Array | None
-    alphas: tuple[jax.Array, ...]
-
-
-def _legs(name: str, x_init, sigmas, alphas, key) -> _Leg:
-    """Return all intervals at once, each field [N, ...]; ValueError as `sample` says."""
-    sampler = _sampler(name)
-    sigmas = jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
+    sampler, sigmas = SAMPLERS[name], jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(
             f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}; "
@@ -253,29 +242,30 @@ def _legs(name: str, x_init, sigmas, alphas, key) -> _Leg:
         raise ValueError(f"sampler {name!r} draws fresh noise at every step: give it a key")
     keys = jax.random.split(key, len(sigmas) - 1) if sampler.draws_noise else None
     if alphas is None:
-        return _Leg(sigmas[:-1], sigmas[1:], keys, ())
+        return sampler, (sigmas[:-1], sigmas[1:], keys)
     alphas = jnp.asarray(alphas, dtype=sigmas.dtype)
     if name != "ddim" or alphas.shape != sigmas.shape:
         raise ValueError(
             f"alphas are for 'ddim' alone, one for each of the {len(sigmas)} sigmas; got {alphas.shape} for {name!r}"
         )
-    return _Leg(sigmas[:-1], sigmas[1:], keys, (alphas[:-1], alphas[1:]))
+    return sampler, (sigmas[:-1], sigmas[1:], keys, alphas[:-1], alphas[1:])
 
 
-def _take(step: Callable, denoise: Denoiser, x_noisy, leg: _Leg):
+def _take(step: Callable, denoise: Denoiser, x_noisy, leg: tuple):
     """Go over one interval; return the state at its end and the clean estimate at its start."""
-    x0_hat = denoise(x_noisy, leg.sigma)
-    noise = None if leg.key is None else jax.random.normal(leg.key, x_noisy.shape, x_noisy.dtype)
-    return step(x_noisy, x0_hat, leg.sigma, leg.sigma_next, denoise, noise, *leg.alphas), x0_hat
+    sigma, sigma_next, key, *alphas = leg
+    x0_hat = denoise(x_noisy, sigma)
+    noise = None if key is None else jax.random.normal(key, x_noisy.shape, x_noisy.dtype)
+    return step(x_noisy, x0_hat, sigma, sigma_next, denoise, noise, *alphas), x0_hat
 
 
-def _pick(legs: _Leg, which) -> _Leg:
+def _pick(legs: tuple, which) -> tuple:
     return jax.tree.map(lambda field: field[which], legs)
 
 
-def _fold(step: Callable, denoise: Denoiser, x_init, legs: _Leg, unroll: bool):
+def _fold(step: Callable, denoise: Denoiser, x_init, legs: tuple, unroll: bool):
     """Go over all intervals in one scan."""
-    num_steps, x_noisy = len(legs.sigma), jnp.asarray(x_init)
+    num_steps, x_noisy = len(legs[0]), jnp.asarray(x_init)
     over = lambda x_noisy, leg: (_take(step, denoise, x_noisy, leg)[0], None)
     # A scan keeps its loop around a single step, unrolled or not, and also around none.
     if num_steps == 0:
@@ -309,7 +299,7 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=Non
       ValueError: for an unknown name, a sampler that draws noise without a key, `sigmas` that
         are not a list of at least two levels, or `alphas` that do not fit them or the sampler.
     """
-    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, alphas, key)
+    sampler, legs = _legs(name, x_init, sigmas, alphas, key)
     if sampler.last is None:
         return _fold(sampler.step, denoise, x_init, legs, unroll)
     # Apart from the scan: masked inside, it would cost an evaluation that nobody uses.
@@ -337,15 +327,15 @@ def walk(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None)
     Raises:
       ValueError: as `sample`.
     """
-    sampler, legs = _sampler(name), _legs(name, x_init, sigmas, alphas, key)
-    x_noisy, num_steps = jnp.asarray(x_init), len(legs.sigma)
-    for number in range(num_steps):
+    sampler, legs = _legs(name, x_init, sigmas, alphas, key)
+    x_noisy, last = jnp.asarray(x_init), len(legs[0]) - 1
+    for number in range(last + 1):
         leg = _pick(legs, number)
-        step = sampler.last if sampler.last and number == num_steps - 1 else sampler.step
+        step = sampler.last if sampler.last and number == last else sampler.step
         x_next, x0_hat = _take(step, denoise, x_noisy, leg)
-        yield Visited(x_noisy, leg.sigma, x0_hat)
+        yield Visited(x_noisy, leg[0], x0_hat)
         x_noisy = x_next
-    yield Visited(x_noisy, legs.sigma_next[-1], None)
+    yield Visited(x_noisy, legs[1][-1], None)
 
 
 def num_evaluations(name: str, num_steps: int) -> int:
@@ -360,4 +350,5 @@ def num_evaluations(name: str, num_steps: int) -> int:
     """
     if num_steps < 1:
         raise ValueError(f"a sampler needs at least 1 step, got num_steps={num_steps}")
-    return _sampler(name).evaluations * (num_steps - 1) + 1
+    check_known(name, SAMPLERS, "sampler")
+    return SAMPLERS[name].evaluations * (num_steps - 1) + 1
