@@ -134,8 +134,6 @@ def test_a_rollout_is_blended_only_if_asked(generator, plain):
         ({"blend_frames": T + 1}, f"from 0 to {T}, the window, got {T + 1}"),
         ({"blend_frames": -1}, "got -1"),
         ({"blend_frames": 2.5}, "got 2.5"),
-        ({"window": 0}, "window must be a whole number .* got 0"),
-        ({"frames": np.zeros((4, 10))}, r"frames must be .* got \(4, 10\)"),
         ({"frames": np.full((4, CHANNELS), np.nan)}, "not finite at frame 0"),
         ({"history": np.zeros((3, CHANNELS - 6))}, r"history must be \[frame, .*\] .* got \(3, "),
     ],

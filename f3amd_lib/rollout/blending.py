@@ -68,16 +68,11 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
       [..., F, C], float64.
 
     Raises:
-      ValueError: for a window or blend_frames out of range, frames that are none, or a history that
-        does not fit.
+      ValueError: for blend_frames out of range, frames that are not finite, or a history that does not fit.
     """
     frames = np.asarray(frames, np.float64)
-    if frames.ndim < 2 or frames.shape[-1] < 9 or (frames.shape[-1] - 3) % 6:
-        raise ValueError(f"frames must be [..., F, 3 + 6 J], got {frames.shape}")
     shape = (*frames.shape[:-2], "frame", frames.shape[-1])
     finite_array("frames", frames, shape)
-    if int(window) != window or window < 1:
-        raise ValueError(f"window must be a whole number of frames, 1 or more, got {window}")
     if int(blend_frames) != blend_frames or not 0 <= blend_frames <= window:
         raise ValueError(f"blend_frames must be a whole number from 0 to {window}, the window, got {blend_frames}")
     before = frames[..., :0, :] if history is None else finite_array("history", history, shape)
@@ -88,14 +83,13 @@ def blend_seams(frames, window: int, blend_frames: int, *, history=None) -> np.n
     root, rotation_6d = split_frames(whole)
     root, turns = root.copy(), matrix_from_rotation_6d(rotation_6d)
     start = before.shape[-2]
-    for seam in range(start or window, len(whole), int(window)):
-        stop = min(seam + int(blend_frames), len(whole))
+    for seam in range(start or window, len(whole), window):
+        after = slice(seam, seam + int(blend_frames))
         for values, between, add in ((root, np.subtract, np.add), (turns, _turn_between, _turned)):
-            added = _offsets(values, between, add, seam, int(blend_frames))[: stop - seam]
-            values[seam:stop] = add(added, values[seam:stop])
+            added = _offsets(values, between, add, seam, int(blend_frames))
+            values[after] = add(added[: len(values[after])], values[after])
     flat = rotation_6d_from_matrix(turns).reshape(*whole.shape[:-1], -1)
-    blended = np.concatenate([root, flat], axis=-1)[start:]
-    return np.moveaxis(blended, 0, -2)
+    return np.moveaxis(np.concatenate([root, flat], axis=-1)[start:], 0, -2)
 
 
 def _turn_between(second, first):

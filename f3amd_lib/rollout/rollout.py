@@ -81,18 +81,11 @@ class MotionGenerator:
     def sample_window_each(self, keys, condition: Condition):
         """Sample one window for each character as if it were alone, [B, T, C]; keys [B]."""
         if self.sampler == "ddpm":
-
-            def alone(key, condition):
-                return self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], condition))[0]
-
+            alone = lambda key, given: self.sample_window(key, jax.tree.map(lambda leaf: leaf[None], given))[0]
             return jax.vmap(alone)(keys, condition)
-
         # Where only the start is drawn, all can walk together from noise of their own.
-        config = self.trained.config
-
-        def draw(key):
-            return jax.random.normal(jax.random.split(key)[0], (config.window, config.channels))
-
+        shape = self.trained.config.state_shape(1)[1:]
+        draw = lambda key: jax.random.normal(jax.random.split(key)[0], shape)
         return self.sample_window(None, condition, noise=jax.vmap(draw)(keys))
 
     def _rounds(self, history, positions, yaws, before, style, key):
@@ -137,16 +130,12 @@ class MotionGenerator:
         Returns:
           World frames, [B, F, C], float32.
         """
-        window = self.trained.config.window
-        batch, num_frames = yaw.shape
+        window, start, (batch, num_frames) = self.trained.config.window, path_start(position), yaw.shape
         rounds = -(-num_frames // window)
-        start = path_start(position)
-        missing = rounds * window - num_frames
-        if missing:
-            ahead = np.arange(1, missing + 1)[None, :, None]
-            pace = position[:, -1:] - position[:, -2:-1]
-            position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
-            yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], missing, axis=1)], axis=1)
+        ahead = np.arange(1, rounds * window - num_frames + 1)[None, :, None]
+        pace = position[:, -1:] - position[:, -2:-1]
+        position = np.concatenate([position, position[:, -1:] + ahead * pace], axis=1)
+        yaw = np.concatenate([yaw, np.repeat(yaw[:, -1:], ahead.size, axis=1)], axis=1)
         shape = (batch, rounds, window)
         targets = np.moveaxis(position.reshape(*shape, 2), 1, 0)
         before = np.concatenate([start[None], targets[:-1, :, -1]])
@@ -181,21 +170,15 @@ class MotionGenerator:
         trained, config, seed = self.trained, self.trained.config, checked_seed(seed)
         paths = [paths] if isinstance(paths, RootPath) else list(paths)
         styles = [styles] if isinstance(styles, str) else list(styles)
-        batch = max(len(paths), len(styles))
-        if not paths or not styles:
-            raise ValueError("a rollout needs at least one path and one style")
-        paths = paths * batch if len(paths) == 1 else paths
-        styles = styles * batch if len(styles) == 1 else styles
-        if len(paths) != batch or len(styles) != batch:
+        batch = max(1, len(paths), len(styles))
+        if not {len(paths), len(styles)} <= {1, batch}:
             raise ValueError(f"got {len(paths)} paths and {len(styles)} styles; give one, or as many")
-        lengths = {len(path.yaw) for path in paths}
-        if len(lengths) != 1:
-            raise ValueError(f"paths must have the same length, got {sorted(lengths)} frames")
+        paths, styles = (given * batch if len(given) == 1 else given for given in (paths, styles))
+        lengths = sorted({len(path.yaw) for path in paths})
+        if len(lengths) != 1 or lengths[0] < 2:
+            raise ValueError(f"paths must have the same length, got {lengths} frames, and at least 2 frames")
         if any(abs(path.fps - 30.0) > 1e-3 for path in paths):
             raise ValueError("paths must be at 30 frames per second, as the models are")
-        num_frames = lengths.pop()
-        if num_frames < 2:
-            raise ValueError("a path needs at least 2 frames")
         indices = np.array([trained.style_index(style) for style in styles])
         position, yaw = (np.stack([getattr(path, name) for path in paths]) for name in ("position", "yaw"))
         start = path_start(position)

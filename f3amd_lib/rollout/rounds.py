@@ -34,14 +34,11 @@ def sample_round(
       ValueError: for neither key nor noise, noise of a wrong shape, an unknown sampler, or one that
         draws noise at every step without a key.
     """
-    config = network.config
-    shape = (condition.history.shape[0], config.window, config.channels)
-    key_steps = None
-    if key is not None:
-        key_init, key_steps = jax.random.split(key)
+    shape = condition.history.shape[0], network.config.window, network.config.channels
+    if noise is None and key is None:
+        raise ValueError("a round starts from noise: give it a key, or the noise itself")
+    key_init, key_steps = (None, None) if key is None else jax.random.split(key)
     if noise is None:
-        if key is None:
-            raise ValueError("a round starts from noise: give it a key, or the noise itself")
         # Drawn with all digits and then cut: one seed, one noise, whatever the precision.
         dtype = condition.history.dtype
         drawn = jax.random.normal(key_init, shape, jnp.promote_types(dtype, jnp.float32))
@@ -72,20 +69,12 @@ def sample_round_on_devices(
       draws none, the numbers of `sample_round`; with a key, others: each device draws its own.
 
     Raises:
-      ValueError: for a mesh of several axes or a number of characters that does not divide; and as
-        `sample_round`.
+      ValueError: for a number of characters that does not divide; and as `sample_round`.
     """
-    if len(mesh.axis_names) != 1:
-        raise ValueError(f"the mesh must have one axis, got {mesh.axis_names}")
     (axis,) = mesh.axis_names
-    characters = condition.history.shape[0]
-    if characters % mesh.size:
-        padded = -(-characters // mesh.size) * mesh.size
-        raise ValueError(f"{characters} characters do not divide among {mesh.size} devices: pad them to {padded}")
 
     def share(condition, key, noise):
-        if key is not None:
-            key = jax.random.fold_in(key, jax.lax.axis_index(axis))
+        key = None if key is None else jax.random.fold_in(key, jax.lax.axis_index(axis))
         return sample_round(network, condition, sigmas, key, noise=noise, sampler=sampler)
 
     rows, whole = PartitionSpec(axis), PartitionSpec()
