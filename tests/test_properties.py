@@ -72,11 +72,11 @@ def motions(draw):
 
 
 @few
-@given(motions(), st.permutations("XYZ"))
-def test_any_motion_goes_through_bvh(motion, order):
+@given(motions())
+def test_any_motion_goes_through_bvh(motion):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        again = parse_bvh(format_bvh(motion, order="".join(order)), "any")
+        again = parse_bvh(format_bvh(motion), "any")
     # Joints come depth first: compared by name.
     place = [again.skeleton.names.index(name) for name in motion.skeleton.names]
     np.testing.assert_allclose(again.positions[:, place], motion.positions, atol=1e-5)

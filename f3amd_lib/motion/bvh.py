@@ -6,7 +6,6 @@ file, line and remedy when a file is broken. Files hold centimetres and degrees;
 metres and rotation matrices.
 """
 
-import collections
 import io
 import re
 import warnings
@@ -23,11 +22,6 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton
 RIGID_TOLERANCE = 1e-3
 """Metres by which a joint's position channels may wander before its bone counts as not rigid."""
 
-_MOTION_LINE = re.compile(rb"^[ \t]*MOTION[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
-_FRAMES_LINE = re.compile(r"frames\s*:\s*(.*)", re.IGNORECASE)
-_FRAME_TIME_LINE = re.compile(r"frame\s*time\s*:\s*(.*)", re.IGNORECASE)
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_CHANNELS = {f"{axis}{kind}".lower(): (axis, kind) for axis in "XYZ" for kind in ("position", "rotation")}
 LARGEST_NUMBER = 1e8
 """Largest number of a file, either way: 1,000 km in centimetres, and as many degrees."""
 
@@ -35,12 +29,50 @@ FRAME_TIMES = (1e-5, 1.0)
 """Shortest and longest time between frames, seconds."""
 
 _LONGEST_WORD = 200
-
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _BRACES = "check that every '{' has its '}'"
+
+_NAMED = r"[ \t]+([^\s{}][^\n{}]*+)\s*+\{", "a name on the same line, then '{'"
+_OFFSET = r"\s+([^\s{}]+)" * 3
+_STATEMENTS = {
+    "HIERARCHY": ("", ""),
+    "ROOT": _NAMED,
+    "JOINT": _NAMED,
+    "OFFSET": (_OFFSET, "3 finite numbers"),
+    "CHANNELS": (
+        r"\s+([0-9]{1,9})((?:\s+[XYZ](?:position|rotation)\b)*)",
+        "a count and names, such as 'CHANNELS 1 Xrotation'",
+    ),
+    # A few exporters name their tips; the name carries nothing.
+    "END": (r"\s+Site[^\n{}]*+\s*+\{\s*OFFSET" + _OFFSET + r"\s*\}", "to be as in 'End Site { OFFSET 0 10 0 }'"),
+    "}": ("", ""),
+}
+"""What may stand in the HIERARCHY: keyword -> pattern of what follows it, and how messages tell it."""
+
+_WORD = re.compile(r"\s*([{}]|[^\s{}]+|$)")
+_MOTION_LINE = re.compile(rb"^[ \t]*MOTION[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
+_MOTION_HEAD = re.compile(
+    rb"\s*Frames\s*:[ \t]*(\S+)[ \t\r]*\n\s*Frame\s*Time\s*:[ \t]*(\S+)[ \t\r]*(?:\n|$)", re.IGNORECASE
+)
 
 
 class _Broken(Exception):
     """(line, what is wrong and what to do); `parse_bvh` adds the file's name."""
+
+
+@dataclass
+class _Joint:
+    """What the HIERARCHY says of one joint; columns of the MOTION block by channel, such as "Xrotation"."""
+
+    name: str
+    line: int
+    parent: int
+    offset: list[float] | None = None
+    channels: dict[str, int] | None = None
+
+    def columns(self, kind: str) -> dict[str, int]:
+        """Return axis -> column, for "position" or "rotation", in the order of the file."""
+        return {channel[0]: column for channel, column in self.channels.items() if channel.endswith(kind)}
 
 
 def read_bvh(path) -> Motion:
@@ -86,122 +118,24 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
       ValueError: "name, line n: what is wrong; what to do" for anything that is not a sound BVH.
     """
     check_positive("scale", scale)
+    # Half a character is found, with its line, when the HIERARCHY is decoded.
+    data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    data = data if b"\n" in data else data.replace(b"\r", b"\n")
     try:
-        data = _clean(text, name)
         motion = _MOTION_LINE.search(data)
+        head = data[: motion.start()] if motion else data
+        try:
+            hierarchy = head.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            line = 1 + head.count(b"\n", 0, error.start)
+            raise _Broken(line, "holds bytes that are not UTF-8 text; is it a BVH file?") from None
         if motion is None:
-            raise _Broken(data.count(b"\n") + 1, "the file ends without a MOTION line; export or copy it again")
-        joints, end_sites = _parse_hierarchy(data[: motion.start()])
-        line = data.count(b"\n", 0, motion.start()) + 1
-        num_frames, frame_time, rows, line = _parse_motion_head(data[motion.end() :], line)
-        values = _parse_rows(rows, line, joints, num_frames)
-        return _build_motion(joints, end_sites, values, frame_time, name, scale, rows, line)
+            raise _Broken(1 + data.count(b"\n"), "the file ends without a MOTION line; export or copy it again")
+        joints, end_sites = _parse_hierarchy(hierarchy)
+        values, frame_time = _parse_motion(data, motion.end(), joints)
+        return _build_motion(joints, end_sites, values, frame_time, name, scale)
     except _Broken as error:
-        line, message = error.args
-        raise ValueError(f"{name}, line {line}: {message}") from None
-
-
-def write_bvh(path, motion: Motion, *, scale: float = 100.0, order: str = "ZXY", overwrite: bool = False) -> Path:
-    """Write a motion as a BVH file; see `format_bvh` for what is in it.
-
-    Args:
-      path: where to; missing folders are made.
-      motion: what to write.
-      scale: file units per metre (centimetres: 100).
-      order: rotation order of all joints, such as "ZXY".
-      overwrite: an existing file is replaced only if this is true.
-
-    Returns:
-      The path.
-
-    Raises:
-      ValueError: if the file exists and `overwrite` is false, or for a bad order.
-    """
-    return write_whole(path, format_bvh(motion, scale=scale, order=order), overwrite=overwrite)
-
-
-def format_bvh(motion: Motion, *, scale: float = 100.0, order: str = "ZXY") -> str:
-    """Return a motion as BVH text: six channels at the root, three at the other joints.
-
-    Args:
-      motion: what to write; joints are written depth first, as BVH asks.
-      scale: file units per metre (centimetres: 100).
-      order: rotation order of all joints, such as "ZXY" for R = Rz Rx Ry.
-
-    Returns:
-      The text, LF line ends, six decimals; read again, joint positions agree to 1e-6 m.
-
-    Raises:
-      ValueError: if the order is not a permutation of XYZ, or the scale is not above 0.
-    """
-    check_positive("scale", scale)
-    if sorted(order) != ["X", "Y", "Z"]:
-        raise ValueError(f"rotation order {order!r} must name X, Y and Z once each, such as 'ZXY'")
-    rotations = motion.needed_rotations("a BVH file")
-    skeleton, lines, depth_first = motion.skeleton, ["HIERARCHY"], []
-    children = skeleton.children
-    offset_line = lambda offset: "OFFSET " + " ".join(f"{scale * float(value):.6f}" for value in offset)
-    steps = [(0, 0, False)]  # a stack, not a recursion: chains of thousands of joints can be written
-    while steps:
-        joint, depth, closes = steps.pop()
-        outer, inner = "\t" * depth, "\t" * (depth + 1)
-        if closes:
-            tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
-            # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
-            for tip in tips or ([] if children[joint] else [(0.0, 0.0, 0.0)]):
-                lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\t{offset_line(tip)}", f"{inner}}}"]
-            lines.append(f"{outer}}}")
-            continue
-        depth_first.append(joint)
-        channels = [f"{axis}position" for axis in "XYZ" if depth == 0] + [f"{axis}rotation" for axis in order]
-        lines += [f"{outer}{'JOINT' if depth else 'ROOT'} {skeleton.names[joint]}", f"{outer}{{"]
-        lines += [inner + offset_line(skeleton.offsets[joint]), f"{inner}CHANNELS {len(channels)} {' '.join(channels)}"]
-        steps += [(joint, depth, True), *((child, depth + 1, False) for child in reversed(children[joint]))]
-    lines += ["MOTION", f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
-    with warnings.catch_warnings():
-        # At gimbal lock any of the equal answers will do: the matrix is the same.
-        warnings.filterwarnings("ignore", message="Gimbal lock")
-        degrees = euler_from_matrix(order, rotations[:, depth_first])
-    root = scale * np.asarray(motion.root_position, dtype=np.float64)
-    rows = np.concatenate([root, degrees.reshape(motion.num_frames, -1)], axis=1)
-    row_format = " ".join(["%.6f"] * rows.shape[1])
-    lines += [row_format % tuple(row) for row in rows.tolist()]
-    return "\n".join(lines) + "\n"
-
-
-@dataclass
-class _Joint:
-    """What the HIERARCHY says of one joint."""
-
-    name: str
-    line: int
-    parent: int
-    offset: tuple[float, ...] | None = None
-    channels: list[tuple[str, str]] | None = None
-    first_column: int = 0
-
-    def columns(self, wanted: str) -> dict[str, int]:
-        """Return axis -> column of the MOTION block, for "position" or "rotation", as listed."""
-        return {axis: self.first_column + k for k, (axis, kind) in enumerate(self.channels) if kind == wanted}
-
-
-def _clean(text: str | bytes, name: str) -> bytes:
-    """Return the file as bytes with LF or CRLF line ends, or say why it is no text."""
-    if isinstance(text, str):
-        data = text.encode("utf-8", "surrogatepass")  # half a character is found, with its line, by the reader
-    elif isinstance(text, bytes | bytearray | memoryview):
-        data = bytes(text)
-    else:
-        raise ValueError(f"{name}: BVH content must be str or bytes, not {type(text).__name__}")
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise _Broken(1, "the file is UTF-16 text; save it as UTF-8 or ASCII")
-    data = data.removeprefix(b"\xef\xbb\xbf")
-    if not data.strip():
-        raise _Broken(1, "the file is empty; export or copy it again")
-    if b"\x00" in data:
-        line = data.count(b"\n", 0, data.index(b"\x00")) + 1
-        raise _Broken(line, "holds zero bytes, so it is not text; is it really a BVH file?")
-    return data if b"\n" in data else data.replace(b"\r", b"\n")
+        raise ValueError("{}, line {}: {}".format(name, *error.args)) from None
 
 
 def finite_number(word: str, largest: float = LARGEST_NUMBER) -> float | None:
@@ -210,216 +144,124 @@ def finite_number(word: str, largest: float = LARGEST_NUMBER) -> float | None:
     return value if abs(value) <= largest else None
 
 
-def _count(word: str) -> int | None:
-    """Return a word as a whole number of nine digits at most, or None."""
-    return int(word) if len(word) <= 9 and word.isdecimal() else None
+def _statements(text: str):
+    """Yield (line, keyword, the words after it) of the HIERARCHY, one statement after the other."""
+    place, line = 0, 1
+    while (word := _WORD.match(text, place))[1]:
+        line += text.count("\n", place, word.start(1))
+        keyword = word[1].upper()
+        if keyword not in _STATEMENTS:
+            raise _Broken(line, f"unexpected {word[1][:40]!r}; known here are {', '.join(_STATEMENTS)}")
+        pattern, needed = _STATEMENTS[keyword]
+        found = re.compile(pattern, re.IGNORECASE).match(text, word.end())
+        if found is None:
+            there = " ".join(text[word.end() : word.end() + 80].split())
+            raise _Broken(line, f"{keyword} needs {needed}, found {there[:40]!r}")
+        yield line, keyword, found.groups()
+        place = found.end()
+        line += text.count("\n", word.start(1), place)
 
 
-class _Tokens(collections.deque):
-    """(word, line) of the HIERARCHY; braces stand alone, and the word after the last one is ""."""
-
-    def __init__(self, data: bytes):
-        super().__init__()
-        for line, raw in enumerate(data.split(b"\n"), start=1):
-            try:
-                words = raw.decode("utf-8")
-            except UnicodeDecodeError:
-                raise _Broken(line, "holds bytes that are not UTF-8 text; is it a BVH file?") from None
-            words = words.replace("{", " { ").replace("}", " } ").split()
-            if max(map(len, words), default=0) > _LONGEST_WORD:
-                what = f"holds a word of {max(map(len, words))} characters"
-                raise _Broken(line, f"{what}, longer than {_LONGEST_WORD}; is it a BVH file?")
-            self.extend((word, line) for word in words)
-        self.append(("", line))
-
-    def take(self, expected: str) -> tuple[str, int]:
-        word, line = self[0]
-        if not word:
-            raise _Broken(line, f"expected {expected}, but MOTION starts here; {_BRACES}")
-        return self.popleft()
-
-    def rest_of_line(self, line: int) -> str:
-        """Take the words left on a line, up to a brace: a joint's name may hold blanks."""
-        words = []
-        while self[0][1] == line and self[0][0] not in ("{", "}", ""):
-            words.append(self.take("a name")[0])
-        return " ".join(words)
-
-    def expect(self, wanted: str, where: str):
-        word, line = self.take(f"{wanted!r} {where}")
-        if word.upper() != wanted.upper():
-            raise _Broken(line, f"expected {wanted!r} {where}, found {word!r}")
-
-    def offset(self) -> tuple[float, ...]:
-        """Take the three numbers after an OFFSET."""
-        values = []
-        for _ in range(3):
-            word, line = self.take("a number of OFFSET")
-            values.append(finite_number(word))
-            if values[-1] is None:
-                raise _Broken(line, f"OFFSET needs 3 finite numbers, found {word!r} among them")
-        return tuple(values)
+def _offset(words: tuple[str, ...], line: int) -> list[float]:
+    values = [finite_number(word) for word in words]
+    if None in values:
+        raise _Broken(line, f"OFFSET needs 3 finite numbers, found {' '.join(words)[:40]!r}")
+    return values
 
 
-def _parse_hierarchy(data: bytes):
+def _parse_hierarchy(text: str) -> tuple[list[_Joint], list[tuple[int, list[float]]]]:
     """Return the joints in file order and the End Sites as (joint, offset) in file units."""
-    tokens = _Tokens(data)
-    word, line = tokens[0]
-    if word.upper() != "HIERARCHY":
-        raise _Broken(line, f"a BVH file starts with HIERARCHY, this one with {word!r}")
-    tokens.take("HIERARCHY")
-    joints: list[_Joint] = []
-    end_sites: list[tuple[int, tuple[float, ...]]] = []
-    open_blocks: list[int] = []  # joints whose braces are open, innermost last
-    column = 0
-    while tokens[0][0]:
-        word, line = tokens.take("a keyword")
-        keyword = word.upper()
-        current = joints[open_blocks[-1]] if open_blocks else None
+    joints, taken, end_sites, column = [], {}, [], 0
+    open_joints = []  # whose braces are open, innermost last
+    for line, keyword, words in _statements(text):
+        if keyword == "HIERARCHY":
+            continue
+        if keyword == "ROOT" and joints:
+            first = f"the first is {joints[0].name!r} in line {joints[0].line}"
+            raise _Broken(line, f"a second ROOT ({first}); a file holds one character: split it")
+        if keyword != "ROOT" and not open_joints:
+            raise _Broken(line, f"{keyword!r} stands outside of the ROOT's braces; {_BRACES}")
         if keyword in ("ROOT", "JOINT"):
-            if keyword == "ROOT" and joints:
-                first = f"the first is {joints[0].name!r} in line {joints[0].line}"
-                raise _Broken(line, f"a second ROOT ({first}); a file holds one character: split it")
-            if keyword == "JOINT" and current is None:
-                raise _Broken(line, f"JOINT stands outside of the ROOT's braces; {_BRACES}")
-            joint = _Joint(tokens.rest_of_line(line), line, open_blocks[-1] if open_blocks else -1)
-            if not joint.name:
-                raise _Broken(line, f"{keyword} needs a name on the same line")
-            for other in joints:
-                if other.name == joint.name:
-                    raise _Broken(line, f"joint name {joint.name!r} is taken (line {other.line}); rename one")
-            tokens.expect("{", f"after {keyword} {joint.name}")
-            open_blocks.append(len(joints))
-            joints.append(joint)
-        elif current is None:
-            why = f"the ROOT's braces are closed; {_BRACES}" if joints else "expected ROOT"
-            raise _Broken(line, f"unexpected {word!r}: {why}" if keyword != "}" else f"a '}}' too many; {_BRACES}")
-        elif keyword == "}":
-            for what, value in (("OFFSET", current.offset), ("CHANNELS", current.channels)):
-                if value is None:
-                    raise _Broken(line, f"joint {current.name!r} ends without {what}; add the line")
-            open_blocks.pop()
-        elif keyword in ("OFFSET", "CHANNELS"):
-            if getattr(current, keyword.lower()) is not None:
-                raise _Broken(line, f"joint {current.name!r} has a second {keyword}; remove one")
-            if keyword == "OFFSET":
-                current.offset = tokens.offset()
-            else:
-                current.channels, current.first_column = _parse_channels(tokens, line, current.name), column
-                column += len(current.channels)
+            name = " ".join(words[0].split())
+            if name in taken:
+                raise _Broken(line, f"joint name {name!r} is taken (line {taken[name]}); rename one")
+            taken[name] = line
+            joints.append(_Joint(name, line, open_joints[-1] if open_joints else -1))
+            open_joints.append(len(joints) - 1)
+            continue
+        joint = joints[open_joints[-1]]
+        if keyword == "}":
+            if joint.offset is None or joint.channels is None:
+                what = "OFFSET" if joint.offset is None else "CHANNELS"
+                raise _Broken(line, f"joint {joint.name!r} ends without {what}; add the line")
+            open_joints.pop()
         elif keyword == "END":
-            tokens.expect("Site", "after End")
-            # A few exporters name their tips; the name carries nothing.
-            tokens.rest_of_line(line)
-            tokens.expect("{", "after End Site")
-            tokens.expect("OFFSET", "inside End Site")
-            end_sites.append((open_blocks[-1], tokens.offset()))
-            tokens.expect("}", "after the OFFSET of End Site")
+            end_sites.append((open_joints[-1], _offset(words, line)))
+        elif getattr(joint, keyword.lower()) is not None:
+            raise _Broken(line, f"joint {joint.name!r} has a second {keyword}; remove one")
+        elif keyword == "OFFSET":
+            joint.offset = _offset(words, line)
         else:
-            raise _Broken(line, f"unexpected {word!r}; known here are OFFSET, CHANNELS, JOINT, End Site and '}}'")
-    if open_blocks:
-        unclosed = joints[open_blocks[-1]]
-        what = f"MOTION starts, but the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open; {_BRACES}"
-        raise _Broken(tokens[0][1], what)
-    if not joints:
-        raise _Broken(tokens[0][1], "MOTION starts, but there is no ROOT")
+            count, channels = words[0], [channel.capitalize() for channel in words[1].split()]
+            joint.channels = {channel: column + k for k, channel in enumerate(channels)}
+            column += len(channels)
+            if not int(count) == len(channels) == len(joint.channels):
+                what = f"joint {joint.name!r} says it has {count} channels, but lists {', '.join(channels) or 'none'}"
+                raise _Broken(line, f"{what}; each is X, Y or Z with position or rotation, such as Xposition, and once")
+    end = 1 + text.count("\n")
+    if open_joints:
+        unclosed = joints[open_joints[-1]]
+        what = f"the '{{' of {unclosed.name!r} (line {unclosed.line}) is still open where the HIERARCHY ends"
+        raise _Broken(end, f"{what}; {_BRACES}")
     if column == 0:
-        raise _Broken(tokens[0][1], "no joint has a channel, so there is no motion to read")
+        raise _Broken(end, "no joint has a channel, so there is no motion to read; a ROOT needs CHANNELS")
     return joints, end_sites
 
 
-def _parse_channels(tokens: _Tokens, line: int, joint: str) -> list[tuple[str, str]]:
-    """Return (axis, kind) of a CHANNELS line, its keyword already taken."""
-    count, _ = tokens.take("the number of channels")
-    if _count(count) is None:
-        raise _Broken(line, f"CHANNELS needs a count first, found {count!r}")
-    channels = []
-    for _ in range(_count(count)):
-        label, label_line = tokens.take(f"channel names of {joint!r}")
-        channel = _CHANNELS.get(label.lower())
-        if channel is None:
-            what = f"unknown channel {label!r} of joint {joint!r}, which says it has {count}"
-            raise _Broken(label_line, f"{what}; channels are X, Y or Z with position or rotation, such as Xposition")
-        if channel in channels:
-            raise _Broken(label_line, f"joint {joint!r} has the channel {label!r} twice; remove one")
-        channels.append(channel)
-    extra, extra_line = tokens[0]
-    if extra.lower() in _CHANNELS:
-        raise _Broken(extra_line, f"joint {joint!r} says it has {count} channels, but lists {extra!r} too")
-    return channels
-
-
-def _parse_motion_head(data: bytes, line: int):
-    """Read "Frames:" (with its line) and "Frame Time:"; return both, the rows' bytes and their first line."""
-    rest = data.partition(b"\n")[2]
-    answers = []
-    for pattern, example in ((_FRAMES_LINE, "Frames: 120"), (_FRAME_TIME_LINE, "Frame Time: 0.0333333")):
-        words = ""
-        while rest and not words:
-            head, _, rest = rest.partition(b"\n")
-            words, line = head.decode("utf-8", errors="replace").strip(), line + 1
-        match = pattern.fullmatch(words)
-        if match is None:
-            there = f"found {words[:40]!r}" if words else "the file ends"
-            raise _Broken(line, f"expected a line like {example!r} here, {there}")
-        answers.append((match.group(1).strip(), line))
-    (count, count_line), (seconds, _) = answers
-    if not _count(count):
-        raise _Broken(count_line, f"Frames: must be a whole number above 0, found {count[:40]!r}")
+def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.ndarray, float]:
+    """Return the numbers of the MOTION block, [frames, channels], and the seconds between frames."""
+    line_at = lambda place: 1 + data.count(b"\n", 0, place)
+    head = _MOTION_HEAD.match(data, place)
+    if head is None:
+        there = data[place:].lstrip()[:40].decode("utf-8", "replace") or "the end of the file"
+        raise _Broken(line_at(place), f"'Frames: 120' and 'Frame Time: 0.0333333' must follow, found {there!r}")
+    count, seconds = (word.decode("utf-8", "replace") for word in head.groups())
+    if not (len(count) <= 9 and count.isdecimal() and int(count)):
+        raise _Broken(line_at(head.start(1)), f"Frames: must be a whole number above 0, found {count[:40]!r}")
     frame_time = finite_number(seconds)
     if frame_time is None or not FRAME_TIMES[0] <= frame_time <= FRAME_TIMES[1]:
         what = f"Frame Time: must be a positive number of seconds, at most {FRAME_TIMES[1]:g}, found {seconds[:40]!r}"
-        raise _Broken(line, f"{what}; 30 frames per second are 0.0333333")
-    return (_count(count), count_line), frame_time, rest, line + 1
-
-
-def _parse_rows(rows: bytes, first_line: int, joints, num_frames) -> np.ndarray:
-    """Return the MOTION block, [frames, channels], in one pass over all of it.
-
-    numpy's text reader is fast but its messages know no BVH; so when anything is amiss, a second,
-    slow pass finds out where and what.
-    """
-    count, count_line = num_frames
-    columns = sum(len(joint.channels) for joint in joints)
-    values = np.empty((0, columns))
-    first = rows.lstrip().partition(b"\n")[0].split(None, columns)
-    if len(first) == columns:  # else there is no need to read the rest
-        try:
+        raise _Broken(line_at(head.start(2)), f"{what}; 30 frames per second are 0.0333333")
+    rows, labels = (
+        data[head.end() :],
+        {n: f"{c} of {joint.name}" for joint in joints for c, n in joint.channels.items()},
+    )
+    try:
+        if rows.strip():
             values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
-        except ValueError:  # UnicodeDecodeError is one, too
-            pass
-    if values.shape == (count, columns) and (np.abs(values) <= LARGEST_NUMBER).all():
-        return values
-    _explain_rows(rows, first_line, joints, columns)
-    what = f"Frames: says {count}, but {len(values)} rows of numbers follow"
-    raise _Broken(count_line, f"{what}; export the file again or mend the count")
-
-
-def _rows_with_lines(rows: bytes, first_line: int):
-    """Yield (line number, words) of the rows that are not blank."""
-    for line, raw in enumerate(rows.split(b"\n"), start=first_line):
-        words = raw.decode("utf-8", errors="replace").split()
-        if words:
-            yield line, words
-
-
-def _explain_rows(rows: bytes, first_line: int, joints, columns: int):
-    """Raise for the first row that is not `columns` finite numbers; return if there is none."""
-    labels = [f"{axis}{kind} of {joint.name}" for joint in joints for axis, kind in joint.channels]
-    for frame, (line, words) in enumerate(_rows_with_lines(rows, first_line)):
-        for column, word in enumerate(words[: columns + 1]):
+            if values.shape == (int(count), len(labels)) and (np.abs(values) <= LARGEST_NUMBER).all():
+                return values, frame_time
+    except ValueError:  # UnicodeDecodeError is one, too
+        pass
+    # numpy's reader is fast, but its messages know no BVH: find out where and what.
+    frame = 0
+    for line, row in enumerate(rows.split(b"\n"), start=line_at(head.end())):
+        words = row.decode("utf-8", "replace").split()
+        for column, word in enumerate(words[: len(labels) + 1]):
             if finite_number(word) is None:
-                what = labels[column] if column < columns else "beyond the last channel"
-                place = f"number {column + 1} of frame {frame}, {what}"
+                place = f"number {column + 1} of frame {frame}, {labels.get(column, 'beyond the last channel')}"
                 how = f"is not a finite number of at most {LARGEST_NUMBER:g}"
                 raise _Broken(line, f"{word[:40]!r} ({place}) {how}; mend it or export again")
-        if len(words) != columns:
-            how = "cut off" if len(words) < columns else "too long"
-            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {columns} channels"
+        if words and len(words) != len(labels):
+            how = "cut off" if len(words) < len(labels) else "too long"
+            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {len(labels)} channels"
             raise _Broken(line, f"{what}: the row is {how}; export the file again")
+        frame += bool(words)
+    what = f"Frames: says {count}, but {frame} rows of numbers follow"
+    raise _Broken(line_at(head.start(1)), f"{what}; export the file again or mend the count")
 
 
-def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, first_line) -> Motion:
+def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
     """Turn channel values into root positions, bones and matrices."""
     frames, count = len(values), len(joints)
     turns = [joint.columns("rotation") for joint in joints]
@@ -429,13 +271,14 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, firs
         members = [joint for joint, columns in enumerate(turns) if "".join(columns) == order]
         rotations[:, members] = matrix_from_euler(order, values[:, [list(turns[joint].values()) for joint in members]])
 
+    moves = [joint.columns("position") for joint in joints]
+
     def channel_positions(joint):
         position = np.tile(scale * np.array(joints[joint].offset), (frames, 1))
         for axis, column in moves[joint].items():
             position[:, "XYZ".index(axis)] = scale * values[:, column]
         return position
 
-    moves = [joint.columns("position") for joint in joints]
     parents = [joint.parent for joint in joints]
     root, root_position = 0, channel_positions(0)
     if count > 1 and moves[0] and moves[1] and parents.count(0) == 1:
@@ -453,11 +296,53 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale, rows, firs
         offsets[joint] = position.mean(axis=0)
         error = np.abs(position - offsets[joint]).max(axis=1)
         if error.max() > RIGID_TOLERANCE:
-            frame = int(error.argmax())
-            line = [line for line, _ in _rows_with_lines(rows, first_line)][frame]
-            what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm in frame {frame}"
-            raise _Broken(line, f"{what}; bones must be rigid: bake the motion to rotations before exporting")
+            what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm"
+            where = f"in frame {error.argmax()}; bones must be rigid: bake the motion to rotations before exporting"
+            raise _Broken(joints[joint].line, f"{what} {where}")
     tips = [(joint - root, [scale * value for value in offset]) for joint, offset in end_sites if joint >= root]
     names, parents = [joint.name for joint in joints[root:]], [max(parent - root, -1) for parent in parents[root:]]
     skeleton = Skeleton(names, parents, offsets[root:], tips)
     return Motion(skeleton, root_position, rotations[:, root:], fps=1.0 / frame_time, name=name)
+
+
+def write_bvh(path, motion: Motion, *, overwrite: bool = False) -> Path:
+    """Write a motion as a BVH file (see `format_bvh`); return its path, whose missing folders are made.
+
+    Raises:
+      ValueError: if the file exists and `overwrite` is false.
+    """
+    return write_whole(path, format_bvh(motion), overwrite=overwrite)
+
+
+def format_bvh(motion: Motion) -> str:
+    """Return a motion as BVH text in centimetres: six channels at the root, R = Rz Rx Ry at every joint.
+
+    Joints are written depth first, as BVH asks; line ends are LF, numbers have six decimals. Read again, joint
+    positions agree to 1e-6 m.
+    """
+    rotations, skeleton, depth_first = motion.needed_rotations("a BVH file"), motion.skeleton, []
+    offset_line = lambda offset: "OFFSET " + " ".join(f"{100.0 * float(value):.6f}" for value in offset)
+
+    def block(joint: int, kind: str) -> list[str]:
+        depth_first.append(joint)
+        channels = "Zrotation Xrotation Yrotation"
+        channels = f"3 {channels}" if joint else f"6 Xposition Yposition Zposition {channels}"
+        inner = [offset_line(skeleton.offsets[joint]), f"CHANNELS {channels}"]
+        for child in skeleton.children[joint]:
+            inner += block(child, "JOINT")
+        tips = [offset for owner, offset in skeleton.end_sites if owner == joint]
+        # Many tools refuse a limb without an End Site, so a bare leaf gets one of length zero.
+        for tip in tips or ([] if skeleton.children[joint] else [(0.0, 0.0, 0.0)]):
+            inner += ["End Site", "{", f"\t{offset_line(tip)}", "}"]
+        return [f"{kind} {skeleton.names[joint]}", "{", *(f"\t{line}" for line in inner), "}"]
+
+    lines = ["HIERARCHY", *block(0, "ROOT"), "MOTION"]
+    lines += [f"Frames: {motion.num_frames}", f"Frame Time: {1.0 / motion.fps:.10f}"]
+    with warnings.catch_warnings():
+        # At gimbal lock any of the equal answers will do: the matrix is the same.
+        warnings.filterwarnings("ignore", message="Gimbal lock")
+        degrees = euler_from_matrix("ZXY", rotations[:, depth_first])
+    root = 100.0 * np.asarray(motion.root_position, dtype=np.float64)
+    rows = np.concatenate([root, degrees.reshape(motion.num_frames, -1)], axis=1)
+    row_format = " ".join(["%.6f"] * rows.shape[1])
+    return "\n".join([*lines, *(row_format % tuple(row) for row in rows.tolist())]) + "\n"
