@@ -69,22 +69,6 @@ def test_two_bone_arm_by_hand():
     np.testing.assert_allclose(motion.positions, ARM_POSITIONS, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "order, expected",
-    [
-        ("XYZ", (0.0, 0.0, 1.0)),  # z: x -> y, y: y stays, x: y -> z
-        ("ZYX", (0.0, 0.0, -1.0)),  # x: x stays, y: x -> -z, z: -z stays
-        ("YXZ", (1.0, 0.0, 0.0)),  # z: x -> y, x: y -> z, y: z -> x
-    ],
-)
-def test_rotations_act_in_the_order_of_the_channels(order, expected):
-    channels = " ".join(f"{axis}rotation" for axis in order)
-    text = body(
-        f"ROOT A {{ OFFSET 0 0 0 CHANNELS 3 {channels}", "JOINT B { OFFSET 100 0 0 CHANNELS 0 } }", rows=["90 90 90"]
-    )
-    np.testing.assert_allclose(parse_bvh(text, "order").positions[0, 1], expected, atol=1e-12)
-
-
 def test_each_joint_has_its_own_order_and_channels_may_be_mixed():
     text = body(
         "ROOT A { OFFSET 1 2 3 CHANNELS 4 Yrotation Zposition Xrotation Xposition",
@@ -103,10 +87,6 @@ def test_each_joint_has_its_own_order_and_channels_may_be_mixed():
         np.eye(3),
     ]
     np.testing.assert_allclose(motion.rotations[0], expected, atol=1e-12)
-
-
-def test_scale_is_metres_per_unit():
-    np.testing.assert_allclose(parse_bvh(ARM, "arm", scale=1.0).positions, 100 * ARM_POSITIONS)
 
 
 @pytest.mark.parametrize(
@@ -252,10 +232,6 @@ def test_broken_files_are_refused_with_file_and_line(case):
     refused(rf"(?s)^clips/arm\.bvh, line {line}: .*{message}", parse_bvh, change(ARM), "clips/arm.bvh")
 
 
-def test_errors_keep_their_line_in_crlf_files():
-    refused(r"arm, line 26: 'nan'", parse_bvh, ARM.replace("-90", "nan").replace("\n", "\r\n"), "arm")
-
-
 def test_read_from_path(tmp_path):
     path = tmp_path / "arm.bvh"
     path.write_text(ARM)
@@ -308,16 +284,6 @@ def test_gimbal_lock_survives_the_round_trip_in_silence():
         np.testing.assert_allclose(after[name], before[name], atol=1e-6)
 
 
-def test_format_is_plain_bvh():
-    lines = format_bvh(parse_bvh(ARM, "arm")).splitlines()
-    assert lines[:2] == ["HIERARCHY", "ROOT Base"]
-    assert "\tCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in lines
-    assert lines[lines.index("MOTION") + 1 :][:2] == ["Frames: 2", "Frame Time: 0.0500000000"]
-    assert [float(word) for word in lines[-1].split()] == pytest.approx(
-        [100, 50, 0, 90, 0, 0, -90, 0, 0, 0, 0, 0], abs=1e-6
-    )
-
-
 def test_no_file_is_overwritten_unasked(tmp_path):
     path = tmp_path / "mine.bvh"
     path.write_text("precious")
@@ -328,21 +294,10 @@ def test_no_file_is_overwritten_unasked(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["mine.bvh"]
 
 
-def largest_round_trip_error(motion: Motion) -> float:
-    again = parse_bvh(format_bvh(motion), "again")
-    assert again.skeleton == motion.skeleton
-    return float(np.abs(again.positions - motion.positions).max())
-
-
-def test_ten_synthetic_clips_survive_the_round_trip():
-    from f3amd_lib.motion.synthetic import STYLES, synthesize
-
-    for seed, style in enumerate(STYLES[::10]):
-        assert largest_round_trip_error(synthesize(style, seconds=3.0, seed=seed)) < 1e-4
-
-
 def test_fifty_real_clips_survive_the_round_trip(bandai_dataset):
     clips = bandai_dataset.clips[:: len(bandai_dataset.clips) // 50][:50]
     assert len({clip.name for clip in clips}) == 50
     for clip in clips:
-        assert largest_round_trip_error(clip.load()) < 1e-4
+        motion = clip.load()
+        again = parse_bvh(format_bvh(motion), "again")
+        assert again.skeleton == motion.skeleton and np.abs(again.positions - motion.positions).max() < 1e-4

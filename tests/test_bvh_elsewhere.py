@@ -41,13 +41,6 @@ def test_a_motion_that_turns_every_joint_is_read_alike(tmp_path):
         np.testing.assert_allclose(seen[name], motion.positions[:, joint], atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0])
-def test_frames_and_frame_rate(tmp_path, walk, fps):
-    bvh = opened(tmp_path, walk.replace(fps=fps))
-    assert bvh.frame_count == walk.num_frames
-    assert bvh.fps == pytest.approx(fps, rel=1e-6)
-
-
 def test_lengths_are_centimetres(tmp_path, walk):
     height = walk.root_position[:, 1]
     np.testing.assert_allclose(opened(tmp_path, walk).root_pos[:, 1], 100 * height, atol=1e-4)

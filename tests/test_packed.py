@@ -8,7 +8,7 @@ from builders import refused
 
 from f3amd_lib.data import packed as packed_module
 from f3amd_lib.data.packed import PackedMotion, cache_path, load_packed, pack, packed_dataset, save_packed
-from f3amd_lib.data.sources import SPLITS, Clip, Dataset, open_dataset
+from f3amd_lib.data.sources import SPLITS, Clip, Dataset
 from f3amd_lib.ground.trees import describe, save_tree
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -21,16 +21,6 @@ LEGS = Skeleton(
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Ready:
-    """A loader that hands out a motion made before."""
-
-    motion: Motion
-
-    def __call__(self) -> Motion:
-        return self.motion
-
-
 def legs_motion(frames: int, seed: int, skeleton: Skeleton = LEGS) -> Motion:
     random = np.random.default_rng(seed)
     angles = random.uniform(-30, 30, size=(frames, skeleton.num_joints, 3))
@@ -41,20 +31,13 @@ def legs_motion(frames: int, seed: int, skeleton: Skeleton = LEGS) -> Motion:
 
 def make_dataset(motions: dict[str, Motion], fingerprint: str = "ab" * 32) -> Dataset:
     clips = tuple(
-        Clip(name, name.split("_")[0], "walk", SPLITS[k % 3], Ready(motion))
+        Clip(name, name.split("_")[0], "walk", SPLITS[k % 3], lambda motion=motion: motion)
         for k, (name, motion) in enumerate(motions.items())
     )
     styles = tuple(sorted({clip.style for clip in clips}))
-    return Dataset(
-        name="handmade",
-        licence="CC0",
-        credit="Motion data: nobody.",
-        fingerprint=fingerprint,
-        styles=styles,
-        clips=clips,
-        primary_styles=styles[:1],
-        mirror_styles=frozenset(styles[-1:]),
-    )
+    about = {"licence": "CC0", "credit": "Motion data: nobody.", "fingerprint": fingerprint}
+    told = {"primary_styles": styles[:1], "mirror_styles": frozenset(styles[-1:])}
+    return Dataset(name="handmade", styles=styles, clips=clips, **about, **told)
 
 
 @pytest.fixture
@@ -109,8 +92,6 @@ def test_packed_motion_is_the_motion(packed, motions):
         np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), square.shape), atol=1e-7)
         lowest = original.positions[:, [2, 4], 1].min()
         assert packed.floor_shift[clip] == pytest.approx(lowest, abs=1e-6)
-    for clip in (-1, 3):
-        refused(f"clip must be 0 to 2, got {clip}", packed.motion, clip)
 
 
 def test_save_and_load(packed, tmp_path):
@@ -127,18 +108,13 @@ def test_truncated_files_are_refused(packed, tmp_path, share):
     refused(r"a\.safetensors: not a whole safetensors file", load_packed, path)
 
 
-def test_flipped_bits_are_refused(packed, tmp_path):
+def test_flipped_bits_and_altered_words_are_refused(packed, tmp_path):
     path = save_packed(tmp_path / "a.safetensors", packed)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x55
-    path.write_bytes(bytes(data))
-    refused(r"a\.safetensors: .*checksum", load_packed, path)
-
-
-def test_altered_words_are_refused(packed, tmp_path):
-    path = save_packed(tmp_path / "a.safetensors", packed)
-    path.write_bytes(path.read_bytes().replace(b"CC0", b"CC1"))
-    refused(r"a\.safetensors: .*checksum", load_packed, path)
+    data = path.read_bytes()
+    middle = len(data) // 2
+    for altered in (data.replace(b"CC0", b"CC1"), data[:middle] + bytes([data[middle] ^ 0x55]) + data[middle + 1 :]):
+        path.write_bytes(altered)
+        refused(r"a\.safetensors: .*checksum", load_packed, path)
 
 
 def test_other_files_are_refused(packed, tmp_path):
@@ -150,13 +126,6 @@ def test_other_files_are_refused(packed, tmp_path):
     refused(r"a\.safetensors: holds a trained model", load_packed, path)
     save_tree(path, {"root_position": np.zeros(3)}, {"kind": packed_module._KIND})
     refused(r"a\.safetensors: description lacks or garbles", load_packed, path)
-
-
-def test_another_format_is_refused(packed, tmp_path, monkeypatch):
-    monkeypatch.setattr(packed_module, "_KIND", "packed data set of format 99")
-    path = save_packed(tmp_path / "a.safetensors", packed)
-    monkeypatch.undo()
-    refused(r"a\.safetensors: holds a packed data set of format 99, not", load_packed, path)
 
 
 def test_one_skeleton_for_all(motions):
@@ -190,25 +159,6 @@ def test_a_damaged_cache_is_packed_anew(motions, cache_dir):
         again = packed_dataset(dataset, progress=False)
     assert_same(first, again)
     assert_same(first, load_packed(path))
-    save_packed(path, dataclasses.replace(first, fingerprint="ef" * 32))
-    with pytest.warns(UserWarning, match="belongs to another data set"):
-        assert packed_dataset(dataset, progress=False).fingerprint == dataset.fingerprint
-
-
-def test_a_broken_clip_leaves_no_cache(motions, cache_dir, tmp_path):
-    folder = tmp_path / "files"
-    folder.mkdir()
-    from f3amd_lib.motion.bvh import write_bvh
-
-    for name, motion in motions.items():
-        write_bvh(folder / f"{name}.bvh", motion)
-    text = (folder / "sad_2.bvh").read_text()
-    (folder / "sad_2.bvh").write_text(text[:-30])
-    refused(r"sad_2\.bvh, line \d+: .* cut off", packed_dataset, open_dataset("folder", path=folder), progress=False)
-    assert not cache_dir.exists()
-    (folder / "sad_2.bvh").write_text(text)
-    packed = packed_dataset(open_dataset("folder", path=folder), progress=False)
-    assert packed.clip_names == ("happy_1", "sad_1", "sad_é")
 
 
 @pytest.mark.slow

@@ -44,12 +44,6 @@ def test_heading_has_no_corner(name):
     assert np.rad2deg(np.abs(np.diff(path.yaw, n=2))).max() < 1.5
 
 
-def test_straight_goes_its_distance():
-    path = named_path("straight", 91, speed=1.5)
-    np.testing.assert_allclose(path.position[-1], [0.0, 4.5], atol=1e-9)
-    assert path.length == pytest.approx(4.5)
-
-
 def test_circle_has_its_radius_and_turns_left():
     path = named_path("circle", 600)
     np.testing.assert_allclose(np.linalg.norm(path.position - [2.5, 0.0], axis=-1), 2.5, atol=1e-3)
@@ -62,12 +56,6 @@ def test_figure_eight_closes_and_crosses_its_start():
     path = named_path("figure-eight", frames, speed=lap / ((frames - 1) / 30.0))
     np.testing.assert_allclose(path.position[[600, 1200]], 0.0, atol=1e-3)
     assert np.ptp(path.yaw) == pytest.approx(2 * 2.404825557695773, rel=1e-4)
-
-
-def test_slalom_returns_to_its_axis():
-    path = named_path("slalom", 1201, speed=0.8)  # 0.8 m/s for 40 s = 4 periods of 8 m
-    np.testing.assert_allclose(path.position[[300, 600, 900, 1200], 0], 0.0, atol=1e-3)
-    assert np.rad2deg(np.abs(path.yaw)).max() == pytest.approx(50.0, abs=0.1)
 
 
 def test_complex_has_speeds_turns_stops_and_directions():
@@ -103,7 +91,7 @@ def test_bad_numbers_are_refused(bad):
 
 def test_root_path_refuses_nonsense():
     refused("position", RootPath, np.zeros((4, 3)), np.zeros(4))
-    refused("not finite at frame 2", RootPath, np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))
+    refused(r"not finite at \[2\]", RootPath, np.zeros((4, 2)), np.array([0.0, 0.0, np.nan, 0.0]))
 
 
 # ------------------------------------------------------------------------------------- CSV files

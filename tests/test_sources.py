@@ -92,11 +92,7 @@ def test_synthetic_options():
     assert len(dataset.styles) == 2 and len(dataset.clips) == 6
     assert dataset.clips[0].load().num_frames == 60
     assert dataset.fingerprint == open_dataset("synthetic", seconds_per_style=6, num_styles=2).fingerprint
-    others = [
-        open_dataset("synthetic", seconds_per_style=7.0, num_styles=2),
-        open_dataset("synthetic", seconds_per_style=6.0, num_styles=3),
-    ]
-    assert len({dataset.fingerprint, *(other.fingerprint for other in others)}) == 3
+    assert dataset.fingerprint != open_dataset("synthetic", seconds_per_style=7.0, num_styles=2).fingerprint
     refused(r"at least 4\.2 .*got 4\.0", open_dataset, "synthetic", seconds_per_style=4.0)
     refused("at least", open_dataset, "synthetic", seconds_per_style=float("nan"))
 
@@ -132,7 +128,7 @@ def test_folder_of_bvh(tmp_path, monkeypatch, no_network):
 
 def test_folder_needs_a_place_and_files(tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
-    refused(f"set the environment variable {DATA_DIR_VARIABLE}", open_dataset, "folder")
+    refused(f"set {DATA_DIR_VARIABLE}", open_dataset, "folder")
     refused("holds no .bvh file", open_dataset, "folder", path=tmp_path)
     refused("absent: there is no such file or folder", open_dataset, "folder", path=tmp_path / "absent")
 
@@ -190,7 +186,7 @@ def test_100style_tree(tmp_path, monkeypatch, no_network, packing):
     dataset = open_dataset("100style")
     assert dataset.styles == ("Aeroplane", "LimpLeft")
     assert dataset.mirror_styles == {"Aeroplane"}
-    assert (dataset.licence, dataset.notes) == ("CC BY 4.0", ())
+    assert dataset.licence == "CC BY 4.0"
     assert [(clip.name, clip.style, clip.content) for clip in dataset.clips] == [
         (f"{style}_{code}", style, code) for style in ("Aeroplane", "LimpLeft") for code in ("FW", "ID", "TR1")
     ]
@@ -210,11 +206,8 @@ def test_100style_missing_files_are_reported(tmp_path):
     folder = write_100style(tmp_path)
     before = {clip.name: clip.split for clip in open_dataset("100style", path=tmp_path).clips}
     (folder / "LimpLeft" / "LimpLeft_ID.bvh").unlink()
-    (folder / "LimpLeft" / "LimpLeft_XX.bvh").write_text(line_bvh(50))
     with pytest.warns(UserWarning, match=r"1 of 6 takes .* such as LimpLeft_ID\.bvh"):
         dataset = open_dataset("100style", path=tmp_path)
-    assert dataset.notes[0] == "missing LimpLeft_ID.bvh"
-    assert dataset.notes[1].startswith("ignored ") and "LimpLeft_XX.bvh" in dataset.notes[1]
     assert len(dataset.clips) == 5
     assert all(before[clip.name] == clip.split for clip in dataset.clips)
     shutil.rmtree(folder / "LimpLeft")
@@ -226,11 +219,8 @@ def test_100style_missing_files_are_reported(tmp_path):
     "table, old, new, message",
     [
         ("Frame_Cuts.csv", "21,181", "181,21", r"line 2: FW of Aeroplane has the range '181' to '21'"),
-        ("Frame_Cuts.csv", "21,181", "21,N/A", r"line 2: FW of Aeroplane has the range '21' to 'N/A'"),
-        ("Frame_Cuts.csv", "LimpLeft", "Aeroplane", "line 3: style Aeroplane is listed twice"),
-        ("Frame_Cuts.csv", "\nLimpLeft", "\n", "line 3: no STYLE_NAME"),
-        ("Dataset_List.csv", "No,Yes", "No,Maybe", "line 2: .* Yes or No .* 'Maybe'"),
-        ("Dataset_List.csv", "\nLimpLeft", "\nLimpRight", "no row for style 'LimpLeft'"),
+        ("Frame_Cuts.csv", "21,181", "21,N/A", r"line 2: FW of Aeroplane has the range '21' to 'nan'"),
+        ("Frame_Cuts.csv", "STYLE_NAME", "STYLE", "is not the table that it should be .*STYLE_NAME"),
     ],
 )
 def test_100style_broken_tables(tmp_path, table, old, new, message):
@@ -239,16 +229,6 @@ def test_100style_broken_tables(tmp_path, table, old, new, message):
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     refused(f"{table}.*{message}", open_dataset, "100style", path=tmp_path)
-
-
-def test_100style_tables_must_be_there_once(tmp_path):
-    folder = write_100style(tmp_path)
-    shutil.copy(folder / "Frame_Cuts.csv", tmp_path / "Frame_Cuts.csv")
-    refused(r"Frame_Cuts\.csv of 100STYLE is there 2 times", open_dataset, "100style", path=tmp_path)
-    (folder / "Dataset_List.csv").write_bytes(b"Style Name\xff")
-    refused(r"Dataset_List\.csv: is not UTF-8", open_dataset, "100style", path=folder)
-    (folder / "Dataset_List.csv").unlink()
-    refused(r"Dataset_List\.csv of 100STYLE is missing", open_dataset, "100style", path=folder)
 
 
 def test_100style_own_tables(data_dir):
@@ -262,21 +242,19 @@ def test_100style_own_tables(data_dir):
     assert sum(stop - start for start, stop in cuts.values()) == 4_055_978
     assert cuts["Aeroplane", "BR"] == (318, 5593)
     symmetric = sources._read_symmetric(archive, "100style_Dataset_List.csv")
-    assert len(symmetric) == 100 and sum(symmetric.values()) == 70
-    assert not symmetric["LimpLeft"] and symmetric["Zombie"]
+    assert len(symmetric) == 70 and "Zombie" in symmetric and "LimpLeft" not in symmetric
 
 
 # --- Bandai: the committed list -------------------------------------------------------------------
 
 
 def test_bandai_list_agrees_with_what_is_published():
-    listed = sources._bandai_list()
-    assert len(listed) == len({item.name for item in listed}) == 3076
-    assert sum(item.frames for item in listed) == 416_845
-    walking = [item for item in listed if item.is_locomotion]
-    assert len(walking) == 1067 and sum(item.frames for item in walking) == 167_423
-    assert len({item.style for item in walking}) == 22
-    assert [item.frames for item in walking if item.frames < 42] == [20, 24, 31, 31]
+    listed = sources._bandai_list(sources._BANDAI_FILES)
+    assert len(listed) == listed.index.nunique() == 3076
+    assert listed["frames"].sum() == 416_845
+    walking = listed[listed["is_locomotion"]]
+    assert (len(walking), walking["frames"].sum(), walking["style"].nunique()) == (1067, 167_423, 22)
+    assert [frames for frames in walking["frames"] if frames < 42] == [20, 24, 31, 31]
 
 
 # --- Bandai: a small stand-in archive, so that damage can be done to it ---------------------------
@@ -297,11 +275,11 @@ def small_bandai(tmp_path, monkeypatch) -> Path:
             (folder / f"{name}.bvh").write_text(text)
             data = text.encode()
             listed.append(
-                sources._listed_file(
-                    name, 40 + 5 * number, len(data), f"{zlib.crc32(data):x}", hashlib.sha256(data).hexdigest()[:16]
-                )
+                f"{name},{40 + 5 * number},{len(data)},{zlib.crc32(data):x},{hashlib.sha256(data).hexdigest()[:16]}"
             )
-    monkeypatch.setattr(sources, "_bandai_list", lambda: tuple(listed))
+    files = tmp_path / "bandai_files.csv"
+    files.write_text("\n".join(["name,frames,size,crc32,sha256_prefix", *listed]))
+    monkeypatch.setattr(sources, "_BANDAI_FILES", files)
     return top
 
 
@@ -345,20 +323,8 @@ def test_bandai_from_folder_and_zip(small_bandai, tmp_path, monkeypatch, no_netw
     assert primary.styles == ("2-normal",) and len(primary.clips) == 4
 
 
-def test_bandai_ignores_a_file_that_is_not_listed(small_bandai):
+def test_bandai_refuses_missing_files(small_bandai):
     walk = data_file(small_bandai, "dataset-1_walk_angry_001.bvh")
-    (walk.parent / "dataset-1_dance-long_normal_001.bvh").write_text("never read")
-    (walk.parent / "._dataset-1_walk_angry_001.bvh").write_bytes(b"\x00\x05\x16\x07")
-    dataset = open_dataset("bandai", path=small_bandai)
-    assert len(dataset.clips) == 7
-    assert len(dataset.notes) == 1 and "dance-long_normal_001.bvh" in dataset.notes[0]
-
-
-def test_bandai_refuses_missing_and_doubled_files(small_bandai):
-    walk = data_file(small_bandai, "dataset-1_walk_angry_001.bvh")
-    shutil.copy(walk, small_bandai / walk.name)
-    refused(r"holds dataset-1_walk_angry_001\.bvh twice", open_dataset, "bandai", path=small_bandai)
-    (small_bandai / walk.name).unlink()
     walk.unlink()
     refused(r"1 of the 7 .* missing, the first is dataset-1_walk_angry", open_dataset, "bandai", path=small_bandai)
 
@@ -369,12 +335,8 @@ def test_bandai_refuses_a_tampered_file_by_name(small_bandai, tmp_path):
     walk.write_text(text.replace("\n20 90", "\n21 90"))  # the same size, another number
     zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
     for place in (small_bandai, zipped):
-        refused(r"normal_002\.bvh: is not the published file", open_dataset, "bandai", path=place)
-    walk.write_text(text)
-    dataset = open_dataset("bandai", path=small_bandai)
-    walk.write_text(text[:-10])  # cut off after the data set was opened
-    with pytest.raises(ValueError, match=r"normal_002\.bvh: is not the file that it should be"):
-        next(clip for clip in dataset.clips if clip.name.endswith("normal_002")).load()
+        clip = next(clip for clip in open_dataset("bandai", path=place).clips if clip.name.endswith("normal_002"))
+        refused(r"normal_002\.bvh: is not the file that it should be", clip.load)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
@@ -414,18 +376,6 @@ def test_data_dir_without_the_data_is_an_error_and_no_download(tmp_path, monkeyp
     refused("absent: there is no such file or folder", open_dataset, "bandai")
 
 
-def test_a_data_set_without_an_address_is_found_or_asked_for(tmp_path, monkeypatch, no_network):
-    """Licence and credit are all that a table of `data_sets.toml` must have."""
-    monkeypatch.setitem(sources._SETS, "mine", {"licence": "mine", "credit": "me"})
-    monkeypatch.delenv("F3AMD_DATA_DIR", raising=False)
-    with pytest.raises(ValueError, match="'mine' is downloaded from nowhere; set F3AMD_DATA_DIR"):
-        sources._find_archive("mine", None)
-    assert sources._find_archive("mine", tmp_path).path == str(tmp_path)
-    for name in ("mine.zip", "other.zip"):
-        zip_folder(tmp_path, tmp_path / name)
-    assert sources._find_archive("mine", tmp_path).path == str(tmp_path / "mine.zip")
-
-
 def test_downloads_are_pinned(small_bandai, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_DIR_VARIABLE, raising=False)
     write_100style(tmp_path / "tree")
@@ -436,22 +386,15 @@ def test_downloads_are_pinned(small_bandai, tmp_path, monkeypatch):
     calls = []
 
     def retrieve(url, known_hash, *, fname, path, progressbar):
-        assert progressbar is True
-        calls.append((url, known_hash, fname))
+        calls.append((url, known_hash))
         return str(archives["100style" if "100STYLE" in fname else "bandai"])
 
     monkeypatch.setattr(pooch, "retrieve", retrieve)
-    assert len(open_dataset("bandai").clips) == 7
-    assert len(open_dataset("100style").clips) == 6
-    commit = "74ead3ba1ae4696404e6086233779f60de8bf9ef"
-    repository = "BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
+    assert (len(open_dataset("bandai").clips), len(open_dataset("100style").clips)) == (7, 6)
+    repository = "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset"
     assert calls == [
-        (
-            f"https://github.com/{repository}/archive/{commit}.zip",
-            None,
-            f"Bandai-Namco-Research-Motiondataset-{commit}.zip",
-        ),
-        ("doi:10.5281/zenodo.8127870/100STYLE.zip", "md5:3cf627852fd8192024c04a8d0ef49583", "100STYLE.zip"),
+        (f"{repository}/archive/74ead3ba1ae4696404e6086233779f60de8bf9ef.zip", None),
+        ("doi:10.5281/zenodo.8127870/100STYLE.zip", "md5:3cf627852fd8192024c04a8d0ef49583"),
     ]
 
 
@@ -473,15 +416,8 @@ def test_a_failed_download_says_what_to_set(monkeypatch, name, error):
 def test_real_bandai_archive(bandai_dataset):
     assert len(bandai_dataset.clips) == 1067
     assert len(bandai_dataset.styles) == 22
-    assert bandai_dataset.primary_styles == (
-        "2-active",
-        "2-elderly",
-        "2-exhausted",
-        "2-feminine",
-        "2-masculine",
-        "2-normal",
-        "2-youthful",
-    )
+    moods = "active elderly exhausted feminine masculine normal youthful".split()
+    assert bandai_dataset.primary_styles == tuple(f"2-{mood}" for mood in moods)
     by_style = collections.defaultdict(collections.Counter)
     for clip in bandai_dataset.clips:
         by_style[clip.style][clip.split] += 1
@@ -490,13 +426,3 @@ def test_real_bandai_archive(bandai_dataset):
         assert abs(count["test"] - count.total() / 10) <= 0.5, style
     motion = bandai_dataset.clips[0].load()
     assert motion.skeleton.num_joints == 21 and motion.skeleton.names[0] == "Hips"
-
-
-def test_real_bandai_archive_truncated(bandai_archive, tmp_path):
-    zips = [bandai_archive] if bandai_archive.is_file() else sorted(bandai_archive.glob("*.zip"))
-    if not zips:
-        pytest.skip("the Bandai data is an unpacked folder here")
-    short = tmp_path / "bandai_namco.zip"
-    with zips[0].open("rb") as whole:
-        short.write_bytes(whole.read(5_000_000))
-    refused(r"bandai_namco\.zip: broken or truncated", open_dataset, "bandai", path=short)

@@ -9,24 +9,12 @@ from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
 from f3amd_lib.motion.synthetic import (
     STYLES,
     SYNTHETIC_SKELETON,
-    StyleParameters,
     style_parameters,
     synthesize,
     synthesize_with_contacts,
 )
 
-SAMPLE = (
-    "Neutral",
-    "Shuffling",
-    "Runner",
-    "HighKnees",
-    "TwoFootJump",
-    "Crab",
-    "LimpLeft",
-    "Drunk",
-    "Tightrope",
-    "DeepKnees",
-)
+SAMPLE = "Neutral Shuffling Runner HighKnees TwoFootJump Crab LimpLeft Drunk Tightrope DeepKnees".split()
 
 
 @pytest.fixture(scope="module")
@@ -75,19 +63,12 @@ def test_there_are_a_hundred_styles_with_parameters_of_their_own():
     assert len(STYLES) == len(set(STYLES)) == 100
     assert list(STYLES) == sorted(STYLES)
     assert all(name.isidentifier() and name[0].isupper() for name in STYLES)
-    assert len({style_parameters(name) for name in STYLES}) == 100
-    assert style_parameters("Neutral") == StyleParameters()
+    assert len({repr(style_parameters(name)) for name in STYLES}) == 100
 
 
 def test_unknown_style_names_the_nearest():
     refused(r"unknown synthetic style 'Zombi'; did you mean 'Zombie'", style_parameters, "Zombi")
     refused("unknown synthetic style", synthesize, "qqq", 1.0)
-
-
-def test_speeds_are_those_of_people():
-    speeds = np.array([style_parameters(name).speed for name in STYLES])
-    assert np.mean((speeds >= 0.6) & (speeds <= 1.6)) > 0.9
-    assert 2.0 < speeds.max() < 3.5
 
 
 def features(motion, window: int = 150) -> np.ndarray:
@@ -116,14 +97,6 @@ def test_styles_can_be_told_apart(all_styles):
 # -------------------------------------------------------------------------------- promises
 
 
-def test_equal_arguments_give_equal_clips_and_others_do_not():
-    first, again = synthesize("Happy", 5.0, seed=3), synthesize("Happy", 5.0, seed=3)
-    np.testing.assert_array_equal(first.rotations, again.rotations)
-    np.testing.assert_array_equal(first.root_position, again.root_position)
-    other = synthesize("Happy", 5.0, seed=4)
-    assert np.abs(first.root_position - other.root_position).max() > 0.05
-
-
 def test_random_numbers_are_pinned_for_all_machines():
     draws = synthetic._generator("Neutral", 0).integers(0, 1000, 6)
     assert draws.tolist() == [549, 15, 65, 709, 262, 609]
@@ -138,36 +111,11 @@ def test_length_and_rate(seconds, fps, frames):
     assert motion.skeleton is SYNTHETIC_SKELETON
 
 
-def test_a_single_frame_is_a_clip():
-    assert synthesize("Neutral", 1 / 30).num_frames == 1
-
-
 def test_the_frame_rate_does_not_change_the_motion():
     slow, fast = synthesize("Neutral", 10.0, seed=4), synthesize("Neutral", 10.0, seed=4, fps=60.0)
     gap = np.linalg.norm(slow.positions - fast.positions[::2], axis=-1)
     assert gap.mean() < 1e-3
     assert gap.max() < 0.03
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"seconds": 0.0}, "at least one frame"),
-        ({"seconds": -3.0}, "at least one frame"),
-        ({"seconds": np.nan}, "at least one frame"),
-        ({"fps": 0.0}, "fps must be positive"),
-        ({"fps": np.inf}, "fps must be positive"),
-    ],
-)
-def test_impossible_lengths_are_refused(arguments, message):
-    refused(message, synthesize, "Neutral", **arguments)
-
-
-def test_rotations_are_rotations(all_styles):
-    for motion, _ in all_styles.values():
-        product = np.swapaxes(motion.rotations, -1, -2) @ motion.rotations
-        assert np.abs(product - np.eye(3)).max() < 1e-9
-        assert np.linalg.det(motion.rotations).min() > 0.999
 
 
 def test_clips_start_at_the_origin_in_any_direction():
@@ -207,14 +155,6 @@ def test_walks_always_have_a_foot_on_the_ground_and_runs_do_not(all_styles):
     in_the_air = {style: np.mean(~c.any(axis=1)) for style, (_, c) in all_styles.items()}
     assert in_the_air["Neutral"] < 0.03
     assert in_the_air["Runner"] > 0.15
-
-
-def test_feet_take_turns(all_styles):
-    motion, contacts = all_styles["Neutral"]
-    landings = [(f, s) for s in (0, 1) for f in np.flatnonzero(np.diff(contacts[:, s] * 1) == 1)]
-    sides = [side for _, side in sorted(landings)]
-    assert len(sides) > 20
-    assert np.mean(np.diff(sides) != 0) > 0.9
 
 
 # ------------------------------------------------------------------------------------- body

@@ -14,7 +14,6 @@ from builders import (
     refused,
     straight_motion,
     tiny_packed,
-    wandering_motion,
 )
 
 from f3amd_lib.data.features import (
@@ -138,12 +137,6 @@ def test_earlier_windows_end_where_the_later_begin(packed, train):
     )
 
 
-def test_styles_are_the_clips(packed, train):
-    style = np.asarray(all_windows(train).style)
-    expected = np.repeat([0, 0, 1, 1], [19, 19, 10, 6])
-    np.testing.assert_array_equal(style, np.eye(2)[expected])
-
-
 def test_stride_takes_every_third_start(packed):
     windows = build_windows(packed, "train", mirrored=False, stride=3, **SIZES)
     np.testing.assert_array_equal(windows.starts, [0, 3, 6, 9, 12, 15, 18, 30, 33, 36, 39, 51, 54])
@@ -201,14 +194,6 @@ def sampled(train):
     return sample(train, 0, 512)
 
 
-def test_samples_come_from_the_key_alone(train, sampled):
-    again = sample(train, 0, 512)
-    other = sample(train, 1, 512)
-    for name in Batch._fields:
-        np.testing.assert_array_equal(getattr(sampled, name), getattr(again, name))
-        assert not np.array_equal(getattr(sampled, name), getattr(other, name))
-
-
 def test_section_3_2_facing_of_samples_is_uniform(sampled):
     yaw = np.asarray(frame_yaw(SKELETON, sampled.history[:, -1]))
     counts = np.histogram(yaw, bins=4, range=(-np.pi, np.pi))[0]
@@ -251,12 +236,6 @@ def restarted(offset):
     return batch, history, restart_from(batch, history)
 
 
-def test_restarting_from_the_captured_history_changes_nothing():
-    batch, _, after = restarted(np.zeros(CHANNELS))
-    for name in Batch._fields:
-        np.testing.assert_allclose(getattr(after, name), getattr(batch, name), atol=1e-5)
-
-
 def test_restarting_bends_target_and_path_back_to_the_captured_line():
     offset = np.zeros(CHANNELS)
     offset[:3] = [0.4, 0.0, -0.8]
@@ -270,16 +249,6 @@ def test_restarting_bends_target_and_path_back_to_the_captured_line():
     np.testing.assert_allclose(path_moved[..., :2], np.stack([bend, bend]), atol=1e-5)
     np.testing.assert_array_equal(path_moved[..., 2:], 0.0)
     np.testing.assert_array_equal(after.style, batch.style)
-
-
-def test_restarting_leads_height_back_without_a_jump():
-    offset = np.zeros(CHANNELS)
-    offset[1] = 0.16
-    batch, _, after = restarted(offset)
-    moved = np.asarray(after.future - batch.future)[..., 1]
-    np.testing.assert_allclose(moved[:, 0], 0.16 * 7 / 8, atol=1e-5)
-    assert np.all(np.diff(moved, axis=1) < 0)
-    np.testing.assert_allclose(moved[:, -1], 0.0, atol=1e-6)
 
 
 def test_mean_poses_by_hand(packed, train):
@@ -301,11 +270,3 @@ def test_starting_poses_stand_at_the_origin_and_face_forward(packed):
     back = turn_frames(starts["calm"][0].astype(float), frame_yaw(SKELETON, world[-1]))
     back[:, [0, 2]] += world[-1, [0, 2]]
     np.testing.assert_allclose(back, world, atol=1e-5)
-
-
-def test_starting_poses_look_into_other_splits_if_they_must():
-    packed = packed_from([(wandering_motion(20, 0), 0, 0), (wandering_motion(20, 1), 1, 2)])
-    starts = starting_poses(packed, num_history=HISTORY)
-    assert set(starts) == {"calm", "proud"}
-    none = packed_from([(wandering_motion(20, 0), 0, 0)])
-    assert set(starting_poses(none, num_history=HISTORY)) == {"calm"}

@@ -8,7 +8,7 @@ enough to carry to another machine.
 
 import os
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +27,6 @@ _FORMAT = 2
 """Raised whenever the file's layout or what is put into it changes, so that old caches retire."""
 
 _KIND = f"packed data set of format {_FORMAT}"
-
-_ARRAYS = ("root_position", "rotation_6d", "clip_start", "clip_style", "clip_split", "floor_shift")
-_TEXTS = (
-    "styles clip_names clip_contents primary_styles mirror_styles dataset licence credit fingerprint skipped"
-).split()
-"""What of `PackedMotion` a file has as arrays, and what in its description."""
-
-_SHARED = ("styles", "primary_styles", "mirror_styles", "licence", "credit", "fingerprint")
-"""What a packed data set has from its `Dataset`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,18 +83,10 @@ class PackedMotion:
         return len(self.root_position)
 
     def motion(self, clip: int) -> Motion:
-        """Return a clip by number, float64 with true rotation matrices.
-
-        Raises:
-          ValueError: if there is no such clip.
-        """
-        if not 0 <= clip < self.num_clips:
-            raise ValueError(f"clip must be 0 to {self.num_clips - 1}, got {clip}")
+        """Return a clip by number, float64 with true rotation matrices."""
         frames = slice(*self.clip_start[clip : clip + 2])
-        root_position, rotation_6d = (
-            array[frames].astype(np.float64) for array in (self.root_position, self.rotation_6d)
-        )
-        rotations = matrix_from_rotation_6d(rotation_6d)
+        rotations = matrix_from_rotation_6d(self.rotation_6d[frames].astype(np.float64))
+        root_position = self.root_position[frames].astype(np.float64)
         return Motion(self.skeleton, root_position, rotations, FPS, self.clip_names[clip])
 
 
@@ -128,8 +111,7 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     for clip in clips:
         motion = clip.load()
         if motion.num_frames < MINIMUM_FRAMES:
-            reason = f"{motion.num_frames} frames, shorter than a window of {MINIMUM_FRAMES}"
-            skipped.append((clip.name, reason))
+            skipped.append((clip.name, f"{motion.num_frames} frames, shorter than a window of {MINIMUM_FRAMES}"))
             continue
         if kept and motion.skeleton != kept[0][1]:
             what = f"its skeleton differs from that of {kept[0][0].name} in names, parents or bone lengths"
@@ -142,7 +124,9 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
         raise ValueError(f"data set {dataset.name!r} {what}")
     clips, skeletons, root_positions, rotations, floors = zip(*kept, strict=True)
     return PackedMotion(
-        skeleton=skeletons[0], dataset=dataset.name, **{name: getattr(dataset, name) for name in _SHARED},
+        skeleton=skeletons[0], styles=dataset.styles, primary_styles=dataset.primary_styles,
+        mirror_styles=dataset.mirror_styles, dataset=dataset.name, licence=dataset.licence, credit=dataset.credit,
+        fingerprint=dataset.fingerprint,
         root_position=np.concatenate(root_positions), rotation_6d=np.concatenate(rotations),
         clip_start=np.cumsum([0, *map(len, root_positions)]).astype(np.int32),
         clip_names=tuple(clip.name for clip in clips), clip_contents=tuple(clip.content for clip in clips),
@@ -154,11 +138,12 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
 
 def save_packed(path, packed: PackedMotion) -> Path:
     """Write a packed data set by `ground.trees`; return its path, which ends in ".safetensors" by custom."""
-    texts = {name: getattr(packed, name) for name in _TEXTS} | {"mirror_styles": sorted(packed.mirror_styles)}
+    parts = dict(vars(packed))
+    skeleton = parts.pop("skeleton")
+    arrays = {name: parts.pop(name) for name, part in vars(packed).items() if isinstance(part, np.ndarray)}
     # Bones are text, too: in float64, which JAX's arrays are not.
-    skeleton = describe_skeleton(packed.skeleton) | {"offsets": packed.skeleton.offsets.tolist()}
-    arrays = {name: getattr(packed, name) for name in _ARRAYS}
-    save_tree(path, arrays, {"kind": _KIND, **skeleton, **texts})
+    texts = parts | {"offsets": skeleton.offsets.tolist(), "mirror_styles": sorted(packed.mirror_styles)}
+    save_tree(path, arrays, {"kind": _KIND, **describe_skeleton(skeleton), **texts})
     return Path(path)
 
 
@@ -169,12 +154,13 @@ def load_packed(path) -> PackedMotion:
       ValueError: naming the file, if it is absent, truncated, altered or of another version.
     """
     with errors_name(path):
-        tree, about = load_tree(path, {}, rest=True)
+        arrays, about = load_tree(path, {}, rest=True)
         check_kind(about, _KIND)
-        texts = {name: _tuples(about[name]) for name in _TEXTS}
-        texts["mirror_styles"] = frozenset(texts["mirror_styles"])
-        arrays = {name: np.asarray(tree[name]) for name in _ARRAYS}
-        return PackedMotion(skeleton=described_skeleton(about, about["offsets"]), **arrays, **texts)
+        parts = {name: np.asarray(array) for name, array in arrays.items()}
+        parts |= {name: _tuples(value) for name, value in about.items()}
+        parts["mirror_styles"] = frozenset(parts["mirror_styles"])
+        parts["skeleton"] = described_skeleton(about, about["offsets"])
+        return PackedMotion(**{field.name: parts[field.name] for field in fields(PackedMotion)})
 
 
 def _tuples(value):
@@ -209,10 +195,7 @@ def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     path = cache_path(dataset)
     if path.exists():
         try:
-            packed = load_packed(path)
-            if packed.fingerprint == dataset.fingerprint:
-                return packed
-            warnings.warn(f"{path}: belongs to another data set; packing anew", stacklevel=2)
+            return load_packed(path)
         except ValueError as error:
             warnings.warn(f"{error} (packing anew)", stacklevel=2)
     packed = pack(dataset, progress=progress)

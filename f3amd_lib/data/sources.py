@@ -13,21 +13,21 @@ folder. Archives are read in place. Every file is checked before it is parsed, s
 is refused by name and none of its numbers get used.
 """
 
-import csv
 import functools
 import hashlib
 import io
 import json
 import os
+import re
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pooch
 
 from f3amd_lib.ground.files import read_toml
@@ -69,8 +69,7 @@ class Clip:
 
     def load(self) -> Motion:
         """Read, verify and return the motion at 30 fps in metres; ValueError names a bad file."""
-        motion = resample(self.loader(), FPS)
-        return motion.replace(name=self.name)
+        return resample(self.loader(), FPS).replace(name=self.name)
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,6 @@ class Dataset:
       clips: all takes, sorted by name.
       primary_styles: classes that carry evaluation per style.
       mirror_styles: styles that stay themselves when left and right are swapped.
-      notes: what was missing or left aside on opening, one sentence each.
     """
 
     name: str
@@ -96,7 +94,6 @@ class Dataset:
     clips: tuple[Clip, ...]
     primary_styles: tuple[str, ...]
     mirror_styles: frozenset[str]
-    notes: tuple[str, ...] = ()
 
 
 def open_dataset(
@@ -159,6 +156,12 @@ def assign_splits(strata: Iterable[tuple[str, object]], percent: tuple[int, int]
 # --- archives -------------------------------------------------------------------------------------
 
 
+_READ = (".bvh", ".csv")  # endings of the files that are read
+_MOST_FILES, _MOST_BYTES, _MOST_IN_ALL, _MOST_RATIO = 100_000, 1 << 29, 1 << 35, 200
+"""Limits on archives: files, bytes of one and of all, and how much one may grow. (100STYLE: 810 files, some 4 GB
+in all, of 17 MB at most; text of numbers shrinks 3 to 5 times, of still frames up to 100 times.)"""
+
+
 @functools.lru_cache(maxsize=4)
 def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     """Open a zip once per process; a changed file is opened anew."""
@@ -167,32 +170,13 @@ def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     # Also what a forged directory raises: ValueError, NotImplementedError, struct.error, ...
     except Exception as error:
         raise ValueError(f"{path}: broken or truncated zip archive ({error}); fetch it again") from error
-    if bomb := _too_large([info for info in opened.infolist() if info.filename.lower().endswith(_READ)]):
-        raise ValueError(f"{path}: refused before anything was unpacked: {bomb}; unpack it yourself if you trust it")
-    return opened
-
-
-_READ = (".bvh", ".csv")  # endings of the files that are read
-_MOST_FILES, _MOST_BYTES, _MOST_IN_ALL, _MOST_RATIO = 100_000, 1 << 29, 1 << 35, 200
-"""Limits on archives: files, bytes of one and of all, and how much one may grow. (100STYLE: 810 files, some 4 GB
-in all, of 17 MB at most; text of numbers shrinks 3 to 5 times, of still frames up to 100 times.)"""
-
-
-def _too_large(members: list[zipfile.ZipInfo]) -> str:
-    """Say by what an archive's directory asks for more than motion files do, "" if it does not."""
-    if len(members) > _MOST_FILES:
-        return f"{len(members)} files, at most {_MOST_FILES} are read"
-    for info in members:
-        if info.file_size > _MOST_BYTES:
-            return f"{info.filename!r} unpacks to {info.file_size / 1e9:.1f} GB"
-        if info.file_size > _MOST_RATIO * max(info.compress_size, 5000):
-            return f"{info.filename!r} unpacks to over {_MOST_RATIO} times its size"
+    members = [info for info in opened.infolist() if info.filename.lower().endswith(_READ)]
     total = sum(info.file_size for info in members)
-    return f"its files unpack to {total / 1e9:.0f} GB" if total > _MOST_IN_ALL else ""
-
-
-# All that a damaged member of a zip, or a file that went away, raises on reading.
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError, RuntimeError, ValueError, MemoryError)
+    swollen = any(info.file_size > min(_MOST_BYTES, _MOST_RATIO * max(info.compress_size, 5000)) for info in members)
+    if swollen or total > _MOST_IN_ALL or len(members) > _MOST_FILES:
+        what = f"{len(members)} files of {total / 1e9:.1f} GB, or one of them, grow more than motion does"
+        raise ValueError(f"{path}: refused before anything was unpacked: {what}; unpack it yourself if you trust it")
+    return opened
 
 
 @dataclass(frozen=True)
@@ -228,13 +212,8 @@ class _Archive:
     def read(self, name: str) -> bytes:
         """Return a file's bytes; ValueError names archive and file if they cannot be had."""
         try:
-            if self.is_zip:
-                return self._zip().read(name)
-            file = Path(self.path) / name
-            if file.stat().st_size > _MOST_BYTES:
-                raise OSError(f"{file.stat().st_size / 1e9:.1f} GB are too many for a motion file")
-            return file.read_bytes()
-        except _UNREADABLE as error:
+            return self._zip().read(name) if self.is_zip else (Path(self.path) / name).read_bytes()
+        except Exception as error:  # whatever a damaged member of a zip, or a file that went away, raises
             raise ValueError(f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again") from error
 
     def size_and_crc(self, name: str) -> tuple[int, int]:
@@ -249,35 +228,24 @@ class _Archive:
         return f"{self.path}: {name}"
 
 
-def _archive_at(path) -> _Archive:
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise ValueError(f"{path}: there is no such file or folder; check the path")
-    if path.is_file() and path.suffix.lower() in _READ:
-        raise ValueError(f"{path}: is a single file; name the folder that it lies in")
-    return _Archive(str(path))
-
-
 def _find_archive(name: str, path) -> _Archive:
     """Choose where a data set is read from: `path`, then F3AMD_DATA_DIR, then the download.
 
-    In a folder a zip of a usual name wins, then the only zip with the data set's name in its own, then
-    the folder itself with unpacked files.
+    In a folder the zip with the data set's name in its own wins over unpacked files.
     """
-    place = path or os.environ.get(DATA_DIR_VARIABLE)
-    if not place:
-        return _archive_at(_download(name))
-    archive = _archive_at(place)
-    if archive.is_zip:
-        return archive
-    folder = Path(archive.path)
-    zips = [item.name for item in sorted(folder.iterdir()) if item.suffix.lower() == ".zip" and item.is_file()]
-    zips = [item for item in zips if name in item.lower() and not item.startswith("._")]
-    usual = [item for item in _SETS[name].get("usual", ()) if item in zips]
-    if len(zips) > 1 and not usual:
-        what = f"several archives may be meant ({', '.join(zips)})"
-        raise ValueError(f"{folder}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
-    return _archive_at(folder / (usual + zips)[0]) if zips else archive
+    place = Path(path or os.environ.get(DATA_DIR_VARIABLE) or _download(name)).expanduser()
+    if not place.exists():
+        raise ValueError(f"{place}: there is no such file or folder; check the path")
+    if place.is_file() and place.suffix.lower() in _READ:
+        raise ValueError(f"{place}: is a single file; name the folder that it lies in")
+    if place.is_dir() and name != "folder":
+        zips = [item for item in sorted(place.glob("*.[zZ][iI][pP]")) if name in item.name.lower() and item.is_file()]
+        zips = [item for item in zips if not item.name.startswith("._")]
+        if len(zips) > 1:
+            what = f"several archives may be meant ({', '.join(item.name for item in zips)})"
+            raise ValueError(f"{place}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
+        place = (zips or [place])[0]
+    return _Archive(str(place))
 
 
 def _download(name: str) -> str:
@@ -296,22 +264,10 @@ def _download(name: str) -> str:
         raise ValueError(f"{what}; {how}") from error
 
 
-def _by_stem(archive: _Archive, files: Iterable[str]) -> dict[str, str]:
-    """Return files by name without folder and suffix; ValueError for one that is there twice."""
-    members: dict[str, str] = {}
-    for member in files:
-        base = PurePosixPath(member)
-        if base.stem in members:
-            what = f"holds {base.name} twice ({members[base.stem]} and {member})"
-            raise ValueError(f"{archive.path}: {what}; leave one copy of the data set there")
-        members[base.stem] = member
-    return members
-
-
 # --- data sets ------------------------------------------------------------------------------------
 
 
-def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror, notes=()) -> Dataset:
+def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror) -> Dataset:
     """Put a data set together.
 
     Args:
@@ -319,7 +275,6 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
       clips: all takes, sorted by name.
       content: what identifies the contents of its files, JSON-ready.
       primary, mirror: tell of a style whether it is a primary one (None: all are), may be mirrored.
-      notes: as in `Dataset`.
     """
     clips = tuple(clips)
     styles = tuple(sorted({clip.style for clip in clips}))
@@ -329,7 +284,7 @@ def _dataset(name: str, clips: Iterable[Clip], content, *, primary=None, mirror,
         name=name, licence=_SETS[name]["licence"], credit=_SETS[name]["credit"],
         fingerprint=hashlib.sha256(decisive.encode("ascii")).hexdigest(), styles=styles, clips=clips,
         primary_styles=styles if primary is None else tuple(filter(primary, styles)),
-        mirror_styles=frozenset(filter(mirror, styles)), notes=tuple(notes),
+        mirror_styles=frozenset(filter(mirror, styles)),
     )  # fmt: skip
 
 
@@ -339,33 +294,26 @@ def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
     kept = [*dataset.primary_styles, *others][:num_styles]
     clips = (clip for clip in dataset.clips if clip.style in kept)
     primary, mirror = dataset.primary_styles.__contains__, dataset.mirror_styles.__contains__
-    return _dataset(dataset.name, clips, dataset.fingerprint, primary=primary, mirror=mirror, notes=dataset.notes)
+    return _dataset(dataset.name, clips, dataset.fingerprint, primary=primary, mirror=mirror)
 
 
 # --- loaders --------------------------------------------------------------------------------------
 
 
-def _bvh_loader(
-    archive: _Archive, member: str, expected: tuple[int, int], *, sha256_prefix: str = "", start=0, stop=None
-) -> Callable[[], Motion]:
-    """Return what reads one file of an archive, checks its bytes, and cuts out a range of 30 fps frames."""
-
-    def load() -> Motion:
-        data = archive.read(member)
-        label = archive.label(member)
-        sound = (len(data), zlib.crc32(data)) == expected
-        if not (sound and hashlib.sha256(data).hexdigest().startswith(sha256_prefix)):
-            raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
-        motion = parse_bvh(data, label)
-        if stop is None:
-            return motion
-        motion = resample(motion, FPS)
-        if stop > motion.num_frames:
-            what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {stop}"
-            raise ValueError(f"{label}: {what}; the file or the table is not the original: fetch both again")
-        return motion.slice(start, stop)
-
-    return load
+def _read_take(archive: _Archive, member: str, expected: tuple[int, int], sha256_prefix="", cut=None) -> Motion:
+    """Read one file of an archive, check its bytes, and cut a range of 30 fps frames out."""
+    data, label = archive.read(member), archive.label(member)
+    sound = (len(data), zlib.crc32(data)) == expected
+    if not (sound and hashlib.sha256(data).hexdigest().startswith(sha256_prefix)):
+        raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
+    motion = parse_bvh(data, label)
+    if cut is None:
+        return motion
+    motion = resample(motion, FPS)
+    if cut[1] > motion.num_frames:
+        what = f"has {motion.num_frames} frames at 30 fps, but Frame_Cuts.csv cuts it at {cut[1]}"
+        raise ValueError(f"{label}: {what}; the file or the table is not the original: fetch both again")
+    return motion.slice(*cut)
 
 
 def _synthetic_take(style: str, seconds: float, seed: int) -> Motion:
@@ -394,8 +342,7 @@ def _open_synthetic(seconds_per_style: float, num_styles: int | None) -> Dataset
         Clip(name, style, "mixed", splits[name], functools.partial(_synthetic_take, style, seconds, seed))
         for name, style, seed in takes
     ]
-    symmetric = lambda style: synthetic.style_parameters(style).symmetric
-    return _dataset("synthetic", clips, [seconds, _synthetic_probe(styles)], mirror=symmetric)
+    return _dataset("synthetic", clips, [seconds, _synthetic_probe(styles)], mirror=synthetic.is_symmetric)
 
 
 @functools.cache
@@ -412,65 +359,47 @@ def _synthetic_probe(styles: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-class _ListedFile(NamedTuple):
-    """A row of `bandai_files.csv`: what a sound file of the Bandai archive is."""
-
-    name: str
-    frames: int
-    size_and_crc: tuple[int, int]
-    sha256_prefix: str
-    style: str
-    content: str
-    is_locomotion: bool
-
-
-def _listed_file(name: str, frames: str, size: str, crc32: str, sha256_prefix: str) -> _ListedFile:
-    """Return a row, told by its name: data set, content, style and number; none of them holds an underscore."""
-    part, content, style, _ = name.split("_")
-    style, walks = f"{part.removeprefix('dataset-')}-{style}", content in _SETS["bandai"]["locomotion"][part]
-    return _ListedFile(name, int(frames), (int(size), int(crc32, 16)), sha256_prefix, style, content, walks)
+_BANDAI_FILES = Path(__file__).with_name("bandai_files.csv")
 
 
 @functools.cache
-def _bandai_list() -> tuple[_ListedFile, ...]:
-    """Return the committed list of files: sizes and checksums at the pinned commit."""
-    lines = Path(__file__).with_name("bandai_files.csv").read_text(encoding="utf-8").splitlines()
-    return tuple(_listed_file(*row) for row in csv.reader(lines[1:]))
+def _bandai_list(path: Path) -> pd.DataFrame:
+    """Return the committed list of files, by name: sizes and checksums at the pinned commit, and what names tell."""
+    listed = pd.read_csv(path, dtype={"crc32": str, "sha256_prefix": str}).set_index("name", drop=False)
+    # Data set, content, style and number; none of them holds an underscore.
+    parts = listed["name"].str.split("_", expand=True)
+    listed["content"] = parts[1]
+    listed["style"] = parts[0].str.removeprefix("dataset-") + "-" + parts[2]
+    walks = _SETS["bandai"]["locomotion"]
+    listed["is_locomotion"] = [content in walks[part] for part, content in zip(parts[0], parts[1], strict=True)]
+    return listed
 
 
 def _open_bandai(path, locomotion_only: bool) -> Dataset:
-    """List the Bandai clips of an archive whose files agree with the committed list."""
+    """List the Bandai clips of an archive; each file must agree with the committed list when it is read."""
     archive = _find_archive("bandai", path)
-    known = {item.name: item for item in _bandai_list()}
-    listed = [item for item in known.values() if item.is_locomotion or not locomotion_only]
-    wanted = {item.name for item in listed}
-    files = archive.bvh_files()
-    members = _by_stem(archive, (file for file in files if PurePosixPath(file).stem in wanted))
-    missing = sorted(wanted - set(members))
-    if missing:
-        what = f"{len(missing)} of the {len(wanted)} Bandai files needed are missing, the first is {missing[0]}.bvh"
+    known = _bandai_list(_BANDAI_FILES)
+    listed = known[known["is_locomotion"]] if locomotion_only else known
+    members = {PurePosixPath(file).stem: file for file in archive.bvh_files()}
+    if missing := sorted(set(listed.index) - set(members)):
+        what = f"{len(missing)} of the {len(listed)} Bandai files needed are missing, the first is {missing[0]}.bvh"
         raise ValueError(f"{archive.path}: {what}; fetch the whole archive again")
-    for item in listed:
-        if archive.size_and_crc(members[item.name]) != item.size_and_crc:
-            label = archive.label(members[item.name])
-            raise ValueError(f"{label}: is not the published file, the archive is refused; fetch it again")
     # Locomotion and other clips are split apart, so that a clip's split does not depend on
     # `locomotion_only`. Clips too short for a window reach no split at all once packed, so they
     # must not take a place in validation or test.
-    splits = dict.fromkeys(known, "train") | assign_splits(
-        (item.name, (item.style, item.is_locomotion)) for item in known.values() if item.frames >= MINIMUM_FRAMES
-    )
+    long = known[known["frames"] >= MINIMUM_FRAMES]
+    strata = zip(long["name"], zip(long["style"], long["is_locomotion"], strict=True), strict=True)
+    splits = dict.fromkeys(known["name"], "train") | assign_splits(strata)
     clips = []
-    for item in sorted(listed, key=lambda item: item.name):
-        loader = _bvh_loader(archive, members[item.name], item.size_and_crc, sha256_prefix=item.sha256_prefix)
+    for item in listed.sort_index().itertuples():
+        expected = (item.size, int(item.crc32, 16))
+        loader = functools.partial(_read_take, archive, members[item.name], expected, item.sha256_prefix)
         clips.append(Clip(item.name, item.style, item.content, splits[item.name], loader))
-    content = [(item.name, item.sha256_prefix) for item in listed]
-    notes = [f"ignored {file}: not on the list of files" for file in files if PurePosixPath(file).stem not in known]
+    content = list(zip(listed["name"], listed["sha256_prefix"], strict=True))
     of_part_2 = lambda style: style.startswith("2-")
-    return _dataset("bandai", clips, content, primary=of_part_2, mirror=lambda style: True, notes=notes)
+    return _dataset("bandai", clips, content, primary=of_part_2, mirror=lambda style: True)
 
 
-_100STYLE_URL = _SETS["100style"]["url"]
 _100STYLE_CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
 
 
@@ -478,96 +407,73 @@ def _open_100style(path) -> Dataset:
     """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
     archive = _find_archive("100style", path)
     cuts, symmetric = _read_frame_cuts(archive), _read_symmetric(archive)
-    members = _by_stem(archive, archive.bvh_files())
+    members = {PurePosixPath(file).stem: file for file in archive.bvh_files()}
     # A transition take may be called TR for TR1, as in the author's own exporter.
     for style, _ in cuts:
         if f"{style}_TR1" not in members and f"{style}_TR" in members:
             members[f"{style}_TR1"] = members.pop(f"{style}_TR")
     # Splits come from the table, not from what is there: a missing file moves no other clip.
     splits = assign_splits((f"{style}_{code}", style) for style, code in cuts)
-    clips, missing, content = [], [], []
+    clips, content = [], []
     for (style, code), (start, stop) in cuts.items():
         name = f"{style}_{code}"
-        if name not in members:
-            missing.append(f"{name}.bvh")
-            continue
-        # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
-        # the same as cutting at even frames of the original and then halving.
-        there = archive.size_and_crc(members[name])
-        loader = _bvh_loader(archive, members[name], there, start=start // 2, stop=stop // 2)
-        clips.append(Clip(name, style, code, splits[name], loader))
-        content.append((name, *there, start, stop))
+        if name in members:
+            # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
+            # the same as cutting at even frames of the original and then halving.
+            there, cut = archive.size_and_crc(members[name]), (start // 2, stop // 2)
+            loader = functools.partial(_read_take, archive, members[name], there, cut=cut)
+            clips.append(Clip(name, style, code, splits[name], loader))
+            content.append((name, *there, start, stop))
+    missing = [name for name in splits if name not in members]
     if not clips:
-        what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there, such as {missing[0]}"
-        raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_100STYLE_URL})")
-    notes = [f"missing {name}" for name in missing]
-    notes += [f"ignored {members[stem]}: not in Frame_Cuts.csv" for stem in sorted(set(members) - set(splits))]
+        what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there"
+        raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_SETS['100style']['url']})")
     if missing:
-        what = f"{len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as {missing[0]}"
-        warnings.warn(f"{archive.path}: {what}; the data set goes without them (see its notes)", stacklevel=3)
-    if unlisted := {clip.style for clip in clips} - symmetric.keys():
-        what = f"Dataset_List.csv has no row for style {min(unlisted)!r} of Frame_Cuts.csv"
-        raise ValueError(f"{archive.path}: {what}; take both tables from the same release")
+        what = f"{len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as {missing[0]}.bvh"
+        warnings.warn(f"{archive.path}: {what}; the data set goes without them", stacklevel=3)
     clips.sort(key=lambda clip: clip.name)
-    return _dataset("100style", clips, sorted(content), mirror=symmetric.get, notes=notes)
+    return _dataset("100style", clips, sorted(content), mirror=symmetric.__contains__)
 
 
-def _read_table(archive: _Archive, table: str) -> tuple[str, list[tuple[int, dict[str, str]]]]:
-    """Return where a table of 100STYLE lies, for messages, and its rows with their lines."""
+def _read_table(archive: _Archive, table: str, columns: list[str]) -> tuple[str, pd.DataFrame]:
+    """Return where a table of 100STYLE lies, for messages, and these columns of it, as text."""
     places = [name for name in archive.names() if PurePosixPath(name).name == table]
     if len(places) != 1:
         how = f"is there {len(places)} times ({', '.join(places)})" if places else "is missing"
-        what = f"the folder or zip must hold one copy of the data set, with its tables ({_100STYLE_URL})"
-        raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what}")
-    label = archive.label(places[0])
+        what = "the folder or zip must hold one copy of the data set, with its tables"
+        raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what} ({_SETS['100style']['url']})")
+    label, content = archive.label(places[0]), io.BytesIO(archive.read(places[0]))
     try:
-        text = archive.read(places[0]).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{label}: is not UTF-8 text; fetch it again") from error
-    reader = csv.DictReader(io.StringIO(text, newline=""))
-    return label, [(reader.line_num, row) for row in reader]
+        return label, pd.read_csv(content, usecols=columns, dtype=str, encoding="utf-8-sig", skip_blank_lines=False)
+    except ValueError as error:
+        raise ValueError(f"{label}: is not the table that it should be ({error}); fetch it again") from error
 
 
 def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[tuple[str, str], tuple[int, int]]:
-    """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges are left out."""
-    (label, rows), cuts = _read_table(archive, table), {}
-    for line, row in rows:
-        style = (row.get("STYLE_NAME") or "").strip()
-        if not style:
-            raise ValueError(f"{label}, line {line}: no STYLE_NAME; fetch the table again")
+    """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges (N/A) are left out."""
+    columns = ["STYLE_NAME", *(f"{code}_{end}" for code in _100STYLE_CODES for end in ("START", "STOP"))]
+    (label, rows), cuts = _read_table(archive, table, columns), {}
+    for line, row in enumerate(rows.to_dict("records"), start=2):
         for code in _100STYLE_CODES:
-            texts = [(row.get(f"{code}_{end}") or "N/A").strip() for end in ("START", "STOP")]
-            if texts == ["N/A", "N/A"]:
+            style, start, stop = (str(row[name]).strip() for name in ("STYLE_NAME", f"{code}_START", f"{code}_STOP"))
+            if start == stop == "nan":
                 continue
-            if not all(text.isdecimal() and len(text) < 10 for text in texts) or int(texts[0]) >= int(texts[1]):
-                what = f"{code} of {style} has the range {texts[0][:20]!r} to {texts[1][:20]!r}"
+            if not all(re.fullmatch("[0-9]{1,9}", frame) for frame in (start, stop)) or int(start) >= int(stop):
+                what = f"{code} of {style} has the range {start[:20]!r} to {stop[:20]!r}"
                 raise ValueError(f"{label}, line {line}: {what}; it needs two rising whole numbers, or N/A twice")
-            if (style, code) in cuts:
-                raise ValueError(f"{label}, line {line}: style {style} is listed twice")
-            cuts[style, code] = (int(texts[0]), int(texts[1]))
-    if not cuts:
-        raise ValueError(f"{label}: holds no frame range; fetch the table again")
+            cuts[style, code] = (int(start), int(stop))
     return cuts
 
 
-def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> dict[str, bool]:
-    """Return, per style, whether its mirror image is the same style."""
-    (label, rows), symmetric = _read_table(archive, table), {}
-    for line, row in rows:
-        style, answer = ((row.get(column) or "").strip() for column in ("Style Name", "Symmetric"))
-        if not style or answer not in ("Yes", "No"):
-            what = "needs a Style Name, and Yes or No under Symmetric"
-            raise ValueError(f"{label}, line {line}: {what}; found {style!r} and {answer!r}")
-        symmetric[style] = answer == "Yes"
-    return symmetric
+def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> set[str]:
+    """Return the styles that stay themselves in a mirror."""
+    _, rows = _read_table(archive, table, ["Style Name", "Symmetric"])
+    return set(rows["Style Name"][rows["Symmetric"].str.strip() == "Yes"].str.strip())
 
 
 def _open_folder(path) -> Dataset:
     """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
-    place = path or os.environ.get(DATA_DIR_VARIABLE)
-    if not place:
-        raise ValueError(f"the data set 'folder' needs path=..., or set the environment variable {DATA_DIR_VARIABLE}")
-    archive = _archive_at(place)
+    archive = _find_archive("folder", path)
     labelled = {}
     for member in archive.bvh_files():
         relative = PurePosixPath(member)
@@ -584,7 +490,7 @@ def _open_folder(path) -> Dataset:
     clips, identities = [], []
     for name, (member, style, content) in sorted(labelled.items()):
         there = archive.size_and_crc(member)
-        clips.append(Clip(name, style, content, splits[name], _bvh_loader(archive, member, there)))
+        clips.append(Clip(name, style, content, splits[name], functools.partial(_read_take, archive, member, there)))
         identities.append((name, *there))
     # Whether a style keeps its name when mirrored is not for us to guess.
     return _dataset("folder", clips, identities, mirror=lambda style: False)

@@ -206,7 +206,8 @@ def _parse_hierarchy(text: str) -> tuple[list[_Joint], list[tuple[int, list[floa
             joint.channels = {channel: column + k for k, channel in enumerate(channels)}
             column += len(channels)
             if not int(count) == len(channels) == len(joint.channels):
-                what = f"joint {joint.name!r} says it has {count} channels, but lists {', '.join(channels) or 'none'}"
+                listed = ", ".join(channels)[:80] or "none"
+                what = f"joint {joint.name!r} says it has {count} channels, but lists {listed}"
                 raise _Broken(line, f"{what}; each is X, Y or Z with position or rotation, such as Xposition, and once")
     end = 1 + text.count("\n")
     if open_joints:

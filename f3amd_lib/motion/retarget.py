@@ -9,8 +9,6 @@ the reference has it.
 Source: ours.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from f3amd_lib.motion.anatomy import joint_roles, leg_length
@@ -24,22 +22,7 @@ NEEDED = ("neck", "head", *(f"{side}_{part}" for side in ("left", "right") for p
 """Roles that both skeletons must have, beside the hips."""
 
 
-@dataclass(frozen=True, eq=False)
-class Retargeted:
-    """What came out.
-
-    Attributes:
-      motion: on our skeleton.
-      scale: our legs' length beside theirs.
-      error: how far joints of shared roles are from theirs, times the scale and seen from the hips, centimetres, [T].
-    """
-
-    motion: Motion
-    scale: float
-    error: np.ndarray
-
-
-def retarget(motion: Motion, reference: Motion) -> Retargeted:
+def retarget(motion: Motion, reference: Motion) -> tuple[Motion, float, np.ndarray]:
     """Put a motion on another skeleton.
 
     Args:
@@ -48,7 +31,8 @@ def retarget(motion: Motion, reference: Motion) -> Retargeted:
         toe the floor.
 
     Returns:
-      The motion on the reference's skeleton, at its own frame rate.
+      The motion on the reference's skeleton, at its own frame rate; the length of our legs beside theirs; and how far
+      joints of shared roles are from theirs, times that and seen from the hips, centimetres, [T].
 
     Raises:
       ValueError: naming the roles for which either skeleton has no joint.
@@ -85,7 +69,7 @@ def retarget(motion: Motion, reference: Motion) -> Retargeted:
     there = motion.positions[:, [theirs[role] for role in shared]]
     here = made.positions[:, [ours[role] for role in shared]]
     apart = (here - here[:, :1]) - scale * (there - there[:, :1])
-    return Retargeted(made, float(scale), 100.0 * np.linalg.norm(apart, axis=-1).mean(axis=-1))
+    return made, float(scale), 100.0 * np.linalg.norm(apart, axis=-1).mean(axis=-1)
 
 
 def _wanted_points(motion: Motion, theirs, skeleton: Skeleton, ours) -> dict[int, np.ndarray]:

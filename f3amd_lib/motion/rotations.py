@@ -115,12 +115,7 @@ def matrix_from_euler(order: str, degrees: np.ndarray) -> np.ndarray:
 
     Returns:
       Rotation matrices, [..., 3, 3], float64.
-
-    Raises:
-      ValueError: if the order is not made of X, Y, Z.
     """
-    if not order or set(order) - set("XYZ"):
-        raise ValueError(f"Euler order {order!r} must be made of the letters X, Y, Z")
     degrees = np.asarray(degrees, dtype=np.float64)
     flat = degrees.reshape(-1, len(order))
     matrices = Rotation.from_euler(order, flat, degrees=True).as_matrix()

@@ -17,7 +17,7 @@ import numpy as np
 
 from f3amd_lib.ground.arrays import array_module, check_positive, finite_array
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices, yaw_from_direction
+from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices
 
 CONTACT_SPEED = 0.01
 """A toe that moves less than this, metres in a frame at 30 fps, is in contact (CAMDM's rule)."""
@@ -50,22 +50,16 @@ class Skeleton:
     end_sites: tuple[tuple[int, tuple[float, float, float]], ...] = ()
 
     def __post_init__(self):
-        offsets = np.array(self.offsets, dtype=np.float64)
+        offsets = finite_array("skeleton offsets", self.offsets, (len(self.names), 3)).copy()
         offsets.setflags(write=False)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "parents", tuple(int(parent) for parent in self.parents))
         object.__setattr__(self, "offsets", offsets)
         object.__setattr__(self, "end_sites", tuple((joint, tuple(tip)) for joint, tip in self.end_sites))
-        count = len(self.names)
-        if count == 0 or len(self.parents) != count or offsets.shape != (count, 3):
-            there = f"{count} names, {len(self.parents)} parents and offsets of shape {offsets.shape}"
-            raise ValueError(f"skeleton needs one name, parent and offset a joint; got {there}")
-        if len(set(self.names)) != count:
-            raise ValueError("skeleton joint names must be unique")
-        if self.parents[0] != -1 or any(not 0 <= parent <= k for k, parent in enumerate(self.parents[1:])):
+        if not len(set(self.names)) == len(self.names) == len(self.parents):
+            raise ValueError(f"skeleton joint names must be unique, with a parent each; got {', '.join(self.names)}")
+        if self.parents[:1] != (-1,) or any(not 0 <= parent <= k for k, parent in enumerate(self.parents[1:])):
             raise ValueError("skeleton needs the root first and every parent before its children")
-        if not np.all(np.isfinite(offsets)):
-            raise ValueError("skeleton offsets must be finite")
 
     def __eq__(self, other):
         alike = isinstance(other, Skeleton) and (self.names, self.parents) == (other.names, other.parents)
@@ -201,14 +195,14 @@ class Motion:
         label = f"motion {self.name!r}"
         if (self.rotations is None) == (self.joint_positions is None):
             raise ValueError(f"{label} needs either rotations or joint_positions")
-        joints = self.skeleton.num_joints
-        shapes = {"root_position": (3,), "rotations": (joints, 3, 3), "joint_positions": (joints, 3)}
+        frames, joints = len(self.root_position), self.skeleton.num_joints
+        shapes = {
+            "root_position": ("frame", 3),
+            "rotations": (frames, joints, 3, 3),
+            "joint_positions": (frames, joints, 3),
+        }
         for what, array in self._arrays().items():
-            array = finite_array(f"{label}: {what}", array, ("frame", *shapes[what]), dtype=None)
-            object.__setattr__(self, what, array)
-        lengths = {what: len(array) for what, array in self._arrays().items()}
-        if len(set(lengths.values())) != 1:
-            raise ValueError(f"{label}: arrays have unlike numbers of frames, {lengths}")
+            object.__setattr__(self, what, finite_array(f"{label}: {what}", array, shapes[what], dtype=None))
         check_positive(f"{label}: fps", self.fps)
 
     @classmethod
@@ -348,9 +342,8 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     if shoulders and skeleton.has_role("left_clavicle") and skeleton.has_role("right_clavicle"):
         unit = lambda vector: vector / xp.maximum(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
         across = unit(across) + unit(between("clavicle"))
-    # cross(a, +Y) = (-a_z, 0, a_x)
-    forward = xp.stack([-across[..., 2], xp.zeros_like(across[..., 0]), across[..., 0]], axis=-1)
-    return yaw_from_direction(forward)
+    # The direction is cross(a, +Y) = (-a_z, 0, a_x).
+    return xp.arctan2(-across[..., 2], across[..., 0])
 
 
 def contact_labels(skeleton: Skeleton, positions, fps: float = 30.0):
@@ -420,14 +413,14 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
     high = np.minimum(low + 1, motion.num_frames - 1)
     weight = (times - low)[:, None]
 
-    def between(positions):
-        across = weight.reshape(-1, *[1] * (positions.ndim - 1))
-        return (1 - across) * positions[low] + across * positions[high]
+    def between(name, array):
+        if name == "rotations":
+            return slerp_matrices(array[low], array[high], weight)
+        across = weight.reshape(-1, *[1] * (array.ndim - 1))
+        return (1 - across) * array[low] + across * array[high]
 
-    if motion.rotations is None:
-        return Motion.from_positions(motion.skeleton, between(motion.positions), float(fps), motion.name)
-    rotations = slerp_matrices(motion.rotations[low], motion.rotations[high], weight)
-    return motion.replace(root_position=between(motion.root_position), rotations=rotations, fps=float(fps))
+    changes = {name: between(name, array) for name, array in motion._arrays().items()}
+    return motion.replace(**changes, fps=float(fps))
 
 
 def turn(motion: Motion, yaw: float) -> Motion:

@@ -16,8 +16,8 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 """
 
 import hashlib
-from dataclasses import make_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,42 +51,19 @@ _FOOT_LENGTH = float(np.hypot(_TOE_OFFSET[1], _TOE_OFFSET[2])) + 0.05
 # ---------------------------------------------------------------------------------- parameters
 
 
-def _symmetric(style) -> bool:
-    """Whether a mirrored clip is again a clip of the same style."""
-    one_sided = ("limp", "heading_deg", "spine_roll_deg", "spine_twist_deg", "head_roll_deg", "head_yaw_deg")
-    return (
-        style.left_arm == style.right_arm
-        and style.left_lift_scale == style.right_lift_scale
-        and style.rhythm == 0.5
-        and not any(getattr(style, name) for name in one_sided)
-    )
-
-
 _STYLE_TABLE = read_toml(Path(__file__).with_name("styles.toml"))
 _NEUTRAL, _NEUTRAL_ARM = _STYLE_TABLE["Neutral"], _STYLE_TABLE["Neutral"].pop("arms")
 
 # What a parameter means stands beside its number, in [Neutral] of styles.toml.
-ArmPose = make_dataclass("ArmPose", [(name, float, value) for name, value in _NEUTRAL_ARM.items()], frozen=True)
-"""How one arm is held and how it moves; the defaults are those of the style Neutral."""
-
-StyleParameters = make_dataclass(
-    "StyleParameters",
-    [(name, type(value), value) for name, value in _NEUTRAL.items()]
-    + [(name, ArmPose, ArmPose()) for name in ("left_arm", "right_arm")],
-    frozen=True,
-    namespace={"symmetric": property(_symmetric)},
-)
-"""Everything that tells one style from another; the defaults are the style Neutral."""
 
 
-def _complete(values: dict) -> StyleParameters:
+def _complete(values: dict) -> SimpleNamespace:
     """Return a style from what differs from Neutral."""
     both = values.get("arms", {})
-    arms = {side: ArmPose(**values.get(side, both)) for side in ("left_arm", "right_arm")}
+    arms = {side: SimpleNamespace(**_NEUTRAL_ARM | values.get(side, both)) for side in ("left_arm", "right_arm")}
     # A slower walk takes shorter steps unless it says otherwise.
     step_length = float(0.62 * np.sqrt(min(values.get("speed", _NEUTRAL["speed"]) / 1.20, 1.3)))
-    own = {name: value for name, value in values.items() if name != "arms"}
-    return StyleParameters(**{"step_length": step_length, **own, **arms})
+    return SimpleNamespace(**_NEUTRAL | {"step_length": step_length} | values | arms)
 
 
 _STYLES = {name: _complete(values) for name, values in _STYLE_TABLE.items()}
@@ -94,20 +71,18 @@ STYLES: tuple[str, ...] = tuple(sorted(_STYLES))
 """The hundred style names, sorted."""
 
 
-def style_parameters(name: str) -> StyleParameters:
-    """Look up a style by name.
-
-    Args:
-      name: one of `STYLES`.
-
-    Returns:
-      The style's parameters.
-
-    Raises:
-      ValueError: for an unknown name; the message lists the nearest known ones.
-    """
+def style_parameters(name: str) -> SimpleNamespace:
+    """Return everything that tells a style, one of `STYLES`, from others; ValueError lists the nearest ones."""
     check_known(name, STYLES, "synthetic style")
     return _STYLES[name]
+
+
+def is_symmetric(name: str) -> bool:
+    """Return whether a mirrored clip of a style is again a clip of the same style."""
+    style = style_parameters(name)
+    one_sided = ("limp", "heading_deg", "spine_roll_deg", "spine_twist_deg", "head_roll_deg", "head_yaw_deg")
+    alike = style.left_arm == style.right_arm and style.left_lift_scale == style.right_lift_scale
+    return alike and style.rhythm == 0.5 and not any(getattr(style, name) for name in one_sided)
 
 
 # ---------------------------------------------------------------------------------- small tools
@@ -123,8 +98,7 @@ _STANDING_SPEED = 0.12
 def _generator(style: str, seed: int) -> np.random.Generator:
     """Seed a generator from text, so that it draws the same on every machine."""
     digest = hashlib.sha256(f"f3amd synthetic walker|{style}|{int(seed)}".encode()).digest()
-    words = np.frombuffer(digest, dtype="<u4").tolist()
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    return np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist())
 
 
 def _smooth(signal: np.ndarray, sigma: float, rate: float) -> np.ndarray:
@@ -174,7 +148,7 @@ _STRETCHES = read_toml(Path(__file__).with_name("stretches.toml"))
 """What a path is strung together from; the file says what its numbers mean."""
 
 
-def _plan_path(style: StyleParameters, seconds: float, rng: np.random.Generator) -> _Path:
+def _plan_path(style, seconds: float, rng: np.random.Generator) -> _Path:
     """String random stretches together and smooth speed, turning and heading."""
     count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
     time = np.arange(count) / _GRID_RATE - _LEAD
@@ -255,7 +229,7 @@ def _given_path(position: np.ndarray, yaw: np.ndarray, fps: float) -> _Path:
 # ------------------------------------------------------------------------------- 2. footfalls
 
 
-def _home(style: StyleParameters, path: _Path, time: float, side: float, width: float):
+def _home(style, path: _Path, time: float, side: float, width: float):
     """Return where a toe wants to stand (x, z) and its yaw, for the body's place at a time."""
     index = path.at(time)
     yaw = path.yaw[index]
@@ -270,7 +244,7 @@ def _home(style: StyleParameters, path: _Path, time: float, side: float, width: 
     return place, foot_yaw, left
 
 
-def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generator):
+def _plan_footfalls(style, path: _Path, rng: np.random.Generator):
     """Walk along the path, one footfall after the other.
 
     Returns:
@@ -367,7 +341,7 @@ def _plan_footfalls(style: StyleParameters, path: _Path, rng: np.random.Generato
 # ------------------------------------------------------------------------------------ 3. feet
 
 
-def _move_foot(style: StyleParameters, plants, time: np.ndarray, side: float, fps: float):
+def _move_foot(style, plants, time: np.ndarray, side: float, fps: float):
     """Turn where a toe stands, from `_plan_footfalls`, into a path of the foot.
 
     Returns:
@@ -458,7 +432,7 @@ def _bend_leg(hip: np.ndarray, ankle: np.ndarray, pole: np.ndarray):
 # --------------------------------------------------------------------------------- 6. the arms
 
 
-def _arm(pose: ArmPose, side, swing, gesture, lean_deg, roll_deg, drift):
+def _arm(pose, side, swing, gesture, lean_deg, roll_deg, drift):
     """Return local shoulder, elbow and wrist rotations of one arm, [T, 3, 3] each."""
     forward = pose.forward_deg + pose.swing_deg * swing + pose.hang * lean_deg
     forward = forward + pose.wave_forward_deg * np.cos(gesture) + 1.5 * drift[:, 0]
@@ -498,39 +472,37 @@ def walk_along(style: str, position, yaw) -> Motion:
     return _walk(style_parameters(style), style, 0, 30.0, len(yaw), (position, yaw))[0]
 
 
-def synthesize_with_contacts(
-    style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0
-) -> tuple[Motion, np.ndarray]:
+def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0) -> Motion:
+    """Return a clip of styled locomotion: the motion of `synthesize_with_contacts`."""
+    return synthesize_with_contacts(style, seconds, seed, fps)[0]
+
+
+def synthesize_with_contacts(style: str, seconds=60.0, seed: int = 0, fps: float = 30.0) -> tuple[Motion, np.ndarray]:
     """Make a clip of styled locomotion together with its planned contacts.
 
     Args:
       style: one of `STYLES`.
       seconds: length of the clip, seconds.
-      seed: any integer; equal (style, seconds, seed, fps) give equal clips.
+      seed: any integer; equal arguments give equal clips on every machine.
       fps: frames per second.
 
     Returns:
-      The motion ([T, 3] metres and [T, 23, 3, 3] local rotations, T = round(seconds * fps)) and
-      the planned toe contacts [T, 2] of bool, left then right: the toe stands still from this
-      frame to the next.
+      The motion (T = round(seconds * fps) frames of 23 joints, metres, floor at y = 0) and the planned toe contacts
+      [T, 2] of bool, left then right: the toe stands still from this frame to the next.
 
     Raises:
       ValueError: for an unknown style, or a length or rate that gives no frame.
     """
-    parameters = style_parameters(style)
     check_positive("fps", fps)
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
-    return _walk(parameters, style, seed, fps, int(round(seconds * fps)))
+    return _walk(style_parameters(style), style, seed, fps, int(round(seconds * fps)))
 
 
 def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None) -> tuple[Motion, np.ndarray]:
     """Make motion and contacts along a random path, or along a drawn one (position, yaw)."""
     rng = _generator(style, seed)
-    if drawn is None:
-        path = _plan_path(parameters, frames / fps, rng)
-    else:
-        path = _given_path(*drawn, fps)
+    path = _given_path(*drawn, fps) if drawn else _plan_path(parameters, frames / fps, rng)
     plants, knots, strides = _plan_footfalls(parameters, path, rng)
     drift = _wander(rng, len(path.time), 0.7, 12)
     gesture_start = rng.uniform(0.0, 2.0 * np.pi)
@@ -634,21 +606,3 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     planted = np.stack(planted, axis=-1)
     contacts = (planted & np.roll(planted, -1, axis=0))[keep]
     return Motion(SYNTHETIC_SKELETON, root[keep], local[keep], float(fps), f"{style}_{int(seed)}"), contacts
-
-
-def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0) -> Motion:
-    """Make a clip of styled locomotion (see `synthesize_with_contacts`).
-
-    Args:
-      style: one of `STYLES`.
-      seconds: length of the clip, seconds.
-      seed: any integer; equal arguments give equal clips on every machine.
-      fps: frames per second.
-
-    Returns:
-      The motion: T = round(seconds * fps) frames of 23 joints, metres, floor at y = 0.
-
-    Raises:
-      ValueError: for an unknown style, or a length or rate that gives no frame.
-    """
-    return synthesize_with_contacts(style, seconds, seed, fps)[0]

@@ -81,11 +81,11 @@ def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tupl
         note = f"{motion.name}: the model's own skeleton, taken as it is"
     else:
         pose = next(iter(trained.start_poses.values()))[0]
-        made = retarget(motion, motion_from_frames(trained.skeleton, pose))
+        made, scale, error = retarget(motion, motion_from_frames(trained.skeleton, pose))
         joints = f"{motion.skeleton.num_joints} joints, the model's has {trained.skeleton.num_joints}"
-        off = f"legs scaled by {made.scale:.2f}, joints off by {made.error.mean():.1f} cm on average"
+        off = f"legs scaled by {scale:.2f}, joints off by {error.mean():.1f} cm on average"
         note = f"{motion.name}: another skeleton ({joints}), retargeted by role; {off}"
-        motion = made.motion
+        motion = made
     world = world_frames(motion)
     turn = path.yaw[0] - frame_yaw(trained.skeleton, world)[-1]
     turned = turn_frames(center_window(world, world[-1, [0, 2]]), turn)
