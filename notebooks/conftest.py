@@ -24,9 +24,9 @@ LONG_TRAININGS = (
 """Notebooks that run longer than they compile."""
 
 FIRST = (
-    "22_one_step_three_ways", "04_training", "21_latents_and_teacher", "11_one_step", "10_printed_update",
-    "06_ablations", "17_control_and_editing", "14_crowd", "20_autoregression", "07_motion_quality",
-    "16_absolute_coordinates", "06_flow_matching",
+    "22_one_step_three_ways", "04_training", "21_latents_and_teacher", "11_one_step",
+    "10_printed_update", "06_ablations", "17_control_and_editing", "14_crowd",
+    "20_autoregression", "07_motion_quality", "16_absolute_coordinates", "06_flow_matching",
 )  # fmt: skip
 """Notebooks that take longest: begun first, so that no core waits for them at the end."""
 

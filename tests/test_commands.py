@@ -13,8 +13,7 @@ from f3amd_companion.ledger.judgements import UNJUDGED, UNMEASURED
 from f3amd_companion.measuring import campaign, measure, sensitivity
 from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
-from f3amd_companion.measuring.text_probes import TEXT_MEASUREMENTS
-from f3amd_companion.measuring.text_tables import TABLES
+from f3amd_companion.measuring.text_tables import TABLES, TEXT_MEASUREMENTS
 from f3amd_companion.speed import implementations, measurements
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file
