@@ -90,7 +90,7 @@ def test_what_makes_no_sense_is_refused():
     for changes, words in (
         ({"coarse_levels": (300, 8)}, "coarse_levels must be as many numbers .*, got .300, 8."),
         ({"channels": (6,)}, "channels must be as many numbers"),
-        ({"around": (5, 0)}, "around must be whole numbers above 0"),
+        ({"around": (5, 0)}, "each of around must be above 0"),
         ({"up": (3, 9)}, "up must be as many numbers .*, got .3, 9."),
     ):
         with pytest.raises(ValueError, match=words):

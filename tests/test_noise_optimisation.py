@@ -88,5 +88,5 @@ def test_a_network_is_brought_to_its_target():
 
 
 def test_no_steps_are_refused():
-    with pytest.raises(ValueError, match="num_steps must be positive"):
+    with pytest.raises(ValueError, match="positive decay_steps"):
         optimise_noise(straight_walk, lambda state: state.sum(), normal(1, *SHAPE), num_steps=0)

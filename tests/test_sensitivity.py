@@ -23,7 +23,7 @@ class PlainClassifier:
     """Stands for a trained one: its features say how fast and how jerkily joints move."""
 
     config = SimpleNamespace(window=SPAN)
-    accuracy = 1.0
+    accuracy, held_out_accuracy = 1.0, {"calm": 1.0, "proud": 1.0}
     styles = ("calm", "proud")
 
     def __init__(self, **clouds):

@@ -88,7 +88,7 @@ def _numbered(text: str) -> set[str]:
     return {f"Eq. {one}" for ends in parts if ends for one in range(int(ends[0]), int(ends[-1]) + 1)}
 
 
-def tested_equations(name: str) -> Mentions:
+def equations_in_name(name: str) -> Mentions:
     """Return the equations that the name of a test carries: "test_eq03_to_eq04_sum", "test_acmdm_eq01_path"."""
     _, pattern, _, marks = _patterns()
     if not (named := pattern.match(name)):
@@ -137,7 +137,7 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
     for path in sorted((root / "tests").glob("test_*.py")):
         for name, text in _documented(path):
             if name.startswith("test_") and "." not in name:
-                note("tests", f"{path.stem}: {name}", mentioned_equations(text) | tested_equations(name))
+                note("tests", f"{path.stem}: {name}", mentioned_equations(text) | equations_in_name(name))
     folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
     for path in (path for folder in folders for path in sorted(folder.glob("[0-9][0-9]_*.ipynb"))):
         # The reading guide shows this very map and explains none of it; solutions only repeat.

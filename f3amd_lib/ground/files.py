@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import itertools
 import os
 import shutil
@@ -12,6 +11,11 @@ import tomllib
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: no locks of this kind
+    fcntl = None
 
 _LEFTOVER_S = 3600.0
 """Age from which an unfinished file belongs to a process that was killed."""
@@ -108,8 +112,8 @@ def whole_folder(path) -> Iterator[Path]:
 def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a lock file while the block runs, so that no second process does the same work there.
 
-    The operating system frees the lock of a process that was killed. The empty file stays: to remove it would
-    take the lock from whoever waits for it.
+    The operating system frees the lock of a process that was killed. Where a file system (or Windows)
+    has no such locks, the block runs without one.
 
     Args:
       path: of the lock file; missing folders are made.
@@ -121,14 +125,26 @@ def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
+    while True:
+        file = path.open("a")
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break
         except BlockingIOError:
+            file.close()
             raise ValueError(
                 f"{path.parent}: another process is {doing} there; wait for it, or name another folder (--out)"
             ) from None
+        except OSError:  # a file system without locks
+            break
+        file.close()  # whoever held the lock has removed its file: ours is another one
+    try:
         yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
 
 
 def set_aside(paths: Iterable[Path], name: str) -> str | None:

@@ -17,6 +17,8 @@ def nearest_hint(name, known: Iterable[str]) -> str:
     by_lower = {item.lower(): item for item in known}
     near = [by_lower[item] for item in difflib.get_close_matches(str(name).lower(), by_lower, n=3, cutoff=0.5)]
     question, names = f"; did you mean {near[0]!r}?" if near else "", list(known)
+    if not names:
+        return "; there is none to choose from"
     if len(names) <= 25:
         return f"{question} (one of {', '.join(names)})"
     return f"{question} ({len(names)} are known, such as {', '.join(near or names[:3])})"

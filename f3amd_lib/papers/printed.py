@@ -124,7 +124,10 @@ def printed_tables(paper: str = "f3amd") -> dict[str, pd.DataFrame]:
         name = printed["metric"].str.extract(r"^(synthesis_time|training_time)", expand=False).fillna("quality")
         printed["metric"] = printed["metric"].replace(about.get("metrics", {}))
         for which, rows in [(entry["record"], printed)] if "record" in entry else printed.groupby(name):
-            find_entry(SCHEMAS, which, "record", f"{paper}/paper.toml, table {entry['number']}")
+            where = f"{paper}/paper.toml: table {entry['number']}"
+            columns = [*find_entry(SCHEMAS, which, "record", where), "unit"]
+            if missing := [column for column in columns if column not in rows]:
+                raise ValueError(f"{where}: {entry['file']} has no {', '.join(missing)}, as rows of {which!r} have")
             parts.setdefault(which, []).append(rows)
     tables = {}
     for name, some in parts.items():
