@@ -46,7 +46,7 @@ def packed_bandai() -> Path:
     Raises:
       ValueError: if there is none.
     """
-    found = sorted(cache_folder().glob("bandai-*.npz"), key=lambda path: path.stat().st_mtime)
+    found = sorted(cache_folder().glob("bandai-*.safetensors"), key=lambda path: path.stat().st_mtime)
     if not found:
         raise ValueError(f"{cache_folder()}: no packed clips of Bandai there; `f3amd data --data bandai` packs them")
     return found[-1]
