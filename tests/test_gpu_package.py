@@ -25,7 +25,7 @@ def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(gpu_pac
     folder = tmp_path / "away"
     words = [str(folder), "--package", "A", "--minutes", "9"]
     assert gpu_package.main(words) == 2 and "no packed clips of Bandai" in capsys.readouterr().err
-    packed = cache_dir / "bandai-0123456789abcdef-v1.npz"
+    packed = cache_dir / "bandai-0123456789abcdef-v2.safetensors"
     packed.parent.mkdir(parents=True)
     packed.write_bytes(b"no clips")
     assert gpu_package.main(words) == 0
@@ -47,11 +47,11 @@ def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(gpu_pac
 
 
 def test_what_cannot_be_laid_out_is_refused(gpu_package, tmp_path, monkeypatch):
-    packed = tmp_path / "bandai.npz"
+    packed = tmp_path / "bandai.safetensors"
     packed.write_bytes(b"0" * 2_000_000)
     refused("package 'a'", gpu_package.lay_out, tmp_path / "x", "a", 9.0, packed)
     refused("is there already", gpu_package.lay_out, tmp_path, "A", 9.0, packed)
-    refused("no such file", gpu_package.lay_out, tmp_path / "x", "A", 9.0, tmp_path / "none.npz")
+    refused("no such file", gpu_package.lay_out, tmp_path / "x", "A", 9.0, tmp_path / "none.safetensors")
     monkeypatch.setattr(gpu_package, "MOST_BYTES", 1_000_000)
-    refused(r"MB, more than 1; the largest: bandai.npz 2.0 MB", gpu_package.lay_out, tmp_path / "x", "A", 9.0, packed)
+    refused(r"MB, more than 1; the largest: bandai.safetensors 2.0 MB", gpu_package.lay_out, tmp_path / "x", "A", 9.0, packed)
     assert not (tmp_path / "x").exists()
