@@ -14,7 +14,7 @@ REAL = {
     "joint_acceleration": 0.6,
 }  # fmt: skip
 MADE = REAL | {
-    "path_drift": 0.01, "x0_error_ratio": 0.2, "seed_spread": 2.0, "FID": 12.0, "EMD": 5.5,
+    "path_drift": 0.01, "x0_error_ratio": 0.2, "FID": 12.0, "EMD": 5.5,
     "foot_sliding": 0.14, "contact_share": 0.45,
 }  # fmt: skip
 
@@ -37,14 +37,13 @@ def met_by(frame: pd.DataFrame) -> dict:
 
 
 def test_good_figures_meet_every_bar():
-    bars = quality_bars(table(), 0.9, 4.0)
-    assert set(bars["met_by"]) == {"both"} and len(bars) == 14
+    bars = quality_bars(table(), 0.9)
+    assert set(bars["met_by"]) == {"both"} and len(bars) == 13
     steady = bars.set_index("bar")["F3AMD-FNO-96-steady"]
     assert steady["Classifier, held-out accuracy"] == pytest.approx(90.0)
     assert steady["FID: distance to real over that to a bad one"] == pytest.approx(2.0 / 88.0)
     assert steady["Foot over real"] == pytest.approx(1.4)
     assert steady["Drift over the rollout"] == pytest.approx(1.0)
-    assert steady["Seed spread over that of real continuations"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
@@ -56,11 +55,10 @@ def test_good_figures_meet_every_bar():
         ("path_drift", 0.06, "Drift over the rollout"),
         ("foot_sliding", 0.16, "Foot over real"),
         ("contact_share", 0.5, "Contact share: distance to real over real"),
-        ("seed_spread", 0.9, "Seed spread over that of real continuations"),
     ],
 )
 def test_a_bad_figure_misses_its_bar_and_no_other(metric, value, bar):
-    found = met_by(quality_bars(table(**{metric: value}), 0.9, 4.0))
+    found = met_by(quality_bars(table(**{metric: value}), 0.9))
     assert [name for name, answer in found.items() if answer != "both"] == [bar]
     assert found[bar] == "neither"
 
@@ -68,12 +66,11 @@ def test_a_bad_figure_misses_its_bar_and_no_other(metric, value, bar):
 def test_bars_name_the_model_that_meets_them():
     frame = table()
     frame.loc[(frame["model"] == BAR_MODELS[0]) & (frame["metric"] == "IRD_excess"), "value"] = 9.0
-    assert met_by(quality_bars(frame, 0.9, 4.0))["IRD excess"] == BAR_MODELS[1]
+    assert met_by(quality_bars(frame, 0.9))["IRD excess"] == BAR_MODELS[1]
 
 
 def test_what_was_not_measured_is_said():
-    bars = met_by(quality_bars(table(), 0.5, None))
-    assert bars["Seed spread over that of real continuations"] == "not measured"
+    bars = met_by(quality_bars(table(), 0.5))
     assert bars["Classifier, held-out accuracy"] == "neither"
     frame = table()
     alone = met_by(quality_bars(frame[~frame["model"].isin(BAR_MODELS)], 0.9))

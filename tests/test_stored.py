@@ -35,14 +35,14 @@ def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
 
 def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
-    found, sentence = stored.measured_table("synthetic", "posterior", "posterior")
+    found, sentence = stored.measured_table("synthetic", "quality", "quality")
     assert found is None
-    assert "`make measure MEASURE=posterior DATA=bandai`" in sentence
+    assert "`make measure MEASURE=quality DATA=bandai`" in sentence
     for dataset, value in (("bandai", 1.0), ("synthetic", 2.0)):
         record = run_record(profile=load_profile("laptop", dataset), dataset=dataset, seed=0)
-        path = tmp_path / "paper_figures" / dataset / "laptop" / "records" / "posterior.csv"
+        path = tmp_path / "paper_figures" / dataset / "laptop" / "records" / "quality.csv"
         write_table(path, pd.DataFrame({"value": [value]}), record)
-        found, sentence = stored.measured_table("synthetic", "posterior", "posterior")
+        found, sentence = stored.measured_table("synthetic", "quality", "quality")
         assert found["value"].tolist() == [value]
         assert found.attrs["dataset"] == dataset
         assert f"data {dataset}, profile laptop" in sentence

@@ -2,7 +2,7 @@
 
 The bars are ours, not the paper's: real motion of the same protocol is the measure. They stand in
 `quality_bars.csv`: what is compared is written in the figures of `made` motion, of `real` motion, the least distance to
-a bad generator (`gap`), the `spread` of real continuations and the `accuracy` of the classifier.
+a bad generator (`gap`) and the `accuracy` of the classifier.
 """
 
 from __future__ import annotations
@@ -13,19 +13,15 @@ import numpy as np
 import pandas as pd
 
 BAR_MODELS = ("F3AMD-FNO-96", "F3AMD-FNO-96-steady")
-"""Models that are asked; the two bars on noise are the second's."""
+"""Models that are asked; the bar on noise is the second's."""
 
 
-def quality_bars(
-    quality: pd.DataFrame, classifier_accuracy: float, continuation_spread: float | None = None
-) -> pd.DataFrame:
+def quality_bars(quality: pd.DataFrame, classifier_accuracy: float) -> pd.DataFrame:
     """Compare measured motion, one denoising step, with what is asked of it.
 
     Args:
       quality: from `protocol.summarise`, with real motion and the bad generators.
       classifier_accuracy: held-out share of the style classifier, 0 to 1.
-      continuation_spread: spread of real continuations of like history, path and style, cm (see
-        `measuring.posterior`); None if it was not measured.
 
     Returns:
       Columns bar, unit, asked, a figure for each of `BAR_MODELS` (NaN where not measured), and
@@ -39,7 +35,7 @@ def quality_bars(
     value = value.reindex(columns=bars["metric"])
     if (0, "real") not in value.index:
         raise ValueError("the quality table has no rows of real motion: nothing to compare with")
-    fixed = {"accuracy": 100.0 * classifier_accuracy, "spread": continuation_spread or np.nan}
+    fixed = {"accuracy": 100.0 * classifier_accuracy}
     rows = []
     for bar in bars.itertuples():
         column, found = value[bar.metric], {}

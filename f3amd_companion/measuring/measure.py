@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -30,13 +29,11 @@ from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve
 from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
-from f3amd_companion.measuring.posterior import GIVEN, POSTERIOR, answer_spread, continuation_spread
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
 from f3amd_companion.speed.measurements import Candidate, time_group
-from f3amd_lib.data.features import num_channels
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
@@ -53,7 +50,7 @@ from f3amd_lib.measures.protocol import (
     summarise,
     windows_that_fit,
 )
-from f3amd_lib.measures.real_clips import measure_rollout, reference_clips, style_floor
+from f3amd_lib.measures.real_clips import reference_clips, style_floor
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
@@ -80,9 +77,6 @@ SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
 
 WALKING_SEEDS = 3
 """Seeds of path and noise in `measure_walking`."""
-
-PRECISION_SEEDS = 5
-"""Seeds of path and noise in `measure_precision`."""
 
 ONE_STEP_MODELS = {"CAMDM": (1, 2, 4), "F3AMD-FNO-96-steady": (1,)}
 """Models that `measure_one_step` distils -> the numbers of phases, each a student of its own. A continuous schedule's
@@ -419,36 +413,6 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
     return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
 
 
-def measure_posterior(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Measure what history, path and style leave open, on real motion and by trained models.
-
-    Some minutes in all.
-
-    Returns:
-      The table `records/posterior.csv`, measured anew: columns model ("real" for real motion), quantity
-      ("continuations", "answer spread", "error", "x0 error"), unit, given, sigma (NaN for real motion), value, low,
-      high, repeats, neighbours, history_apart, path_apart (see `measuring.posterior`), weights (which, for a model).
-    """
-    settings = POSTERIOR.get(profile.name, POSTERIOR["laptop"])
-    how = {"num_windows": settings["num_windows"], "seed": profile.seed}
-    held_out, trained = prepared.windows(prepared.held_out_split), _models(prepared, profile, models)
-    skeleton, pool = prepared.packed.skeleton, prepared.windows("train")
-    real = continuation_spread(skeleton, held_out, pool, num_neighbours=settings["num_neighbours"], **how)
-    tables = [real.assign(model="real", quantity="continuations", unit="cm", weights="")]
-    sigmas, digests = np.geomspace(0.01, 128.0, settings["num_levels"]), _digests(trained)
-    for name, model in trained.items():
-        log.info("posterior of %s", name)
-        rows = answer_spread(model, held_out, sigmas, num_draws=settings["num_draws"], **how)
-        tables.append(rows.assign(model=name, given=list(GIVEN)[-1], weights=digests[name]))
-    columns = ["model", "quantity", "unit", "given", "sigma", "value", "low", "high", "repeats"]
-    columns += ["neighbours", "history_apart", "path_apart", "weights"]
-    table = pd.concat(tables, ignore_index=True).reindex(columns=columns)
-    return _write_anew(
-        prepared, profile, "posterior", table, trained, held_out_split=prepared.held_out_split, settings=settings,
-        numbers_per_window=prepared.window * num_channels(skeleton),
-    )  # fmt: skip
-
-
 def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Walk trained models with the printed update, rescaled and taken literally, side by side.
 
@@ -575,67 +539,6 @@ def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[s
     return _measure(profile, record, ["recipes"], [{"recipe": name} for name in RECIPES], train_and_ask, again=None)
 
 
-def compare_precisions(
-    trained, packed, styles: Iterable[str], *, steps: int, num_frames: int, seeds: Iterable[int]
-) -> pd.DataFrame:
-    """Generate the same characters in float32 and in bfloat16 and measure both.
-
-    Args:
-      trained: a trained model.
-      packed: its data, for paths and floors.
-      styles: of the characters.
-      steps: a round.
-      num_frames: of each character.
-      seeds: each draws paths, starting poses and noise anew.
-
-    Returns:
-      A row a metric: model, steps, metric, float32 and bfloat16 (means over seeds and characters),
-      change (their difference), and seed_deviation: how much the float32 mean moves from seed to
-      seed, the yardstick for the change. One more row, "joint distance (cm)": how far joints of the
-      two motions are apart in the first window.
-    """
-    styles, seeds = list(styles), list(seeds)
-    floors = [style_floor(packed, style) for style in styles]
-    precisions = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
-    generators = {name: MotionGenerator(trained, steps, dtype=dtype) for name, dtype in precisions.items()}
-    means, distances = {name: [] for name in generators}, []
-    for seed in seeds:
-        paths = evaluation_paths(packed, styles, num_frames, seed=seed)
-        first_windows = []
-        for name, generator in generators.items():
-            rollout = generator.rollout(paths, styles, seed=seed)
-            measures = measure_rollout(rollout, floors)
-            means[name].append({key: np.nanmean(values) for key, values in measures.items()})
-            motions = [rollout.motion(character) for character in range(len(styles))]
-            first_windows.append(np.stack([motion.positions[: trained.config.window] for motion in motions]))
-        distances.append(100.0 * np.linalg.norm(first_windows[0] - first_windows[1], axis=-1).mean())
-    float32, bfloat16 = (pd.DataFrame(rows) for rows in means.values())
-    table = pd.DataFrame({"float32": float32.mean(), "bfloat16": bfloat16.mean(), "seed_deviation": float32.std()})
-    table.loc["joint distance (cm)"] = {"float32": 0.0, "bfloat16": np.mean(distances), "seed_deviation": np.nan}
-    table = table.rename_axis("metric").reset_index()
-    table = table.assign(model=trained.name, steps=steps, change=table["bfloat16"] - table["float32"])
-    return table[["model", "steps", "metric", "float32", "bfloat16", "change", "seed_deviation"]]
-
-
-def measure_precision(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Compare float32 and bfloat16 on trained models, with 1 step and with 8 (see `compare_precisions`).
-
-    Returns:
-      The table `records/precision.csv`.
-    """
-    packed, styles = prepared.packed, _styles(prepared, profile)
-    seeds = range(profile.seed, profile.seed + PRECISION_SEEDS)
-    trained = _models(prepared, profile, models, at_least_one=True)
-    record = _record(prepared, profile, "precision", styles=styles, num_seeds=PRECISION_SEEDS)
-
-    def compare(row: Mapping) -> dict:
-        settings = {"steps": row["steps"], "num_frames": profile.rollout_frames, "seeds": seeds}
-        return {"precision": compare_precisions(trained[row["model"]], packed, styles, **settings)}
-
-    todo = [{"model": name, "steps": steps} for name, steps in itertools.product(trained, (1, 8))]
-    return _measure(profile, record, ["precision"], todo, compare, again=models, trained=trained)
-
-
 DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
 """Added to the name of a network in rows of its students of few steps, and of the walk that they learned."""
 
@@ -694,7 +597,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
 MEASUREMENTS: dict[str, Callable] = {
     measure.__name__.removeprefix("measure_"): measure
     for measure in (
-        measure_learning, measure_precision, measure_literal_update, measure_posterior, measure_noise_use,
+        measure_learning, measure_literal_update, measure_noise_use,
         measure_gradient_norm, measure_recipes, measure_quality, measure_walking,
         measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
         measure_round_times,
