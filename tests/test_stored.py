@@ -67,7 +67,7 @@ REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weigh
             {"weights_digests": {"A, distilled": ["ab"]}},
             "was measured with other weights of A (ab, now aa)",
         ),
-        ("literal_update", {"weights_digests": {"A": ["aa"]}, "classifier_weights": "cc"}, ""),
+        ("quality_by_seed", {"weights_digests": {"A": ["aa"]}, "classifier_weights": "cc"}, ""),
         ("quality_by_epoch", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
         ("quality_by_epoch", {}, "was seen through another style classifier (None, now cc)"),
         ("corruptions", {"classifier_weights": "cd"}, ""),  # about the distances, whichever classifier

@@ -2,6 +2,8 @@
 
 Table 5 prints two plateaus, {8, 4} and {2, 1} steps. Whether ours has any may hang on where the steps lie and on
 which state the network is shown; both cost no training, so that every reading of the paper is measured under all four.
+Appendix F prints a DDIM step that takes a variance-exploding state and returns a preserving one. To rescale it before
+the next step gives plain DDIM ("rescaled"); to leave it as it is gives another walk ("literal").
 Walks amplify a millimetre to a per cent: single windows are compared in centimetres beside them.
 
 How like the paper's FNO-96 is a network? `likeness` has a distance for each line of `papers/f3amd/fingerprint.toml`.
@@ -14,24 +16,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import product
 
+import jax
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
+from f3amd_lib.data.features import frame_positions
 from f3amd_lib.data.packed import PackedMotion
-from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.data.windows import WindowSet, spread_windows
+from f3amd_lib.diffusion.samplers import walk
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table
 from f3amd_lib.measures import real_clips
 from f3amd_lib.measures.classifier import StyleClassifier
-from f3amd_lib.measures.metrics import foot_sliding
+from f3amd_lib.measures.denoising import CM
+from f3amd_lib.measures.distributions import diversity
+from f3amd_lib.measures.metrics import foot_sliding, joint_acceleration
 from f3amd_lib.measures.protocol import classify_windows, distribution_figures, evaluation_paths, real_features
 from f3amd_lib.measures.real_clips import motion_figures
 from f3amd_lib.measures.registry import BY_KEY, METRICS
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rollout import MotionGenerator, Rollout
 from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.denoising_task import network_inputs
+
+UPDATES = {"rescaled": "ddim", "literal": "ddim_literal"}
+"""Reading of Appendix F -> name of its sampler in `samplers.SAMPLERS`."""
 
 GRIDS = ("endpoints", "uniform")
 """Where the steps lie: t = linspace(0, 1, N), and t = i / N."""
@@ -113,6 +124,50 @@ def walk_rows(
     return pd.concat(tables, ignore_index=True)
 
 
+Walks = dict[tuple[str, int], np.ndarray]
+"""(update, steps) -> joints that one network made, [S, B, T, J, 3], metres; seed s has one noise in all of them."""
+
+
+def walk_updates(
+    trained: TrainedModel, condition: Condition, *, spacing: str = GRIDS[0], num_seeds: int = 8, seed: int = 0
+) -> Walks:
+    """Sample windows under given conditions, B rows in network units, with both updates and each number of `STEPS`."""
+    # One compiled evaluation serves every update and number of steps.
+    denoise = trained.denoiser(condition)
+    shape, made = (len(condition.style), trained.config.window, trained.config.channels), {}
+    for key in jax.random.split(jax.random.key(seed), num_seeds):
+        noise = jax.random.normal(key, shape)
+        for steps, (update, sampler) in product(STEPS, UPDATES.items()):
+            grid = trained.diffusion.grid(steps, spacing).astype(np.float32)
+            *_, end = walk(sampler, denoise, grid[0] * noise, grid)
+            made.setdefault((update, steps), []).append(trained.joint_positions(end.x_noisy))
+    return {way: np.stack(draws) for way, draws in made.items()}
+
+
+def window_figures(made: Walks, real: np.ndarray | None = None) -> pd.DataFrame:
+    """Measure what walks from the same noise made, beside what was captured ([B, T, J, 3], metres) if anything was.
+
+    Returns:
+      Columns update, steps, metric, unit, value, means over windows and seeds. joint_error, from_rescaled and
+      from_half_the_steps are mean distances of joints from what was captured, from the rescaled walk of as many steps,
+      and from the same update with half the steps; joint_acceleration is that of `metrics`; seed_spread is
+      `diversity` over the seeds of one condition.
+    """
+    distance = lambda one, other: float(CM * np.mean(np.linalg.norm(one - other, axis=-1)))
+    rows = []
+    for (update, steps), joints in made.items():
+        figures = {} if real is None else {"joint_error": distance(joints, real)}
+        figures["joint_acceleration"] = float(np.mean(joint_acceleration(joints)))
+        figures["seed_spread"] = diversity(np.swapaxes(joints, 0, 1))
+        figures["from_rescaled"] = distance(joints, made["rescaled", steps])
+        if (half := (update, steps / 2)) in made:
+            figures["from_half_the_steps"] = distance(joints, made[half])
+        rows += [(update, steps, name, value) for name, value in figures.items()]
+    table = pd.DataFrame(rows, columns=["update", "steps", "metric", "value"])
+    table.insert(3, "unit", np.where(table["metric"] == "joint_acceleration", "cm/frame^2", "cm"))
+    return table
+
+
 def window_rows(trained: TrainedModel, held_out: WindowSet, *, num_windows: int = 64, seed: int = 0) -> pd.DataFrame:
     """Compare single windows from one noise between N and N / 2 steps; columns as of `walk_rows`, walks and diverged 0.
 
@@ -122,12 +177,11 @@ def window_rows(trained: TrainedModel, held_out: WindowSet, *, num_windows: int 
       num_windows: conditions.
       seed: of the noise.
     """
-    tables = []
-    for grid in GRIDS:
-        made, real = walk_windows(
-            trained, held_out, STEPS, spacing=grid, num_windows=num_windows, num_seeds=4, seed=seed
-        )
-        tables.append(window_figures(made, real).query("update != 'real'").assign(grid=grid))
+    batch = spread_windows(held_out, num_windows)
+    _, condition = network_inputs(batch, trained.normaliser)
+    real, how = frame_positions(trained.skeleton, np.asarray(batch.future)), {"num_seeds": 4, "seed": seed}
+    made = {grid: walk_updates(trained, condition, spacing=grid, **how) for grid in GRIDS}
+    tables = [window_figures(walks, real).assign(grid=grid) for grid, walks in made.items()]
     table = pd.concat(tables, ignore_index=True)
     return table.assign(metric="window_" + table["metric"], median=np.nan, walks=0, diverged=0)
 

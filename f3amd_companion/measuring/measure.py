@@ -28,7 +28,6 @@ from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve
-from f3amd_companion.measuring.literal_update import UPDATES, walk_windows, window_figures
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records
@@ -68,9 +67,6 @@ STEPS = (8, 4, 2, 1)
 
 LEADING = ", leading"
 """Added to the name of a network of K levels in rows whose fewer steps count from the least noisy one."""
-
-SPACINGS = ("endpoints", "uniform")
-"""Both readings of where N steps lie, ours first (see `NoiseSchedule.times`)."""
 
 SIGMAS = tuple(np.geomspace(0.01, 128.0, 17).tolist())
 """Noise levels at which an x0 error is measured, for networks that take any level."""
@@ -413,55 +409,6 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
     return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
 
 
-def measure_literal_update(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Walk trained models with the printed update, rescaled and taken literally, side by side.
-
-    See `measuring.literal_update` and Appendix F of the paper. Rollouts by the evaluation protocol
-    with 8, 4, 2 and 1 steps on both readings of the grid, and single windows from the same noise.
-    One step is the same in all four; it is walked once. A rollout takes about a minute on 2 cores,
-    13 of them a model. Models whose own sampler is not DDIM are left out.
-
-    Returns:
-      The table of means and intervals, `records/literal_update.csv`; beside it
-      `literal_update_by_seed.csv` and `literal_update_windows.csv`.
-
-    Raises:
-      ValueError: for a model asked for by name whose sampler is not DDIM.
-    """
-    classifier, protocol, record = protocol_of(prepared, profile, "literal_update")
-    held_out = prepared.windows(prepared.held_out_split)
-    trained = _models(prepared, profile, models, at_least_one=True)
-    others = sorted(name for name, model in trained.items() if model.diffusion.sampler != UPDATES["rescaled"])
-    if others and models:
-        raise ValueError(f"{', '.join(others)}: has no printed update: name models that sample by DDIM")
-    trained = {name: model for name, model in trained.items() if name not in others}
-
-    def summary(rows: pd.DataFrame) -> pd.DataFrame:
-        groups = rows.groupby(["spacing", "update"], sort=False)
-        return pd.concat(summarise(part).assign(spacing=spacing, update=update) for (spacing, update), part in groups)
-
-    def windows_of(row: Mapping) -> dict:
-        walks = walk_windows(trained[row["model"]], held_out, STEPS, spacing=row["spacing"])
-        return {"literal_update_windows": window_figures(*walks)}
-
-    def walk_rollouts(row: Mapping) -> dict:
-        generator = MotionGenerator(
-            trained[row["model"]], row["steps"], spacing=row["spacing"], sampler=UPDATES[row["update"]]
-        )
-        rows, _ = measure_model(generator, prepared.packed, classifier, protocol, held_out, name=row["model"])
-        return {"literal_update_by_seed": rows}
-
-    windows = [{"model": name, "spacing": spacing} for name, spacing in itertools.product(trained, SPACINGS)]
-    rollouts = [
-        {"model": name, "spacing": spacing, "update": update, "steps": steps}
-        for name, spacing, update, steps in itertools.product(trained, SPACINGS, UPDATES, STEPS)
-        if steps > 1 or (spacing, update) == (SPACINGS[0], "rescaled")
-    ]
-    how = {"again": models, "trained": trained}
-    _measure(profile, record, ["literal_update_windows"], windows, windows_of, **how)
-    return _measure(profile, record, ["literal_update_by_seed"], rollouts, walk_rollouts, summary=summary, **how)
-
-
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Ask trained models whether they use their noisy input; single windows, seconds a model.
 
@@ -597,7 +544,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
 MEASUREMENTS: dict[str, Callable] = {
     measure.__name__.removeprefix("measure_"): measure
     for measure in (
-        measure_learning, measure_literal_update, measure_noise_use,
+        measure_learning, measure_noise_use,
         measure_gradient_norm, measure_recipes, measure_quality, measure_walking,
         measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
         measure_round_times,
