@@ -206,7 +206,6 @@ def train(
       all_devices: share each batch among the devices JAX sees.
       teacher: file of the teacher of a MotionPCM student, such as the one that ships, instead of training one.
     """
-    from f3amd_companion.measuring.learning_curves import train_family
     from f3amd_lib.training import pipeline
     from f3amd_lib.training.optimise import all_devices as mesh_of_all
 
@@ -218,12 +217,16 @@ def train(
             raise ValueError("models of captioned motion train on one device: leave --all-devices out")
         return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
     prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
-    how = {"budget_s": None if minutes is None else 60.0 * minutes, "folder": out}
-    mesh, state = mesh_of_all() if all_devices else None, "finished"
-    for name, state in train_family(prepared, profile, preset or [profile.preset], mesh=mesh, **how):
-        files = pipeline.model_files(profile, name, folder=out)
-        log.info("%-12s %s", name, files.state if state == "unfinished" else files.model)
-    return UNFINISHED if state == "unfinished" else 0
+    how = {"folder": out, "stop_at": _stop_at(minutes), "mesh": mesh_of_all() if all_devices else None}
+    files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
+    for name, its in files.items():
+        trained = pipeline.finished_model(prepared, profile, name, its)
+        if trained is None:
+            trained, _ = pipeline.train(prepared, profile, preset=name, **how)
+        log.info("%-12s %s", name, its.state if trained is None else its.model)
+        if trained is None:
+            return UNFINISHED
+    return 0
 
 
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
@@ -593,7 +596,7 @@ def measure(
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
-      names: learning, quality, walking and so on; all if none. Of text to motion (--data bandai) text_judge,
+      names: quality, walking, recipes and so on; all if none. Of text to motion (--data bandai) text_judge,
         hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4,
         text_guidance, text_one_caption, by name alone.
       model: this preset; repeatable.

@@ -27,7 +27,7 @@ from builders import (
 )
 from builders import wandering_motion as wandering
 
-from f3amd_companion.measuring import learning_curves
+from f3amd_companion.measuring import campaign
 from f3amd_lib.data import windows as windows_module
 from f3amd_lib.data.features import Normaliser, world_frames
 from f3amd_lib.data.windows import gather_windows
@@ -198,8 +198,7 @@ def untrained(monkeypatch, prepared):
     task = tiny_task(num_steps=4)
     monkeypatch.setattr(PreparedData, "task", lambda self, *args, **settings: task)
     done = _two_kinds(types.SimpleNamespace(params={"a": jnp.ones(3)}))
-    for module in (pipeline, learning_curves):
-        monkeypatch.setattr(module, "optimise", lambda *args, **settings: (done, []))
+    monkeypatch.setattr(pipeline, "optimise", lambda *args, **settings: (done, []))
     return task
 
 
@@ -213,9 +212,8 @@ def test_the_moving_average_is_what_training_returns_and_ships(untrained, prepar
 
 
 def test_the_moving_average_is_what_a_snapshot_returns(untrained, prepared, monkeypatch, tmp_path):
-    monkeypatch.setattr(learning_curves, "initial_state", lambda task: None)
-    monkeypatch.setattr(learning_curves, "held_out_terms", lambda task, state, windows: {"loss": 0.0})
-    trained, _ = learning_curves.snapshot(prepared, "F3AMD-FNO-96", untrained.config, 4, {}, folder=tmp_path)
+    monkeypatch.setattr(campaign, "held_out_terms", lambda task, state, windows: {"loss": 0.0})
+    trained, _ = campaign.snapshot(prepared, "F3AMD-FNO-96", untrained.config, 4, {}, folder=tmp_path)
     np.testing.assert_array_equal(trained.params["a"], 2.0 * np.ones(3))
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import time
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -36,7 +37,6 @@ import pandas as pd
 
 import f3amd_lib
 from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
-from f3amd_companion.measuring.learning_curves import snapshot
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.speed.machine import device_name, matmul_precision
 from f3amd_lib.data.windows import WindowSet
@@ -55,7 +55,7 @@ from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import compile_steps, held_out_terms, restore_state
-from f3amd_lib.training.pipeline import ModelFiles, PreparedData
+from f3amd_lib.training.pipeline import ModelFiles, PreparedData, as_trained, set_aside_run, train_in_legs
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
 log = logging.getLogger("f3amd")
@@ -369,6 +369,43 @@ def _laid_out(prepared: PreparedData, run: Run, batch_size: int) -> tuple[Prepar
 
 def _weights(folder, run: Run, windows: int) -> Path:
     return Path(folder) / run.name / f"{windows}.safetensors"
+
+
+def snapshot(
+    prepared: PreparedData, preset: str, recipe: TrainingConfig, steps: int, record: dict, *, folder,
+    network: Mapping | None = None, every: int = 400, stop_at: float | None = None, progress: bool = True,
+) -> tuple[TrainedModel | None, float]:  # fmt: skip
+    """Train up to a step, going on from an earlier snapshot of the folder.
+
+    Args:
+      prepared, preset, recipe: the data, the model, and how a whole run is trained.
+      steps: at most those of the recipe.
+      record: from `run_record`; what the model is told of its training.
+      folder: where the training state and the history of the losses are kept; a state that is further than `steps` is
+        kept under another name.
+      network: fields of the preset's network to change.
+      every: steps between checkpoints and held-out losses.
+      stop_at: see `optimise`.
+      progress: show a progress bar.
+
+    Returns:
+      (model with the moving average of the weights, held-out loss); the model is None where `stop_at` came first.
+
+    Raises:
+      ValueError: if the state that lies there is of other settings.
+    """
+    task, files = prepared.task(preset, recipe, network=network), ModelFiles.of(folder, preset)
+    held_out = prepared.windows(prepared.held_out_split)
+    record = {**record, "training": recipe.to_dict()}
+    if files.state.exists() and int(restore_state(files.state, task).step) > steps:
+        set_aside_run(files)
+    leg = {"every": min(steps, every), "stop_after": steps, "stop_at": stop_at, "progress": progress}
+    state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
+    if int(state.step) < steps:
+        return None, math.nan
+    loss = held_out_terms(task, state, held_out)["loss"]
+    seen = {"windows_seen": steps * recipe.batch_size}
+    return as_trained(prepared, task, preset, state.averaged, record | seen), loss
 
 
 def _trained(

@@ -1,4 +1,4 @@
-"""Measure what takes too long for a notebook: `f3amd measure learning`.
+"""Measure what takes too long for a notebook: `f3amd measure quality`.
 
 A measurement writes a tidy table with its run record under `<results>/records/`, after every row,
 so that a run that was stopped goes on where it was (see `runner`). Notebooks only read these tables.
@@ -27,7 +27,6 @@ import pandas as pd
 from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
-from f3amd_companion.measuring.learning_curves import SHORT_RUN, learning_curve
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records
@@ -53,7 +52,6 @@ from f3amd_lib.measures.real_clips import reference_clips, style_floor
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
-from f3amd_lib.networks import presets
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
@@ -195,21 +193,6 @@ def protocol_of(prepared: PreparedData, profile: Profile, measurement: str) -> t
         classifier_accuracy=classifier.accuracy,
     )  # fmt: skip
     return classifier, protocol, record
-
-
-def measure_learning(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train every preset for a short while and keep its learning curve (see `measuring.learning_curves`).
-
-    Returns:
-      The table, `records/learning.csv`.
-    """
-
-    def curve(row: Mapping) -> dict:
-        return {"learning": learning_curve(prepared, row["model"], seed=profile.seed)}
-
-    record = _record(prepared, profile, "learning", **SHORT_RUN)
-    todo = [{"model": name} for name in models or presets.of_paper()]
-    return _measure(profile, record, ["learning"], todo, curve, again=models)
 
 
 def measure_quality(
@@ -544,7 +527,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
 MEASUREMENTS: dict[str, Callable] = {
     measure.__name__.removeprefix("measure_"): measure
     for measure in (
-        measure_learning, measure_noise_use,
+        measure_noise_use,
         measure_gradient_norm, measure_recipes, measure_quality, measure_walking,
         measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
         measure_round_times,
