@@ -59,7 +59,6 @@ def test_fft_form_runs_the_same_round():
         pytest.param("IREE", "F3AMD-FNO-96", marks=pytest.mark.needs("iree.compiler", "iree.runtime")),
         pytest.param("IREE", "CAMDM", marks=pytest.mark.needs("iree.compiler", "iree.runtime")),
         pytest.param("PyTorch", "CAMDM", marks=pytest.mark.needs("torch")),
-        pytest.param("PyTorch, oneDNN", "CAMDM", marks=pytest.mark.needs("torch")),
     ],
 )
 def test_a_peer_runs_a_round_of_finite_numbers(name, model):

@@ -82,11 +82,10 @@ def jax_round(network, condition, sigmas, sampler):
     return np.asarray(jax.jit(run)(condition))
 
 
-@pytest.mark.parametrize("products", torch_camdm.PRODUCTS)
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_denoiser_gives_the_numbers_of_jax(layout, products):
+def test_denoiser_gives_the_numbers_of_jax(layout):
     network = lively(small(**LAYOUTS[layout]))
-    module = torch_camdm.torch_camdm(network, products=products)
+    module = torch_camdm.torch_camdm(network)
     condition, noise = make_condition(3), draw(3, WINDOW, CHANNELS)
     for sigma in (*SIGMAS[:-1], 0.3, np.array([0.2, 1.0, 9.0])):
         levels = jnp.broadcast_to(jnp.asarray(sigma, jnp.float32), 3)
@@ -104,8 +103,8 @@ def test_round_gives_the_numbers_of_jax(layout, sampler):
     condition = make_condition(3)
     noise, step_noise = given_noise(3, 4, network.config)
     expected = jax_round(network, condition, SIGMAS, sampler)
-    for products, runtime in (("blas", "eager"), ("onednn", "eager"), ("blas", "onnx")):
-        module = torch_camdm.torch_camdm(network, products=products)
+    for runtime in ("eager", "onnx"):
+        module = torch_camdm.torch_camdm(network)
         found = torch_camdm.torch_round(module, SIGMAS, sampler, runtime=runtime)(
             torch_camdm.torch_condition(condition), noise=as_tensor(noise), step_noise=as_tensor(step_noise)
         )
@@ -148,7 +147,6 @@ def test_bad_input_is_refused():
     make, prepare = torch_camdm.torch_camdm, torch_camdm.torch_round
     for call, message in {
         lambda: make(stranger): "only CAMDM",
-        lambda: make(network, products="onedn"): "did you mean 'onednn'",
         lambda: prepare(module, SIGMAS, "ddmp"): "unknown PyTorch sampler 'ddmp'.*'ddpm'",
         lambda: prepare(module, SIGMAS, runtime="onx"): "unknown PyTorch runtime 'onx'.*'onnx'",
         lambda: module.encode(given._replace(path=given.path[..., :7])): "condition path must have shape",

@@ -166,15 +166,15 @@ def _iree(workload: Workload) -> Round:
     return Round(lambda: artefact(*given, *map(draw, shapes)), seconds)
 
 
-def _torch(workload: Workload, *, runtime: str = "eager", products: str = "blas") -> Round:
-    on_gpu = device_name() == "GPU" and workload.precision != "bfloat16" and runtime != "onnx" and products == "blas"
+def _torch(workload: Workload, *, runtime: str = "eager") -> Round:
+    on_gpu = device_name() == "GPU" and workload.precision != "bfloat16" and runtime != "onnx"
     if not on_gpu:
         _check_outside_of_jax(workload, "PyTorch")
     from f3amd_companion.speed import torch_camdm
 
     started, device = time.perf_counter(), "cuda" if on_gpu else "cpu"
     tf32 = workload.precision == "tf32"
-    module = torch_camdm.torch_camdm(workload.network, products=products, device=device, tf32=tf32)
+    module = torch_camdm.torch_camdm(workload.network, device=device, tf32=tf32)
     condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters), device)
     call = partial(torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime), condition)
     call()
@@ -187,7 +187,6 @@ IMPLEMENTATIONS: dict[str, tuple[str, Callable[[Workload], Round]]] = {
     "jit, FFT": ("jax", lambda workload: jit_round(workload, fft_reference(workload.network))),
     "IREE": ("iree", _iree),
     "PyTorch": ("torch", _torch),
-    "PyTorch, oneDNN": ("torch", partial(_torch, products="onednn")),
     "PyTorch, compiled": ("torch", partial(_torch, runtime="compiled")),
     "ONNX Runtime": ("onnx", partial(_torch, runtime="onnx")),
 }

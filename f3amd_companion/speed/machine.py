@@ -78,9 +78,9 @@ def describe_machine() -> dict:
     """Describe the machine as far as it decides how fast things run.
 
     Returns:
-      A dict ready for a run record: processor, cores (that this process may use), physical_cores,
-      clock_mhz and clock_max_mhz (None where the system does not tell), memory_gib, load (mean of
-      the last minute: what else was running), system, xla_flags, graphics_clocks.
+      A dict ready for a run record: processor, cores (that this process may use), clock_mhz
+      (None where the system does not tell), load (mean of the last minute: what else was running), system,
+      xla_flags, graphics_clocks.
     """
     import psutil
 
@@ -88,10 +88,7 @@ def describe_machine() -> dict:
     return {
         "processor": _processor(),
         "cores": usable_cores(),
-        "physical_cores": psutil.cpu_count(logical=False),
         "clock_mhz": round(clock.current) if clock and clock.current else None,
-        "clock_max_mhz": round(clock.max) if clock and clock.max else None,
-        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

@@ -43,7 +43,7 @@ def _tensor(parameter) -> torch.Tensor:
 
 
 class _Linear(nn.Module):
-    """Linear layer on rows [M, K], by BLAS: the kernel is [K, N], so that nothing is transposed."""
+    """Linear layer on rows [M, K]: the kernel is [K, N], so that nothing is transposed."""
 
     def __init__(self, kernel: torch.Tensor, bias: torch.Tensor):
         super().__init__()
@@ -61,35 +61,10 @@ class _Linear(nn.Module):
         return residual.addmm_(rows, self.kernel).add_(self.bias)
 
 
-class _PackedLinear(nn.Module):
-    """Linear layer on rows [M, K], by oneDNN, which packs the kernel and does what comes after."""
-
-    def __init__(self, kernel: torch.Tensor, bias: torch.Tensor):
-        super().__init__()
-        # Not a parameter: the packed form is opaque, and a module could not save it.
-        self.packed = torch.ops.mkldnn._reorder_linear_weight(kernel.T.contiguous(), None)
-        self.bias = nn.Parameter(bias)
-
-    def forward(self, rows):
-        return torch.ops.mkldnn._linear_pointwise(rows, self.packed, self.bias, "none", [], "")
-
-    def gelu(self, rows):
-        return torch.ops.mkldnn._linear_pointwise(rows, self.packed, self.bias, "gelu", [], "none")
-
-    def added_to(self, residual, rows):
-        return torch.ops.mkldnn._linear_pointwise.binary(rows, residual, self.packed, self.bias, "add")
-
-
-PRODUCTS = {"blas": _Linear, "onednn": _PackedLinear}
-"""Libraries within PyTorch that can do the large products. "blas" is what everybody gets, and on
-x86 that is MKL, which need not be at its best on a processor of another make. "onednn" packs the
-kernels once and does bias, residual and GELU within the product."""
-
-
-def _rows_layer(kind: type, *layers):
-    """Return JAX's linear layers side by side as one of a kind in PyTorch."""
+def _rows_layer(*layers) -> _Linear:
+    """Return JAX's linear layers side by side as one in PyTorch."""
     kernels, biases = zip(*((_tensor(layer.kernel), _tensor(layer.bias)) for layer in layers), strict=True)
-    return kind(torch.cat(kernels, dim=1), torch.cat(biases))
+    return _Linear(torch.cat(kernels, dim=1), torch.cat(biases))
 
 
 def _layer_norm(layer) -> nn.LayerNorm:
@@ -101,14 +76,14 @@ def _layer_norm(layer) -> nn.LayerNorm:
 class _Block(nn.Module):
     """Encoder block (`networks.attention.TransformerBlock`) on the rows of all characters."""
 
-    def __init__(self, block, linear):
+    def __init__(self, block):
         super().__init__()
         attention = block.attention
         self.num_heads = attention.num_heads
-        self.query_key_value = _rows_layer(linear, attention.query, attention.key, attention.value)
-        self.attention_output = _rows_layer(linear, attention.output)
+        self.query_key_value = _rows_layer(attention.query, attention.key, attention.value)
+        self.attention_output = _rows_layer(attention.output)
         self.attention_norm = _layer_norm(block.attention_norm)
-        self.hidden, self.output = _rows_layer(linear, block.hidden), _rows_layer(linear, block.output)
+        self.hidden, self.output = _rows_layer(block.hidden), _rows_layer(block.output)
         self.output_norm = _layer_norm(block.output_norm)
 
     def forward(self, z, num_tokens: int):
@@ -131,16 +106,14 @@ class TorchCAMDM(nn.Module):
       config: of the JAX network.
     """
 
-    def __init__(self, network: CAMDM, products: str = "blas"):
+    def __init__(self, network: CAMDM):
         super().__init__()
         self.config = config = network.config
-        # Packing pays in the large products only.
-        plain = lambda layer: _rows_layer(_Linear, layer)
-        self.noise_first, self.noise_second = plain(network.noise_first), plain(network.noise_second)
-        self.history, self.future, self.output = plain(network.history), plain(network.future), plain(network.output)
+        for name in ("noise_first", "noise_second", "history", "future", "output"):
+            setattr(self, name, _rows_layer(getattr(network, name)))
         self.style = nn.Parameter(_tensor(network.style.kernel))
-        self.path = nn.ModuleList(map(plain, network.path))
-        self.blocks = nn.ModuleList([_Block(block, PRODUCTS[products]) for block in network.blocks])
+        self.path = nn.ModuleList(map(_rows_layer, network.path))
+        self.blocks = nn.ModuleList(map(_Block, network.blocks))
         code = position_code(0, config.num_tokens, config.latent_width, base=POSITION_BASE)
         self.register_buffer("code", torch.tensor(code, dtype=torch.float32))
 
@@ -197,29 +170,25 @@ class TorchCAMDM(nn.Module):
         return self.output(answered.reshape(-1, width)).view(batch, window, channels)
 
 
-def torch_camdm(network: CAMDM, *, products: str = "blas", device: str = "cpu", tf32: bool = False) -> TorchCAMDM:
+def torch_camdm(network: CAMDM, *, device: str = "cpu", tf32: bool = False) -> TorchCAMDM:
     """Return CAMDM in PyTorch with a copy of a network's weights, float32, without dropout.
 
     PyTorch gets as many threads as there are usable cores.
 
     Args:
       network: CAMDM of any config.
-      products: of `PRODUCTS`.
-      device: "cpu" or "cuda", which takes the products of BLAS alone.
+      device: "cpu" or "cuda".
       tf32: whether matrix products on a GPU may have mantissas of 10 bits, as JAX has them there.
 
     Raises:
       RuntimeError: where PyTorch sees no GPU.
-      ValueError: for another network, unknown products, or a PyTorch without oneDNN's.
+      ValueError: for another network.
     """
     if not isinstance(network, CAMDM):
         raise ValueError(f"only CAMDM has a form in PyTorch, got a {type(network).__name__}")
-    check_known(products, PRODUCTS, "products")
-    if products == "onednn" and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
-        raise ValueError(f"PyTorch {torch.__version__} has no linear layers of oneDNN here: use products='blas'")
     torch.set_num_threads(usable_cores())
     torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    return TorchCAMDM(network, products).eval().requires_grad_(False).to(device)
+    return TorchCAMDM(network).eval().requires_grad_(False).to(device)
 
 
 def torch_condition(condition: Condition, device: str = "cpu") -> Condition:
