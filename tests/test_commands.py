@@ -230,7 +230,6 @@ SMALL = "F3AMD-FNO-32"
         (["measure", "sensitivity"], "corruptions"),
         (["measure", "noise_use", "--model", SMALL], "x0_by_sigma"),
         (["measure", "feet", "--model", SMALL], "feet"),
-        (["measure", "precision", "--model", SMALL], "precision"),
         (["measure", "gradient_norm", "--model", SMALL], "gradient_norm"),
         (["measure", "recipes"], "recipes"),
         (["bench", "--suite", "smoke", "--characters", "1"], "synthesis_time"),

@@ -80,7 +80,7 @@ def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
 @pytest.mark.parametrize(
     ("names", "models", "told"),
     [
-        ([], [A], "name what to sweep: campaign, precision"),
+        ([], [A], "name what to sweep: campaign, noise_use"),
         (["wolking"], [A], "walking"),
         (["recipes"], [A], "unknown measurement by preset 'recipes'"),
         (["walking"], ["F3AMD-FNO-33"], "F3AMD-FNO-32"),
