@@ -57,11 +57,6 @@ def _patterns() -> tuple[re.Pattern, re.Pattern, dict[str, str], dict[str, str]]
     return re.compile(mention), re.compile(test), names, marks
 
 
-def clauses(text: str) -> list[str]:
-    """Split a text where a citation ends to be about what follows."""
-    return re.split(r"[;()]|\.\s*\n", text)
-
-
 def mentioned_equations(text: str) -> Mentions:
     """Return the equations that a text mentions, whether or not the paper has such equations.
 
@@ -71,7 +66,7 @@ def mentioned_equations(text: str) -> Mentions:
     """
     pattern, _, names, _ = _patterns()
     found = set()
-    for clause in clauses(text):
+    for clause in re.split(r"[;()]|\.\s*\n", text):  # where a citation ends to be about what follows
         for match in pattern.finditer(clause):
             name, numbers, mark = match.groups()
             if not _OTHERS.search(clause[: match.start()]):
@@ -127,12 +122,10 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
     """Return where equations live: kind (of `_KINDS`), place, paper, label."""
     found: list[tuple] = []
     note = lambda kind, place, mentions: found.extend((kind, place, *each) for each in mentions)
-    for path in [
-        path for package in ("f3amd_lib", "f3amd_companion") for path in sorted((root / package).rglob("*.py"))
-    ]:
+    for path in (path for name in ("f3amd_lib", "f3amd_companion") for path in sorted((root / name).rglob("*.py"))):
         module = "/".join(path.relative_to(root).with_suffix("").parts[1:])
-        if not module.startswith("ledger/"):  # what draws and lists implements nothing
-            for name, text in _documented(path):
+        for name, text in _documented(path):
+            if not module.startswith("ledger/"):  # what draws and lists implements nothing
                 note("functions", f"{module}: {name}", mentioned_equations(text))
     for path in sorted((root / "tests").glob("test_*.py")):
         for name, text in _documented(path):
@@ -146,9 +139,9 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
         markdown = ("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "markdown")
         note("notebooks", path.stem, Section("", "\n\n".join(markdown)).equations)
         for section in filter(lambda section: section.number, notebook_sections(path)):
-            note("cells", section.number, section.equations)
-            for figure in section.figures:
-                note("figures", figure, section.equations)
+            for kind, places in {"cells": [section.number], "figures": section.figures}.items():
+                for place in places:
+                    note(kind, place, section.equations)
     return pd.DataFrame(found, columns=["kind", "place", "paper", "label"])
 
 
@@ -181,8 +174,7 @@ class Section:
     @property
     def number(self) -> str:
         """The heading's own number, "2.3" or "C4.1"; "" if it has none, as "What we learned" has."""
-        found = re.match(r"C?\d+\.\d+(?= )", self.heading)
-        return found[0] if found else ""
+        return "".join(re.findall(r"^C?\d+\.\d+(?= )", self.heading))
 
     @property
     def equations(self) -> Mentions:
@@ -246,11 +238,10 @@ def equations_markdown(*, root=None) -> str:
 
 def _first_tests(names: str) -> str:
     """Return the first test of each file, and how many more it has."""
-    files: dict[str, list[str]] = {}
-    for file, test in re.findall(r"(\w+): (\w+)", names):
-        files.setdefault(file, []).append(test)
-    more = lambda tests: f" and {len(tests) - 1} more" if len(tests) > 1 else ""
-    return "; ".join(f"`tests/{file}.py`: `{tests[0]}`{more(tests)}" for file, tests in files.items())
+    tests = pd.DataFrame(re.findall(r"(\w+): (\w+)", names), columns=["file", "test"])
+    by_file = tests.groupby("file", sort=False)["test"].agg(["first", "size"])
+    more = lambda count: f" and {count - 1} more" if count > 1 else ""
+    return "; ".join(f"`tests/{file}.py`: `{test}`{more(count)}" for file, test, count in by_file.itertuples())
 
 
 def _notebook_of(root: Path, section: str) -> Path:
