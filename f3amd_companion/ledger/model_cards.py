@@ -45,17 +45,23 @@ _OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
 def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:
     """Return the table of a model's figures beside real motion's."""
     shown = SHOWN["card"]
-    columns = {"figure": ["Dir. (degrees)" if metric.name == "direction_error" else metric.title for metric in shown]}
-    for steps, rows in reversed([*measured.groupby("steps")]):
-        columns[f"{steps} steps" if steps > 1 else "1 step"] = figure_column(rows, shown)
-    return pd.DataFrame(columns | {"real motion": figure_column(real, shown)})
+    titles = ["Dir. (degrees)" if metric.name == "direction_error" else metric.title for metric in shown]
+    systems = {f"{steps} steps" if steps > 1 else "1 step": rows for steps, rows in measured.groupby("steps")}
+    systems = dict(reversed(systems.items())) | {"real motion": real}
+    return pd.DataFrame({"figure": titles} | {name: figure_column(rows, shown) for name, rows in systems.items()})
+
+
+def _wide(rows: pd.DataFrame, index: str, metrics: list[str]) -> pd.DataFrame:
+    """Spread figures to a line for each value of `index`, a column for each of the metrics that there are."""
+    wide = rows.pivot(index=index, columns="metric", values="value").loc[rows[index].unique()]
+    titles = {name: METRICS[name].title for name in metrics if name in wide}
+    return wide[list(titles)].rename(columns=titles).reset_index()
 
 
 def _limits(measured: pd.DataFrame, real: pd.DataFrame) -> list[str]:
     """Return sentences on what a model does badly with most steps, as far as its figures say so."""
-    most = measured[measured["steps"] == measured["steps"].max()]
+    most, limits = measured[measured["steps"] == measured["steps"].max()], []
     both = pd.DataFrame({name: rows.set_index("metric")["value"] for name, rows in (("value", most), ("real", real))})
-    limits = []
     for limit in _CARDS["limit"]:
         found = both.reindex([limit["metric"]]).iloc[0]  # what was not measured is NaN, and beyond no bound
         over = found["value"] / (limit["bound"] * (found["real"] if limit.get("of_real") else 1.0))
@@ -121,9 +127,8 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
     whole = load_paper_file("paper")["training"]["windows"].get(str(trained.config.window))
     if whole and training["seen"] < LEAST_SHARE * whole:
         limits.append(f"It saw {100 * training['seen'] / whole:.2g} % of the windows that the paper's models saw.")
-    limits = "\n".join(f"- {limit}" for limit in limits)
-    styles = ", ".join(trained.styles)
-    return _filled("model_card", path, trained, trained.params, figures, **training, styles=styles, limits=limits)
+    told = {"styles": ", ".join(trained.styles), "limits": "\n".join(f"- {limit}" for limit in limits)}
+    return _filled("model_card", path, trained, trained.params, figures, **training, **told)
 
 
 def text_model_card(path: Path, hands: pd.DataFrame | None) -> str:
@@ -159,10 +164,9 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
     trained, wide = load_text_model(path), None
     rows = [table[table["trained"] == trained.name] for table in tables.values() if "steps" in table]
     if any(map(len, rows)):
-        own = pd.concat(rows).drop_duplicates(["steps", "metric"])
-        wide = own.pivot(index="steps", columns="metric", values="value").map("{:.3g}".format, na_action="ignore")
-        titles = {name: METRICS[name].title for name in [*_OF_JUDGE, "sampling_seconds"] if name in wide}
-        wide = wide[list(titles)].fillna("–").rename(columns=titles).reset_index()
+        own = pd.concat(rows).drop_duplicates(["steps", "metric"]).sort_values("steps")
+        own["value"] = own["value"].map("{:.3g}".format, na_action="ignore")
+        wide = _wide(own, "steps", [*_OF_JUDGE, "sampling_seconds"]).fillna("–")
     movement = "Its autoencoder was trained as briefly, and vague where that was too short"
     if "text_pcm3" in tables:
         kept = tables["text_pcm3"].set_index(["trained", "metric"])["value"]
@@ -186,10 +190,7 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     judge, wide, fields = load_judge(path), None, {}
     digest = weights_digest(judge.params)
     if seen is not None and seen[1]["judge_weights"] == digest:
-        systems, titles = seen[0]["system"].unique(), {name: METRICS[name].title for name in _OF_JUDGE}
-        wide = seen[0].pivot(index="system", columns="metric", values="value").loc[systems, _OF_JUDGE]
-        wide = wide.rename(columns=titles).reset_index()
-        fields["repeats"] = seen[1]["settings"]["repeats"]
+        wide, fields = _wide(seen[0], "system", _OF_JUDGE), {"repeats": seen[1]["settings"]["repeats"]}
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
 
 
@@ -198,11 +199,9 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
 
     Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
     """
-    tables = []
+    tables, keys = [], ["model", "window_frames", "steps"]
     if found := committed_table(dataset, "quality"):
-        keys = ["model", "window_frames", "steps"]
-        by_seed, _ = committed_table(dataset, "quality_by_seed")
-        weights = by_seed[[*keys, "weights"]].drop_duplicates(keys)
+        weights = committed_table(dataset, "quality_by_seed")[0][[*keys, "weights"]].drop_duplicates(keys)
         tables.append(found[0].merge(weights, on=keys, how="left"))
     if found := committed_table(dataset, "walking"):
         tables.append(_walking_rows(found[0]))
@@ -211,8 +210,8 @@ def committed_quality(dataset: str) -> pd.DataFrame | None:
 
 def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
     """Sum `records/walking.csv` up in the form of the protocol's table."""
-    figures = [metric.name for metric in SHOWN["card"] if metric.name in walking]
-    figures.remove("joint_acceleration")  # the protocol has its own
+    # The protocol has its own acceleration.
+    figures = [one.name for one in SHOWN["card"] if one.name in walking and one.name != "joint_acceleration"]
     columns = ["model", "window_frames", "steps", "weights"]
     means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
     return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
