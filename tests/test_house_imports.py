@@ -26,7 +26,7 @@ ALLOWED: dict[str, str] = {}
 
 FOREIGN = (
     "papermill nbconvert nbformat nbclient ipykernel jupyterlab selenium dask distributed tyro pygltflib onnx "
-    "onnxruntime jax2onnx iree torch transformers psutil"
+    "onnxruntime jax2onnx iree torch transformers"
 ).split()
 """What runs notebooks, drives pages, serves or exports."""
 

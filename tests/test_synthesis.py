@@ -45,7 +45,7 @@ def test_jit_runs_the_round(model):
     expected = sample_round(network, given, asked.sigmas, jax.random.key(0), sampler=asked.sampler)
     ready = prepare_round("jit", asked)
     np.testing.assert_allclose(ready.call(), expected, atol=1e-4)
-    assert ready.compile_seconds > 0 and ready.bytes_accessed > 0
+    assert ready.compile_seconds > 0
 
 
 def test_fft_form_runs_the_same_round():

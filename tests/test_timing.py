@@ -60,14 +60,7 @@ def test_a_slow_candidate_stops_by_its_seconds_and_the_quick_one_goes_on():
     assert found["quick"].rounds == 100
 
 
-def test_what_the_system_does_not_tell_is_left_out_and_what_a_tool_tells_is_kept(tmp_path, monkeypatch):
-    tool = tmp_path / "nvidia-smi"
-    tool.write_text("#!/bin/sh\necho 'A card, 100 MHz, 200 MHz'\n")
-    tool.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    assert machine._graphics_clocks() == "A card, 100 MHz, 200 MHz"
-    tool.write_text("#!/bin/sh\nexit 9\n")  # a driver that does not answer
-    assert machine._graphics_clocks() is None
+def test_a_processor_without_a_name_has_that_of_its_kind(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "Path", lambda name: tmp_path / "none")
     assert machine._processor() == (platform.processor() or platform.machine())
 

@@ -79,12 +79,10 @@ class Round:
     Attributes:
       call: runs it and waits; returns the clean features, [B, T, C].
       compile_seconds: what making it ready took.
-      bytes_accessed: the compiler's own estimate of memory traffic; None where it tells none.
     """
 
     call: Callable[[], object]
     compile_seconds: float
-    bytes_accessed: int | None = None
 
 
 def round_flops(workload: Workload) -> int:
@@ -129,9 +127,7 @@ def jit_round(workload: Workload, network, sample: Callable = sample_round, shar
     with matmul_precision(workload.precision):
         compiled = jax.jit(run).lower(*given).compile()
     seconds = time.perf_counter() - started
-    accessed = (compiled.cost_analysis() or {}).get("bytes accessed")
-    call = lambda: compiled(*given).block_until_ready()
-    return Round(call, seconds, None if accessed is None else int(accessed))
+    return Round(lambda: compiled(*given).block_until_ready(), seconds)
 
 
 def _all_devices(workload: Workload) -> Round:

@@ -64,35 +64,19 @@ def _processor() -> str:
     return name[1].strip() if name else platform.processor() or platform.machine()
 
 
-def _graphics_clocks() -> str | None:
-    """Return what nvidia-smi tells of clocks now and at most, in MHz; None where there is none."""
-    asked = "--query-gpu=name,clocks.sm,clocks.max.sm,clocks.mem,power.limit"
-    command = ["nvidia-smi", asked, "--format=csv,noheader"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False).stdout.strip() or None
-    except FileNotFoundError:
-        return None
-
-
 def describe_machine() -> dict:
     """Describe the machine as far as it decides how fast things run.
 
     Returns:
-      A dict ready for a run record: processor, cores (that this process may use), clock_mhz
-      (None where the system does not tell), load (mean of the last minute: what else was running), system,
-      xla_flags, graphics_clocks.
+      A dict ready for a run record: processor, cores (that this process may use), load (mean of
+      the last minute: what else was running; None where the system does not tell), system, xla_flags.
     """
-    import psutil
-
-    clock = psutil.cpu_freq()
     return {
         "processor": _processor(),
         "cores": usable_cores(),
-        "clock_mhz": round(clock.current) if clock and clock.current else None,
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "graphics_clocks": _graphics_clocks(),
     }
 
 

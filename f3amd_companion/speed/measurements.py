@@ -70,8 +70,7 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra)
 def _circumstances() -> dict:
     """Return what of the machine may change from one group of rows to the next."""
     machine = describe_machine()
-    changing = {name: machine[name] for name in ("load", "clock_mhz")} | {"devices": jax.local_device_count()}
-    return changing | {"xla_flags": machine["xla_flags"], "clocks": machine["graphics_clocks"]}
+    return {"load": machine["load"], "devices": jax.local_device_count(), "xla_flags": machine["xla_flags"]}
 
 
 def _path(profile: Profile, name: str) -> Path:
@@ -138,7 +137,7 @@ def time_group(
 
     Returns:
       (a row a candidate that worked: what it is, value, low and high in ms a round, rounds,
-      compile_seconds, flops and bytes_accessed of a round, gflops reached, peak_gflops of the
+      compile_seconds, flops of a round, gflops reached, peak_gflops of the
       framework's own matrix product in the same turns, and their quotient share_of_peak;
       candidate in words -> why it did not work).
     """
@@ -172,8 +171,8 @@ def time_group(
         row |= {"sampler": workload.sampler, "framework": frameworks[candidate], "way": candidate.implementation}
         row |= {"device": device_name(), "precision": precision, "characters": characters}
         row |= timing.columns("ms", 1e3) | {"compile_seconds": round(done.compile_seconds, 2)}
-        row |= {"bytes_accessed": done.bytes_accessed, "flops": flops, "gflops": reached, "peak_gflops": peak}
-        rows.append(row | {"share_of_peak": reached / peak})
+        row |= {"flops": flops, "gflops": reached, "peak_gflops": peak, "share_of_peak": reached / peak}
+        rows.append(row)
     return pd.DataFrame(rows), failed
 
 
