@@ -34,7 +34,7 @@ BYTES_OF_STATE = 16
 """Of a parameter in a training state: itself, its moving average, Adam's two; float32."""
 
 SNAPSHOT_EVERY = 400
-"""Steps between two states that are written (`campaign.snapshot`)."""
+"""Steps between two states that are written (`campaign`)."""
 
 
 def finished_after(legs: Sequence[Leg], seconds: Mapping[str, float], machines: int) -> dict[str, float]:

@@ -92,7 +92,12 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
     run, seen = Run("F3AMD-FNO-96", "batch-512"), []
     assert (run.config(100_000, 128).batch_size, run.config(100_000, 128).num_steps) == (512, 100 * 100_000 // 512)
     assert Run("F3AMD-FNO-96").config(100_000, 128).batch_size == 128
-    monkeypatch.setattr(campaign, "snapshot", lambda *given, **_: (seen.append(given[2:4]), (None, 0.0))[1])
+
+    def look(task, files, record, *, stop_after, **_):
+        seen.append((task.config, stop_after))
+        return SimpleNamespace(step=0), None
+
+    monkeypatch.setattr(campaign, "train_in_legs", look)
     prepared = PreparedData(packed, 32, 10)
     how = {"batch_size": 128, "folder": tmp_path, "progress": False}
     for each in (run, Run("F3AMD-FNO-96")):
@@ -103,8 +108,12 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
 @pytest.mark.parametrize(("precision", "products"), [("float32", "float32"), ("tf32", "tensorfloat32")])
 def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp_path, precision, products):
     seen = []
-    look = lambda *_, **__: (seen.append(jax.config.jax_default_matmul_precision), (None, 0.0))[1]
-    monkeypatch.setattr(campaign, "snapshot", look)
+
+    def look(*_, **__):
+        seen.append(jax.config.jax_default_matmul_precision)
+        return SimpleNamespace(step=0), None
+
+    monkeypatch.setattr(campaign, "train_in_legs", look)
     monkeypatch.setattr(campaign, "check_precision", lambda precision: None)  # as on a GPU
     how = {"snapshots": [(SEEDED, 10_240)], "folder": tmp_path, "precision": precision}
     assert [state for *_, state in train_snapshots(PreparedData(packed, 32, 10), PROFILE, **how)] == ["unfinished"]

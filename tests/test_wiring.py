@@ -213,8 +213,13 @@ def test_the_moving_average_is_what_training_returns_and_ships(untrained, prepar
 
 def test_the_moving_average_is_what_a_snapshot_returns(untrained, prepared, monkeypatch, tmp_path):
     monkeypatch.setattr(campaign, "held_out_terms", lambda task, state, windows: {"loss": 0.0})
-    trained, _ = campaign.snapshot(prepared, "F3AMD-FNO-96", untrained.config, 4, {}, folder=tmp_path)
-    np.testing.assert_array_equal(trained.params["a"], 2.0 * np.ones(3))
+    written = {}
+    monkeypatch.setattr(campaign, "save_model", lambda path, trained, dtype: written.update(trained.params))
+    run, how = campaign.Run("F3AMD-FNO-96", window=WINDOW), {"precision": "float32", "stop_at": None, "progress": False}
+    windows = 4 * untrained.config.batch_size
+    _, trained, *_ = campaign._trained(prepared, run, windows, batch_size=2, record={}, folder=tmp_path, **how)
+    for params in (trained.params, written):
+        np.testing.assert_array_equal(params["a"], 2.0 * np.ones(3))
 
 
 def test_the_normaliser_and_the_training_know_training_windows_alone(prepared, monkeypatch):

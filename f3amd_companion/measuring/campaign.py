@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 import time
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -371,66 +370,35 @@ def _weights(folder, run: Run, windows: int) -> Path:
     return Path(folder) / run.name / f"{windows}.safetensors"
 
 
-def snapshot(
-    prepared: PreparedData, preset: str, recipe: TrainingConfig, steps: int, record: dict, *, folder,
-    network: Mapping | None = None, every: int = 400, stop_at: float | None = None, progress: bool = True,
-) -> tuple[TrainedModel | None, float]:  # fmt: skip
-    """Train up to a step, going on from an earlier snapshot of the folder.
-
-    Args:
-      prepared, preset, recipe: the data, the model, and how a whole run is trained.
-      steps: at most those of the recipe.
-      record: from `run_record`; what the model is told of its training.
-      folder: where the training state and the history of the losses are kept; a state that is further than `steps` is
-        kept under another name.
-      network: fields of the preset's network to change.
-      every: steps between checkpoints and held-out losses.
-      stop_at: see `optimise`.
-      progress: show a progress bar.
-
-    Returns:
-      (model with the moving average of the weights, held-out loss); the model is None where `stop_at` came first.
-
-    Raises:
-      ValueError: if the state that lies there is of other settings.
-    """
-    task, files = prepared.task(preset, recipe, network=network), ModelFiles.of(folder, preset)
-    held_out = prepared.windows(prepared.held_out_split)
-    record = {**record, "training": recipe.to_dict()}
-    if files.state.exists() and int(restore_state(files.state, task).step) > steps:
-        set_aside_run(files)
-    leg = {"every": min(steps, every), "stop_after": steps, "stop_at": stop_at, "progress": progress}
-    state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
-    if int(state.step) < steps:
-        return None, math.nan
-    loss = held_out_terms(task, state, held_out)["loss"]
-    seen = {"windows_seen": steps * recipe.batch_size}
-    return as_trained(prepared, task, preset, state.averaged, record | seen), loss
-
-
 def _trained(
     prepared, run: Run, windows: int, *, batch_size: int, precision: str, record, folder, stop_at, progress
 ) -> tuple[PreparedData, TrainedModel, float, TrainingConfig] | None:
     """Train a run to a snapshot and keep its weights, or take those that are there.
+
+    It goes on from an earlier state; one that is further than the snapshot is kept under another name.
 
     Returns:
       (the data in the run's windows, model, held-out loss, config); None where the time was over before.
     """
     (data, task), file = _laid_out(prepared, run, batch_size), _weights(folder, run, windows)
     config, steps = task.config, max(1, windows // task.config.batch_size)
-    state = ModelFiles.of(file.parent, run.preset).state
+    files, held_out = ModelFiles.of(file.parent, run.preset), data.windows(data.held_out_split)
+    reached = int(restore_state(files.state, task).step) if files.state.exists() else 0
     # A leg that was killed before it was measured has the state still, which is not rounded as the kept weights are.
-    rounded = file.exists() and not (state.exists() and int(restore_state(state, task).step) == steps)
-    if rounded and (found := load_model(file)).record["training"] == config.to_dict():
+    if file.exists() and reached != steps and (found := load_model(file)).record["training"] == config.to_dict():
         kept = SimpleNamespace(averaged=found.params, statistics=None)
-        return data, found, held_out_terms(task, kept, data.windows(data.held_out_split))["loss"], config
+        return data, found, held_out_terms(task, kept, held_out)["loss"], config
+    if reached > steps:
+        set_aside_run(files)
+    record, every = {**record, "training": config.to_dict()}, min(steps, _EVERY.get(device_name(), 1000))
     with matmul_precision(precision):
-        trained, loss = snapshot(
-            data, run.preset, config, steps, record, folder=file.parent, network=find_recipe(run.recipe).network,
-            every=_EVERY.get(device_name(), 1000), stop_at=stop_at, progress=progress,
-        )  # fmt: skip
-    if trained is None:
-        return None
+        leg = {"stop_after": steps, "stop_at": stop_at, "progress": progress}
+        state, _ = train_in_legs(task, files, record, held_out=held_out, every=every, **leg)
+        if int(state.step) < steps:
+            return None
+        loss = held_out_terms(task, state, held_out)["loss"]
+    record |= {"windows_seen": steps * config.batch_size}
+    trained = as_trained(data, task, run.preset, state.averaged, record)
     save_model(file, trained, jnp.bfloat16)
     return data, trained, loss, config
 

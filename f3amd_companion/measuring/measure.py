@@ -115,14 +115,11 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
 
 
 def _models(
-    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, *, at_least_one: bool = False,
-    among: Iterable[str] = (),
-) -> dict[str, TrainedModel]:  # fmt: skip
+    prepared: PreparedData, profile: Profile, models: Iterable[str] | None, among: Iterable[str] = ()
+) -> dict[str, TrainedModel]:
     """Return the models that were asked for by name, or all (of `among`) that have weights."""
-    names = models
-    if not names:
-        known = (models_with_weights if at_least_one else available_models)(profile)
-        names = [name for name in among if name in known] if among else known
+    known = available_models(profile)
+    names = models or ([name for name in among if name in known] if among else known)
     return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
 
 
@@ -402,7 +399,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
       estimates move with noisy input and noise level (see `denoising.input_use`).
     """
     held_out = prepared.windows(prepared.held_out_split)
-    trained = _models(prepared, profile, models, at_least_one=True)
+    trained = _models(prepared, profile, models or models_with_weights(profile))
 
     def ask(row: Mapping) -> dict:
         model = trained[row["model"]]
