@@ -22,6 +22,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 COURSE = sorted((ROOT / "notebooks/course").glob("*.ipynb"))
 STANDALONE = sorted((ROOT / "notebooks/standalone").glob("*.ipynb"))
 LARGEST_NOTEBOOK = 250_000  # bytes
+LONGEST_SETUP = 12  # lines of code of the cell that calls use_style()
 LARGEST_FILE = 5_000_000  # bytes
 ALL_WEIGHTS = 28_000_000  # bytes of f3amd_lib/pretrained/ together
 
@@ -92,6 +93,9 @@ def parameter_faults(code_cells) -> list[str]:
         return [f"{len(tagged)} cells are tagged parameters"]
     values = {}
     faults = []
+    setup = next((cell.source for cell in code_cells if "use_style()" in cell.source), "")
+    if (lines := len([line for line in setup.splitlines() if line.strip() and line[0] != "#"])) > LONGEST_SETUP:
+        faults.append(f"{lines} lines of code before the story begins, limit {LONGEST_SETUP}")
     for statement in ast.parse(tagged[0].source).body:
         try:
             (target,) = statement.targets
@@ -280,6 +284,7 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (set_verdict(metadata={}), "no cell is tagged nbval-check-output"),
         (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
         (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
+        (set_verdict(source="import numpy as np\n" * 12 + "use_style()"), "13 lines of code before the story"),
         (set_verdict(source="  "), "empty code cell"),
         (set_verdict(source="keep_figure(figure, results, 'name')\ntable"), "drawn and not shown: keep_figure(figure"),
         (lambda notebook: notebook["cells"].append(said(r"Divided by $\\alpha_t$.")), r"\\alpha ends a line"),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import types
 
 import pytest
 from builders import refused
@@ -66,6 +67,22 @@ def test_wrong_values_are_refused(key, value, complaint):
 )
 def test_unknown_names_are_refused_with_the_nearest(arguments, complaint):
     refused(complaint, load_profile, **{"name": "smoke", "dataset": "synthetic", **arguments})
+
+
+@pytest.mark.parametrize(
+    "injected, complaint",
+    [
+        ("profile = 'laptop'\nseed = 3\n", None),
+        ("profle = 'smoke'\n", "unknown parameter of this notebook 'profle'; did you mean 'profile'"),
+    ],
+)
+def test_a_parameter_that_papermill_adds_is_one_of_the_notebook(monkeypatch, injected, complaint):
+    cells = ["", 'profile = "smoke"  # or "laptop"\nseed: int = 0\n', f"# Parameters\n{injected}", "load_profile()"]
+    monkeypatch.setattr("IPython.get_ipython", lambda: types.SimpleNamespace(user_ns={"In": cells}))
+    if complaint:
+        refused(complaint, load_profile, "smoke", "synthetic")
+    else:
+        load_profile("smoke", "synthetic")
 
 
 def test_results_go_to_the_ignored_runs_folder(tmp_path, monkeypatch):

@@ -1,6 +1,9 @@
 """The main job runs notebooks in order, passes parameters, stops where one stops and says where."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -68,6 +71,39 @@ def test_notebooks_run_in_order_with_their_parameters(checkout):
     # One line a notebook: its time, and what it wrote.
     assert [line.split()[0] for line in news] == ["00_first", "01_second"]
     assert all("wrote no file" in line for line in news)  # a record alone is no result
+
+
+NOTEBOOKS = Path(reproduce.__file__).parents[1] / "notebooks"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "notebook, folder",
+    [
+        ("08_claims.ipynb", NOTEBOOKS.parent),
+        ("08_claims.ipynb", NOTEBOOKS),
+        ("08_claims.ipynb", None),
+        ("course/02_sde.ipynb", NOTEBOOKS.parent),
+        ("course/02_sde.ipynb", None),
+        ("standalone/sampler_theory_standalone.ipynb", None),
+    ],
+    ids=lambda given: given.name if isinstance(given, Path) else given or "elsewhere",
+)
+def test_plain_papermill_runs_each_kind_of_notebook_from_any_folder(notebook, folder, tmp_path):
+    (tmp_path / "empty").mkdir()
+    environment = os.environ | {profiles.RESULTS_DIR_VARIABLE: str(tmp_path / "results")}
+    call = [sys.executable, "-m", "papermill", str(NOTEBOOKS / notebook), str(tmp_path / "copy.ipynb")]
+    done = subprocess.run(call, cwd=folder or tmp_path / "empty", env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not any((tmp_path / "empty").iterdir())
+    assert any((tmp_path / "results").rglob("08_*")) == (notebook == "08_claims.ipynb")
+
+
+def test_plain_papermill_refuses_a_parameter_that_a_notebook_does_not_have(tmp_path):
+    call = [sys.executable, "-m", "papermill", str(NOTEBOOKS / "08_claims.ipynb"), "copy.ipynb", "-p", "profle", "gpu"]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "unknown parameter of this notebook 'profle'; did you mean 'profile'?" in done.stderr
 
 
 def test_it_stops_at_the_first_failure_and_says_where(checkout, capsys):

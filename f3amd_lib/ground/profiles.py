@@ -1,7 +1,7 @@
 """Profiles: how much is done. `smoke` in seconds, `laptop` in minutes, `gpu` in hours.
 
 A profile says how much, a data set says on what; every notebook takes both as parameters and asks
-`load_profile` for the numbers. Papermill accepts a misspelt parameter without a word, so that
+`load_profile` for the numbers. Papermill accepts a misspelt parameter with a mere warning, so that
 unknown names and wrong types are refused here.
 """
 
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
+import sys
 from pathlib import Path
 
 from f3amd_lib.ground.files import read_toml
@@ -86,8 +88,9 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
 
     Raises:
       ValueError: for an unknown profile, data set or field (with the nearest known one), a value
-        of the wrong type (True is no number, 8.0 no count) or one out of range.
+        of the wrong type (True is no number, 8.0 no count) or one out of range; see `refuse_unknown_parameters`.
     """
+    refuse_unknown_parameters()
     _check_names(dataset, name)
     types = {item.name: item.type for item in dataclasses.fields(Profile) if item.name not in ("name", "dataset")}
     for key in overrides:
@@ -95,6 +98,19 @@ def load_profile(name: str, dataset: str, **overrides) -> Profile:
     values = _NUMBERS["common"] | _NUMBERS[name] | _NUMBERS["on"].get(dataset, {}).get(name, {}) | overrides
     checked = {key: checked_value(key, values.get(key), annotation) for key, annotation in types.items()}
     return Profile(name=name, dataset=dataset, **checked)
+
+
+def refuse_unknown_parameters() -> None:
+    """In a notebook that papermill runs, raise ValueError for a parameter that the notebook does not have.
+
+    Papermill puts a cell that begins with "# Parameters" after the notebook's own cell of them.
+    """
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    cells = [cell for cell in getattr(shell, "user_ns", {}).get("In", ()) if cell]
+    assigned = lambda cell: re.findall(r"^(\w+)\s*(?::[^=\n]*)?=(?!=)", cell, flags=re.M)
+    for before, cell in zip(["", *cells], cells, strict=False):
+        for name in assigned(cell) if cell.startswith("# Parameters\n") else ():
+            check_known(name, assigned(before), "parameter of this notebook")
 
 
 def _check_names(dataset: str, profile: str) -> None:

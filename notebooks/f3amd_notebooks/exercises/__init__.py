@@ -12,6 +12,7 @@ answer that returns None if it is right, else the hint.
 from __future__ import annotations
 
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.profiles import refuse_unknown_parameters
 
 from f3amd_notebooks.exercises import course, networks, one_step, printed_update, sampler_theory
 from f3amd_notebooks.exercises.judging import NotAnswered, is_missing
@@ -46,5 +47,6 @@ def hint(number: str, answer) -> str | None:
 
 def check(number: str, answer) -> None:
     """Print whether an answer is right: "2.a: right" or "2.a: not yet: <hint>"; see `hint`."""
+    refuse_unknown_parameters()  # here for notebooks that load no profile
     found = hint(number, answer)
     print(f"{number}: {'right' if found is None else f'not yet: {found}'}")
