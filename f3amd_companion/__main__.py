@@ -6,10 +6,13 @@ imported inside, so that `f3amd --help` is quick.
 
 import contextlib
 import importlib.util
+import json
 import logging
 import os
 import re
+import shlex
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +22,11 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction
 
-from f3amd_lib.ground.files import locked, whole_folder
-from f3amd_lib.ground.names import check_known, checked_seed
-from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
+from f3amd_companion import terminal
+from f3amd_lib import __version__
+from f3amd_lib.ground.files import locked
+from f3amd_lib.ground.names import check_known, checked_seed, checked_value
+from f3amd_lib.ground.profiles import DATASETS, find_model, load_profile, results_dir, runs_dir
 
 log = logging.getLogger("f3amd")
 
@@ -47,13 +52,6 @@ def _use_fast_flags() -> None:
 
     if "XLA_FLAGS" not in os.environ:
         os.environ["XLA_FLAGS"] = fast_xla_flags()
-
-
-def _check_free(targets: Sequence[Path], overwrite: bool) -> None:
-    """Raise ValueError if one of the files is there and may not be replaced."""
-    taken = [str(target) for target in targets if target.exists()]
-    if taken and not overwrite:
-        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
 
 
 def _say_model(trained):
@@ -91,9 +89,10 @@ class Data:
 
     def open(self, **overrides):
         """Return the data set, prepared, and the profile as `numbers` does, with this window."""
+        profile = self.numbers(**overrides, window=self.window)
+        terminal.check_there(self.source)
         from f3amd_lib.training.pipeline import prepare
 
-        profile = self.numbers(**overrides, window=self.window)
         return prepare(profile, path=self.source), profile
 
 
@@ -115,12 +114,36 @@ class Model:
     weights: Path | None = None
     overwrite: bool = False
 
+    @property
+    def file(self) -> Path:
+        """Return the weights file; ValueError if there is none, or no step to take."""
+        checked_value("--steps", self.steps, "int")
+        terminal.check_there(self.weights)
+        return self.weights or find_model(self.data)
+
+    @property
+    def styles(self) -> list[str]:
+        """Return the styles that the model knows, from the head of its file: JAX is not loaded."""
+        try:
+            with self.file.open("rb") as file:
+                head = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+            return list(json.loads(head["__metadata__"]["description"])["styles"])
+        except (OSError, LookupError, TypeError, ValueError, OverflowError):
+            raise ValueError(f"{self.file}: no whole file of a model with styles") from None
+
+    def style(self, asked: str) -> str:
+        """Return a style as the model has it, whatever its case; ValueError names the nearest if there is none."""
+        known = {style.casefold(): style for style in self.styles}
+        style = asked if asked in known.values() else known.get(asked.casefold(), asked)
+        check_known(style, known.values(), "style")
+        return style
+
     def load(self):
         """Load the model, and say what it is."""
+        file = self.file
         from f3amd_lib.training.checkpoints import load_model
-        from f3amd_lib.training.pipeline import find_model
 
-        return _say_model(load_model(self.weights or find_model(self.data)))
+        return _say_model(load_model(file))
 
     def generator(self):
         """Return what animates characters with the model."""
@@ -131,9 +154,9 @@ class Model:
 
 def data(motion: Data) -> None:
     """Open a data set, build its packed cache, say what is in it."""
+    packed = motion.open()[0].packed
     from f3amd_lib.data.sources import SPLITS
 
-    packed = motion.open()[0].packed
     splits = packed.clip_split.tolist()
     split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(SPLITS))
     log.info("data set     %s, %s; %s", packed.dataset, packed.licence, packed.credit)
@@ -154,6 +177,9 @@ def dataset(
       fps: frames per second to write.
       out: folder to write to; must be empty or not there yet.
     """
+    check_known(data, DATASETS, "data set")
+    terminal.check_there(captions, source)
+    terminal.check_writable(out)
     from f3amd_companion.serving import captioned_folder
     from f3amd_lib.data import sources
 
@@ -165,6 +191,16 @@ def dataset(
     split = ", ".join(f"{written.splits.count(split)} {split}" for split in sources.SPLITS)
     log.info("clips        %d of %d joints: %s", written.num_clips, written.skeleton.num_joints, split)
     log.info("terms        %s", written.licence)
+
+
+def styles(data: str = "synthetic", weights: Path | None = None) -> None:
+    """List the styles that a model knows.
+
+    Args:
+      data: the model of this data set.
+      weights: a weights file, instead of the data set's own.
+    """
+    log.info("%s", textwrap.fill(", ".join(Model(data=data, weights=weights).styles), 100, break_on_hyphens=False))
 
 
 def presets(
@@ -179,11 +215,17 @@ def presets(
       joints: J, for ACMDM's.
       text_width: for ACMDM's and MotionPCM's: numbers in a caption's embedding; by default the paper's encoder's.
     """
+    from f3amd_lib.ground.papers import load_sizes
     from f3amd_lib.ground.tables import markdown_table
-    from f3amd_lib.networks import presets
 
-    of_data = {"channels": channels, "num_styles": styles, "num_joints": joints} | _given(text_width=text_width)
-    log.info("%s", markdown_table(presets.table(paper, **of_data)))
+    table, asked = load_sizes(paper), (channels, styles, joints, text_width)
+    if table is None or asked != (141, 100, 22, None):
+        from f3amd_lib.networks import presets
+
+        of_data = {"channels": channels, "num_styles": styles, "num_joints": joints} | _given(text_width=text_width)
+        table = presets.table(paper, **of_data)
+    short = {"latent_width": "width", "mflop_per_evaluation": "MFLOP"}
+    log.info("%s", markdown_table(table.drop(columns=["depth", "diffusion", "sampler"]).rename(columns=short)))
 
 
 def train(
@@ -206,9 +248,8 @@ def train(
       all_devices: share each batch among the devices JAX sees.
       teacher: file of the teacher of a MotionPCM student, such as the one that ships, instead of training one.
     """
-    from f3amd_lib.training import pipeline
-    from f3amd_lib.training.optimise import all_devices as mesh_of_all
-
+    terminal.check_there(teacher)
+    terminal.check_writable(*_given(out=out).values())
     of_latents = [name for name in preset if name.startswith(("MotionPCM", "MotionLCM"))]
     if teacher is not None and not (preset and set(of_latents) == set(preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
@@ -217,16 +258,26 @@ def train(
             raise ValueError("models of captioned motion train on one device: leave --all-devices out")
         return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
     prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
+    from f3amd_lib.training import pipeline
+    from f3amd_lib.training.optimise import all_devices as mesh_of_all
+
     how = {"folder": out, "stop_at": _stop_at(minutes), "mesh": mesh_of_all() if all_devices else None}
     files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
     for name, its in files.items():
         trained = pipeline.finished_model(prepared, profile, name, its)
         if trained is None:
             trained, _ = pipeline.train(prepared, profile, preset=name, **how)
-        log.info("%-12s %s", name, its.state if trained is None else its.model)
-        if trained is None:
+        if not _say_trained([*files], name, its, trained is not None):
             return UNFINISHED
     return 0
+
+
+def _say_trained(names: Sequence[str], name: str, files, finished: bool) -> bool:
+    """Say what became of one of the models to train, and which of them wait, and return whether it is finished."""
+    log.info("%-12s %s", name, files.model if finished else f"unfinished; what is done: {files.state}")
+    if not finished and (waiting := names[names.index(name) + 1 :]):
+        log.info("not begun    %s", ", ".join(waiting))
+    return finished
 
 
 def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
@@ -249,8 +300,7 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
             done = text_judge.train_judge(data, encoder, training, files=files, stop_at=stop_at)
         else:
             done = train_stage.train_stage(data, encoder, profile, name, **how)
-        log.info("%-12s %s", name, files.state if done is None else files.model)
-        if done is None:
+        if not _say_trained(names, name, files, done is not None):
             return UNFINISHED
     return 0
 
@@ -259,7 +309,7 @@ def rollout(
     style: str, model: Model, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0, speed: float = 1.2,
     raw: bool = False, format: str = "bvh", start: Path | None = None, out: Path = Path("out"),
 ) -> None:  # fmt: skip
-    """Animate one character: motion, film strip, GIF (its first 12 s), player.
+    """Animate one character: motion, film strip, player.
 
     Args:
       style: one that the model knows.
@@ -268,19 +318,21 @@ def rollout(
       seconds: length of a named path; a CSV has its own.
       speed: of a named path, m/s; a CSV has its own.
       raw: as the network made it: seams are not blended (over 4 frames), feet not held where they stand.
-      format: of the motion: bvh, glb (glTF with a body) or csv; several with commas between.
+      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
       start: a BVH file to go on from: its last frames are the history; another humanoid's are retargeted.
       out: folder to write to.
     """
+    style, seed, drawn, history = model.style(style), checked_seed(seed), path.lower().endswith(".csv"), None
+    targets = _targets(out, f"{style}_{Path(path).stem}_seed{seed}", format, model.overwrite)
+    terminal.check_there(start, path if drawn else None)
+    log.info("animating    %s along %s", style, path)
     from f3amd_companion.serving import player
+    from f3amd_companion.serving.finishing import held
     from f3amd_companion.serving.foot_locking import lock_rollout
     from f3amd_lib.motion.bvh import read_bvh
     from f3amd_lib.motion.root_paths import named_path, read_path_csv
     from f3amd_lib.rollout.start_poses import start_history
 
-    named, history = f"{style}_{Path(path).stem}_seed{seed}", None
-    targets = _targets(out, named, format, model.overwrite)
-    drawn = path.lower().endswith(".csv")
     line = read_path_csv(path) if drawn else named_path(path, _num_frames(seconds), speed=speed, seed=seed)
     generator = model.generator()
     trained = generator.trained
@@ -288,7 +340,7 @@ def rollout(
         history, note = start_history(trained, read_bvh(start), line)
         log.info("start        %s", note)
     made = generator.rollout(line, style, seed=seed, history=history, blend_frames=0 if raw else 4)
-    made = made if raw else _held(lock_rollout, made)
+    made = made if raw else held(lock_rollout, made)
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
     title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
     _write_shown(targets, player.rollout_scene(made, title), trained)
@@ -296,26 +348,28 @@ def rollout(
 
 def _targets(folder: Path, name: str, format: str, overwrite: bool) -> list[Path]:
     """Return the files that `_write_shown` writes; ValueError where one is there already and may not be replaced."""
-    targets = [folder / f"{name}{ending}" for ending in (".png", ".gif", ".html", *_motion_formats(format))]
-    _check_free(targets, overwrite)
+    targets = [folder / f"{name}{ending}" for ending in (".png", ".html", *_motion_formats(format, "gif"))]
+    terminal.check_free(targets, overwrite)
     return targets
 
 
 def _write_shown(targets, scene, trained) -> None:
-    """Write a scene of one character as GIF (its first 12 s), player page with film strip, and in each format asked."""
+    """Write a scene of one character as player page with film strip, and in each format asked."""
     from f3amd_companion.serving import motion_files, player
     from f3amd_lib.drawing.pictures import write_gif
     from f3amd_lib.rollout.generated import generated_credit
 
-    _, gif, page, *files = targets
+    _, page, *files = targets
     (character,) = scene.characters
     motion = character.motion
     credit = generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
-    every = max(1, round(motion.fps / 10))
-    write_gif(gif, motion, target_paths=character.path, titles=[scene.title], every=every, max_seconds=12.0)
     player.write_player(page, scene, credit=credit)  # the strip has its name
     for path in files:
-        motion_files.write_motion(path, motion, credit=credit, overwrite=True)
+        if path.suffix == ".gif":
+            how = {"every": max(1, round(motion.fps / 10)), "max_seconds": 12.0}
+            write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
+        else:
+            motion_files.write_motion(path, motion, credit=credit, overwrite=True)
     _say_written(*targets)
 
 
@@ -325,7 +379,7 @@ def text(
     seed: int = 0, control: Path | None = None, joint: str = "pelvis", any_words: bool = False,
     text_weights: Path | None = None, format: str = "bvh", overwrite: bool = False, out: Path = Path("out"),
 ) -> None:  # fmt: skip
-    """Animate what a caption tells: motion, film strip, GIF (its first 12 s), player.
+    """Animate what a caption tells: motion, film strip, player.
 
     Args:
       caption: such as "an elderly person raises the left hand".
@@ -344,10 +398,16 @@ def text(
       joint: that is controlled: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
       any_words: take words, too, that no caption of the training had.
       text_weights: folder of CLIP or Sentence-T5, for a model that was trained with one of them.
-      format: of the motion: bvh, glb (glTF with a body) or csv; several with commas between.
+      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
       overwrite: replace what lies there.
       out: folder to write to.
     """
+    captions, seed = [caption, *then], checked_seed(seed)
+    if then and control:
+        raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
+    name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
+    targets = _targets(out, name, format, overwrite)
+    terminal.check_there(weights, control, text_weights)
     import jax
     import numpy as np
 
@@ -357,12 +417,7 @@ def text(
     from f3amd_lib.text.sampling import captioned_motion
     from f3amd_lib.text.stages import text_models
 
-    captions, seed = [caption, *then], checked_seed(seed)
     captioned_motion.check_solver(steps, guidance)
-    if then and control:
-        raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
-    name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
-    targets = _targets(out, name, format, overwrite)
     if weights is None:
         preset = model or (captioned_motion.STREAM_PRESET if then else None)
         latent = model and text_models.is_latent_preset(text_models.named_model(model, steps))
@@ -399,21 +454,12 @@ def text(
     _write_shown(targets, scene, trained)
 
 
-def _motion_formats(given: str) -> list[str]:
+def _motion_formats(given: str, *more: str) -> list[str]:
     """Return the file endings of `--format bvh,glb`; ValueError for one that is not known."""
-    endings = [f".{name.strip().lower()}" for name in given.split(",")]
-    if not {*endings} <= {".bvh", ".glb", ".csv"}:
-        raise ValueError(f"--format {given}: give bvh, glb or csv, or several with commas between")
-    return endings
-
-
-def _held(lock, made):
-    """Return a motion or a rollout with its feet held where they stand, if its legs are hip, knee, ankle and toe."""
-    try:
-        return lock(made)
-    except ValueError as error:
-        log.info("feet         slide as they come: %s", error)
-        return made
+    names, known = [name.strip().lower() for name in given.split(",")], ("bvh", "glb", "csv", *more)
+    if not {*names} <= {*known}:
+        raise ValueError(f"--format {given}: give one of {', '.join(known)}, or several with commas between")
+    return [f".{name}" for name in names]
 
 
 def _num_frames(seconds: float) -> int:
@@ -442,72 +488,35 @@ def crowd(
       raw: draw and write them as the network made them; the folder holds that in any case.
       out: folder to write to.
     """
-    from f3amd_companion.serving.crowd import MIN_DISTANCE, generate_crowd
-    from f3amd_lib.rollout.generated import generated_credit
-
     if plan is not None and len(plan) > 1:
         raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
     drawn = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")] if pictures else []
     formats, motions = _motion_formats(format) if format else [], out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
-    _check_free([*drawn, *([motions] if formats else [])], model.overwrite)
+    terminal.check_free([*drawn, *([motions] if formats else [])], model.overwrite)
+    terminal.check_writable(out)
+    named = [model.style(one) for one in style] or None
+    log.info("animating    %d characters, %.1f seconds each", characters, num_frames / 30)
+    from f3amd_companion.serving import finishing
+    from f3amd_companion.serving.crowd import MIN_DISTANCE, generate_crowd
+    from f3amd_lib.rollout.generated import generated_credit
+
     generator = model.generator()
     made = generate_crowd(
-        generator, characters, num_frames, out, styles=list(style) or None,
+        generator, characters, num_frames, out, styles=named,
         min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
         overwrite=model.overwrite, progress=True,
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     window = generator.trained.config.window
-    shown = made.motion if raw else lambda character: _finished(made.motion(character), window)
+    shown = made.motion if raw else lambda character: finishing.finished(made.motion(character), window)
     credit = generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
     if formats:  # the longer part first: where it is stopped, nothing stands in the way of the same command
-        _crowd_motions(made, shown, credit, motions, formats)
+        finishing.crowd_motions(made, shown, credit, motions, formats)
         _say_written(motions)
     if pictures:
-        _crowd_pictures(made, shown, credit, *drawn)
+        finishing.crowd_pictures(made, shown, credit, *drawn)
         _say_written(*drawn)
-
-
-def _finished(motion, window: int):
-    """Blend a motion's seams over 4 frames and hold its feet, as where people look."""
-    from f3amd_companion.serving.foot_locking import lock_feet
-    from f3amd_lib.data.features import motion_from_frames, world_frames
-    from f3amd_lib.rollout.blending import blend_seams
-
-    frames = blend_seams(world_frames(motion), window, min(4, window))
-    return _held(lock_feet, motion_from_frames(motion.skeleton, frames, motion.fps, motion.name))
-
-
-def _crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
-    """Write a file a character and format, one after the other, so that no crowd is too large: NUMBER_STYLE.bvh.
-
-    Files of an earlier crowd are removed first; what else lies there stays. A new folder is there whole or not at all.
-    """
-    from f3amd_companion.serving import motion_files
-
-    digits = len(str(len(crowd) - 1))
-    for file in folder.glob("*"):
-        if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
-            file.unlink()
-    with contextlib.nullcontext(folder) if folder.exists() else whole_folder(folder) as place:
-        for character in range(len(crowd)):
-            motion, name = shown(character), f"{character:0{digits}d}_{crowd.style(character)}"
-            for ending in formats:
-                motion_files.write_motion(place / f"{name}{ending}", motion, credit=credit)
-
-
-def _crowd_pictures(crowd, shown, credit: str, still: Path, page: Path) -> None:
-    """Draw a crowd half way through, and write a page that plays up to 100 of it; `shown` gives a motion by number."""
-    from f3amd_companion.serving.player import Character, Scene, write_player
-    from f3amd_lib.drawing import pictures, style
-
-    name = crowd.settings["model"]["name"]
-    motions = [shown(k) for k in range(min(100, len(crowd)))]
-    colors = pictures.crowd_colors([motion.name for motion in motions])
-    characters = [Character(motion, path=crowd.target(k), color=colors[k]) for k, motion in enumerate(motions)]
-    write_player(page, Scene(characters, title=name), strip=False, credit=credit)
-    style.save_figure(pictures.crowd_figure({name: (motions, colors)}, crowd.num_frames // 2), still)
 
 
 def export(
@@ -522,6 +531,7 @@ def export(
       stored: with onnx, how weights are kept: float32, float16, int8.
       out: folder to write to.
     """
+    terminal.check_writable(out)
     if "onnx" in target:
         from f3amd_companion.serving import onnx_export
 
@@ -550,17 +560,18 @@ def steer(model: Model, stored: str = "int8", runtime: str = "wasm", out: Path =
       runtime: what runs the network: wasm; or webgpu, where the browser has it, in a larger page.
       out: page to write.
     """
+    terminal.check_free([out], model.overwrite)
+    terminal.check_there(model.file)
     from f3amd_companion.serving.steer import write_steer
 
-    _check_free([out], model.overwrite)
     _say_written(write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime))
 
 
 def bench(
     motion: Data, suite: Repeatable = (), characters: UseAppendAction[tuple[int, ...]] = (), again: bool = False,
     training: bool = False, parts: bool = False,
-) -> None:  # fmt: skip
-    """Time synthesis and training, write records, compare with what is asked.
+) -> int:  # fmt: skip
+    """Time synthesis and training, write records, compare with what is asked; exit status 1 where a bar is missed.
 
     Args:
       suite: smoke, bars, main, family, windows, curve or gpu; repeatable; by default the profile's.
@@ -575,7 +586,7 @@ def bench(
     from f3amd_lib.ground.tables import markdown_table
 
     suites = measurements.check_suites(suite)
-    prepared, profile = motion.open()
+    (prepared, profile), missed = motion.open(), False
     if suites or not (training or parts):
         how = {"characters": characters or None, "again": again}
         table = measurements.measure_synthesis_time(prepared, profile, suites, **how)
@@ -583,10 +594,12 @@ def bench(
         bars = speed_tables.speed_bars(read_table(every)[0], suite="bars" if suites == ["bars"] else "main")
         log.info("\n%s\n", markdown_table(bars, digits=3))
         _say_written(every, table)
+        missed = "no" in set(bars["met"])
     if parts:
         _say_written(measurements.measure_round_parts(prepared, profile))
     if training:
         _say_written(measurements.measure_training_time(prepared, profile, again=again))
+    return int(missed)
 
 
 def measure(
@@ -799,35 +812,52 @@ def cards() -> int:
 RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
+OF_PROCESSES = ("sweep", "figures", "course")
+"""Commands that end processes of theirs in Python when they are stopped, and compile nothing themselves meanwhile."""
+
 COMMANDS = (
-    data, dataset, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep, figures,
-    course, claims, cards,
+    data, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
+    figures, course, claims, cards,
 )  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; what the user has to mend ends with one line and status 2."""
     logging.basicConfig(format="%(message)s", stream=sys.stdout)  # of others' logs, warnings
-    log.setLevel(logging.INFO)
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    # JAX multiplies in tf32 on a GPU, with 10 bits of mantissa, where nothing else is said.
-    os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
-    words = sys.argv[1:] if argv is None else list(argv)
+    terminal.set_environment()
+    given = sys.argv[1:] if argv is None else list(argv)
+    words = [word for word in given if word != "--quiet"]
+    named = {command.__name__: command for command in COMMANDS}
+    if words == ["--version"]:
+        print(f"f3amd {__version__}")
+        return 0
+    terminal.show_plainly("--quiet" in given)
+    name = words[0] if words else ""
+    again = "; the same command goes on from what is written" if name in RESUMED else ""
+    stopped = f"f3amd {name}: stopped by Ctrl-C{again}"
+    if argv is None and name not in OF_PROCESSES:
+        terminal.leave_on_ctrl_c(stopped)
     try:
+        if name and not name.startswith("-"):
+            check_known(name, named, "command")
         status = tyro.extras.subcommand_cli_from_dict(
-            {command.__name__: command for command in COMMANDS},
+            named,
             prog="f3amd",
-            description="Fast Fourier autoregressive motion diffusion: data, training, motion, measurements, figures.",
+            description="Fast Fourier autoregressive motion diffusion: data, training, motion, measurements, figures. "
+            "f3amd --version names the version; --quiet with any command shows warnings and errors alone.",
             args=words,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
     except (ValueError, OSError, ArithmeticError, ImportError) as error:
-        print(f"f3amd {words[0]}: {error}", file=sys.stderr)
+        print(f"f3amd {name}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = "; the same command goes on from what is written" if words[0] in RESUMED else ""
-        print(f"\nf3amd {words[0]}: stopped by Ctrl-C{again}", file=sys.stderr)
+        if argv is None:
+            terminal.leave(stopped)
+        print(f"\n{stopped}", file=sys.stderr)
         return 130
+    if status == UNFINISHED:
+        log.info("unfinished   this goes on with it: f3amd %s", shlex.join(given))
     return status or 0
 
 

@@ -10,6 +10,7 @@ import f3amd_lib.training.pipeline as pipeline
 from f3amd_companion.__main__ import main
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
+from f3amd_lib.ground import profiles
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.bvh import read_bvh
@@ -128,9 +129,9 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
 
 
 def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "runs_dir", lambda dataset, profile: tmp_path / profile)
-    monkeypatch.setattr(pipeline, "PRETRAINED_DIR", tmp_path / "pretrained")
-    refused("f3amd train --data bandai", pipeline.find_model, "bandai")
+    monkeypatch.setattr(profiles, "runs_dir", lambda dataset, profile: tmp_path / profile)
+    monkeypatch.setattr(profiles, "PRETRAINED_DIR", tmp_path / "pretrained")
+    refused("f3amd train --data bandai", profiles.find_model, "bandai")
 
 
 @pytest.mark.slow
@@ -138,7 +139,7 @@ def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path
     _, _, profile, model = trained_once
     weights = pipeline.model_files(profile).model
     command = ["rollout", "--style", model.styles[0], "--path", "circle", "--seconds", "1.5"]
-    command += ["--steps", "1", "--weights", str(weights), "--out", str(tmp_path)]
+    command += ["--steps", "1", "--weights", str(weights), "--out", str(tmp_path), "--format", "bvh,gif"]
     assert main(command) == 0
     stem = tmp_path / f"{model.styles[0]}_circle_seed0"
     motion = read_bvh(stem.with_suffix(".bvh"))

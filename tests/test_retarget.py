@@ -8,6 +8,7 @@ from builders import CHANNELS, HISTORY, refused, tiny_trained, wandering_motion
 from test_skeleton import BANDAI
 
 from f3amd_lib.data.features import frame_positions, frame_yaw, motion_from_frames
+from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.motion.anatomy import joint_roles
 from f3amd_lib.motion.retarget import retarget
 from f3amd_lib.motion.root_paths import named_path
@@ -15,7 +16,6 @@ from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.rollout.start_poses import start_history
 from f3amd_lib.training.checkpoints import load_model
-from f3amd_lib.training.pipeline import find_model
 
 
 @pytest.fixture(scope="module")

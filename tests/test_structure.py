@@ -55,7 +55,7 @@ def test_a_circle_is_found():
 ROOMS = {
     "f3amd_lib": "ground motion data diffusion networks training rollout measures drawing papers",
     "f3amd_lib.text": "data networks phases stages judge sampling",
-    "f3amd_companion": "serving speed measuring ledger reproduce __main__",
+    "f3amd_companion": "serving speed measuring ledger reproduce terminal __main__",
 }
 """From the ground up: a room knows itself and those before it."""
 

@@ -475,8 +475,13 @@ def main(accept: bool = False, paper: str | None = None) -> int:
 
     Returns:
       Exit status: 0 if the ledgers were written, 1 if a verdict changed and was not accepted.
+
+    Raises:
+      ValueError: outside a clone of the repository, where the records lie.
     """
-    status = 0
+    status, folder = 0, ledger_path().parent
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no records lie there; run this in a clone of the repository")
     for name in [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]:
         path = ledger_path(name)
         changes = write_ledger(path, judge_claims(paper=name), accept=accept)

@@ -24,6 +24,8 @@ lines:
 What an autoencoder makes of a latent is not exported, nor is the text encoder: the card says which one it was.
 """
 
+import contextlib
+import io
 import json
 import logging
 from collections.abc import Callable
@@ -88,10 +90,11 @@ def denoiser_program(network, *, batch: int | None = None, weights: str = "float
     graph, state = nnx.split(network)
     network = nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(jnp.float32), state))
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of every shape that it does not need to know
-    model = jax2onnx.to_onnx(
-        lambda *given: ask(network, *given), list(inputs.values()), model_name="denoiser",
-        input_names=list(inputs), output_names=[output],
-    )  # fmt: skip
+    with contextlib.redirect_stdout(io.StringIO()):  # it tells of its own progress
+        model = jax2onnx.to_onnx(
+            lambda *given: ask(network, *given), list(inputs.values()), model_name="denoiser",
+            input_names=list(inputs), output_names=[output],
+        )  # fmt: skip
     if weights != "float32":
         _store_small(model.graph, weights)
     return model.SerializeToString()

@@ -134,9 +134,7 @@ def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
                 break
         except BlockingIOError:
             file.close()
-            raise ValueError(
-                f"{path.parent}: another process is {doing} there; wait for it, or name another folder (--out)"
-            ) from None
+            raise ValueError(f"{path.parent}: another process is {doing} there; wait until it has finished") from None
         except OSError:  # a file system without locks
             break
         file.close()  # whoever held the lock has removed its file: ours is another one

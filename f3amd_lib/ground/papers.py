@@ -92,3 +92,9 @@ def load_paper_table(number: int | str, paper: str = "f3amd") -> pd.DataFrame:
     frame.attrs = {"table": number, "title": entry["title"], "note": entry.get("note", "")}
     frame.attrs["setting"] = description["setting"]
     return frame
+
+
+def load_sizes(paper: str) -> pd.DataFrame | None:
+    """Return the models of a paper with their sizes as `presets.table` counted them; None where none are kept."""
+    path = _FOLDER / paper / "sizes.csv"
+    return pd.read_csv(path) if path.exists() else None

@@ -26,7 +26,7 @@ from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, starting_poses
 from f3amd_lib.ground.files import locked, set_aside
-from f3amd_lib.ground.profiles import Profile, load_profile, runs_dir
+from f3amd_lib.ground.profiles import PRETRAINED_DIR, Profile, load_profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
 from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks import presets
@@ -36,8 +36,6 @@ from f3amd_lib.training.optimise import Task, TrainingState, differences, optimi
 from f3amd_lib.training.recipe import TrainingConfig, profile_recipe
 
 log = logging.getLogger("f3amd")
-
-PRETRAINED_DIR = Path(__file__).resolve().parents[1] / "pretrained"
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,29 +394,6 @@ def available_models(profile: Profile) -> list[str]:
     asked = folders if profile.name == "laptop" else folders[:1]
     found = {path.name for folder in asked for path in folder.glob("*.safetensors")}
     return [name for name in dict.fromkeys(names) if f"{name}{suffix}.safetensors" in found]
-
-
-def find_model(dataset: str) -> Path:
-    """Return the weights to use for a data set: the user's own gpu or laptop run, else shipped.
-
-    Of several presets the profile's own comes first, then the newest.
-
-    Raises:
-      ValueError: if there are none, saying how to train them.
-    """
-    for profile, folder in (
-        ("gpu", runs_dir(dataset, "gpu") / "models"),
-        ("laptop", runs_dir(dataset, "laptop") / "models"),
-        ("laptop", PRETRAINED_DIR / dataset),
-    ):
-        first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
-        models = [path for path in folder.glob("*.safetensors") if "." not in path.stem]  # no state, nothing set aside
-        if models:
-            return first if first in models else max(models, key=lambda path: path.stat().st_mtime)
-    raise ValueError(
-        f"no trained model for data set {dataset!r}: run `f3amd train --data "
-        f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
-    )
 
 
 def set_aside_run(files: ModelFiles) -> None:

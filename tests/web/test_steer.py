@@ -11,10 +11,10 @@ from f3amd_companion.serving import steer
 from f3amd_companion.serving.onnx_export import denoiser_program
 from f3amd_companion.serving.steer import write_steer
 from f3amd_lib.diffusion.schedules import variance_exploding
+from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.measures.walking import seam_kick, slide_speed
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model
-from f3amd_lib.training.pipeline import find_model
 
 pytestmark = pytest.mark.needs("jax2onnx", "onnxruntime")
 PHONE = (390, 844)

@@ -1,0 +1,99 @@
+"""Manners of the command line: what is refused before JAX is loaded, how progress is shown, how Ctrl-C ends."""
+
+import functools
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+log = logging.getLogger("f3amd")
+
+
+def set_environment() -> None:
+    """Tell matplotlib and JAX, before they are loaded, what the user has not told them otherwise."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    # JAX multiplies in tf32 on a GPU, with 10 bits of mantissa, where nothing else is said.
+    os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(cache, "f3amd/jax").expanduser()))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def check_there(*files: Path | str | None) -> None:
+    """Raise ValueError if one of the files that are asked for is not there."""
+    for file in files:
+        if file is not None and not Path(file).exists():
+            raise ValueError(f"{file}: no such file or folder")
+
+
+def check_writable(*targets: Path) -> None:
+    """Raise ValueError if one of the files or folders could not be made."""
+    for target in targets:
+        folder = next(folder for folder in target.absolute().parents if folder.exists())
+        try:
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            raise ValueError(f"{folder}: cannot be written to ({error.strerror}); pass another --out") from None
+
+
+def check_free(targets: Sequence[Path], overwrite: bool) -> None:
+    """Raise ValueError if one of the files could not be made, or is there and may not be replaced."""
+    taken = [str(target) for target in targets if target.exists()]
+    if taken and not overwrite:
+        raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
+    check_writable(*targets)
+
+
+def show_plainly(quiet: bool) -> None:
+    """Let bars of progress be lines, one in ten seconds, where no terminal shows them; none if quiet."""
+    log.setLevel(logging.WARNING if quiet else logging.INFO)
+    if quiet or not sys.stderr.isatty():
+        from tqdm import tqdm
+
+        tqdm.__init__ = functools.partialmethod(getattr(tqdm.__init__, "func", tqdm.__init__), file=Lines(quiet))
+
+
+class Lines:
+    """What tqdm writes to: of the states of a bar, it shows one in ten seconds and the last."""
+
+    def __init__(self, quiet: bool):
+        self.quiet, self.line, self.shown, self.due = quiet, "", "", 0.0
+
+    def write(self, text: str) -> None:
+        self.line = text.strip() or self.line
+        if (text == "\n" or time.monotonic() >= self.due) and self.line != self.shown and not self.quiet:
+            print(self.line, file=sys.stderr, flush=True)
+            self.shown, self.due = self.line, time.monotonic() + 10.0
+
+    def flush(self) -> None:
+        pass
+
+    def isatty(self) -> bool:
+        return False
+
+
+def leave(says: str) -> None:
+    """End with status 130, without the farewell that JAX's threads take for a crash."""
+    print(f"\n{says}", file=sys.stderr, flush=True)
+    os._exit(130)
+
+
+def leave_on_ctrl_c(says: str) -> None:
+    """End within a second of Ctrl-C: while compiled code runs, Python itself hears of it only afterwards."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing)
+
+    def watch() -> None:
+        while os.read(reading, 1)[0] != signal.SIGINT:
+            pass
+        time.sleep(0.6)  # what can be put in order in Python has this long
+        leave(says)
+
+    threading.Thread(target=watch, daemon=True).start()
