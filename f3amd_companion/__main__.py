@@ -836,7 +836,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     again = "; the same command goes on from what is written" if name in RESUMED else ""
     stopped = f"f3amd {name}: stopped by Ctrl-C{again}"
     if argv is None and name not in OF_PROCESSES:
-        terminal.leave_on_ctrl_c(stopped)
+        terminal.leave_on_ctrl_c(stopped, at_once=name not in RESUMED)
     try:
         if name and not name.startswith("-"):
             check_known(name, named, "command")

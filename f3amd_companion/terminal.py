@@ -84,8 +84,13 @@ def leave(says: str) -> None:
     os._exit(130)
 
 
-def leave_on_ctrl_c(says: str) -> None:
-    """End within a second of Ctrl-C: while compiled code runs, Python itself hears of it only afterwards."""
+def leave_on_ctrl_c(says: str, at_once: bool) -> None:
+    """End within a second of Ctrl-C: while compiled code runs, Python itself hears of it only afterwards.
+
+    At once, where nothing is to be put in order: a KeyboardInterrupt while libraries are loaded can be a crash.
+    """
+    if at_once:
+        signal.signal(signal.SIGINT, lambda *_: leave(says))
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing)
