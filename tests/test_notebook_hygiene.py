@@ -79,6 +79,9 @@ def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
         shown = any("image/png" in output.get("data", {}) for output in cell.outputs)
         if kept and not shown and not kept[0].rstrip().endswith(";"):
             faults.append(f"a picture is drawn and not shown: {kept[0].splitlines()[0]}")
+    hidden = lambda cell: cell.metadata.get("jupyter", {}).get("source_hidden", False)
+    if any(("hide-input" in tags_of(cell)) != hidden(cell) for cell in code):
+        faults.append("a cell is folded on the site or in JupyterLab, and not in both")
     if not any("nbval-check-output" in tags_of(cell) for cell in code):
         faults.append("no cell is tagged nbval-check-output")
     if not all(cell.outputs for cell in code if "nbval-check-output" in tags_of(cell)):
@@ -285,6 +288,7 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
         (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
         (set_verdict(source="import numpy as np\n" * 12 + "use_style()"), "13 lines of code before the story"),
+        (set_verdict(metadata={"tags": ["hide-input", "nbval-check-output"]}), "folded on the site or in JupyterLab"),
         (set_verdict(source="  "), "empty code cell"),
         (set_verdict(source="keep_figure(figure, results, 'name')\ntable"), "drawn and not shown: keep_figure(figure"),
         (lambda notebook: notebook["cells"].append(said(r"Divided by $\\alpha_t$.")), r"\\alpha ends a line"),
