@@ -26,7 +26,7 @@ from f3amd_companion import terminal
 from f3amd_lib import __version__
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
-from f3amd_lib.ground.profiles import DATASETS, find_model, load_profile, results_dir, runs_dir
+from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
 log = logging.getLogger("f3amd")
 
@@ -177,7 +177,6 @@ def dataset(
       fps: frames per second to write.
       out: folder to write to; must be empty or not there yet.
     """
-    check_known(data, DATASETS, "data set")
     terminal.check_there(captions, source)
     terminal.check_writable(out)
     from f3amd_companion.serving import captioned_folder
@@ -812,9 +811,6 @@ def cards() -> int:
 RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
-OF_PROCESSES = ("sweep", "figures", "course")
-"""Commands that end processes of theirs in Python when they are stopped, and compile nothing themselves meanwhile."""
-
 COMMANDS = (
     data, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
     figures, course, claims, cards,
@@ -833,9 +829,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     terminal.show_plainly("--quiet" in given)
     name = words[0] if words else ""
-    again = "; the same command goes on from what is written" if name in RESUMED else ""
-    stopped = f"f3amd {name}: stopped by Ctrl-C{again}"
-    if argv is None and name not in OF_PROCESSES:
+    stopped = f"f3amd {name}: stopped by Ctrl-C" + "; the same command goes on from what is written" * (name in RESUMED)
+    if argv is None and name not in ("sweep", "figures", "course"):  # these have processes to end in Python
         terminal.leave_on_ctrl_c(stopped, at_once=name not in RESUMED)
     try:
         if name and not name.startswith("-"):
