@@ -90,7 +90,7 @@ class Reader:
 
 def walk(num_frames: int = 50) -> Motion:
     """A small figure that moves a little."""
-    names = ("Hips", "LeftUpLeg", "LeftFoot", "LeftToeBase", "RightUpLeg", "RightFoot", "RightToeBase")
+    names = ("Hips", "LeftUpLeg", "LeftFoot", "left_toe", "RightUpLeg", "RightFoot", "right_toe")
     offsets = [[0, 0, 0], [0.1, 0, 0], [0, -0.4, 0], [0, -0.4, 0.1], [-0.1, 0, 0], [0, -0.4, 0], [0, -0.4, 0.1]]
     frame = np.arange(num_frames)
     root = np.stack([0.02 * frame, 0.9 + 0.01 * np.sin(frame), 0.03 * frame], axis=-1)

@@ -229,7 +229,7 @@ def test_an_array_of_a_crowd_with_a_damaged_head_is_refused_by_name(tmp_path):
 
 def _with_collars(turned: float):
     """A figure that stands with its hips along +X and its collar bones turned by some radians."""
-    names = ("Hips", "LeftUpLeg", "RightUpLeg", "Shoulder_L", "Shoulder_R", "LeftToeBase", "RightToeBase")
+    names = ("Hips", "LeftUpLeg", "RightUpLeg", "left_collar", "right_collar", "LeftToeBase", "RightToeBase")
     skeleton = Skeleton(names, (-1, 0, 0, 0, 0, 1, 2), np.zeros((7, 3)))
     across = np.array([np.cos(turned), 0.0, -np.sin(turned)])
     body = [[0, 1, 0], [0.1, 1, 0], [-0.1, 1, 0], 0.2 * across + [0, 1.5, 0], -0.2 * across + [0, 1.5, 0]]

@@ -25,7 +25,13 @@ def test_roles_are_found_by_name_and_by_tree(rig):
     else:
         wanted = {"left_elbow": "LeftElbow", "right_knee": "RightKnee", "neck": "Neck", "right_collar": "RightCollar"}
     assert wanted.items() <= names.items()
-    assert joint_roles(legs()) == {"hips": 0}  # a leg of hip and toe alone is none that we know
+    assert joint_roles(legs()) == {
+        "hips": 0,
+        "left_hip": 1,
+        "left_toe": 2,
+        "right_hip": 3,
+        "right_toe": 4,
+    }  # names alone
 
 
 @RIGS

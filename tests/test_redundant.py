@@ -61,7 +61,7 @@ def test_the_start_is_canonical():
 def turning_figure(degrees_a_frame=3.0, frames=40) -> tuple[Skeleton, np.ndarray]:
     """A rigid figure that turns left on a circle: hips, toes, and one arm that points ahead."""
     skeleton = Skeleton(
-        ("Hips", "LeftHip", "LeftAnkle", "LeftToe", "RightHip", "RightAnkle", "RightToe", "Hand"),
+        ("Hips", "LeftHip", "LeftAnkle", "left_toe", "RightHip", "RightAnkle", "right_toe", "Hand"),
         (-1, 0, 1, 2, 0, 4, 5, 0),
         [[0, 0, 0], [0.1, 0, 0], [0, -0.8, 0], [0, 0, 0.1], [-0.1, 0, 0], [0, -0.8, 0], [0, 0, 0.1], [0, 0, 0.5]],
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from f3amd_lib.motion.anatomy import side_of
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
 
 LIMB_COLORS = {"left": "#EF9A26", "right": "#1B4F8F", "middle": "#3A3A3A"}
@@ -57,11 +58,7 @@ class Camera:
 
 def limb_side(name: str) -> str:
     """Return "left", "right" or "middle" for a joint name of the usual conventions."""
-    lowered = name.lower()
-    for side in ("left", "right"):
-        if side in lowered or lowered.endswith(f"_{side[0]}"):
-            return side
-    return "middle"
+    return side_of(name) or "middle"
 
 
 def bones_of(skeleton: Skeleton) -> list[tuple[int, int, str]]:
@@ -73,20 +70,15 @@ def bones_of(skeleton: Skeleton) -> list[tuple[int, int, str]]:
     ]
     for tip, (joint, offset) in enumerate(skeleton.end_sites):
         # A tip on the head would stick out of the disc that is drawn for it.
-        if np.linalg.norm(offset) > 1e-3 and not is_head(skeleton.names[joint]):
+        if np.linalg.norm(offset) > 1e-3 and joint != skeleton.roles.get("head"):
             bones.append((joint, skeleton.num_joints + tip, limb_side(skeleton.names[joint])))
     return bones
 
 
-def is_head(name: str) -> bool:
-    """Return whether a joint is called head, whatever stands before a colon."""
-    return name.lower().split(":")[-1] == "head"
-
-
 def head_and_parent(skeleton: Skeleton) -> list[int] | None:
-    """Return the head joint and its parent; None where no joint is called head, or the root is."""
-    heads = [joint for joint, name in enumerate(skeleton.names) if is_head(name)]
-    return [heads[0], skeleton.parents[heads[0]]] if heads and heads[0] > 0 else None
+    """Return the head joint and its parent; None where none is known, or the root is."""
+    head = skeleton.roles.get("head", 0)
+    return [head, skeleton.parents[head]] if head > 0 else None
 
 
 def toes_of(skeleton: Skeleton) -> list[int]:

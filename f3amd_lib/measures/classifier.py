@@ -33,12 +33,12 @@ from flax import nnx
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
-from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
 from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
 from f3amd_lib.measures.metrics import checked_positions
+from f3amd_lib.motion.anatomy import twin_name
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Skeleton, check_joints, describe_skeleton, described_skeleton, facing_yaw
 from f3amd_lib.networks.attention import dropout
@@ -58,37 +58,12 @@ _BATCH = 256
 
 # ------------------------------------------------------------------------------- what it sees of motion
 
-_JOINTS = read_toml(Path(__file__).with_name("classifier_joints.toml"))
-_CONVENTIONS = _JOINTS["conventions"]
-
-CLASSIFIER_JOINTS = tuple(_JOINTS["joints"])
-"""The 15 joints that the classifier sees."""
+_LIMBS = ("collar", "shoulder", "elbow", "hip", "knee", "ankle")
+CLASSIFIER_JOINTS = ("hips", "neck", "head", *(f"{side}_{part}" for side in ("left", "right") for part in _LIMBS))
+"""Roles of the 15 joints that the classifier sees; wrists and toes, the noisiest, are left out."""
 
 NUM_CHANNELS = 3 * len(CLASSIFIER_JOINTS)
 """Numbers a frame: x, y, z of each of `CLASSIFIER_JOINTS`."""
-
-
-def classifier_joints(skeleton: Skeleton) -> tuple[int, ...]:
-    """Find the joints of `CLASSIFIER_JOINTS` in a skeleton.
-
-    Args:
-      skeleton: with the joint names of 100STYLE (and our synthetic walker), Bandai Namco or Mixamo.
-
-    Returns:
-      15 joint indices, in the order of `CLASSIFIER_JOINTS`.
-
-    Raises:
-      ValueError: naming the joints that are missing.
-    """
-    names = [name.removeprefix("mixamorig:") for name in skeleton.names]
-    missing = {convention: set(wanted) - set(names) for convention, wanted in _CONVENTIONS.items()}
-    nearest = min(missing, key=lambda convention: len(missing[convention]))
-    if missing[nearest]:
-        raise ValueError(
-            f"the style classifier finds no {', '.join(sorted(missing[nearest]))} in this skeleton, by the names of "
-            f"{nearest}, the nearest convention"
-        )
-    return tuple(names.index(name) for name in _CONVENTIONS[nearest])
 
 
 def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
@@ -113,7 +88,7 @@ def classifier_frames(positions, skeleton: Skeleton) -> np.ndarray:
     """
     positions = checked_positions(positions)
     check_joints(skeleton, positions)
-    seen = list(classifier_joints(skeleton))
+    seen = [skeleton.role(role) for role in CLASSIFIER_JOINTS]
     body = positions - positions[..., seen[:1], :]
     turned = body[..., seen, :] @ np.swapaxes(matrix_from_yaw(-facing_yaw(skeleton, body, shoulders=True)), -1, -2)
     return turned.reshape(*turned.shape[:-2], NUM_CHANNELS)
@@ -128,9 +103,7 @@ def side_by_side(frames: np.ndarray, window: int) -> np.ndarray:
 
 def mirror_channels() -> tuple[np.ndarray, np.ndarray]:
     """Return (which channel to take, its sign), each [45], that show a frame in the mirror."""
-    twin = {"left": "right", "right": "left"}
-    mirrored = [" ".join(twin.get(word, word) for word in joint.split()) for joint in CLASSIFIER_JOINTS]
-    twins = [CLASSIFIER_JOINTS.index(joint) for joint in mirrored]
+    twins = [CLASSIFIER_JOINTS.index(twin_name(role)) for role in CLASSIFIER_JOINTS]
     order = 3 * np.repeat(twins, 3) + np.tile(np.arange(3), len(twins))
     return order, np.tile(np.array([-1.0, 1.0, 1.0], np.float32), len(twins))
 

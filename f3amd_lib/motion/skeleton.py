@@ -9,24 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from f3amd_lib.ground.arrays import array_module, check_positive, finite_array
-from f3amd_lib.ground.files import read_toml
+from f3amd_lib.motion.anatomy import joint_roles, side_of, twin_name
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices
 
 CONTACT_SPEED = 0.01
 """A toe that moves less than this, metres in a frame at 30 fps, is in contact (CAMDM's rule)."""
-
-_ROLE_NAMES = read_toml(Path(__file__).with_name("joint_roles.toml"))
-
-
-_SIDES = ("Left", "Right"), ("left", "right"), ("_L", "_R"), ("_l", "_r")
-_TWINS = {own: other for pair in _SIDES for own, other in (pair, pair[::-1])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,16 +71,20 @@ class Skeleton:
             raise ValueError(f"skeleton has no joint {name!r}; it has {', '.join(self.names)}")
         return self.names.index(name)
 
+    @functools.cached_property
+    def roles(self) -> dict[str, int]:
+        """The joint that plays each role (see `anatomy.joint_roles`)."""
+        return joint_roles(self)
+
     def role(self, role: str) -> int:
-        """Return the joint that plays a role: head, or left_ or right_ hip, toe, clavicle, shoulder or wrist."""
-        if found := [name for name in _ROLE_NAMES[role] if name in self.names]:
-            return self.names.index(found[0])
-        wanted = ", ".join(_ROLE_NAMES[role])
-        raise ValueError(f"no joint is known as its {role}; looked for {wanted} among {', '.join(self.names)}")
+        """Return the joint that plays a role, such as head or left_toe; ValueError if none does."""
+        if role not in self.roles:
+            raise ValueError(f"no joint is known as its {role}; call one of them so: {', '.join(self.names)}")
+        return self.roles[role]
 
     def has_role(self, role: str) -> bool:
         """Say whether a joint is known to play a role."""
-        return any(name in self.names for name in _ROLE_NAMES[role])
+        return role in self.roles
 
     @property
     def toes(self) -> tuple[int, int]:
@@ -116,11 +112,14 @@ class Skeleton:
     @functools.cached_property
     def mirror_permutation(self) -> tuple[int, ...]:
         """For each joint the index of its left-right twin (itself for middle joints)."""
-        twins = [re.sub("Left|Right|left|right|_[LRlr]$", lambda found: _TWINS[found[0]], name) for name in self.names]
-        for name, twin in zip(self.names, twins, strict=True):
-            if twin not in self.names:
-                raise ValueError(f"joint {name!r} has no twin {twin!r}: it cannot be mirrored")
-        return tuple(map(self.names.index, twins))
+        labels = self.names
+        if not any(map(side_of, labels)):
+            played = {joint: role for role, joint in self.roles.items()}
+            labels = [played.get(joint, name) for joint, name in enumerate(labels)]
+        for name in labels:
+            if twin_name(name) not in labels:
+                raise ValueError(f"joint {name!r} has no twin {twin_name(name)!r}: it cannot be mirrored")
+        return tuple(labels.index(twin_name(name)) for name in labels)
 
     @functools.cached_property
     def mirror_frames(self) -> np.ndarray:
@@ -323,7 +322,7 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
     Args:
       skeleton: the joints.
       positions: global positions, [..., J, 3].
-      shoulders: take a = unit(left clavicle - right clavicle) + unit(left hip - right hip), as CAMDM's
+      shoulders: take a = unit(left collar - right collar) + unit(left hip - right hip), as CAMDM's
         evaluation does; a skeleton without these joints faces where its hips do.
 
     Returns:
@@ -339,9 +338,9 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
         return positions[..., skeleton.role(f"left_{part}"), :] - positions[..., skeleton.role(f"right_{part}"), :]
 
     across = between("hip")
-    if shoulders and skeleton.has_role("left_clavicle") and skeleton.has_role("right_clavicle"):
+    if shoulders and skeleton.has_role("left_collar") and skeleton.has_role("right_collar"):
         unit = lambda vector: vector / xp.maximum(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
-        across = unit(across) + unit(between("clavicle"))
+        across = unit(across) + unit(between("collar"))
     # The direction is cross(a, +Y) = (-a_z, 0, a_x).
     return xp.arctan2(-across[..., 2], across[..., 0])
 
