@@ -171,8 +171,8 @@ def stretching_bone(second: str) -> str:
 
 def test_bones_must_be_rigid():
     assert parse_bvh(stretching_bone("10.1"), "jitter").skeleton.offsets[1, 0] == pytest.approx(0.1005)
-    with pytest.raises(ValueError, match=r"rubber\.bvh, line 3: .*'Left' move.* 2\.0 mm .*rigid"):
-        parse_bvh(stretching_bone("10.4"), "rubber.bvh")
+    with pytest.raises(ValueError, match=r"rubber\.bvh, line 3: .*'Left' move.* 6\.0 mm .*rigid"):
+        parse_bvh(stretching_bone("11.2"), "rubber.bvh")
 
 
 def swap(old: str, new: str, count: int = 1):
@@ -220,9 +220,8 @@ BROKEN = {
     "no HIERARCHY": (swap("HIERARCHY", "HELLO"), 1, "unexpected 'HELLO'; known here are HIERARCHY"),
     "no ROOT": (lambda text: "HIERARCHY\n" + text[text.index("MOTION") :], 2, "a ROOT needs CHANNELS"),
     "stray word": (swap("OFFSET 0 10 0", "OFFSETS 0 10 0"), 8, "unexpected 'OFFSETS'"),
-    "latin-1 bytes": (lambda text: text.replace("Elbow", "Élbow").encode("latin-1"), 6, "UTF-8"),
     "odd bytes in a row": (lambda text: text.encode().replace(b"-90", b"\xff\xfe"), 26, "number 7"),
-    "UTF-16": (lambda text: text.encode("utf-16"), 1, "not UTF-8"),
+    "UTF-16": (lambda text: text.encode("utf-16"), 1, "as UTF-8"),
 }
 
 

@@ -7,6 +7,7 @@ metres and rotation matrices.
 """
 
 import io
+import logging
 import re
 import warnings
 from dataclasses import dataclass
@@ -19,8 +20,13 @@ from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
-RIGID_TOLERANCE = 1e-3
-"""Metres by which a joint's position channels may wander before its bone counts as not rigid."""
+log = logging.getLogger("f3amd")
+
+RIGID_TOLERANCE, TOLD_TOLERANCE = 5e-3, 1e-3
+"""Metres by which a joint's position channels may wander before its bone is not rigid, and before that is told."""
+
+USUAL_RATES = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 150, 200, 240)
+"""Frames per second that a frame time of few digits stands for: .033 is 30."""
 
 LARGEST_NUMBER = 1e8
 """Largest number of a file, either way: 1,000 km in centimetres, and as many degrees."""
@@ -50,9 +56,10 @@ _STATEMENTS = {
 """What may stand in the HIERARCHY: keyword -> pattern of what follows it, and how messages tell it."""
 
 _WORD = re.compile(r"\s*([{}]|[^\s{}]+|$)")
-_MOTION_LINE = re.compile(rb"^[ \t]*MOTION[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
+_NOTE = re.compile(r"^[ \t]*(#|//|;).*$", re.MULTILINE)
+_MOTION_LINE = re.compile(rb"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _MOTION_HEAD = re.compile(
-    rb"\s*Frames\s*:[ \t]*(\S+)[ \t\r]*\n\s*Frame\s*Time\s*:[ \t]*(\S+)[ \t\r]*(?:\n|$)", re.IGNORECASE
+    rb"\s*Frames[ \t]*:?[ \t]*(\S+)[ \t]*\n\s*Frame\s*Time[ \t]*:?[ \t]*(\S+)[ \t]*(?:\n|$)", re.IGNORECASE
 )
 
 
@@ -99,7 +106,7 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
 
     How channels are read:
       * Position channels replace OFFSET (they are not added to it). Below the root they must be
-        constant to `RIGID_TOLERANCE`; their mean then is the bone.
+        constant to `RIGID_TOLERANCE`; their mean then is the bone. Where they are zero throughout, OFFSET is.
       * R is the product of the rotations in the order in which the channels are listed.
       * A first joint with position channels whose only child has position channels too (Bandai's
         `joint_Root` above `Hips`) only carries its child. It is folded into the child, which
@@ -107,7 +114,8 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
       * Joints come in the order of the file, parents first.
 
     Args:
-      text: content of the file; line ends may be LF, CRLF or CR, blanks may be tabs.
+      text: content of the file; line ends may be LF, CRLF, CR CR LF or CR, blanks may be tabs, names in Latin-1. Rows
+        may be wrapped, and notes may stand in lines of their own in the HIERARCHY (#, // or ;) and after the rows.
       name: what messages and the motion call it.
       scale: metres per unit of length in the file.
 
@@ -118,20 +126,20 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
       ValueError: "name, line n: what is wrong; what to do" for anything that is not a sound BVH.
     """
     check_positive("scale", scale)
-    # Half a character is found, with its line, when the HIERARCHY is decoded.
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
-    data = data if b"\n" in data else data.replace(b"\r", b"\n")
+    data = re.sub(rb"\r*\n|\r", b"\n", data) if b"\r" in data else data
     try:
         motion = _MOTION_LINE.search(data)
         head = data[: motion.start()] if motion else data
+        if b"\0" in head:
+            raise _Broken(1, "is UTF-16 or no text at all; save it as UTF-8")
         try:
             hierarchy = head.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            line = 1 + head.count(b"\n", 0, error.start)
-            raise _Broken(line, "holds bytes that are not UTF-8 text; is it a BVH file?") from None
+        except UnicodeDecodeError:
+            hierarchy = head.decode("latin-1")
         if motion is None:
             raise _Broken(1 + data.count(b"\n"), "the file ends without a MOTION line; export or copy it again")
-        joints, end_sites = _parse_hierarchy(hierarchy)
+        joints, end_sites = _parse_hierarchy(_NOTE.sub("", hierarchy))
         values, frame_time = _parse_motion(data, motion.end(), joints)
         return _build_motion(joints, end_sites, values, frame_time, name, scale)
     except _Broken as error:
@@ -151,7 +159,9 @@ def _statements(text: str):
         line += text.count("\n", place, word.start(1))
         keyword = word[1].upper()
         if keyword not in _STATEMENTS:
-            raise _Broken(line, f"unexpected {word[1][:40]!r}; known here are {', '.join(_STATEMENTS)}")
+            glued = re.match(r"[A-Z]+(?=[-+.\d])", keyword)
+            fix = f"put a blank after {glued[0]}" if glued else f"known here are {', '.join(_STATEMENTS)}"
+            raise _Broken(line, f"unexpected {word[1][:40]!r}; {fix}")
         pattern, needed = _STATEMENTS[keyword]
         found = re.compile(pattern, re.IGNORECASE).match(text, word.end())
         if found is None:
@@ -162,10 +172,15 @@ def _statements(text: str):
         line += text.count("\n", word.start(1), place)
 
 
+def _comma(word: str) -> str:
+    """Return the end of a message on a word that is no number."""
+    return "; write decimal points, not commas" if "," in word else ""
+
+
 def _offset(words: tuple[str, ...], line: int) -> list[float]:
     values = [finite_number(word) for word in words]
     if None in values:
-        raise _Broken(line, f"OFFSET needs 3 finite numbers, found {' '.join(words)[:40]!r}")
+        raise _Broken(line, f"OFFSET needs 3 finite numbers, found {' '.join(words)[:40]!r}{_comma(words[0])}")
     return values
 
 
@@ -232,18 +247,18 @@ def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.nda
     frame_time = finite_number(seconds)
     if frame_time is None or not FRAME_TIMES[0] <= frame_time <= FRAME_TIMES[1]:
         what = f"Frame Time: must be a positive number of seconds, at most {FRAME_TIMES[1]:g}, found {seconds[:40]!r}"
-        raise _Broken(line_at(head.start(2)), f"{what}; 30 frames per second are 0.0333333")
+        raise _Broken(line_at(head.start(2)), f"{what}{_comma(seconds)}; 30 frames per second are 0.0333333")
+    digits = len(seconds.partition(".")[2])
+    if "e" not in seconds.lower() and 0.5 * 10.0**-digits > 1e-3 * frame_time:
+        usual = [1 / rate for rate in USUAL_RATES if round(1 / rate, digits) == round(frame_time, digits)]
+        frame_time = min(usual, key=lambda time: abs(time - frame_time), default=frame_time)
     rows, labels = (
         data[head.end() :],
         {n: f"{c} of {joint.name}" for joint in joints for c, n in joint.channels.items()},
     )
-    try:
-        if rows.strip():
-            values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
-            if values.shape == (int(count), len(labels)) and (np.abs(values) <= LARGEST_NUMBER).all():
-                return values, frame_time
-    except ValueError:  # UnicodeDecodeError is one, too
-        pass
+    values = _read_rows(rows, int(count), len(labels))
+    if values is not None:
+        return values, frame_time
     # numpy's reader is fast, but its messages know no BVH: find out where and what.
     frame = 0
     for line, row in enumerate(rows.split(b"\n"), start=line_at(head.end())):
@@ -251,7 +266,7 @@ def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.nda
         for column, word in enumerate(words[: len(labels) + 1]):
             if finite_number(word) is None:
                 place = f"number {column + 1} of frame {frame}, {labels.get(column, 'beyond the last channel')}"
-                how = f"is not a finite number of at most {LARGEST_NUMBER:g}"
+                how = f"is not a finite number of at most {LARGEST_NUMBER:g}{_comma(word)}"
                 raise _Broken(line, f"{word[:40]!r} ({place}) {how}; mend it or export again")
         if words and len(words) != len(labels):
             how = "cut off" if len(words) < len(labels) else "too long"
@@ -260,6 +275,26 @@ def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.nda
         frame += bool(words)
     what = f"Frames: says {count}, but {frame} rows of numbers follow"
     raise _Broken(line_at(head.start(1)), f"{what}; export the file again or mend the count")
+
+
+def _read_rows(rows: bytes, frames: int, channels: int) -> np.ndarray | None:
+    """Return numbers, [frames, channels], however rows are wrapped and whatever note follows; None for no fit."""
+    try:
+        if rows.strip():
+            values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
+            if values.shape == (frames, channels) and (np.abs(values) <= LARGEST_NUMBER).all():
+                return values
+    except ValueError:  # UnicodeDecodeError is one, too
+        pass
+    values = []
+    for line in rows.decode("latin-1").splitlines():
+        numbers = [finite_number(word) for word in line.split()]
+        if len(values) < frames * channels:
+            values += numbers
+        elif numbers and numbers[0] is not None:
+            return None
+    fits = len(values) == frames * channels and None not in values
+    return np.reshape(np.array(values, np.float64), (frames, channels)) if fits else None
 
 
 def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
@@ -288,18 +323,22 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
         root_position = root_position + np.einsum("tab,tb->ta", rotations[:, 0], channel_positions(1))
         rotations[:, 1] = rotations[:, 0] @ rotations[:, 1]
 
-    offsets = np.zeros((count, 3))
+    offsets, wandered = np.zeros((count, 3)), 0.0
     for joint in range(root + 1, count):
         if not moves[joint]:
             offsets[joint] = scale * np.array(joints[joint].offset)
             continue
         position = channel_positions(joint)
-        offsets[joint] = position.mean(axis=0)
-        error = np.abs(position - offsets[joint]).max(axis=1)
+        zero = not values[:, list(moves[joint].values())].any()  # nothing is said beside OFFSET
+        offsets[joint] = scale * np.array(joints[joint].offset) if zero else position.mean(axis=0)
+        error = 0.0 * position[:, 0] if zero else np.abs(position - offsets[joint]).max(axis=1)
+        wandered = max(wandered, error.max())
         if error.max() > RIGID_TOLERANCE:
             what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm"
             where = f"in frame {error.argmax()}; bones must be rigid: bake the motion to rotations before exporting"
             raise _Broken(joints[joint].line, f"{what} {where}")
+    if wandered > TOLD_TOLERANCE:
+        log.warning("%s: bones change by up to %.1f mm; each is as long as on average", name, 1000 * wandered)
     tips = [(joint - root, [scale * value for value in offset]) for joint, offset in end_sites if joint >= root]
     names, parents = [joint.name for joint in joints[root:]], [max(parent - root, -1) for parent in parents[root:]]
     skeleton = Skeleton(names, parents, offsets[root:], tips)
