@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 from builders import CHANNELS, HISTORY, refused, tiny_trained, wandering_motion
+from strangers import cmu_skeleton
 from test_skeleton import BANDAI
 
 from f3amd_lib.data.features import frame_positions, frame_yaw, motion_from_frames
 from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.motion.anatomy import joint_roles
-from f3amd_lib.motion.retarget import retarget
+from f3amd_lib.motion.plausible import as_person
+from f3amd_lib.motion.retarget import DOUBTFUL, retarget
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
 from f3amd_lib.motion.synthetic import synthesize
@@ -68,7 +70,7 @@ def test_the_same_person_in_another_size_comes_back_to_the_millimetre(walk):
     assert np.abs(shift - shift[:1, :1]).max() < 1e-3  # the path, too
 
 
-def test_an_error_is_seen_where_there_is_one(walk):
+def test_an_error_is_seen_where_there_is_one_and_a_large_one_refused(walk, caplog):
     bent = Skeleton(
         walk.skeleton.names,
         walk.skeleton.parents,
@@ -76,7 +78,30 @@ def test_an_error_is_seen_where_there_is_one(walk):
         walk.skeleton.end_sites,
     )
     reference = walk.replace(skeleton=bent)
-    assert retarget(walk, reference)[2].mean() > 10.0
+    with caplog.at_level("WARNING"):
+        assert retarget(walk, reference)[2].mean() > DOUBTFUL
+    assert "24 cm off" in caplog.text
+    wide = dataclasses.replace(bent, offsets=bent.offsets * np.array([2, 1, 1]))
+    refused("'Neutral_0': joints would be .* cm off", retarget, walk, walk.replace(skeleton=wide))
+
+
+def test_collar_bones_without_length_leave_shoulders_as_wide_as_they_are_and_the_back_upright(walk, bandai):
+    """CMU's person, whose collar bones and hip joints have no length: put on, and taken off again."""
+    still = Motion(cmu_skeleton(), [[0.0, 0.17, 0.0]], np.tile(np.eye(3), (1, 31, 1, 1)))
+    cmu = retarget(walk, as_person(still)[0])[0]
+    for reference in (bandai, walk):
+        made = retarget(cmu, reference)[0]
+        width, tall = zip(*map(shoulders_and_height, (made, reference)), strict=True)
+        assert width[0] == pytest.approx(width[1], rel=0.1)
+        assert tall[0] == pytest.approx(tall[1], abs=0.1)
+    assert shoulders_and_height(cmu)[1] > 1.2
+
+
+def shoulders_and_height(motion: Motion) -> tuple[float, float]:
+    """How far shoulders are apart, and how high the head is over the lower toe, on average, metres."""
+    roles, at = motion.skeleton.roles, motion.positions
+    width = np.linalg.norm(at[:, roles["left_shoulder"]] - at[:, roles["right_shoulder"]], axis=-1).mean()
+    return width, (at[:, roles["head"], 1] - at[:, list(motion.skeleton.toes), 1].min(axis=-1)).mean()
 
 
 def test_who_lacks_joints_is_told_which(walk):

@@ -15,7 +15,7 @@ import numpy as np
 
 from f3amd_lib.ground.arrays import array_module, exact_products
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.motion.anatomy import joint_roles, leg_length, part_of
+from f3amd_lib.motion.anatomy import leg_length, part_of
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Skeleton, walk_tree
 
@@ -72,7 +72,7 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
     Args:
       skeleton: any. A joint whose role is not known gets a thin limb; a skeleton that cannot be mirrored, round ones.
     """
-    roles = joint_roles(skeleton)
+    roles = skeleton.roles
     parts = {joint: part_of(role) for role, joint in roles.items()}
     try:
         twins, frames = skeleton.mirror_permutation, skeleton.mirror_frames
