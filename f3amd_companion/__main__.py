@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, UseAppendAction
@@ -150,6 +150,53 @@ class Model:
         from f3amd_lib.rollout.rollout import MotionGenerator
 
         return MotionGenerator(self.load(), self.steps, sampler=self.sampler)
+
+
+@dataclass(frozen=True)
+class Person:
+    """How a BVH file of others is read.
+
+    Attributes:
+      scale: metres in a unit of the file, instead of what its legs tell.
+      up: axis that is up in the file, Y or Z, instead of what legs and hips tell.
+      joint_map: TOML file of lines such as left_knee = "calf_l": which joint plays a role, where it is not found.
+    """
+
+    scale: float | None = None
+    up: Literal["Y", "Z"] | None = None
+    joint_map: Path | None = None
+
+    def mapped(self) -> dict[str, str]:
+        """Return the joint map, role -> joint's name."""
+        from f3amd_lib.motion.plausible import read_joint_map
+
+        return read_joint_map(self.joint_map) if self.joint_map else {}
+
+    def read(self, path: Path):
+        """Read a file, and say what was corrected."""
+        from f3amd_lib.motion.bvh import read_bvh
+        from f3amd_lib.motion.plausible import as_person, call_by_roles
+
+        motion = call_by_roles(read_bvh(path), self.mapped())
+        motion, notes = as_person(motion, scale=self.scale, up=self.up)
+        if notes:
+            log.info("corrected    %s: %s", path, "; ".join(notes))
+        return motion
+
+
+def joints(file: Positional[Path], person: Person) -> None:
+    """Show which joint of a BVH file plays which role, and what is corrected on reading.
+
+    Args:
+      file: BVH.
+    """
+    motion = person.read(file)
+    names, roles, mapped = motion.skeleton.names, motion.skeleton.roles, person.mapped()
+    for role, joint in sorted(roles.items(), key=lambda item: item[1]):
+        log.info("%-14s %s", role, mapped.get(role, names[joint]))
+    rest = ", ".join(name for joint, name in enumerate(names) if joint not in roles.values())
+    log.info("%-14s %s", "without a role", rest or "no joint")
+    log.info("%-14s %d at %.4g fps", "frames", motion.num_frames, motion.fps)
 
 
 def data(motion: Data) -> None:
@@ -305,8 +352,8 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
 
 
 def rollout(
-    style: str, model: Model, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0, speed: float = 1.2,
-    raw: bool = False, format: str = "bvh", start: Path | None = None, out: Path = Path("out"),
+    style: str, model: Model, person: Person, path: str = "figure-eight", seed: int = 0, seconds: float = 20.0,
+    speed: float = 1.2, raw: bool = False, format: str = "bvh", start: Path | None = None, out: Path = Path("out"),
 ) -> None:  # fmt: skip
     """Animate one character: motion, film strip, player.
 
@@ -328,7 +375,6 @@ def rollout(
     from f3amd_companion.serving import player
     from f3amd_companion.serving.finishing import held
     from f3amd_companion.serving.foot_locking import lock_rollout
-    from f3amd_lib.motion.bvh import read_bvh
     from f3amd_lib.motion.root_paths import named_path, read_path_csv
     from f3amd_lib.rollout.start_poses import start_history
 
@@ -336,7 +382,7 @@ def rollout(
     generator = model.generator()
     trained = generator.trained
     if start is not None:
-        history, note = start_history(trained, read_bvh(start), line)
+        history, note = start_history(trained, person.read(start), line)
         log.info("start        %s", note)
     made = generator.rollout(line, style, seed=seed, history=history, blend_frames=0 if raw else 4)
     made = made if raw else held(lock_rollout, made)
@@ -812,7 +858,7 @@ RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
 COMMANDS = (
-    data, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
+    data, joints, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
     figures, course, claims, cards,
 )  # fmt: skip
 

@@ -116,6 +116,15 @@ def test_feet_far_over_a_known_floor_do_not_stand(walk):
     assert not plan_contacts(lifted(walk, 0.15).positions, walk.skeleton, floor=FLOOR).any()
 
 
+def test_a_contact_no_two_frames_of_which_are_alike_is_none():
+    """It stands 4 cm up and then moves along the floor at 2 m/s: each frame is too high or too fast for the rest."""
+    path = np.concatenate([np.zeros(41), 4 / 30 + np.arange(39) * 2 / 30])
+    height = np.repeat([0.043, 0.0], 40)
+    positions = np.tile(SYNTHETIC_SKELETON.rest_positions, (80, 1, 1))
+    positions[:, SYNTHETIC_SKELETON.toes] = np.stack([0 * path, height, path], axis=-1)[:, None]
+    assert not plan_contacts(positions, SYNTHETIC_SKELETON).all(axis=-1).any()
+
+
 def test_a_clean_walk_stays(walk):
     locked = lock_feet(walk)
     moved = np.linalg.norm(locked.positions - walk.positions, axis=-1)

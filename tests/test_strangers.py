@@ -4,11 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from builders import refused
 from strangers import NAMES, NAMINGS, REFUSED, bvh_cases, cmu_skeleton, walker
 
+from f3amd_companion.__main__ import main
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, side_of, twin_name
 from f3amd_lib.motion.bvh import parse_bvh
-from f3amd_lib.motion.plausible import as_person
+from f3amd_lib.motion.plausible import as_person, call_by_roles, read_joint_map
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 CASES = bvh_cases()
@@ -88,6 +90,30 @@ def test_a_person_of_no_known_unit_is_refused_and_an_option_overrules_it():
     motion, notes = as_person(odd, scale=0.01 / 3.0)
     assert leg_length(motion.skeleton, joint_roles(motion.skeleton)) == pytest.approx(0.82)
     assert notes
+
+
+def test_a_joint_map_overrules_what_the_tree_says(tmp_path, caplog):
+    file, mapped = tmp_path / "walk.bvh", tmp_path / "map.toml"
+    file.write_bytes(CASES["metres"])
+    mapped.write_text('left_wrist = "LeftForeArm"\nhead = "Neck"\n')
+    with caplog.at_level("INFO", logger="f3amd"):
+        assert main(["joints", str(file), "--joint-map", str(mapped)]) == 0
+    said = "\n".join(caplog.messages)
+    assert re.search(r"corrected .*walk\.bvh: read in metres", said)
+    for role, name in (
+        ("left_shoulder", "LeftArm"),
+        ("left_wrist", "LeftForeArm"),
+        ("without a role", "Head, LeftHand"),
+    ):
+        assert re.search(f"{role} +{name}\n", said)
+    assert "left_elbow" not in said
+    made = call_by_roles(walker(), read_joint_map(mapped)).skeleton
+    assert [made.roles[role] for role in ("left_wrist", "head")] == [NAMES.index("LeftForeArm"), NAMES.index("Neck")]
+    for text, message in (("lef_toe = 'a'", "did you mean 'left_toe'"), ("head = 3", "quotes"), ("head", "map.toml")):
+        mapped.write_text(text)
+        refused(message, read_joint_map, mapped)
+    refused("no joint 'Tail'", call_by_roles, walker(), {"head": "Tail"})
+    refused("one role", call_by_roles, walker(), {"head": "Head", "neck": "Head"})
 
 
 def test_somebody_who_lies_is_not_taken_for_z_up():

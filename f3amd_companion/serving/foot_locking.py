@@ -159,8 +159,8 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
                 continue
             differs = speed[:, foot] > 1.5 * np.median(speed[start:stop, foot]) + 0.3
             differs |= height[:, foot] > np.median(height[start:stop, foot]) + 0.02
-            alike = np.flatnonzero(~differs[start:stop])
-            contact[start + alike[0] : start + alike[-1] + 1] = True
+            if (alike := np.flatnonzero(~differs[start:stop])).size:
+                contact[start + alike[0] : start + alike[-1] + 1] = True
         contacts[:, foot] = _without_short(~_without_short(~contact, _GAP, fps, ends=True), _SHORTEST, fps)
     return contacts
 

@@ -44,7 +44,7 @@ def joint_roles(skeleton) -> dict[str, int]:
 
     Legs and arms are pairs of limbs that hang on one joint, as long as each other: the pair nearest to the root is the
     legs. Of a limb the two longest bones in a row are thigh and shin, or upper arm and forearm. What goes on from where
-    the arms hang are neck and head. A joint that is called by a role plays it.
+    the arms hang are neck and head. A joint that is called by a role plays it, and no other.
 
     Args:
       skeleton: any; what is not found is left out. Of one without legs of three joints, hips, toes, wrists and head are
@@ -74,7 +74,8 @@ def joint_roles(skeleton) -> dict[str, int]:
             shoulder = roles[f"{side}_shoulder"]
             collar = {f"{side}_collar": skeleton.parents[shoulder]} if shoulder != arms[number] else {}
         roles |= _limb(skeleton, ways[legs[number]][1], side, _LEG) | collar
-    return roles | called
+    free = set(roles.values()) - set(called.values())
+    return {role: joint for role, joint in (roles | called).items() if role in called or joint in free}
 
 
 def leg_length(skeleton, roles: dict[str, int]) -> float:

@@ -6,11 +6,15 @@ of others, legs and hips are measured: a unit in use or Z up is corrected and sa
 Source: ours.
 """
 
+import dataclasses
+from collections.abc import Mapping
+
 import numpy as np
 
 from f3amd_lib.ground.arrays import check_positive
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.motion.anatomy import leg_length
+from f3amd_lib.motion.anatomy import ROLES, leg_length
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
@@ -70,6 +74,32 @@ def as_person(motion: Motion, *, scale: float | None = None, up: str | None = No
             motion = motion.slice(1, motion.num_frames)
             notes.append(f"its first frame is left out: wrists jump {100 * steps[0]:.0f} cm after it, as from a T-pose")
     return motion, notes
+
+
+def read_joint_map(path) -> dict[str, str]:
+    """Return role -> joint's name, of a TOML file of lines such as left_knee = "calf_l"."""
+    try:
+        named = read_toml(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f'{path}: cannot be read as TOML ({error}); write lines such as left_knee = "calf_l"'
+        ) from error
+    for role, name in named.items():
+        check_known(role, sorted(ROLES), f"role in {path}:")
+        if not isinstance(name, str):
+            raise ValueError(f"{path}: {role} must be a joint's name in quotes, got {name!r}")
+    return named
+
+
+def call_by_roles(motion: Motion, joint_map: Mapping[str, str]) -> Motion:
+    """Return a motion whose joints are called by the roles that a map, role -> joint's name, gives them."""
+    skeleton = motion.skeleton
+    roles = {skeleton.index(name): role for role, name in joint_map.items()}
+    if len(roles) < len(joint_map):
+        raise ValueError(f"a joint can play one role; two are given to one of {', '.join(joint_map.values())}")
+    others = {name: f"{name} of the file" for name in joint_map}  # a name that now is another joint's
+    names = [roles.get(joint, others.get(name, name)) for joint, name in enumerate(skeleton.names)]
+    return motion.replace(skeleton=dataclasses.replace(skeleton, names=names))
 
 
 def _completed(motion: Motion, notes: list[str]) -> Motion:
