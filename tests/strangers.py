@@ -38,7 +38,12 @@ _VRM = """J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_Neck J_Bip_C_Head J_B
 J_Bip_L_LowerArm J_Bip_L_Hand J_Bip_R_Shoulder J_Bip_R_UpperArm J_Bip_R_LowerArm J_Bip_R_Hand
 J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot J_Bip_L_ToeBase J_Bip_R_UpperLeg J_Bip_R_LowerLeg
 J_Bip_R_Foot J_Bip_R_ToeBase""".split()
+_UNREAL = """pelvis spine_01 spine_02 neck_01 head clavicle_l upperarm_l lowerarm_l hand_l clavicle_r upperarm_r
+lowerarm_r hand_r thigh_l calf_l foot_l ball_l thigh_r calf_r foot_r ball_r""".split()
 NAMINGS = {
+    "Unreal": _UNREAL,
+    "capitals": [name.upper() for name in NAMES],
+    "a namespace with a side": [f"Wright:{name}" for name in NAMES],
     "mixamorig": [f"mixamorig:{name}" for name in NAMES],
     "mixamorig1": [f"mixamorig1:{name}" for name in NAMES],
     "no colon": [f"mixamorig{name}" for name in NAMES],

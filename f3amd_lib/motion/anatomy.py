@@ -7,8 +7,11 @@ import numpy as np
 
 _ARM = ("shoulder", "elbow", "wrist")
 _LEG = ("hip", "knee", "ankle", "toe")
-# "Left" in any case; or a letter that stands alone (L_Hip, thigh.l, Bip01 L Thigh) or before a capital (lThigh).
-_SIDE = re.compile(r"(?i:left|right)|(?<![A-Za-z])[LRlr](?![A-Za-z])|(?<![A-Za-z])[LRlr](?=[A-Z][A-Za-z])")
+# "Left" in any case; or a letter that stands alone (L_Hip, thigh.l, Bip01 L Thigh; not L5, a vertebra) or before a
+# capital (lThigh, LTHIGH; not ROOT); never in what stands before a colon.
+_SIDE = re.compile(
+    r"(?:(?i:left|right)|(?<![A-Za-z])[LRlr](?:(?![A-Za-z0-9])|(?=[A-Z][A-Za-z])(?!OOT|OWER|IB|UMBAR)))(?!.*:)"
+)
 _TWINS = {"L": "R", "l": "r", "Left": "Right", "left": "right", "LEFT": "RIGHT"}
 _TWINS |= {right: left for left, right in _TWINS.items()}
 ROLES = {"hips", "neck", "head"} | {f"{side}_{part}" for side in ("left", "right") for part in ("collar", *_ARM, *_LEG)}

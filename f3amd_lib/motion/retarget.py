@@ -54,8 +54,8 @@ def retarget(motion: Motion, reference: Motion) -> tuple[Motion, float, np.ndarr
     for whose, roles in ((motion, theirs), (reference, ours)):
         missing = [role for role in NEEDED if role not in roles]
         if missing:
-            names = ", ".join(whose.skeleton.names)
-            raise ValueError(f"motion {whose.name!r}: no joint is known as {', '.join(missing)}; it has {names}")
+            what = f"no joint is known as {', '.join(missing)}; it has {', '.join(whose.skeleton.names)}"
+            raise ValueError(f"motion {whose.name!r}: {what}; --joint-map says which is which")
     wanted = _wanted_points(motion, theirs, skeleton, ours)
     above = np.asarray(reference.needed_rotations("retargeting"), np.float64)[:1]
     rest, bones = global_rotations(skeleton, above)[0], _aimed_bones(skeleton, above[0], wanted)
@@ -75,7 +75,7 @@ def retarget(motion: Motion, reference: Motion) -> tuple[Motion, float, np.ndarr
             turned[:, joint] = shortest_turn(before @ was[0], shall[:, 0]) @ before
     local = local_rotations(skeleton, turned @ rest)
     scale = leg_length(skeleton, ours) / leg_length(motion.skeleton, theirs)
-    made = Motion(skeleton, scale * motion.root_position, local, motion.fps, motion.name)
+    made = Motion(skeleton, scale * motion.positions[:, theirs["hips"]], local, motion.fps, motion.name)
     floor = reference.positions[:, list(skeleton.toes), 1].min() - made.positions[:, list(skeleton.toes), 1].min()
     made = made.replace(root_position=made.root_position + [0.0, floor, 0.0])
     shared = [role for role in theirs if role in ours and "spine" not in role]

@@ -119,7 +119,11 @@ class Skeleton:
         for name in labels:
             if twin_name(name) not in labels:
                 raise ValueError(f"joint {name!r} has no twin {twin_name(name)!r}: it cannot be mirrored")
-        return tuple(labels.index(twin_name(name)) for name in labels)
+        twins = [labels.index(twin_name(name)) for name in labels]
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            if self.parents[twins[joint]] != twins[parent]:
+                raise ValueError(f"the twin of joint {self.names[joint]!r} hangs elsewhere: it cannot be mirrored")
+        return tuple(twins)
 
     @functools.cached_property
     def mirror_frames(self) -> np.ndarray:
