@@ -104,6 +104,17 @@ def shoulders_and_height(motion: Motion) -> tuple[float, float]:
     return width, (at[:, roles["head"], 1] - at[:, list(motion.skeleton.toes), 1].min(axis=-1)).mean()
 
 
+def test_a_rig_that_says_nothing_of_up_at_rest_is_put_upright_by_its_motion(bandai):
+    """All bones of Bandai's lie along X at rest."""
+    tip = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    turns = bandai.rotations.copy()
+    turns[:, 0] = tip @ turns[:, 0]
+    made, notes = as_person(bandai.replace(root_position=bandai.root_position @ tip.T, rotations=turns))
+    assert notes == ["read with Z up"]
+    np.testing.assert_allclose(made.positions, bandai.positions, atol=1e-6)
+    assert as_person(bandai)[0] is bandai
+
+
 def test_who_lacks_joints_is_told_which(walk):
     refused("no joint is known as neck, head.*left_knee", retarget, wandering_motion(5), walk)
     refused("'wandering 0': no joint is known as", retarget, walk, wandering_motion(5))

@@ -128,6 +128,7 @@ def test_somebody_who_lies_is_not_taken_for_z_up():
     motion, notes = as_person(lying)
     assert motion is lying and not notes
     assert as_person(lying, up="Z")[1] == ["read with Z up"]
+    refused("did you mean 'Z'", as_person, lying, up="z")
 
 
 def test_a_t_pose_before_the_take_is_cut_and_kept_on_request():
@@ -153,8 +154,6 @@ def test_a_name_with_a_side_has_its_twin(name, twin):
     assert (side_of(name), side_of(twin)) == ("left", "right")
 
 
-@pytest.mark.parametrize(
-    "name", ["Hips", "Neck", "Roll", "root", "ROOT", "LOWERBACK", "L5", "Head", "bone_07"]
-)
+@pytest.mark.parametrize("name", ["Hips", "Neck", "Roll", "root", "ROOT", "LOWERBACK", "L5", "Head", "bone_07"])
 def test_a_middle_joint_is_its_own_twin(name):
     assert twin_name(name) == name and side_of(name) == ""

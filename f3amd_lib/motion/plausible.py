@@ -48,15 +48,16 @@ def as_person(motion: Motion, *, scale: float | None = None, up: str | None = No
     Raises:
       ValueError: for legs that are a person's in no unit; names the option that overrules it.
     """
-    check_known(up, (None, "Y", "Z"), "axis that is up")
-    check_positive("scale", 1.0 if scale is None else scale)
+    if up is not None:
+        check_known(up, ("Y", "Z"), "axis that is up")
+    if scale is not None:
+        check_positive("scale", scale)
     notes, roles = [], motion.skeleton.roles
     legs = {"left_ankle", "right_ankle"} <= set(roles)
     if not legs and (scale is None or up is None):
         notes.append("no two legs were found, so it is read in centimetres with Y up")
-    measure, factor = (
-        _unit(motion, roles) if scale is None and legs else (f"units of {scale} m", 100.0 * (scale or 0.01))
-    )
+    told = f"units of {scale} m", 100.0 * (scale or 0.01)
+    measure, factor = _unit(motion, roles) if scale is None and legs else told
     if factor != 1.0:
         motion = _mapped(motion, factor * np.eye(3), np.eye(3))
         long = f": its legs are {leg_length(motion.skeleton, roles):.2f} m" if legs else ""
@@ -155,11 +156,10 @@ def _unit(motion: Motion, roles) -> tuple[str, float]:
 
 
 def _lies(motion: Motion, roles) -> bool:
-    """Say whether hips are over ankles along Z, at rest and on average over the frames: Z is up."""
+    """Say whether the left hip is over its ankle along Z on average, and not along Y in a skeleton at rest: Z is up."""
     places = motion.skeleton.rest_positions, motion.positions.mean(axis=0)
-    hips, ankles = ([roles[f"{side}_{part}"] for side in ("left", "right")] for part in ("hip", "ankle"))
-    ways = [place[hips].mean(axis=0) - place[ankles].mean(axis=0) for place in places]
-    return all(np.abs(way).argmax() == 2 for way in ways) and ways[1][2] > 0
+    rest, moving = (place[roles["left_hip"]] - place[roles["left_ankle"]] for place in places)
+    return np.abs(rest).argmax() != 1 and np.abs(moving).argmax() == 2 and moving[2] > 0
 
 
 def _mapped(motion: Motion, move: np.ndarray, axes: np.ndarray) -> Motion:
