@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import WINDOW, tiny_trained
+from strangers import bvh_cases
 from tqdm import tqdm
 
 from f3amd_companion.__main__ import COMMANDS, main
@@ -282,6 +283,17 @@ sys.exit(jax.device_count())
 """
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     assert subprocess.run([sys.executable, "-c", script], env=environment, check=False).returncode == 3
+
+
+def test_a_start_is_corrected_before_it_is_retargeted(weights, tmp_path, caplog, capsys):
+    file = tmp_path / "walk.bvh"
+    file.write_bytes(bvh_cases()["metres"])
+    words = ["rollout", "--weights", weights, "--style", "proud", "--out", str(tmp_path), "--start", str(file)]
+    with caplog.at_level("INFO", logger="f3amd"):
+        assert main(words) == 2  # the tiny model is no person
+    assert "walk.bvh: read in metres" in caplog.text and "no joint is known as" in capsys.readouterr().err
+    assert main([*words, "--scale", "1e-3"]) == main([*words, "--joint-map", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [command.__name__ for command in COMMANDS])

@@ -118,7 +118,7 @@ def _completed(motion: Motion, notes: list[str]) -> Motion:
 
     for side in ("left", "right"):
         if f"{side}_toe" not in roles:
-            motion = ended(motion, f"{side}_toe", roles[f"{side}_ankle"], 0.14 * ahead - [0.0, 0.04, 0.0])
+            motion = ended(motion, f"{side}_toe", roles[f"{side}_ankle"], 0.13 * ahead - [0.0, 0.06, 0.0])
     if "neck" in roles and "head" not in roles:
         motion = ended(motion, "head", roles["neck"], 0.1 * unit(skeleton.offsets[roles["neck"]]))
     elif "head" in roles and "neck" not in roles:
