@@ -73,7 +73,7 @@ def body_capsules(skeleton: Skeleton) -> list[Capsule]:
       skeleton: any. A joint whose role is not known gets a thin limb; a skeleton that cannot be mirrored, round ones.
     """
     roles = skeleton.roles
-    parts = {joint: part_of(role) for role, joint in roles.items()}
+    parts = {joint: part_of(role) for role, joint in roles.items()} if "left_knee" in roles else {}
     try:
         twins, frames = skeleton.mirror_permutation, skeleton.mirror_frames
     except ValueError:
