@@ -9,12 +9,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from tqdm import tqdm
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
 from f3amd_lib.ground.files import whole_folder
+from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.ground.tables import read_text_table
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
 from f3amd_lib.text.data.humanml3d import SPLIT_FILES
 from f3amd_lib.text.data.redundant import grouped_statistics, redundant_from_positions
@@ -91,25 +92,27 @@ def _write(path: Path, lines) -> None:
 
 
 def read_caption_table(path) -> dict[str, tuple[str, ...]]:
-    """Read captions from a CSV file with columns `file` and `caption`, several lines a file if you like.
+    """Read captions from a table with columns `file` and `caption`, several lines a file if you like.
 
     Returns:
-      Name of a motion file, without folder and ending -> its captions.
+      Name of a motion file, without folder and ending -> its captions. Rows that lack one, or have a # in the caption,
+      are left out.
 
     Raises:
-      ValueError: naming the file and the row, for a missing column, an empty cell or a # in a caption.
+      ValueError: as `read_text_table`, or where a fifth of the rows or all are bad.
     """
-    try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False, index_col=False)[["file", "caption"]]
-    except (OSError, LookupError, ValueError) as error:
-        raise ValueError(f"{path}: is no CSV file with columns file and caption ({error}); write it anew") from error
-    table = table.apply(lambda column: column.str.strip())
-    bad = table.eq("").any(axis=1) | table["caption"].str.contains("#")
-    if bad.any() or table.empty:
-        row = f"row {bad.argmax() + 1}" if bad.any() else "no row"
-        raise ValueError(f"{path}, {row}: needs a file and a caption; a # parts the fields of HumanML3D's texts")
-    names = table["file"].map(lambda file: Path(file).stem if file.lower().endswith(".bvh") else Path(file).name)
-    return {name: tuple(said.unique()) for name, said in table["caption"].groupby(names, sort=False)}
+    said, bad = {}, []
+    rows = read_text_table(path, "file,caption", others=True)
+    for where, row in rows:
+        name = re.sub(r"(?i)\.bvh$", "", re.split(r"[\\/]", row["file"])[-1])
+        if not name or not row["caption"] or "#" in row["caption"]:
+            bad.append((where.rpartition(": ")[2][:-1], "needs a file and a caption; a # parts the fields of HumanML3D's texts"))
+            continue
+        said.setdefault(name, {})[row["caption"]] = None
+    leave_out(path, bad, len(rows))
+    if not said:
+        raise ValueError(f"{path}: holds no caption; write a file and a caption in each row")
+    return {name: tuple(captions) for name, captions in said.items()}
 
 
 def _has_twins(skeleton: Skeleton) -> bool:

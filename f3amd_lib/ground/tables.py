@@ -1,4 +1,4 @@
-"""Tables as Markdown, with units.
+"""Tables: those that people write are read here, ours become Markdown, with units.
 
 A tidy table has one number a row: columns that say what it is about (model, steps, ...), then
 `metric`, `unit`, `better` and `value`.
@@ -6,12 +6,81 @@ A tidy table has one number a row: columns that say what it is about (model, ste
 
 from __future__ import annotations
 
+import csv
+import io
 import re
+import unicodedata
 from collections.abc import Mapping
+from pathlib import Path
 
 import pandas as pd
 
 ARROWS = {"down": " ↓", "up": " ↑"}
+
+
+def read_text(path) -> str:
+    """Read what somebody wrote: UTF-8, with a byte order mark or without, or UTF-16; letters are composed (NFC).
+
+    Raises:
+      ValueError: naming a file that is not there, or is no text.
+    """
+    try:
+        content = Path(path).read_bytes()
+        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except OSError as error:
+        raise ValueError(f"{path}: no such file, or not to be read ({error.strerror}); check the path") from error
+    except UnicodeDecodeError as error:
+        what = f"byte {error.start} is not {error.encoding.upper()}"
+        raise ValueError(f"{path}: not a text file ({what}); save it as UTF-8") from error
+    return unicodedata.normalize("NFC", text)
+
+
+def read_text_table(path, *headers: str, others: bool = False) -> list[tuple[str, dict[str, str]]]:
+    """Read a table that somebody wrote by hand or with a spreadsheet: CSV with commas, semicolons or tabs.
+
+    Blank rows, empty cells at the end of a row, the case of headings and how letters are encoded make no difference.
+    White space within a cell, a line break too, becomes a blank.
+
+    Args:
+      path: of the file.
+      headers: those that it may have, such as "x,z"; columns may come in any order.
+      others: let it have other columns beside these.
+
+    Returns:
+      (place, which begins what is said of a row: file and line; cell by heading) of each row.
+
+    Raises:
+      ValueError: naming file and line, for no text, a missing, repeated or unknown column, or a row with more or fewer
+        cells than the header.
+    """
+    text = re.sub(r'\A"?sep=."?[ \t]*$', "", read_text(path), count=1, flags=re.IGNORECASE | re.MULTILINE)
+    heading = next(filter(str.strip, text.splitlines()), "")
+    delimiter = max(",;\t", key=heading.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True)
+    rows, line = [], 1
+    try:
+        for row in reader:
+            cells = [" ".join(cell.split()) for cell in row]
+            rows += [(f"{path}: line {line}:", cells)] if any(cells) else []
+            line = reader.line_num + 1
+    except csv.Error as error:
+        raise ValueError(f"{path}: line {line}: not a row of a table ({error}); mend the line") from error
+    where, names = rows[0] if rows else (f"{path}: line 1:", [])
+    names = [name.casefold() for name in names]
+    while names[-1:] == [""]:
+        names.pop()
+    known = [set(header.split(",")) for header in headers]
+    if len(set(names)) < len(names) or not any(set(names) >= each if others else set(names) == each for each in known):
+        what = f"the header must be {' or '.join(headers)}, it is {','.join(names)[:80] or 'empty'}"
+        raise ValueError(f"{where} {what}")
+    table = []
+    for where, cells in rows[1:]:
+        cells = cells[: len(names)] + list(filter(None, cells[len(names) :]))
+        if len(cells) != len(names):
+            hint = f"; put text that holds {delimiter!r} in quotes" if len(cells) > len(names) else ""
+            raise ValueError(f"{where} {len(cells)} cells where the header has {len(names)}{hint}")
+        table.append((where, dict(zip(names, cells, strict=True))))
+    return table
 
 
 def fill_tables(page: str, tables: Mapping[str, str], where: str) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -18,6 +17,7 @@ from scipy.special import jn_zeros
 
 from f3amd_lib.ground.arrays import check_positive, finite_array
 from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.ground.tables import read_text_table
 from f3amd_lib.motion.bvh import finite_number
 from f3amd_lib.motion.curves import smoothstep
 from f3amd_lib.motion.skeleton import Motion
@@ -213,44 +213,24 @@ def _complex_profile(seconds: float, speed: float, seed: int):
 
 
 def read_points_csv(path, *headers: str) -> list[tuple[str, dict[str, float]]]:
-    """Read a CSV file of points, all of whose cells are numbers; blank rows are left out.
+    """Read a table of points, all of whose cells are numbers, with a decimal point or a decimal comma.
 
-    Args:
-      path: the file.
-      headers: those that it may have, such as "x,z"; columns may come in any order.
-
-    Returns:
-      (place, which begins what is said of a row: file and line; number by column) of each row.
+    Args, returns:
+      as `read_text_table`, with numbers for cells.
 
     Raises:
-      ValueError: naming file and line, for a missing, repeated or unknown column, a row of the wrong length, a cell
-        that is not a finite number of at most 10,000, or more than an hour's rows.
+      ValueError: as `read_text_table`; naming file and line, for a cell that is not a finite number of at most 10,000,
+        or more than an hour's rows.
     """
-    known = " or ".join(headers)
-    try:
-        # With quotes a cell could run over lines; numbers and headings need none.
-        lines = Path(path).read_text(encoding="utf-8-sig").replace('"', "").splitlines()
-    except OSError:
-        raise ValueError(f"{path}: no such file; write a CSV with the header {known}") from None
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
-    if len(lines) > MAX_ROWS + 1:
-        raise ValueError(f"{path}: line {MAX_ROWS + 2}: more than {MAX_ROWS} rows, an hour at 30 fps; cut the file up")
-    columns = [cell.strip() for cell in "".join(lines[:1]).split(",")]
-    if sorted(columns) not in [sorted(header.split(",")) for header in headers]:
-        raise ValueError(f"{path}: line 1: the header must be {known}, it is {','.join(columns)[:80] or 'empty'}")
-    rows = []
-    for number, line in enumerate(lines[1:], 2):
-        where, cells = f"{path}: line {number}:", [cell.strip() for cell in line.split(",")]
-        if not any(cells):
-            continue
-        if len(cells) != len(columns):
-            raise ValueError(f"{where} {len(cells)} cells where the header has {len(columns)}")
-        numbers = [finite_number(cell, MAX_DISTANCE) for cell in cells]
-        if None in numbers:
-            wrong, what = numbers.index(None), f"not a finite number of at most {MAX_DISTANCE:g} either way"
-            raise ValueError(f"{where} {columns[wrong]} is {cells[wrong][:40]!r}, {what}")
-        rows.append((where, dict(zip(columns, numbers, strict=True))))
+    rows = read_text_table(path, *headers)
+    if len(rows) > MAX_ROWS:
+        raise ValueError(f"{rows[MAX_ROWS][0]} more than {MAX_ROWS} rows, an hour at 30 fps; cut the file up")
+    for where, row in rows:
+        for name, cell in row.items():
+            row[name] = finite_number(cell.replace(",", "."), MAX_DISTANCE)
+            if row[name] is None:
+                what = f"not a finite number of at most {MAX_DISTANCE:g} either way"
+                raise ValueError(f"{where} {name} is {cell[:40]!r}, {what}")
     return rows
 
 
