@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import forward_kinematics, resample, turn
 from f3amd_lib.text.data import humanml3d, redundant
 from f3amd_lib.text.data.text_motions import TextMotions
+from f3amd_lib.text.stages import motionpcm_training
 
 LENGTHS = {"000001": 60, "M000001": 60, "000002": 120, "000003": 30, "000004": 250}
 TEXTS = {
@@ -70,15 +72,12 @@ def test_both_published_layouts_are_read(tmp_path, layout, joints, fps, clips):
 
 @pytest.mark.parametrize("layout, contact_step", [("humanml3d", 0.002), ("kit", 0.05)])
 def test_contacts_are_judged_by_the_step_of_the_folders_own_unit(tmp_path, layout, contact_step):
-    data = humanml3d.read_humanml3d(write_tree(tmp_path, layout)).select([0])
+    shutil.rmtree(write_tree(tmp_path, layout) / "new_joint_vecs")
+    data = humanml3d.read_humanml3d(tmp_path).select([0])
     clip = data.clip(0)
     feet = redundant.redundant_from_positions(data.skeleton, clip, contact_step=contact_step)[:, -4:]
     other = redundant.redundant_from_positions(data.skeleton, clip, contact_step=0.052 - contact_step)[:, -4:]
     assert np.array_equal(data.redundant_vectors()[:-1, -4:], feet) and not np.array_equal(feet, other)
-
-
-def append(path, text):
-    path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
 
 
 def put(name, array):
@@ -92,34 +91,116 @@ def add(file, text):
 
 
 BROKEN = {
-    "a pickle": (put("000002", np.array([{}], dtype=object)), r"000002\.npy: holds no positions \[L, 22, 3\]"),
-    "cut short": (lambda f: (f / "new_joints/000002.npy").write_bytes(b"\x93NUMPY"), r"000002\.npy: holds no"),
-    "a joint less": (put("000002", np.zeros((50, 21, 3))), r"shape \(50, 21, 3\)"),
-    "not finite": (put("000002", np.full((50, 22, 3), np.nan)), r"000002\.npy: .* not finite"),
-    "no text": (lambda f: (f / "texts/000001.txt").unlink(), r"000001\.txt: cannot be read as text"),
-    "empty text": (lambda f: (f / "texts/000001.txt").write_text(""), r"000001\.txt: holds no caption"),
-    "few parts": (add("texts/000001.txt", "a man#0.0\n"), r"000001\.txt, line 3: 'a man#0.0' is not caption#words"),
-    "no caption": (add("texts/000001.txt", "#x#0.0#0.0\n"), r"line 3: .*the caption is empty"),
-    "words for times": (add("texts/000001.txt", "a#b#now#0.0\n"), r"line 3: .*'now'"),
-    "falling times": (add("texts/000001.txt", "a#b#2.0#1.0\n"), r"line 3: .*times do not rise"),
-    "after the end": (add("texts/000001.txt", "a#b#7.0#9.0\n"), r"line 3: begins at 7.0 s"),
-    "twice": (add("test.txt", "000001\n"), r"test\.txt, line 2: '000001' is listed before"),
-    "no id": (add("test.txt", "../000001\n"), r"test\.txt, line 2: .*no plain id"),
-    "no split": (lambda f: (f / "val.txt").unlink(), r"val\.txt: cannot be read as text"),
-    "all too short": (
-        lambda f: [(f / f"{split}.txt").write_text("000003\n" * (split == "train")) for split in SPLITS],
-        "no clip of 40 to 199 frames",
-    ),
-    "thirty joints": (put("000001", np.zeros((50, 30, 3))), "has 30 joints"),
+    "a pickle": (put("000002", np.array([{}], dtype=object)), "000002", "000002.npy cannot be used"),
+    "cut short": (lambda f: (f / "new_joints/000002.npy").write_bytes(b"\x93NUMPY"), "000002", "cannot be used"),
+    "a joint less": (put("000002", np.zeros((50, 21, 3))), "000002", "shape (50, 21, 3)"),
+    "not finite": (put("000002", np.full((50, 22, 3), np.nan)), "000002", "not finite"),
+    "thirty joints first": (put("000001", np.zeros((50, 30, 3))), "000001", "shape (50, 30, 3)"),
+    "no text": (lambda f: (f / "texts/000001.txt").unlink(), "000001", "000001.txt: no such file"),
+    "empty text": (lambda f: (f / "texts/000001.txt").write_text(""), "000001", "holds no caption"),
+    "few parts": (add("texts/000001.txt", "a man#0.0\n"), "texts/000001.txt, line 3", "is not caption#words"),
+    "no caption": (add("texts/000001.txt", "#x#0.0#0.0\n"), "texts/000001.txt, line 3", "the caption is empty"),
+    "words for times": (add("texts/000001.txt", "a#b#now#0.0\n"), "texts/000001.txt, line 3", "now"),
+    "falling times": (add("texts/000001.txt", "a#b#2.0#1.0\n"), "texts/000001.txt, line 3", "times do not rise"),
+    "after the end": (add("texts/000001.txt", "a#b#7.0#9.0\n"), "texts/000001.txt, line 3", "begins at 7.0 s"),
+    "twice": (add("test.txt", "000001\n"), "test.txt, line 2", "'000001' is listed before"),
+    "no id": (add("test.txt", "../000001\n"), "test.txt, line 2", "no plain id"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_what_is_broken_is_refused_by_file_and_line(tmp_path, what):
-    breaking, words = BROKEN[what]
-    breaking(write_tree(tmp_path))
+def test_what_is_broken_is_left_out_and_named(tmp_path, caplog, what):
+    whole = humanml3d.read_humanml3d(write_tree(tmp_path))
+    breaking, place, reason = BROKEN[what]
+    breaking(tmp_path)
+    data = humanml3d.read_humanml3d(tmp_path)
+    assert reason in dict(data.skipped)[place] and f"{place}: " in caplog.text
+    kept = [name for name in whole.names if name.partition("@")[0] != place]
+    assert list(data.names) == kept and data.captions == tuple(whole.captions[whole.names.index(name)] for name in kept)
+
+
+@pytest.mark.parametrize(
+    "breaking, words",
+    [
+        (BROKEN["a pickle"][0], "2 of 5 records are broken, more than 20%.*000004: new_joints/000004.npy is missing"),
+        (lambda f: (f / "train.txt").unlink(), r"train\.txt: no such file"),
+        (
+            lambda f: [(f / f"{split}.txt").write_text("000003\n" * (split == "train")) for split in SPLITS],
+            "no clip of 40 to 199 frames",
+        ),
+        (lambda f: [put(name, np.zeros((50, 30, 3)))(f) for name in LENGTHS], "000001 has 30 joints"),
+        (lambda f: np.save(f / "Mean.npy", np.zeros(262)), r"Mean\.npy and Std\.npy are not mean and deviation of 263"),
+    ],
+)
+def test_more_than_a_fifth_broken_or_nothing_left_is_refused(tmp_path, breaking, words):
+    write_tree(tmp_path)
+    np.save(tmp_path / "Std.npy", np.ones(263))
+    (tmp_path / "new_joints/000004.npy").unlink()
+    (tmp_path / "new_joint_vecs/000004.npy").unlink()
+    breaking(tmp_path)
     with pytest.raises(ValueError, match=words):
         humanml3d.read_humanml3d(tmp_path)
+
+
+def test_a_folder_of_windows_with_vectors_alone_gives_the_same_positions(tmp_path):
+    whole = humanml3d.read_humanml3d(write_tree(tmp_path))
+    shutil.rmtree(tmp_path / "new_joints")
+    for file in tmp_path.glob("**/*.txt"):
+        file.write_bytes(file.read_text("utf-8").replace("\n", "\r\n").encode("utf-8-sig"))
+    data = humanml3d.read_humanml3d(tmp_path)
+    assert (data.names, data.captions, data.splits) == (whole.names, whole.captions, whole.splits)
+    np.testing.assert_allclose(data.positions, whole.positions, atol=2e-6)
+
+
+def test_clips_are_held_out_of_training_where_other_lists_are_missing(tmp_path):
+    write_tree(tmp_path)
+    names = [f"{mirrored}{k:06d}" for k in range(10, 30) for mirrored in ("", "M")]
+    for name in names:
+        shutil.copy(tmp_path / "new_joints/000001.npy", tmp_path / "new_joints" / f"{name}.npy")
+        shutil.copy(tmp_path / "texts/000001.txt", tmp_path / "texts" / f"{name}.txt")
+    (tmp_path / "train.txt").write_text("\n".join(names))
+    (tmp_path / "val.txt").unlink()
+    data = humanml3d.read_humanml3d(tmp_path)
+    split = dict(zip(data.names, data.splits, strict=True))
+    assert set(split[name] for name in names) == {"train", "validation"} and split["000002"] == "test"
+    assert all(split[name] == split[f"M{name}"] for name in names[::2])
+
+
+def test_parts_of_a_motion_have_the_vectors_and_the_folder_the_statistics_that_are_stored(tmp_path):
+    vectors = np.load(write_tree(tmp_path) / "new_joint_vecs" / "000002.npy")
+    statistics = np.linspace(-1, 1, 263, dtype=np.float32), np.linspace(1, 2, 263, dtype=np.float32)
+    for file, numbers in zip(("Mean.npy", "Std.npy"), statistics, strict=True):
+        np.save(tmp_path / file, numbers)
+    data = humanml3d.read_humanml3d(tmp_path)
+    part = data.names.index("000002@2-5")
+    np.testing.assert_array_equal(data.select([part]).redundant_vectors(), vectors[40:100])
+    np.testing.assert_array_equal(data.select([part], 24).redundant_vectors(), vectors[40:64])
+    np.testing.assert_array_equal(motionpcm_training.frame_statistics(data).mean, statistics[0])
+    (tmp_path / "new_joint_vecs" / "000002.npy").unlink()
+    computed = humanml3d.read_humanml3d(tmp_path).redundant_vectors()[data.start[part] : data.start[part + 1]]
+    assert np.isfinite(computed).all() and np.abs(computed - vectors[40:100]).max() > 0.01  # faces otherwise
+
+
+@pytest.mark.slow
+def test_a_folder_with_ten_broken_records_of_sixty_trains(tmp_path, caplog):
+    folder = write_tree(tmp_path / "set")
+    names = {split: [f"{split}{k}" for k in range(count)] for split, count in (("train", 50), ("val", 7), ("test", 3))}
+    for split, every in names.items():
+        (folder / f"{split}.txt").write_text("\n".join(every))
+        for name in every:
+            for part, known in (
+                ("new_joints", "000001.npy"),
+                ("new_joint_vecs", "000001.npy"),
+                ("texts", "000001.txt"),
+            ):
+                shutil.copy(folder / part / known, folder / part / known.replace("000001", name))
+    for k in range(5):
+        (folder / "texts" / f"train{k}.txt").write_text("#x#0.0#0.0\n")
+        put(f"train{k + 5}", np.full((60, 22, 3), np.inf))(folder)
+    words = "train --data folder --profile smoke --preset ACMDM-S-PS22-raw-n2 --steps 2 --batch-size 4 --window 40"
+    assert main([*words.split(), "--source", str(folder), "--out", str(tmp_path / "models")]) == 0
+    assert "10 of 60 records are broken and left out: train0: " in caplog.text
+    assert list((tmp_path / "models").glob("*.safetensors"))
 
 
 def test_caption_lines_are_read_as_they_were_written():

@@ -63,4 +63,4 @@ def test_one_row_without_a_caption_among_many_is_left_out(tmp_path, caplog, rows
     path.write_text("file,caption\nempty,\n" + "".join(f"take{k},walks\n" for k in range(rows - 1)))
     if not kept:
         return refused("1 of 3 records are broken.*line 2", read_caption_table, path)
-    assert len(read_caption_table(path)) == kept and "1 of 10 broken records" in caplog.text
+    assert len(read_caption_table(path)) == kept and "1 of 10 records are broken" in caplog.text

@@ -104,9 +104,8 @@ def test_each_part_of_a_turning_figure_by_hand(monkeypatch):
 def test_joint_features_are_steps_in_the_world_and_the_vectors_own_rotations_and_contacts():
     skeleton, positions = turning_figure()
     for shown in (positions, np.repeat(positions[:1], 9, axis=0)):
-        features, vectors = (
-            made(skeleton, shown) for made in (redundant.joint_features, redundant.redundant_from_positions)
-        )
+        vectors = redundant.redundant_from_positions(skeleton, shown)
+        features = redundant.joint_features(skeleton, shown, vectors)
         parts = {name: vectors[:, part] for name, part in redundant.vector_parts(8).items()}
         np.testing.assert_allclose(features[..., :3], np.diff(shown, axis=0))
         np.testing.assert_allclose(features[:, 1:, 3:9].reshape(len(features), -1), parts["rotations"])

@@ -106,7 +106,8 @@ def read_caption_table(path) -> dict[str, tuple[str, ...]]:
     for where, row in rows:
         name = re.sub(r"(?i)\.bvh$", "", re.split(r"[\\/]", row["file"])[-1])
         if not name or not row["caption"] or "#" in row["caption"]:
-            bad.append((where.rpartition(": ")[2][:-1], "needs a file and a caption; a # parts the fields of HumanML3D's texts"))
+            what = "needs a file and a caption; a # parts the fields of HumanML3D's texts"
+            bad.append((where.rpartition(": ")[2][:-1], what))
             continue
         said.setdefault(name, {})[row["caption"]] = None
     leave_out(path, bad, len(rows))

@@ -33,4 +33,6 @@ def leave_out(
         raise ValueError(f"{where}: {what}; mend them or take them out: {named}")
     if every:
         of_parts = f", and {len(parts)} parts of others" if parts else ""
-        log.warning("%s: %d of %d broken records left out%s: %s", where, len(broken), num_records, of_parts, named)
+        log.warning(
+            "%s: %d of %d records are broken and left out%s: %s", where, len(broken), num_records, of_parts, named
+        )

@@ -146,22 +146,19 @@ def redundant_from_positions(skeleton: Skeleton, positions, *, contact_step: flo
     return np.concatenate([part.reshape(len(step), -1) for part in parts], axis=-1)
 
 
-def joint_features(skeleton: Skeleton, positions, *, contact_step: float = CONTACT_STEP) -> np.ndarray:
+def joint_features(skeleton: Skeleton, positions, vectors) -> np.ndarray:
     """Return what InterGen's representation adds to each joint's position.
 
     Args:
-      skeleton, positions, contact_step: as in `redundant_from_positions`.
+      skeleton, positions: as in `redundant_from_positions`.
+      vectors: what that returns.
 
     Returns:
       [L - 1, J, 10], float64: step to the next frame in the world, metres; 6D rotation of the bone that leads to the
       joint, as in the redundant vector; contact, 0 or 1. What a joint lacks is 0: the root's bone, contact but of feet.
 
-    Raises:
-      ValueError: as `redundant_from_positions`.
-
     Source: ACMDM section 4.2; Liang et al. 2024 (InterGen), its non-canonical representation.
     """
-    vectors = redundant_from_positions(skeleton, positions, contact_step=contact_step)
     parts = vector_parts(skeleton.num_joints)
     features = np.zeros((len(vectors), skeleton.num_joints, NUM_JOINT_FEATURES))
     features[..., :3] = np.diff(np.asarray(positions, np.float64), axis=0)

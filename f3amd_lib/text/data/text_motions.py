@@ -10,9 +10,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,6 +84,9 @@ class TextMotions:
       licence, credit: terms of the motion.
       skipped: (clip, reason) of those left out.
       contact_step: squared step below which a foot is in contact, in the positions' unit.
+      stored: (file, first frame there) of each clip's redundant vectors, [K], None for a file where they are computed;
+        empty where all are.
+      statistics: mean and deviation of redundant vectors, [12 J - 1] each, that came with the data.
     """
 
     name: str
@@ -100,6 +102,8 @@ class TextMotions:
     credit: str = ""
     skipped: tuple[tuple[str, str], ...] = ()
     contact_step: float = redundant.CONTACT_STEP
+    stored: tuple[tuple[Path | None, int], ...] = ()
+    statistics: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def joined(cls, clips, **attributes) -> TextMotions:
@@ -146,7 +150,8 @@ class TextMotions:
         """Return a data set of some of the clips, in the order given; of each no more than its first frames."""
         kept = self.lengths[list(clips)] if most_frames is None else np.minimum(self.lengths[list(clips)], most_frames)
         rows = np.concatenate([self.start[k] + np.arange(count) for k, count in zip(clips, kept, strict=True)])
-        chosen = {what: tuple(getattr(self, what)[k] for k in clips) for what in _LISTS}
+        lists = (*_LISTS, "stored") if self.stored else _LISTS
+        chosen = {what: tuple(getattr(self, what)[k] for k in clips) for what in lists}
         return dataclasses.replace(self, positions=self.positions[rows], start=np.cumsum([0, *kept]), **chosen)
 
     def cut(self, most_frames: int) -> TextMotions:
@@ -166,21 +171,34 @@ class TextMotions:
     def redundant_vectors(self) -> np.ndarray:
         """Return redundant vectors of all frames, [N, 12 J - 1], float32.
 
-        A clip's last frame has no next one to step to: it is taken to go on as it moves.
+        Those stored with the data are taken as they are, so that a part of a motion faces as it does in the whole. Of
+        those computed, a clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        return self._of_each(partial(redundant.redundant_from_positions, contact_step=self.contact_step))
+        return np.concatenate(list(self._vectors()))
 
     def essential_features(self) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
-        return self._of_each(redundant.essential_features)
+        features = (redundant.essential_features(self.skeleton, clip) for clip in self._going_on())
+        return np.concatenate([feature.astype(np.float32) for feature in features])
 
     def joint_features(self) -> np.ndarray:
         """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
-        return self._of_each(partial(redundant.joint_features, contact_step=self.contact_step))
+        every = zip(self._going_on(), self._vectors(), strict=True)
+        features = (redundant.joint_features(self.skeleton, clip, vectors) for clip, vectors in every)
+        return np.concatenate([feature.astype(np.float32) for feature in features])
 
-    def _of_each(self, features) -> np.ndarray:
-        clips = (self.clip(number) for number in range(self.num_clips))
-        return np.concatenate([features(self.skeleton, going_on(clip)).astype(np.float32) for clip in clips])
+    def _going_on(self) -> Iterator[np.ndarray]:
+        """Yield the positions of each clip, and one frame more."""
+        return (going_on(self.clip(number)) for number in range(self.num_clips))
+
+    def _vectors(self) -> Iterator[np.ndarray]:
+        """Yield the redundant vectors of each clip, float32."""
+        stored = self.stored or [(None, 0)] * self.num_clips
+        for (file, first), clip in zip(stored, self._going_on(), strict=True):
+            vectors = [np.nan] if file is None else np.load(file, mmap_mode="r")[first : first + len(clip) - 1]
+            if not np.isfinite(vectors).all():
+                vectors = redundant.redundant_from_positions(self.skeleton, clip, contact_step=self.contact_step)
+            yield np.asarray(vectors, np.float32)
 
 
 def going_on(positions) -> np.ndarray:

@@ -103,8 +103,8 @@ class LatentMotionTraining:
 
 @functools.lru_cache(maxsize=1)
 def frame_statistics(data: TextMotions) -> AxisNormaliser:
-    """Return mean and deviation of the training clips' redundant vectors, as HumanML3D has them, [features]."""
-    mean, deviation = grouped_statistics(data.select(data.members("train")).redundant_vectors())
+    """Return mean and deviation of redundant vectors: the data's own, or the training clips', [features]."""
+    mean, deviation = data.statistics or grouped_statistics(data.select(data.members("train")).redundant_vectors())
     return AxisNormaliser(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
 
 
