@@ -68,6 +68,23 @@ def _say_written(*files: Path) -> None:
 
 
 @dataclass(frozen=True)
+class People:
+    """How the motion of a folder is read.
+
+    Attributes:
+      retarget: bring several people to the skeleton of the first file.
+      scale: metres in a unit of the files, instead of what legs tell.
+      up: axis that is up in the files, Y or Z, instead of what legs tell.
+      keep_first: keep a T-pose before the take.
+    """
+
+    retarget: bool = False
+    scale: float | None = None
+    up: Literal["Y", "Z"] | None = None
+    keep_first: bool = False
+
+
+@dataclass(frozen=True)
 class Data:
     """Motion, and how much is done with it.
 
@@ -82,6 +99,7 @@ class Data:
     profile: str = "laptop"
     source: str | None = None
     window: int | None = None
+    people: People = People()
 
     def numbers(self, **overrides):
         """Return the profile with those values replaced that are given."""
@@ -93,7 +111,7 @@ class Data:
         terminal.check_there(self.source)
         from f3amd_lib.training.pipeline import prepare
 
-        return prepare(profile, path=self.source), profile
+        return prepare(profile, path=self.source, **vars(self.people)), profile
 
 
 @dataclass(frozen=True)
@@ -213,13 +231,14 @@ def data(motion: Data) -> None:
 
 
 def dataset(
-    captions: Path, source: str | None = None, data: str = "folder", fps: float = 20.0, out: Path = Path("out/dataset")
-) -> None:
+    captions: Path, people: People, source: str | None = None, data: str = "folder", fps: float = 20.0,
+    out: Path = Path("out/dataset"),
+) -> None:  # fmt: skip
     """Write motions with captions as a data set in HumanML3D's layout, for text-to-motion code.
 
     Args:
-      captions: CSV file with columns file and caption, one line a caption.
-      source: folder or zip of BVH files of one skeleton.
+      captions: table (CSV) with columns file and caption, one line a caption.
+      source: folder or zip of BVH files.
       data: another data set instead of a folder: synthetic, bandai, 100style.
       fps: frames per second to write.
       out: folder to write to; must be empty or not there yet.
@@ -229,7 +248,7 @@ def dataset(
     from f3amd_companion.serving import captioned_folder
     from f3amd_lib.data import sources
 
-    opened = sources.open_dataset(data, path=source)
+    opened = sources.open_dataset(data, path=source, **vars(people))
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
     _say_written(captioned_folder.write_humanml3d(out, written))
     for clip, reason in written.skipped:
@@ -777,8 +796,8 @@ def sweep(
     from f3amd_lib.ground.records import THROUGH_CLASSIFIER, run_record
 
     profile = motion.numbers()
-    if motion.window not in (None, profile.window):
-        raise ValueError("--window is for f3amd measure alone")
+    if motion.window not in (None, profile.window) or motion.people != People():
+        raise ValueError("--window is for f3amd measure alone, and how a folder is read for one process")
     folder = (out or runs_dir(profile.dataset, profile.name)).resolve()
     results = results_dir(profile.dataset, profile.name).resolve()
     work = engine.Work(profile, motion.source, results.parents[1], folder, batch_size)

@@ -74,7 +74,7 @@ def test_pack_keeps_clips_labels_and_order(packed, motions):
     np.testing.assert_array_equal(packed.clip_start, [0, 42, 102, 152])
     np.testing.assert_array_equal(packed.clip_style, [1, 0, 1])
     np.testing.assert_array_equal(packed.clip_split, [0, 1, 0])
-    assert packed.skipped == (("sad_2", "41 frames, shorter than a window of 42"),)
+    assert packed.skipped == (("sad_2", "41 frames, shorter than 42"),)
     assert (packed.primary_styles, packed.mirror_styles) == (("happy",), {"sad"})
     assert (packed.num_clips, packed.num_frames) == (3, 152)
     assert packed.root_position.dtype == np.float32
@@ -135,7 +135,7 @@ def test_one_skeleton_for_all(motions):
 
 
 def test_nothing_but_short_clips_is_an_error():
-    with pytest.raises(ValueError, match="'handmade' has no clip of at least 42 frames; 1 are"):
+    with pytest.raises(ValueError, match="'handmade' has no clip of at least 42 frames; 1 are left out"):
         pack(make_dataset({"sad_1": legs_motion(41, 0)}), progress=False)
 
 

@@ -1,6 +1,7 @@
 """Data sets by name: finding, verifying, refusing, splitting."""
 
 import collections
+import dataclasses
 import hashlib
 import shutil
 import zipfile
@@ -13,7 +14,10 @@ import pytest
 from builders import refused
 
 from f3amd_lib.data import sources
+from f3amd_lib.data.packed import pack
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE, assign_splits, open_dataset
+from f3amd_lib.motion import synthetic
+from f3amd_lib.motion.bvh import write_bvh
 
 
 def line_bvh(frames: int, *, step_cm: float = 1.0, frame_time: str = "0.016667") -> str:
@@ -137,6 +141,62 @@ def test_a_broken_file_is_named_on_loading(tmp_path):
     (tmp_path / "x_1.bvh").write_text(line_bvh(50).replace("\n7 90", "\nseven 90"))
     (clip,) = open_dataset("folder", path=tmp_path).clips
     refused(r"x_1\.bvh, line 20: 'seven'", clip.load)
+
+
+def write_people(folder: Path, sizes, scale: float = 1.0) -> Path:
+    """The same walk of 2 s by people of these sizes, in centimetres times a scale."""
+    folder.mkdir(exist_ok=True)
+    for number, size in enumerate(sizes):
+        motion = synthetic.synthesize("Neutral", seconds=2.0, seed=0)
+        size = size * scale
+        offsets, root = size * np.asarray(motion.skeleton.offsets), size * np.asarray(motion.root_position)
+        skeleton = dataclasses.replace(motion.skeleton, offsets=offsets, end_sites=())
+        write_bvh(folder / f"walk_{number}.bvh", motion.replace(skeleton=skeleton, root_position=root))
+    return folder
+
+
+@pytest.mark.parametrize("broken, message", [(1, "1 of 6 records are broken"), (2, "2 of 6 records are broken, more")])
+def test_one_broken_file_of_a_folder_is_left_out_and_many_are_refused(tmp_path, caplog, broken, message):
+    write_people(tmp_path, [1.0] * 6)
+    for number in range(broken):
+        (tmp_path / f"walk_{number}.bvh").write_text("HIERARCHY\nRUBBISH\n")
+    dataset = open_dataset("folder", path=tmp_path)
+    if broken > 1:
+        return refused(f"{message}.*walk_1", pack, dataset, progress=False)
+    packed = pack(dataset, progress=False)
+    assert packed.clip_names == tuple(f"walk_{number}" for number in range(1, 6))
+    assert "MOTION" in dict(packed.skipped)["walk_0"] and message in caplog.text and "walk_0: " in caplog.text
+
+
+def test_metres_are_recognised_in_a_folder_and_said_once(tmp_path, caplog):
+    packed = pack(open_dataset("folder", path=write_people(tmp_path, [1.0] * 6, 0.01)), progress=False)
+    assert 0.7 < packed.root_position[:, 1].mean() < 1.2
+    assert caplog.text.count("read in metres") == 1 and "6 of 6 clips" in caplog.text
+    told = open_dataset("folder", path=tmp_path, scale=0.5)
+    assert told.fingerprint != open_dataset("folder", path=tmp_path).fingerprint
+    assert told.clips[0].load().root_position[0, 1] == pytest.approx(packed.root_position[0, 1] / 2, rel=1e-3)
+    refused("are for a folder", open_dataset, "synthetic", scale=0.5)
+
+
+def test_several_people_are_brought_to_one_skeleton_if_asked(tmp_path):
+    write_people(tmp_path, [1.0, 1.1, 0.9])
+    refused("walk_1: its skeleton differs from that of walk_0.*--retarget", pack, open_dataset("folder", path=tmp_path))
+    packed = pack(open_dataset("folder", path=tmp_path, retarget=True), progress=False)
+    own = pack(open_dataset("folder", path=write_people(tmp_path / "one", [1.0])), progress=False)
+    assert packed.num_clips == 3 and packed.skeleton == own.skeleton
+    for clip in (1, 2):
+        np.testing.assert_allclose(packed.motion(clip).positions, packed.motion(0).positions, atol=0.02)
+
+
+@pytest.mark.parametrize("raw", [b"l\xc3\xa4ufer", b"l\x84ufer"])
+def test_names_in_a_zip_without_the_mark_of_utf8(tmp_path, raw):
+    (tmp_path / "a.bvh").write_text(line_bvh(50))
+    path, stand_in = tmp_path / "a.zip", b"X" * len(raw)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(tmp_path / "a.bvh", f"{stand_in.decode()}/a.bvh")
+    path.write_bytes(path.read_bytes().replace(stand_in, raw))
+    dataset = open_dataset("folder", path=path)
+    assert dataset.styles == ("läufer",) and dataset.clips[0].load().num_frames > 1
 
 
 # --- 100STYLE, on a tiny tree ---------------------------------------------------------------------

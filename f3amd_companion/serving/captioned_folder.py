@@ -4,19 +4,21 @@
 """
 
 import json
+import logging
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits
+from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits, read_clips
 from f3amd_lib.ground.files import whole_folder
 from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.tables import read_text_table
-from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror, resample
+from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.text.data.humanml3d import SPLIT_FILES
 from f3amd_lib.text.data.redundant import grouped_statistics, redundant_from_positions
 from f3amd_lib.text.data.text_motions import (
@@ -28,6 +30,8 @@ from f3amd_lib.text.data.text_motions import (
     TextMotions,
     text_motions,
 )
+
+log = logging.getLogger("f3amd")
 
 
 def write_caption_line(caption: str) -> str:
@@ -116,6 +120,10 @@ def read_caption_table(path) -> dict[str, tuple[str, ...]]:
     return {name: tuple(captions) for name, captions in said.items()}
 
 
+_SIDED = re.compile(r"\b(left|right)|clockwise|\bc?cw\b")
+"""Words that are wrong of a mirror image."""
+
+
 def _has_twins(skeleton: Skeleton) -> bool:
     """Say whether every joint with a side has its twin on the other one."""
     try:
@@ -128,7 +136,8 @@ def captioned_motions(dataset: Dataset, captions: Mapping[str, Sequence[str]], *
     """Put the motions of a data set, such as a folder of BVH files, together with captions.
 
     Each clip of 24 frames or more is brought to `fps`, moved to the canonical start, and cut to 199; its mirror image
-    joins it where joints have twins and the captions name no side. Clips are split by their names, 80, 5 and 15 %.
+    joins it where joints have twins and the captions name no side and no way round. Clips are split by their names, 80,
+    5 and 15 %.
 
     Args:
       dataset: from `open_dataset`.
@@ -136,34 +145,30 @@ def captioned_motions(dataset: Dataset, captions: Mapping[str, Sequence[str]], *
       fps: wanted rate.
 
     Raises:
-      ValueError: for a caption without a motion, no motion with a caption, a name that two motions
-        share, or skeletons that differ.
+      ValueError: if a fifth of the captions have no motion, or several; for no motion with a caption; or as
+        `read_clips`.
     """
     shorts = [clip.name.rsplit("/", 1)[-1] for clip in dataset.clips]
-    for name in captions:
-        if shorts.count(name) != 1:
-            raise ValueError(f"captions of {name!r} have {shorts.count(name)} motions{nearest_hint(name, set(shorts))}")
+    counts = Counter(shorts)
+    lost = [(name, f"{counts[name]} motions{nearest_hint(name, counts)}") for name in captions if counts[name] != 1]
+    leave_out(f"captions of {dataset.name!r}", lost, len(captions))
+    captions = {name: tuple(said) for name, said in captions.items() if counts[name] == 1}
     splits = assign_splits(((name, "all") for name in captions), percent=HELD_OUT_PERCENT)
-    skeleton, clips, skipped = None, [], []
-    every = zip(shorts, dataset.clips, strict=True)
-    for short, clip in tqdm(every, f"reading {dataset.name}", len(shorts), unit="clip", disable=None):
-        if short not in captions:
-            skipped.append((clip.name, "no caption"))
-            continue
-        motion = resample(clip.loader(), fps)
-        skeleton = skeleton or motion.skeleton
-        if motion.skeleton != skeleton:
-            raise ValueError(f"{clip.name}: its skeleton differs from the first clip's; a data set needs one")
-        if motion.num_frames < FEWEST_FRAMES:
-            skipped.append((clip.name, f"{motion.num_frames} frames, fewer than {FEWEST_FRAMES}"))
-            continue
+    every = list(zip(shorts, dataset.clips, strict=True))
+    clips, skipped = [], [*lost, *((clip.name, "no caption") for short, clip in every if short not in captions)]
+    captioned = replace(dataset, clips=tuple(clip for short, clip in every if short in captions))
+    for clip, motion in read_clips(captioned, skipped, fps=fps, fewest=FEWEST_FRAMES):
+        short = clip.name.rsplit("/", 1)[-1]
+        skeleton, said = motion.skeleton, captions[short]
         motion = motion.slice(0, min(motion.num_frames, MOST_FRAMES + 1) // UNIT * UNIT)
-        said = tuple(captions[short])
         clips.append((short, motion, said, splits[short], short))
-        if _has_twins(skeleton) and not re.search(r"\b(left|right)", " ".join(said).lower()):
+        if _has_twins(skeleton) and not _SIDED.search(" ".join(said).lower()):
             seen = Motion.from_positions(skeleton, motion.positions, fps)
             clips.append((f"M{short}", mirror(seen), said, splits[short], short))
     if not clips:
         raise ValueError(f"data set {dataset.name!r}: no captioned motion has {FEWEST_FRAMES} frames at {fps:g} fps")
+    if empty := [split for split in SPLITS if split not in {clip[3] for clip in clips}]:
+        what = "training and judging need one in each; caption three motions or more"
+        log.warning("%s: no clip for %s: %s", dataset.name, " and ".join(empty), what)
     described = {name: getattr(dataset, name) for name in ("name", "licence", "credit")}
     return text_motions(clips, skeleton=skeleton, fps=fps, skipped=tuple(skipped), **described)

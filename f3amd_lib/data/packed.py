@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pooch
-from tqdm import tqdm
 
 from f3amd_lib.data.features import lowest_toe_height
-from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset
+from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset, read_clips
 from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
@@ -93,8 +92,8 @@ class PackedMotion:
 def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
     """Read all clips of a data set into one packed set of arrays.
 
-    Clips shorter than one window (`MINIMUM_FRAMES`) are left out and listed in `skipped`. Any clip
-    that cannot be read or verified stops the whole: nothing is half-used.
+    Clips shorter than one window (`MINIMUM_FRAMES`) are left out and listed in `skipped`, and so are broken files of a
+    folder (`read_clips`).
 
     Args:
       dataset: from `open_dataset`.
@@ -104,23 +103,15 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
       The packed arrays.
 
     Raises:
-      ValueError: naming the first file that is broken, or whose skeleton differs from the others'.
+      ValueError: as `read_clips`, or if no clip is left.
     """
     kept, skipped = [], []
-    clips = tqdm(dataset.clips, desc=f"reading {dataset.name}", unit="clip", disable=not progress)
-    for clip in clips:
-        motion = clip.load()
-        if motion.num_frames < MINIMUM_FRAMES:
-            skipped.append((clip.name, f"{motion.num_frames} frames, shorter than a window of {MINIMUM_FRAMES}"))
-            continue
-        if kept and motion.skeleton != kept[0][1]:
-            what = f"its skeleton differs from that of {kept[0][0].name} in names, parents or bone lengths"
-            raise ValueError(f"{clip.name}: {what}; a data set needs one: retarget or remove the file")
+    for clip, motion in read_clips(dataset, skipped, progress=progress):
         rotations = rotation_6d_from_matrix(motion.needed_rotations("a packed data set")).astype(np.float16)
         root = motion.root_position.astype(np.float32)
         kept.append((clip, motion.skeleton, root, rotations, lowest_toe_height(motion)))
     if not kept:
-        what = f"has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are shorter"
+        what = f"has no clip of at least {MINIMUM_FRAMES} frames; {len(skipped)} are left out"
         raise ValueError(f"data set {dataset.name!r} {what}")
     clips, skeletons, root_positions, rotations, floors = zip(*kept, strict=True)
     return PackedMotion(
@@ -175,7 +166,9 @@ def cache_folder() -> Path:
 
 def cache_path(dataset: Dataset) -> Path:
     """Return where the packed form of a data set is cached."""
-    return cache_folder() / f"{dataset.name}-{dataset.fingerprint[:16]}-v{_FORMAT}.safetensors"
+    # Earlier folders were packed without a look at units and axes.
+    name = "people" if dataset.name == "folder" else dataset.name
+    return cache_folder() / f"{name}-{dataset.fingerprint[:16]}-v{_FORMAT}.safetensors"
 
 
 def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:

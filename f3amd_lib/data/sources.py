@@ -13,29 +13,38 @@ folder. Archives are read in place. Every file is checked before it is parsed, s
 is refused by name and none of its numbers get used.
 """
 
+import contextlib
 import functools
 import hashlib
 import io
 import json
+import logging
 import os
 import re
+import unicodedata
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pandas as pd
 import pooch
+from tqdm import tqdm
 
 from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
+from f3amd_lib.motion.plausible import as_person
+from f3amd_lib.motion.retarget import retarget as put_on
 from f3amd_lib.motion.skeleton import Motion, resample
+
+log = logging.getLogger("f3amd")
 
 _SETS = read_toml(Path(__file__).with_name("data_sets.toml"))
 NAMES = tuple(_SETS)
@@ -59,6 +68,7 @@ class Clip:
       content: what is done in it, such as "walk" or "FW"; may be empty.
       split: "train", "validation" or "test".
       loader: callable without arguments that returns the motion.
+      person: of a stranger's motion, how it is made plausible (`as_person`); None for motion that we know.
     """
 
     name: str
@@ -66,10 +76,18 @@ class Clip:
     content: str
     split: str
     loader: Callable[[], Motion] = field(repr=False)
+    person: Mapping | None = None
 
-    def load(self) -> Motion:
+    def load(self, fps: float = FPS) -> Motion:
         """Read, verify and return the motion at 30 fps in metres; ValueError names a bad file."""
-        return resample(self.loader(), FPS).replace(name=self.name)
+        return self.load_noted(fps)[0]
+
+    def load_noted(self, fps: float = FPS) -> tuple[Motion, list[str]]:
+        """Return what `load` does, and notes on what had to be corrected."""
+        motion, notes = self.loader(), []
+        if self.person is not None:
+            motion, notes = as_person(motion, **self.person)
+        return resample(motion, fps).replace(name=self.name), notes
 
 
 @dataclass(frozen=True)
@@ -84,6 +102,7 @@ class Dataset:
       clips: all takes, sorted by name.
       primary_styles: classes that carry evaluation per style.
       mirror_styles: styles that stay themselves when left and right are swapped.
+      retarget: bring all clips to the skeleton of the first.
     """
 
     name: str
@@ -94,11 +113,13 @@ class Dataset:
     clips: tuple[Clip, ...]
     primary_styles: tuple[str, ...]
     mirror_styles: frozenset[str]
+    retarget: bool = False
 
 
 def open_dataset(
     name: str, *, path=None, locomotion_only: bool = True, seconds_per_style: float = 60.0,
-    num_styles: int | None = None,
+    num_styles: int | None = None, retarget: bool = False, scale: float | None = None, up: str | None = None,
+    keep_first: bool = False,
 ) -> Dataset:  # fmt: skip
     """Open a data set by name: find or download it, verify it and list its clips.
 
@@ -108,6 +129,8 @@ def open_dataset(
       locomotion_only: bandai only: leave out bows, waves, dances and the like.
       seconds_per_style: synthetic only: motion per style, shared out over several takes.
       num_styles: keep only so many styles (primary ones first, then by name); None keeps all.
+      retarget: folder only: bring several people's motion to the skeleton of the first clip.
+      scale, up, keep_first: folder only, as in `as_person`.
 
     Returns:
       The data set. Numbers are read by `Clip.load`.
@@ -119,13 +142,66 @@ def open_dataset(
     check_known(name, NAMES, "data set")
     if num_styles is not None and num_styles < 1:
         raise ValueError(f"num_styles must be at least 1, got {num_styles}")
+    person = {"scale": scale, "up": up, "keep_first": keep_first}
+    if name != "folder" and (retarget or any(person.values())):
+        raise ValueError(f"retarget, {', '.join(person)} are for a folder, not for data set {name!r}: leave them out")
     if name == "synthetic":
         dataset = _open_synthetic(seconds_per_style, num_styles)
     elif name == "bandai":
         dataset = _open_bandai(path, locomotion_only)
     else:
-        dataset = {"100style": _open_100style, "folder": _open_folder}[name](path)
-    return dataset if num_styles is None else _keep_styles(dataset, num_styles)
+        dataset = _open_100style(path) if name == "100style" else _open_folder(path, retarget, person)
+    dataset = dataset if num_styles is None else _keep_styles(dataset, num_styles)
+    return replace(dataset, retarget=retarget)
+
+
+def read_clips(
+    dataset: Dataset, skipped: list[tuple[str, str]], *, fps: float = FPS, fewest: int = MINIMUM_FRAMES, progress=True
+) -> Iterator[tuple[Clip, Motion]]:
+    """Read the clips of a data set one after the other; at the end, say what was corrected or left out.
+
+    A data set that we know stops at its first broken file: fetch it again. Of a folder, broken files are left out.
+
+    Args:
+      dataset: from `open_dataset`.
+      skipped: takes (clip name, reason) of those left out.
+      fps: wanted rate.
+      fewest: frames of a clip; shorter ones are left out.
+      progress: show a progress bar, where there is a terminal.
+
+    Yields:
+      (clip, motion), all of one skeleton.
+
+    Raises:
+      ValueError: naming a file that is broken, or of a folder a fifth of them; or skeletons that differ.
+    """
+    first, broken, notes = None, [], {}
+    every = tqdm(dataset.clips, f"reading {dataset.name}", unit="clip", disable=None if progress else True)
+    for clip in every:
+        try:
+            motion, noted = clip.load_noted(fps)
+            if motion.num_frames < fewest:
+                skipped.append((clip.name, f"{motion.num_frames} frames, shorter than {fewest}"))
+                continue
+            first = first or motion
+            if motion.skeleton != first.skeleton and dataset.retarget:
+                motion = put_on(motion, first)[0]
+        except ValueError as error:
+            if clip.person is None:
+                raise
+            broken.append((clip.name, str(error)))
+            continue
+        if motion.skeleton != first.skeleton:
+            what = f"its skeleton differs from that of {first.name} in names, parents or bone lengths"
+            how = "pass --retarget (retarget=True) to bring all to one, or remove the file"
+            raise ValueError(f"{clip.name}: {what}; a data set needs one: {how}")
+        for note in noted:
+            notes.setdefault(note.partition(":")[0], []).append(f"{note} ({clip.name})")
+        yield clip, motion
+    for noted in notes.values():
+        log.warning("%s: %d of %d clips: %s", dataset.name, len(noted), len(dataset.clips), noted[0])
+    skipped += broken
+    leave_out(dataset.name, broken, len(dataset.clips))
 
 
 def assign_splits(strata: Iterable[tuple[str, object]], percent: tuple[int, int] = (10, 10)) -> dict[str, str]:
@@ -166,7 +242,10 @@ in all, of 17 MB at most; text of numbers shrinks 3 to 5 times, of still frames 
 def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     """Open a zip once per process; a changed file is opened anew."""
     try:
-        opened = zipfile.ZipFile(path)
+        try:  # names without a mark of their encoding are mostly UTF-8, else as the format has it (cp437)
+            opened = zipfile.ZipFile(path, metadata_encoding="utf-8")
+        except UnicodeDecodeError:
+            opened = zipfile.ZipFile(path)
     # Also what a forged directory raises: ValueError, NotImplementedError, struct.error, ...
     except Exception as error:
         raise ValueError(f"{path}: broken or truncated zip archive ({error}); fetch it again") from error
@@ -252,8 +331,8 @@ def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
     published, folder = _SETS[name], pooch.os_cache("f3amd")
     if "url" not in published:
-        how = f"set {DATA_DIR_VARIABLE} (or path=...) to its folder or zip"
-        raise ValueError(f"data set {name!r} is downloaded from nowhere; {how}")
+        how = f"name its folder or zip by --source (path=...), or set {DATA_DIR_VARIABLE}"
+        raise ValueError(f"data set {name!r} is downloaded from nowhere: {how}")
     pooch.get_logger().setLevel("WARNING")
     url, digest, file = published["url"], published.get("hash"), published["file"]
     try:
@@ -471,26 +550,31 @@ def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> set[s
     return set(rows["Style Name"][rows["Symmetric"].str.strip() == "Yes"].str.strip())
 
 
-def _open_folder(path) -> Dataset:
+def _open_folder(path, retarget: bool, person: Mapping) -> Dataset:
     """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
     archive = _find_archive("folder", path)
     labelled = {}
     for member in archive.bvh_files():
         relative = PurePosixPath(member)
-        name = relative.with_suffix("").as_posix()
+        name = unicodedata.normalize("NFC", relative.with_suffix("").as_posix())
         if name in labelled:
             raise ValueError(f"{archive.label(member)}: two files differ only in the case of their suffix; rename one")
-        style, _, content = relative.stem.partition("_")
-        if relative.parent.name:
-            style, content = relative.parent.name, relative.stem
+        *_, style, content = ("", *name.split("/"))
+        if not style:
+            style, _, content = content.partition("_")
         labelled[name] = (member, style, content)
     if not labelled:
         raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
     splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
     clips, identities = [], []
     for name, (member, style, content) in sorted(labelled.items()):
-        there = archive.size_and_crc(member)
-        clips.append(Clip(name, style, content, splits[name], functools.partial(_read_take, archive, member, there)))
+        there = (0, 0)
+        with contextlib.suppress(ValueError):  # said when it is read
+            there = archive.size_and_crc(member)
+        loader = functools.partial(_read_take, archive, member, there)
+        clips.append(Clip(name, style, content, splits[name], loader, person))
         identities.append((name, *there))
+    # As before, where nothing is asked for: trainings go on.
+    asked = {key: value for key, value in (person | {"retarget": retarget}).items() if value}
     # Whether a style keeps its name when mirrored is not for us to guess.
-    return _dataset("folder", clips, identities, mirror=lambda style: False)
+    return _dataset("folder", clips, [identities, asked] if asked else identities, mirror=lambda style: False)

@@ -100,16 +100,16 @@ class PreparedData:
         )  # fmt: skip
 
 
-def prepare(profile: Profile, *, path=None) -> PreparedData:
+def prepare(profile: Profile, *, path=None, **of_folder) -> PreparedData:
     """Open, pack and lay out the data set that a profile asks for.
 
     Args:
       profile: names the data set and how much of it.
       path: folder or archive, where the data set needs one.
+      **of_folder: what `open_dataset` takes for a folder alone.
     """
-    dataset = open_dataset(
-        profile.dataset, path=path, seconds_per_style=profile.seconds_per_style, num_styles=profile.num_styles
-    )
+    how_much = {"seconds_per_style": profile.seconds_per_style, "num_styles": profile.num_styles}
+    dataset = open_dataset(profile.dataset, path=path, **how_much, **of_folder)
     return PreparedData(packed_dataset(dataset), profile.window, profile.num_history)
 
 
