@@ -44,6 +44,13 @@ def test_what_was_embedded_is_not_embedded_again(cache_dir):
     assert np.array_equal(embed_captions(captions, encoder).tokens, first.tokens) and encoder.calls == 3
 
 
+@pytest.mark.parametrize(
+    "printed, typed", [("“A person’s”", '"A person\'s"'), ("well‑known … – so", "well-known ...  -  so")]
+)
+def test_printers_quotes_and_dashes_are_embedded_as_those_of_a_keyboard(cache_dir, printed, typed):
+    assert np.array_equal(embed_captions([printed], Letters()).tokens, embed_captions([typed], Letters()).tokens)
+
+
 def test_many_captions_come_back_in_order(cache_dir):
     captions = ["a" * (1 + k % 9) for k in range(600)]
     embedded = embed_captions(captions, Letters())
@@ -66,7 +73,8 @@ def test_an_empty_caption_is_refused(cache_dir, captions, words):
 def test_words_that_a_model_never_saw_are_named():
     known = ["a person raises the left hand", "an elderly person walks"]
     check_words("An elderly person raises the hand.", known)
-    with pytest.raises(ValueError, match="never saw 'walsk', 'happily'; did you mean 'walks'"):
+    check_words("A person’s hand", ["a person's hand"])
+    with pytest.raises(ValueError, match="never saw 'walsk', 'happily'; did you mean 'walks'.*--any-words"):
         check_words("a person walsk happily", known)
 
 

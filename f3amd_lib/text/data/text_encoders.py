@@ -31,6 +31,10 @@ MOST_TOKENS = 32
 """Longer captions are refused: what was cut off could not be seen in the motion."""
 
 
+_PLAIN = dict.fromkeys("‘’‚‛′´`", "'") | dict.fromkeys("“”„‟″«»", '"') | dict.fromkeys("‐‑‒−", "-")
+_PLAIN |= dict.fromkeys("–—―", " - ") | dict.fromkeys("\u00a0\u202f\u2009", " ") | {"…": "..."}
+
+
 class TextEmbeddings(NamedTuple):
     """Captions as vectors.
 
@@ -67,6 +71,11 @@ class TextEncoder:
         return _padded(pieces, pooled)
 
 
+def plain_caption(caption: str) -> str:
+    """Return a caption with typewriter's quotes, dashes and blanks instead of a printer's."""
+    return caption.translate(str.maketrans(_PLAIN))
+
+
 def check_captions(captions: Sequence[str]) -> None:
     """Refuse what no motion could follow.
 
@@ -93,7 +102,8 @@ def check_words(caption: str, known: Sequence[str]) -> None:
     vocabulary = words_of(known)
     if unknown := [word for word in _words(caption) if word not in vocabulary]:
         hint = nearest_hint(unknown[0], vocabulary)
-        raise ValueError(f"caption {caption!r}: the model never saw {', '.join(map(repr, unknown))}{hint}")
+        never = f"the model never saw {', '.join(map(repr, unknown))}{hint}"
+        raise ValueError(f"caption {caption!r}: {never}; --any-words (any_words=True) lets them through")
 
 
 def words_of(captions: Sequence[str]) -> tuple[str, ...]:
@@ -102,7 +112,7 @@ def words_of(captions: Sequence[str]) -> tuple[str, ...]:
 
 
 def _words(text: str) -> list[str]:
-    return re.findall(r"[^\W\d_]+(?:['-][^\W\d_]+)*", text.lower())
+    return re.findall(r"[^\W\d_]+(?:['-][^\W\d_]+)*", plain_caption(text).lower())
 
 
 def _padded(pieces: Sequence[np.ndarray], pooled) -> TextEmbeddings:
@@ -207,6 +217,7 @@ def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddi
       ValueError: for a caption that is empty, too long, or that the encoder cannot read.
     """
     check_captions(captions)
+    captions = [plain_caption(caption) for caption in captions]
     key = hashlib.sha256("\n".join([encoder.identity, *captions]).encode()).hexdigest()[:16]
     path = cache_folder() / f"captions-{encoder.identity}-{key}.npz"
     if path.exists():
