@@ -260,7 +260,7 @@ def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags
         asked.update(options, suites=suites, flags=os.environ["XLA_FLAGS"])
         raise ValueError("enough")
 
-    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path: None)
+    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: None)
     monkeypatch.setattr(measurements, "measure_synthesis_time", note)
     words = ["bench", "--suite", "bars", "--suite", "main", "--again", "--characters", "8", "--characters", "1"]
     assert main(words) == 2

@@ -150,7 +150,7 @@ def test_every_claim_has_a_command_that_the_ledger_prints():
 def test_a_command_is_understood(run, monkeypatch):
     """The words reach the measurement that is meant; nothing is measured."""
     called = []
-    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path=None: profile)
+    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: profile)
     for name in measure.MEASUREMENTS:
         note = lambda prepared, profile, models, name=name, **extra: (
             called.append((name, profile.window, models, extra)) or "table"
@@ -208,7 +208,7 @@ def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, clai
 
 
 def test_a_window_of_another_length_is_for_what_the_ledger_asks_of_it(capsys, monkeypatch):
-    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path=None: profile)
+    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: profile)
     assert main(["measure", "feet", "--profile", "smoke", "--window", "64"]) == 2
     assert "for quality, trained and walking" in capsys.readouterr().err
 
