@@ -68,20 +68,52 @@ def _say_written(*files: Path) -> None:
 
 
 @dataclass(frozen=True)
-class People:
-    """How the motion of a folder is read.
+class Person:
+    """How BVH files of others are read.
+
+    Attributes:
+      scale: metres in a unit of the file, instead of what its legs tell.
+      up: axis that is up in the file, Y or Z, instead of what legs and hips tell.
+      joint_map: TOML file of lines such as left_knee = "calf_l": which joint plays a role, where it is not found.
+    """
+
+    scale: float | None = None
+    up: Literal["Y", "Z"] | None = None
+    joint_map: Path | None = None
+
+    def mapped(self) -> dict[str, str]:
+        """Return the joint map, role -> joint's name."""
+        from f3amd_lib.motion.plausible import read_joint_map
+
+        return read_joint_map(self.joint_map) if self.joint_map else {}
+
+    def read(self, path: Path):
+        """Read a file, and say what was corrected."""
+        from f3amd_lib.motion.bvh import read_bvh
+        from f3amd_lib.motion.plausible import as_person, call_by_roles
+
+        motion = call_by_roles(read_bvh(path), self.mapped())
+        motion, notes = as_person(motion, scale=self.scale, up=self.up)
+        if notes:
+            log.info("corrected    %s: %s", path, "; ".join(notes))
+        return motion
+
+
+@dataclass(frozen=True)
+class People(Person):
+    """How a folder of BVH files is read.
 
     Attributes:
       retarget: bring several people to the skeleton of the first file.
-      scale: metres in a unit of the files, instead of what legs tell.
-      up: axis that is up in the files, Y or Z, instead of what legs tell.
       keep_first: keep a T-pose before the take.
     """
 
     retarget: bool = False
-    scale: float | None = None
-    up: Literal["Y", "Z"] | None = None
     keep_first: bool = False
+
+    def asked(self) -> dict:
+        """Return what `open_dataset` takes for a folder."""
+        return vars(self) | {"joint_map": self.mapped()}
 
 
 @dataclass(frozen=True)
@@ -111,7 +143,7 @@ class Data:
         terminal.check_there(self.source)
         from f3amd_lib.training.pipeline import prepare
 
-        return prepare(profile, path=self.source, **vars(self.people)), profile
+        return prepare(profile, path=self.source, **self.people.asked()), profile
 
 
 @dataclass(frozen=True)
@@ -170,38 +202,6 @@ class Model:
         return MotionGenerator(self.load(), self.steps, sampler=self.sampler)
 
 
-@dataclass(frozen=True)
-class Person:
-    """How a BVH file of others is read.
-
-    Attributes:
-      scale: metres in a unit of the file, instead of what its legs tell.
-      up: axis that is up in the file, Y or Z, instead of what legs and hips tell.
-      joint_map: TOML file of lines such as left_knee = "calf_l": which joint plays a role, where it is not found.
-    """
-
-    scale: float | None = None
-    up: Literal["Y", "Z"] | None = None
-    joint_map: Path | None = None
-
-    def mapped(self) -> dict[str, str]:
-        """Return the joint map, role -> joint's name."""
-        from f3amd_lib.motion.plausible import read_joint_map
-
-        return read_joint_map(self.joint_map) if self.joint_map else {}
-
-    def read(self, path: Path):
-        """Read a file, and say what was corrected."""
-        from f3amd_lib.motion.bvh import read_bvh
-        from f3amd_lib.motion.plausible import as_person, call_by_roles
-
-        motion = call_by_roles(read_bvh(path), self.mapped())
-        motion, notes = as_person(motion, scale=self.scale, up=self.up)
-        if notes:
-            log.info("corrected    %s: %s", path, "; ".join(notes))
-        return motion
-
-
 def joints(file: Positional[Path], person: Person) -> None:
     """Show which joint of a BVH file plays which role, and what is corrected on reading.
 
@@ -248,7 +248,7 @@ def dataset(
     from f3amd_companion.serving import captioned_folder
     from f3amd_lib.data import sources
 
-    opened = sources.open_dataset(data, path=source, **vars(people))
+    opened = sources.open_dataset(data, path=source, **people.asked())
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
     _say_written(captioned_folder.write_humanml3d(out, written))
     for clip, reason in written.skipped:

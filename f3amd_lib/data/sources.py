@@ -40,7 +40,7 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
-from f3amd_lib.motion.plausible import as_person
+from f3amd_lib.motion.plausible import as_person, call_by_roles
 from f3amd_lib.motion.retarget import retarget as put_on
 from f3amd_lib.motion.skeleton import Motion, resample
 
@@ -68,7 +68,8 @@ class Clip:
       content: what is done in it, such as "walk" or "FW"; may be empty.
       split: "train", "validation" or "test".
       loader: callable without arguments that returns the motion.
-      person: of a stranger's motion, how it is made plausible (`as_person`); None for motion that we know.
+      person: of a stranger's motion, joint_map of `call_by_roles` and what `as_person` takes; None for motion that we
+        know.
     """
 
     name: str
@@ -86,7 +87,8 @@ class Clip:
         """Return what `load` does, and notes on what had to be corrected."""
         motion, notes = self.loader(), []
         if self.person is not None:
-            motion, notes = as_person(motion, **self.person)
+            how = dict(self.person)
+            motion, notes = as_person(call_by_roles(motion, how.pop("joint_map")), **how)
         return resample(motion, fps).replace(name=self.name), notes
 
 
@@ -119,7 +121,7 @@ class Dataset:
 def open_dataset(
     name: str, *, path=None, locomotion_only: bool = True, seconds_per_style: float = 60.0,
     num_styles: int | None = None, retarget: bool = False, scale: float | None = None, up: str | None = None,
-    keep_first: bool = False,
+    keep_first: bool = False, joint_map: Mapping[str, str] | None = None,
 ) -> Dataset:  # fmt: skip
     """Open a data set by name: find or download it, verify it and list its clips.
 
@@ -131,6 +133,7 @@ def open_dataset(
       num_styles: keep only so many styles (primary ones first, then by name); None keeps all.
       retarget: folder only: bring several people's motion to the skeleton of the first clip.
       scale, up, keep_first: folder only, as in `as_person`.
+      joint_map: folder only, as in `call_by_roles`.
 
     Returns:
       The data set. Numbers are read by `Clip.load`.
@@ -142,7 +145,7 @@ def open_dataset(
     check_known(name, NAMES, "data set")
     if num_styles is not None and num_styles < 1:
         raise ValueError(f"num_styles must be at least 1, got {num_styles}")
-    person = {"scale": scale, "up": up, "keep_first": keep_first}
+    person = {"scale": scale, "up": up, "keep_first": keep_first, "joint_map": joint_map or {}}
     if name != "folder" and (retarget or any(person.values())):
         raise ValueError(f"retarget, {', '.join(person)} are for a folder, not for data set {name!r}: leave them out")
     if name == "synthetic":
@@ -185,7 +188,8 @@ def read_clips(
                 continue
             first = first or motion
             if motion.skeleton != first.skeleton and dataset.retarget:
-                motion = put_on(motion, first)[0]
+                motion, _, off = put_on(motion, first)
+                noted.append(f"retargeted: joints are off by {off.mean():.1f} cm on average")
         except ValueError as error:
             if clip.person is None:
                 raise
