@@ -348,14 +348,14 @@ def test_three_is_the_bundle_that_was_checked():
 
 def test_what_the_scripts_import_is_bundled():
     bundled = (FOLDER / "three_parts.js").read_text()
-    for name in ("scene", "body", "player"):
+    for name in ("scene", "body", "bvh", "player"):
         wanted = re.search(r'import \{([^}]*)\} from "three"', (FOLDER / f"{name}.js").read_text())[1]
         for part in filter(None, map(str.strip, wanted.split(","))):
             assert re.search(rf"\b{part}\b", bundled), part
 
 
 @pytest.mark.needs("node")
-@pytest.mark.parametrize("name", ["scene", "body", "player"])
+@pytest.mark.parametrize("name", ["scene", "body", "bvh", "player"])
 def test_the_scripts_are_sound(name, tmp_path):
     copy = tmp_path / f"{name}.mjs"
     copy.write_text((FOLDER / f"{name}.js").read_text())

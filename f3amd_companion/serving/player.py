@@ -314,14 +314,14 @@ def module_scripts(start: str) -> str:
     one. Browsers of 2023 and later can do that (Chrome 89, Firefox 113, Safari 16.4).
 
     Args:
-      start: name of the module that begins; `NAME.js` in `serving/web`. It may import three, scene and body.
+      start: name of the module that begins; `NAME.js` in `serving/web`. It may import three, scene, body and bvh.
 
     Returns:
       Two script elements. The page has to have an element "message" (hidden) and a policy that allows `blob:` scripts
       (`POLICY`).
     """
     texts = {"three": (FOLDER / "three.min.js").read_text(encoding="utf-8")}
-    texts |= {name: read_web(f"{name}.js") for name in ("scene", "body", start)}
+    texts |= {name: read_web(f"{name}.js") for name in ("scene", "body", "bvh", start)}
     packed = {name: base64.b64encode(zlib.compress(text.encode(), 9)).decode() for name, text in texts.items()}
     modules = json.dumps({"start": start, "modules": packed})
     begin = read_web("start.js")

@@ -122,6 +122,13 @@ class Browser:
         """Run JavaScript; `return` hands a value back."""
         return self.driver.execute_script(text, *arguments)
 
+    def fetched(self, address: str) -> str:
+        """Let the page ask for an address: "sent", or the name of the error."""
+        return self.driver.execute_async_script(
+            "const done = arguments[1]; fetch(arguments[0]).then(() => done('sent'), (error) => done(error.name))",
+            address,
+        )
+
     def wait(self, text: str, seconds: float = 20.0) -> None:
         """Wait until a script answers with something true."""
         until = time.monotonic() + seconds

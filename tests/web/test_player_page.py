@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from builders import wandering_motion
 from conftest import DESKTOP, PHONE
+from test_page_bvh import ASSUMED, CASES
 
 from f3amd_companion.serving.player import Character, Scene, player_page, write_player
-from f3amd_lib.motion.bvh import format_bvh, parse_bvh
+from f3amd_lib.motion.bvh import parse_bvh
 from f3amd_lib.motion.root_paths import path_from_motion
+from f3amd_lib.motion.skeleton import Skeleton, resample
 from f3amd_lib.motion.synthetic import synthesize
 
 FRAMES = 90
@@ -451,11 +453,7 @@ def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
 
 def test_the_page_forbids_itself_any_request(browser, alone):
     opened(browser, alone)
-    refused = browser.driver.execute_async_script(
-        "const done = arguments[0];"
-        "fetch('http://outside.invalid/').then(() => done('sent'), (error) => done(error.name));"
-    )
-    assert refused == "TypeError"
+    assert browser.fetched("http://outside.invalid/") == "TypeError"
     assert any("Content Security Policy" in message for message in browser.errors())
     assert browser.outside() == []
 
@@ -593,26 +591,70 @@ def test_what_the_page_saves_as_glb_has_skin_joints_and_every_frame(browser, sid
     assert (times["count"], times["max"][0]) == (FRAMES, pytest.approx((FRAMES - 1) / 30))
 
 
-def test_a_dropped_bvh_walks_beside_the_first(browser, alone, walks, screenshots):
-    opened(browser, alone)
-    text = format_bvh(walks[2])
-    drop = (
-        "const items = new DataTransfer(); items.items.add(new File([arguments[0]], arguments[1]));"
-        "document.dispatchEvent(new DragEvent('drop', {dataTransfer: items, bubbles: true, cancelable: true}))"
+def drop(browser, content: str, name: str) -> None:
+    """Let go of a file over the page; its content is JavaScript."""
+    browser.script(
+        f"const items = new DataTransfer(); items.items.add(new File([{content}], arguments[0]));"
+        "document.dispatchEvent(new DragEvent('drop', {dataTransfer: items, bubbles: true, cancelable: true}))",
+        name,
     )
-    browser.script(drop, text, "mine.bvh")
-    browser.wait("return player.characters.length === 2")
+
+
+def notice(browser, words: str) -> str:
+    """What the page says, as soon as these words are in it."""
+    browser.wait(f"return document.getElementById('notice').textContent.includes({json.dumps(words)})")
+    return browser.find("#notice").text
+
+
+@pytest.mark.parametrize("name", ["plain", "metres", "CMU", "six channels, no OFFSET", "one frame", "Z up"])
+def test_a_dropped_bvh_walks_beside_the_first(browser, alone, screenshots, name):
+    content, motion = CASES[name]
+    opened(browser, alone)
+    drop(browser, json.dumps(content.decode()), f"{name}.bvh")
+    said = notice(browser, f"{name}: {motion.skeleton.num_joints} joints")
+    assert "another skeleton" in said and ASSUMED.get(name, "") in said
+    motion = resample(motion, 30.0)
+    browser.script("player.seek(40)")
     settled(browser)
-    browser.screenshot(screenshots / "player_dropped.png")
-    assert "another skeleton" in browser.script("return document.getElementById('notice').textContent")
-    joints = [0, 9, 18]
-    read = np.array([browser.script("return player.position(0, 1, 40, arguments[0])", joint) for joint in joints])
-    expected = 1000 * walks[2].positions[40, joints]
-    np.testing.assert_allclose(read - read[0], expected - expected[0], atol=1.5)  # it stands somewhere else
-    browser.script(drop, "nonsense", "bad.bvh")
-    browser.wait("return document.getElementById('notice').textContent.includes('bad.bvh cannot be shown')")
-    assert browser.script("return player.characters.length") == 2
+    browser.screenshot(screenshots / f"player_dropped_{name}.png")
+    joints = range(0, motion.skeleton.num_joints, 4)
+    for frame in (0, 40):
+        read = [browser.script("return player.position(0, 1, ...arguments)", frame, joint) for joint in joints]
+        expected = 1000 * motion.positions[min(frame, motion.num_frames - 1), joints]
+        beside = [read[0][0] - expected[0, 0], 0, read[0][2] - expected[0, 2]]  # on the same floor
+        np.testing.assert_allclose(read, expected + beside, atol=1.5)
     assert browser.errors() == []
+
+
+def test_a_file_that_cannot_be_shown_is_refused_and_one_too_large_is_not_even_read(browser, alone):
+    opened(browser, alone)
+    drop(browser, "'nonsense'", "<b>bad</b>.bvh")
+    assert "<b>bad<" in notice(browser, "it does not begin with HIERARCHY")
+    browser.script("Blob.prototype.arrayBuffer = Blob.prototype.text = () => { window.wasRead = true; }")
+    drop(browser, "new Uint8Array(50e6 + 1)", "large.bvh")
+    assert "51 MB" in notice(browser, "large.bvh") and "50 at most" in notice(browser, "large.bvh")
+    assert browser.script("return [player.characters.length, window.wasRead]") == [1, None]
+
+
+MARKUP = "<img src=x onerror='window.ran = true'><script>window.ran = true</script>&amp;$title"
+
+
+def test_names_with_markup_are_text(browser, tmp_path):
+    one = wandering_motion(FRAMES)
+    skeleton = Skeleton([MARKUP, *one.skeleton.names[1:]], one.skeleton.parents, one.skeleton.offsets)
+    scene = Scene(
+        [Character(one.replace(skeleton=skeleton), name=MARKUP), one], title=MARKUP, note=MARKUP, boundaries=(9,)
+    )  # fmt: skip
+    opened(browser, write_player(tmp_path / "page.html", scene, title=MARKUP, credit=MARKUP, strip=False))
+    browser.script("player.characters[0].panel.follows = player.characters[0]")
+    browser.keys("n")
+    settled(browser)
+    drop(browser, json.dumps(CASES["one frame"][0].decode()), f"{MARKUP.replace('/', '')}.bvh")
+    notice(browser, "<img")
+    places = "title", "h1", "figcaption strong", "figcaption span", ".credit", ".labels span", "#person option"
+    for place in places:
+        assert MARKUP in browser.script("return document.querySelector(arguments[0]).textContent", place), place
+    assert browser.script("return [document.images.length, window.ran]") == [0, None]
 
 
 # --------------------------------------------------------------------------------- loop, names, ghost

@@ -1,10 +1,11 @@
 // The motion player. What the data mean stands in player.py.
 import {
-  AnimationClip, BVHLoader, BufferAttribute, BufferGeometry, CircleGeometry, GLTFExporter, Group, InstancedMesh, Matrix4,
-  Mesh, MeshBasicMaterial, OrbitControls, PerspectiveCamera, Quaternion, QuaternionKeyframeTrack, RingGeometry, Spherical,
-  Vector3, VectorKeyframeTrack,
+  AnimationClip, BufferAttribute, BufferGeometry, CircleGeometry, GLTFExporter, Group, InstancedMesh, Matrix4, Mesh,
+  MeshBasicMaterial, OrbitControls, PerspectiveCamera, Quaternion, QuaternionKeyframeTrack, RingGeometry, Spherical, Vector3,
+  VectorKeyframeTrack,
 } from "three";
 import { Bodies, Figure, Sticks, bodyGeometry, bodyMaterial, paintBody, plainCapsules } from "body";
+import { readBvh } from "bvh";
 import { Stage } from "scene";
 
 const data = JSON.parse(document.getElementById("player-data").textContent);
@@ -14,6 +15,7 @@ const HOLD = 0.7; // seconds to rest on the last frame before it starts again
 const HEIGHT = 0.88; // metres above the floor that the camera looks at
 const FILL = { height: 2.35, width: 1.9 }; // metres around one person
 const CROWD = 12; // more than so many need not be drawn as well
+const LARGEST = 50e6; // bytes of a file that is dropped here
 const colors = {};
 const characters = []; // of all scenes
 let panels = [];
@@ -626,48 +628,17 @@ function chooseBody() {
 
 // ---------------------------------------------------------------- files in and out
 
-const BODY_PARTS = /left|right|_l$|_r$/i;
-
-function sideOfName(name) {
-  const [found] = name.match(BODY_PARTS) || [""];
-  return { left: "left", _l: "left", right: "right", _r: "right" }[found.toLowerCase()] || "middle";
-}
-
 // A BVH file becomes a character of the first panel.
-function takeBvh(text, name) {
-  const { skeleton: { bones }, clip } = new BVHLoader().parse(text);
-  const joints = bones.filter((bone) => bone.name !== "ENDSITE");
-  const parents = joints.map((bone) => joints.indexOf(bone.parent));
-  const tracks = Object.fromEntries(clip.tracks.map((track) => [track.name, track]));
-  const { times } = clip.tracks[0];
-  const fps = (times.length - 1) / Math.max(times[times.length - 1], 1e-6);
-  const frames = Math.max(1, Math.floor((times.length - 1) / fps * data.fps) + 1);
-  const scale = likelyScale(bones);
-  const bonesOf = bones.filter((bone) => bone.parent && joints.includes(bone.parent) && bone.position.length() > 1e-6);
-  const described = {
-    names: joints.map((bone) => bone.name), parents, head: null, toes: null,
-    offsets: joints.map((bone) => bone.position.toArray().map((value) => scale * value)),
-    sides: joints.map((bone) => sideOfName(bone.name)),
-    bones: bonesOf.map((bone) => [joints.indexOf(bone.parent), bone.position.toArray().map((value) => scale * value),
-      sideOfName(bone.name === "ENDSITE" ? bone.parent.name : bone.name)]),
-  };
-  const known = data.skeletons.find(({ names }) => names.join() === described.names.join());
-  described.capsules = known ? known.capsules : plainCapsules(described);
-  if (known) [described.head, described.toes] = [known.head, known.toes];
-  const character = { skeleton: data.skeletons.push(described) - 1, color: null, name, frames, touch: null, target: null,
-    root: new Float32Array(3 * frames), turns: new Float32Array(4 * frames * joints.length) };
-  for (let frame = 0; frame < frames; frame += 1) {
-    const source = Math.min(Math.round(frame / data.fps * fps), times.length - 1);
-    joints.forEach((bone, joint) => {
-      const turns = tracks[`${bone.name}.quaternion`].values;
-      character.turns.set(turns.subarray(4 * source, 4 * source + 4), 4 * (frame * joints.length + joint));
-    });
-    const moved = tracks[`${joints[0].name}.position`].values;
-    for (let axis = 0; axis < 3; axis += 1) character.root[3 * frame + axis] = scale * moved[3 * source + axis];
-  }
-  // A metre beside where the first one starts.
+function takeBvh(bytes, name) {
+  const { root, turns, frames, said, ...read } = readBvh(bytes, data.fps);
+  const known = data.skeletons.find(({ names }) => names.join() === read.names.join());
+  const { capsules, head, toes } = known || { capsules: plainCapsules(read), head: null, toes: null };
+  const skeleton = data.skeletons.push({ ...read, capsules, head, toes }) - 1;
+  const character = { skeleton, color: null, name, frames, touch: null, target: null, root, turns };
+  // Beside where the first one starts, each a metre further.
   const [first] = panels[0].scene.characters;
-  const shift = [0, 2].map((axis) => first.root[axis] - character.root[axis] + (axis ? 0 : 1));
+  panels[0].guests = (panels[0].guests || 0) + 1;
+  const shift = [0, 2].map((axis) => first.root[axis] - character.root[axis] + (axis ? 0 : panels[0].guests));
   for (let k = 0; k < character.root.length; k += 3) {
     character.root[k] += shift[0];
     character.root[k + 2] += shift[1];
@@ -684,18 +655,9 @@ function takeBvh(text, name) {
   listPeople();
   setLoop(clock.from, whole ? numFrames - 1 : clock.to);
   fitDistance();
-  say(`${name}: ${joints.length} joints, ${frames} frames at ${data.fps} a second` +
-    (known ? "." : "; another skeleton than the page's, so its body is a plain one."));
-}
-
-// Metres for a file's unit: what makes a person of its bones, from hip to top 0.5 to 1.4 m.
-function likelyScale(bones) {
-  const size = Math.max(...bones.map((bone) => {
-    let sum = 0;
-    for (let one = bone; one.parent && one.parent.isBone; one = one.parent) sum += one.position.length();
-    return sum;
-  }));
-  return [1, 0.01, 0.0254, 0.001].find((scale) => size * scale > 0.5 && size * scale < 2.5) || 0.9 / size;
+  said.unshift(`${name}: ${read.names.length} joints, ${frames} frames at ${+data.fps.toFixed(2)} a second`);
+  if (!known) said.push("another skeleton than the page's, so its body is a plain one");
+  say(`${said.join("; ")}.`);
 }
 
 function say(text) {
@@ -706,9 +668,8 @@ function say(text) {
 async function takeFile(file) {
   try {
     if (!/\.bvh$/i.test(file.name)) throw new Error("only BVH files can be dropped here");
-    const text = await file.text();
-    if (!/^\s*HIERARCHY/.test(text)) throw new Error("it does not begin with HIERARCHY, as BVH files do");
-    takeBvh(text, file.name.replace(/\.bvh$/i, ""));
+    if (file.size > LARGEST) throw new Error(`it has ${Math.ceil(file.size / 1e6)} MB, and this page takes ${LARGEST / 1e6} at most`);
+    takeBvh(new Uint8Array(await file.arrayBuffer()), file.name.replace(/\.bvh$/i, ""));
   } catch (error) {
     say(`${file.name} cannot be shown: ${error.message}.`);
   }
