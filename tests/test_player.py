@@ -205,7 +205,8 @@ def test_the_page_holds_everything_and_asks_for_nothing():
     for script in sorted(FOLDER.glob("*.js")):  # three.js names addresses of standards and asks for none
         assert script.name == "three.min.js" or "://" not in script.read_text(), script
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
-    assert "default-src 'none'" in policy
+    assert policy.startswith("default-src 'none';")
+    assert all('content="$policy"' in template.read_text() for template in FOLDER.glob("*.html"))
     assert not re.search(r"\$[a-z]+\b", page.split('id="player-data"')[0])
 
 

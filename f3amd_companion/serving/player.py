@@ -44,10 +44,10 @@ FOLDER = Path(__file__).parent / "web"
 """Scripts, styles and templates of pages. The modules import each other by name."""
 
 POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; "
-    "img-src data: blob:; connect-src blob:"
+    "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "connect-src blob:; script-src 'unsafe-inline' blob:"
 )
-"""Content security policy of a page: what it carries, and no request to anybody."""
+"""Content security policy of a page: what it carries, and no request to anybody. Others add to its end, the scripts."""
 
 _MILLIMETRES = 1000.0
 _FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`

@@ -22,7 +22,7 @@ import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.player import FOLDER, page_json, read_web
+from f3amd_companion.serving.player import FOLDER, POLICY, page_json, read_web
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
@@ -99,6 +99,7 @@ def steer_page(
     packed = {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode() for name, file in files.items()}
     count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
     return string.Template(read_web("steer.html")).substitute(
+        policy=f"{POLICY} 'wasm-unsafe-eval'; worker-src blob:",
         title=html.escape(f"Steer {trained.name}"),
         name=html.escape(trained.name),
         about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),

@@ -1,6 +1,7 @@
 """The steer page in a real browser: the network runs in it, and somebody drives."""
 
 import json
+from dataclasses import replace
 
 import builders  # noqa: F401  (tests/ is on the path)
 import numpy as np
@@ -133,6 +134,37 @@ def test_a_page_for_webgpu_says_why_it_walks_without_a_card(
     assert browser.script("return steer.state().runs") == "wasm"
     browser.wait("return steer.state().rounds > 1", 120)
     assert browser.errors() == [] and browser.requests() == []
+
+
+NO_WEBASSEMBLY = {
+    "this browser has no WebAssembly": "delete self.WebAssembly",
+    "its memory is used up": "WebAssembly.instantiate = async () => { throw new Error('its memory is used up'); }",
+    "the worker is broken": "throw new Error('the worker is broken')",
+}
+"""What the page says -> what its worker begins with."""
+
+
+@pytest.mark.parametrize("reason", NO_WEBASSEMBLY)
+def test_a_network_that_does_not_start_says_why(browser, trained, program, tmp_path, monkeypatch, reason):
+    made = steer._worker
+    monkeypatch.setattr(steer, "_worker", lambda script: f"{NO_WEBASSEMBLY[reason]};\n{made(script)}")
+    browser.open(write_steer(tmp_path / "page.html", trained, program=program))
+    browser.wait("return !document.getElementById('message').hidden", 60)
+    assert reason in browser.find("#message").text
+
+
+MARKUP = "<img src=x onerror='window.ran = true'><script>window.ran = true</script>$name"
+
+
+def test_names_with_markup_are_text_and_the_page_may_ask_nobody(browser, trained, program, tmp_path):
+    first, *others = trained.styles
+    poses = trained.start_poses | {MARKUP: trained.start_poses[first]}
+    renamed = replace(trained, name=MARKUP, styles=(MARKUP, *others), start_poses=poses)
+    opened(browser, write_steer(tmp_path / "page.html", renamed, program=program))
+    for place in ("title", "h1 small", "#first", "details p"):
+        assert MARKUP in browser.script("return document.querySelector(arguments[0]).textContent", place), place
+    assert browser.script("return [document.images.length, window.ran]") == [0, None]
+    assert browser.fetched("http://outside.invalid/") == "TypeError" and browser.outside() == []
 
 
 @pytest.mark.parametrize("slow", [True, False])

@@ -23,6 +23,7 @@ const frameList = (flat, channels) =>
 
 const answers = {
   async open(message) {
+    if (!globalThis.WebAssembly) throw new Error("this browser has no WebAssembly, or it is switched off");
     ({ card } = message);
     poses = frameList(message.poses, card.num_history * card.channels).map((pose) => frameList(pose, card.channels));
     Object.assign(ort.env.wasm, { wasmBinary: message.wasm, numThreads: 1, proxy: false });
