@@ -1,5 +1,7 @@
 """The judge's network and task: padding, order, the loss by hand, a rehearsal on toys it must and must not learn."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +53,72 @@ def test_padding_changes_no_text_and_order_does(network):
     longer = jnp.pad(tokens, ((0, 0), (0, 5), (0, 0)), constant_values=7.0)
     assert np.allclose(network.embed_text(longer, jnp.arange(9)[None] < 4), answer, atol=1e-6)
     assert not np.allclose(network.embed_text(tokens[:, ::-1], jnp.ones((1, 4), bool)), answer, atol=1e-3)
+
+
+def leaky(x):
+    return np.where(x < 0, 0.2 * x, x)
+
+
+def linear(layer, x):
+    return x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+
+
+def halved(layer, x):
+    """PyTorch's Conv1d(width, width, 4, stride 2, padding 1) of [F, C]."""
+    kernel = np.asarray(layer.taps.kernel[...]).reshape(4, x.shape[1], -1)
+    x = np.pad(x, ((1, 1), (0, 0)))
+    taps = [sum(x[at + k] @ kernel[k] for k in range(4)) for at in range(0, len(x) - 3, 2)]
+    return np.array(taps) + np.asarray(layer.taps.bias[...])
+
+
+def recurred(cell, x, h):
+    """The last state of PyTorch's GRU over [T, C]: n = tanh(W x + b + r (U h + c)), h' = (1 - z) n + z h."""
+    sigmoid = lambda x: 1.0 / (1.0 + np.exp(-x))
+    for one in x:
+        (r_x, z_x, n_x), (r_h, z_h, n_h) = (
+            np.split(linear(layer, given), 3) for layer, given in ((cell.dense_i, one), (cell.dense_h, h))
+        )
+        r, z = sigmoid(r_x + r_h), sigmoid(z_x + z_h)
+        h = (1.0 - z) * np.tanh(n_x + r * n_h) + z * h
+    return h
+
+
+def both_ways(part, x):
+    """Guo et al.'s BiGRUCo over the tokens that count: linear, GRU, linear, LayerNorm, LeakyReLU(0.2), linear."""
+    x, start = linear(part.inside, x), np.asarray(part.start[...])
+    last = [recurred(part.forwards.cell, x, start[0]), recurred(part.backwards.cell, x[::-1], start[1])]
+    x = linear(part.middle, np.concatenate(last))
+    x = (x - x.mean()) / np.sqrt(x.var() + 1e-5) * np.asarray(part.norm.scale[...]) + np.asarray(part.norm.bias[...])
+    return linear(part.output, leaky(x))
+
+
+def test_each_layer_is_pytorchs_own():
+    """Random weights, biases too; a norm's input of little deviation shows its epsilon."""
+    config = dataclasses.replace(SMALL, released=True, tag_width=3)
+    graph, params = nnx.split(TextMotionNetwork(config, rngs=nnx.Rngs(0)))
+    keys = iter(jax.random.split(jax.random.key(1), 99))
+    params = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), params)
+    network = nnx.merge(graph, params)
+    for part in (network.motion, network.text):
+        part.middle.kernel[...], part.middle.bias[...] = 1e-3 * part.middle.kernel[...], 1e-3 * part.middle.bias[...]
+    motion, lengths = np.array(jax.random.normal(jax.random.key(2), (2, 24, 5))), (12, 19)
+    motion[0, 12:], motion[1, 19:] = 0.0, 0.0
+    made = network.embed_motion(jnp.asarray(motion), jnp.array(lengths))
+    for seen, length, answer in zip(motion, lengths, made, strict=True):
+        once = halved(network.movement[0], seen)
+        np.testing.assert_allclose(network.movement[0](seen[None])[0], once, atol=1e-5)
+        twice = halved(network.movement[1], leaky(once))
+        tokens = linear(network.movement_output, leaky(twice))[: length // 4]
+        told = network.motion(jnp.asarray(tokens)[None], jnp.array([len(tokens)]))[0]
+        wanted = both_ways(network.motion, tokens)
+        np.testing.assert_allclose(told, wanted, atol=1e-4)
+        np.testing.assert_allclose(answer, wanted, atol=1e-4)
+    words, tags = (np.array(jax.random.normal(jax.random.key(k), (2, 6, width))) for k, width in ((3, 6), (4, 3)))
+    mask = np.arange(6) < np.array([[4], [6]])
+    for given in ((words, mask), (words, mask, tags)):
+        tagged = words + linear(network.tags, tags) if len(given) == 3 else words
+        wanted = [both_ways(network.text, row[kept]) for row, kept in zip(tagged, mask, strict=True)]
+        np.testing.assert_allclose(network.embed_text(*map(jnp.asarray, given)), wanted, atol=1e-4)
 
 
 def test_time_has_a_direction(network):

@@ -236,6 +236,8 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
     assert np.abs(statistics.mean - grouped_statistics(data.redundant_vectors())[0]).max() > 1e-3
 
     class Coder(nnx.Module):
+        config = LatentAutoencoderConfig(released_facing=True)
+
         def encode(self, features, mask):
             return (features * mask[..., None]).sum(axis=1, keepdims=True), features[:, :1] + 1.0
 

@@ -77,7 +77,8 @@ def test_reconstruction_is_judged_both_ways(data, monkeypatch):
     """An autoencoder that gives clips back has no error; one that gives the first clip for all has."""
     vectors = data.redundant_vectors()
     deviation = np.maximum(vectors.std(axis=0), 1e-3)
-    trained = type("Trained", (), {"statistics": type("S", (), {"deviation": deviation})})
+    statistics, coder = type("S", (), {"deviation": deviation}), type("A", (), {"released_facing": True})
+    trained = type("Trained", (), {"statistics": statistics, "autoencoder": coder})
     bench = type("Bench", (), {"real": data, "quality": lambda self, make: text_tables.pd.DataFrame()})()
 
     def figures(positions_of, vectors_of):

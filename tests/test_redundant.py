@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, shortest_turn
@@ -122,7 +123,7 @@ def test_rotations_carry_the_rest_pose_down_each_chain():
     vectors = redundant.redundant_from_positions(skeleton, positions)
     part = redundant.vector_parts(23)["rotations"]
     local = matrix_from_rotation_6d(vectors[:, part].reshape(len(vectors), 22, 6))
-    facing = redundant.smoothed_yaw(skeleton, positions)[:-1]
+    facing = redundant.smoothed_yaw(skeleton, positions, released=True)[:-1]
     facing[0] = 0.0
     begin = matrix_from_yaw(-facing)
     in_world, begun = {}, {0}
@@ -136,6 +137,33 @@ def test_rotations_carry_the_rest_pose_down_each_chain():
         rest = skeleton.offsets[joint] / np.linalg.norm(skeleton.offsets[joint])
         shown = in_world[joint] @ rest
         assert np.allclose(shown, bone / np.linalg.norm(bone, axis=-1, keepdims=True), atol=1e-6), joint
+
+
+@pytest.mark.parametrize("released", [True, False])
+def test_turn_and_velocity_by_the_formula_of_either_facing(released):
+    skeleton = MOTIONS[22].skeleton
+    positions = redundant.canonical_start(skeleton, MOTIONS[22].positions)
+    left_hip, right_hip, left_shoulder, right_shoulder = (
+        positions[:, skeleton.role(f"{side}_{joint}")] for joint in ("hip", "shoulder") for side in ("left", "right")
+    )
+    across = right_shoulder - left_shoulder + (left_hip - right_hip if released else right_hip - left_hip)
+    across[:, 1] *= released
+    forward = np.cross([0.0, 1.0, 0.0], across / np.linalg.norm(across, axis=-1, keepdims=True))
+    forward = gaussian_filter1d(forward, 20.0, axis=0, mode="nearest")
+    yaw = np.arctan2(forward[:, 0], forward[:, 2])
+    yaw[0] = 0.0
+    step, sine, cosine = np.diff(positions[:, 0], axis=0), np.sin(yaw[1:]), np.cos(yaw[1:])
+    seen = [cosine * step[:, 0] - sine * step[:, 2], sine * step[:, 0] + cosine * step[:, 2]]
+    turning = -0.5 * np.diff(yaw)
+    for made in (redundant.redundant_from_positions, redundant.essential_features):
+        vectors = made(skeleton, positions, released=released)
+        np.testing.assert_allclose(vectors[:, 0], turning, atol=1e-9)
+        np.testing.assert_allclose(vectors[:, 1:3].T, seen, atol=1e-9)
+    other = redundant.redundant_from_positions(skeleton, positions, released=not released)
+    assert np.abs(other[:, 0] - turning).max() > 1e-3
+    # A figure without shoulders faces as its hips do, and clips begin by hips and shoulders together.
+    rigid, still = turning_figure()
+    assert np.allclose(*(redundant.smoothed_yaw(rigid, still, released=which) for which in (True, False)))
 
 
 def test_a_smoothed_facing_sways_less():

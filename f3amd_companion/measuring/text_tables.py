@@ -380,7 +380,7 @@ def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about:
     is the variance over a clip's frames, over that of the real clip: a pose that only glides along has nearly none.
     """
     real, most = bench.real, int(bench.real.lengths.max())
-    vectors = real.redundant_vectors()
+    vectors = real.redundant_vectors(released=trained.autoencoder.released_facing)
     clips = [vectors[first:last] for first, last in zip(real.start[:-1], real.start[1:], strict=True)]
     motions, apart, moved = [], [], []
     spread = lambda vectors: np.sum(np.var(vectors / np.asarray(trained.statistics.deviation), axis=0))

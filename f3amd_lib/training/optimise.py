@@ -280,11 +280,17 @@ def differences(identity: dict, description: dict) -> list[str]:
         ours, theirs = (json.loads(json.dumps(of.get(part))) for of in (identity, description))
         if isinstance(ours, dict) and isinstance(theirs, dict):
             names = sorted(ours.keys() | theirs.keys())
-            if changed := [name for name in names if (ours.get(name) or None) != (theirs.get(name) or None)]:
+            if changed := [name for name in names if _known(ours.get(name)) != _known(theirs.get(name))]:
                 unlike.append(f"{part} settings ({', '.join(changed)})")
         elif ours != theirs:
             unlike.append(part.replace("_", " "))
     return unlike
+
+
+def _known(setting):
+    """Return a setting without what is off in it; None where it is off itself."""
+    inside = isinstance(setting, dict)
+    return ({name: _known(value) for name, value in setting.items() if value} if inside else setting) or None
 
 
 def optimise(

@@ -12,7 +12,8 @@
 
 263 numbers for the 22 joints of HumanML3D, 251 for the 21 of KIT-ML. "Seen from the root" is turned
 so that the facing is +Z. The facing is a smoothed one, so that it does not sway with each step; in the
-first frame it is +Z.
+first frame it is +Z. The released processing lets hips count against shoulders (`smoothed_yaw`), and so do we;
+weights of earlier versions know vectors in which they count together.
 
 Rotations are those of the released processing, to the letter, so that vectors of both kinds can be
 mixed: a chain of bones begins against the facing turned backwards, so that the rotations of its first
@@ -57,19 +58,24 @@ def count_joints(width: int) -> int:
     return (width + 1) // 12
 
 
-def smoothed_yaw(skeleton: Skeleton, positions, smoothing: float = FACING_SMOOTHING) -> np.ndarray:
+def smoothed_yaw(
+    skeleton: Skeleton, positions, smoothing: float = FACING_SMOOTHING, *, released: bool = False
+) -> np.ndarray:
     """Return the facing of hips and shoulders together, [L], radians, smoothed over frames.
 
     Args:
       skeleton: one whose hips are known; its shoulders count where they are.
       positions: [L, J, 3], metres.
       smoothing: deviation of the Gaussian, frames; 0 for none.
+      released: the facing of HumanML3D's vectors, in which hips count against shoulders: the inverse kinematics of the
+        released code takes the left hip for the right one.
     """
     across = positions[:, skeleton.role("left_hip")] - positions[:, skeleton.role("right_hip")]
     if skeleton.has_role("left_shoulder") and skeleton.has_role("right_shoulder"):
-        across = across + positions[:, skeleton.role("left_shoulder")] - positions[:, skeleton.role("right_shoulder")]
+        shoulders = positions[:, skeleton.role("left_shoulder")] - positions[:, skeleton.role("right_shoulder")]
+        across = shoulders + (-across if released else across)
     forward = np.stack([-across[:, 2], 0 * across[:, 0], across[:, 0]], axis=-1)
-    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    forward = forward / np.linalg.norm(across if released else forward, axis=-1, keepdims=True)
     if smoothing:
         forward = gaussian_filter1d(forward, smoothing, axis=0, mode="nearest")
     return rotations.yaw_from_direction(forward)
@@ -93,7 +99,7 @@ def canonical_start(skeleton: Skeleton, positions) -> np.ndarray:
     return (positions - start) @ rotations.matrix_from_yaw(smoothed_yaw(skeleton, positions[:1], 0.0)[0])
 
 
-def essential_features(skeleton: Skeleton, positions) -> np.ndarray:
+def essential_features(skeleton: Skeleton, positions, *, released: bool = True) -> np.ndarray:
     """Return the first four parts of redundant vectors, which tell the whole motion: what a judge looks at.
 
     Args, errors: as `redundant_from_positions`.
@@ -103,15 +109,15 @@ def essential_features(skeleton: Skeleton, positions) -> np.ndarray:
 
     Source: ACMDM's released evaluation code ("essential" features).
     """
-    return _first_parts(skeleton, positions)[0]
+    return _first_parts(skeleton, positions, released)[0]
 
 
-def _first_parts(skeleton: Skeleton, positions):
+def _first_parts(skeleton: Skeleton, positions, released: bool):
     """Return (turn, velocity, height and local positions; matrices from the root's view into the world, [L, 3, 3])."""
     positions = finite_array("positions", positions, ("frame", skeleton.num_joints, 3))
     if len(positions) < 2:
         raise ValueError("redundant vectors need at least 2 frames: a step leads to the next one")
-    yaw = smoothed_yaw(skeleton, positions, FACING_SMOOTHING)
+    yaw = smoothed_yaw(skeleton, positions, FACING_SMOOTHING, released=released)
     yaw[0] = 0.0
     turned = rotations.matrix_from_yaw(yaw)  # `rows @ turned` is the way from the world to the root's view
     velocity = (np.diff(positions[:, :1], axis=0) @ turned[1:])[:, 0, ::2]
@@ -121,13 +127,16 @@ def _first_parts(skeleton: Skeleton, positions):
     return np.concatenate(parts, axis=-1), turned
 
 
-def redundant_from_positions(skeleton: Skeleton, positions, *, contact_step: float = CONTACT_STEP) -> np.ndarray:
+def redundant_from_positions(
+    skeleton: Skeleton, positions, *, contact_step: float = CONTACT_STEP, released: bool = True
+) -> np.ndarray:
     """Turn positions into redundant vectors.
 
     Args:
       skeleton: J joints; its offsets are the rest pose that rotations start from, in any length.
       positions: [L, J, 3], metres, from `canonical_start`.
       contact_step: squared step below which a foot is in contact.
+      released: by the facing of HumanML3D's vectors; else, as in earlier versions, hips count as shoulders do.
 
     Returns:
       [L - 1, 12 J - 1], float64: a frame's steps need the next one.
@@ -135,7 +144,7 @@ def redundant_from_positions(skeleton: Skeleton, positions, *, contact_step: flo
     Raises:
       ValueError: for fewer than 2 frames, another shape, or positions that are not finite.
     """
-    first, turned = _first_parts(skeleton, positions)
+    first, turned = _first_parts(skeleton, positions, released)
     step = np.diff(np.asarray(positions, np.float64), axis=0)
     parts = [
         first,
@@ -155,7 +164,8 @@ def joint_features(skeleton: Skeleton, positions, vectors) -> np.ndarray:
 
     Returns:
       [L - 1, J, 10], float64: step to the next frame in the world, metres; 6D rotation of the bone that leads to the
-      joint, as in the redundant vector; contact, 0 or 1. What a joint lacks is 0: the root's bone, contact but of feet.
+      joint, as in the redundant vector of the facing of hips and shoulders together; contact, 0 or 1. What a joint
+      lacks is 0: the root's bone, contact but of feet.
 
     Source: ACMDM section 4.2; Liang et al. 2024 (InterGen), its non-canonical representation.
     """

@@ -168,22 +168,23 @@ class TextMotions:
         """Return mean and deviation of x, y and z over the training clips."""
         return AxisNormaliser.of(self.select(self.members("train")).positions)
 
-    def redundant_vectors(self) -> np.ndarray:
-        """Return redundant vectors of all frames, [N, 12 J - 1], float32.
+    def redundant_vectors(self, *, released: bool = True) -> np.ndarray:
+        """Return redundant vectors of all frames, [N, 12 J - 1], float32, by the released facing or the earlier one.
 
         Those stored with the data are taken as they are, so that a part of a motion faces as it does in the whole. Of
         those computed, a clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        return np.concatenate(list(self._vectors()))
+        return np.concatenate(list(self._vectors(released)))
 
-    def essential_features(self) -> np.ndarray:
+    def essential_features(self, *, released: bool = True) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
-        features = (redundant.essential_features(self.skeleton, clip) for clip in self._going_on())
+        each = lambda clip: redundant.essential_features(self.skeleton, clip, released=released)
+        features = map(each, self._going_on())
         return np.concatenate([feature.astype(np.float32) for feature in features])
 
     def joint_features(self) -> np.ndarray:
         """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
-        every = zip(self._going_on(), self._vectors(), strict=True)
+        every = zip(self._going_on(), self._vectors(released=False), strict=True)
         features = (redundant.joint_features(self.skeleton, clip, vectors) for clip, vectors in every)
         return np.concatenate([feature.astype(np.float32) for feature in features])
 
@@ -191,13 +192,15 @@ class TextMotions:
         """Yield the positions of each clip, and one frame more."""
         return (going_on(self.clip(number)) for number in range(self.num_clips))
 
-    def _vectors(self) -> Iterator[np.ndarray]:
+    def _vectors(self, released: bool) -> Iterator[np.ndarray]:
         """Yield the redundant vectors of each clip, float32."""
         stored = self.stored or [(None, 0)] * self.num_clips
         for (file, first), clip in zip(stored, self._going_on(), strict=True):
             vectors = [np.nan] if file is None else np.load(file, mmap_mode="r")[first : first + len(clip) - 1]
             if not np.isfinite(vectors).all():
-                vectors = redundant.redundant_from_positions(self.skeleton, clip, contact_step=self.contact_step)
+                vectors = redundant.redundant_from_positions(
+                    self.skeleton, clip, contact_step=self.contact_step, released=released
+                )
             yield np.asarray(vectors, np.float32)
 
 

@@ -51,10 +51,14 @@ class TextMotionConfig(CheckedConfig):
       motion_hidden, text_hidden: of the recurrence, in each direction.
       embedding_width: of the common space.
       dropout: after each convolution, in training.
+      released: layers and facing (`redundant.smoothed_yaw`) of the published evaluators; files of earlier versions have
+        not: no bias on the state inside the recurrence's candidate, padding zeroed between convolutions, LayerNorm's
+        epsilon 1e-6.
+      tag_width: numbers of a token's part of speech, one of them 1; 0: captions are not tagged. Published: 15.
     """
 
     family: ClassVar[str] = "text-to-motion judge"
-    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout",)
+    may_be_zero: ClassVar[tuple[str, ...]] = ("dropout", "tag_width")
 
     features: int
     token_width: int
@@ -63,6 +67,8 @@ class TextMotionConfig(CheckedConfig):
     text_hidden: int = 128
     embedding_width: int = 64
     dropout: float = 0.2
+    released: bool = False
+    tag_width: int = 0
 
 
 class HalvingConvolution(nnx.Module):
@@ -84,14 +90,18 @@ class HalvingConvolution(nnx.Module):
 class _BothWays(nnx.Module):
     """A gated recurrence forwards and backwards from a learned start; its last states become one vector."""
 
-    def __init__(self, width_in: int, hidden: int, width_out: int, *, rngs: nnx.Rngs):
+    def __init__(self, width_in: int, hidden: int, width_out: int, released: bool, *, rngs: nnx.Rngs):
         self.inside = nnx.Linear(width_in, hidden, rngs=rngs)
         self.start = nnx.Param(scaled_normal(rngs.params(), 0.1, (2, hidden)))
         options = {"return_carry": True, "rngs": False}  # its start is given: nothing is drawn
         self.forwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), **options)
         self.backwards = nnx.RNN(nnx.GRUCell(hidden, hidden, rngs=rngs), reverse=True, **options)
+        if released:  # PyTorch's cell: r * (W h + b) in the candidate, where flax has r * W h
+            for recurrence in (self.forwards, self.backwards):
+                square = nnx.initializers.orthogonal()
+                recurrence.cell.dense_h = nnx.Linear(hidden, 3 * hidden, kernel_init=square, rngs=rngs)
         self.middle = nnx.Linear(2 * hidden, hidden, rngs=rngs)
-        self.norm = nnx.LayerNorm(hidden, rngs=rngs)
+        self.norm = nnx.LayerNorm(hidden, epsilon=1e-5 if released else 1e-6, rngs=rngs)
         self.output = nnx.Linear(hidden, width_out, rngs=rngs)
 
     def __call__(self, z, length):
@@ -109,20 +119,23 @@ class TextMotionNetwork(nnx.Module):
     """Two encoders that meet: a motion and its caption become vectors of one space.
 
     Movement convolutions and a bidirectional recurrence over motion features, the same recurrence over the caption's
-    token vectors. Numbers in the padding change nothing.
+    token vectors. As released, the convolutions see what biases make of the padding's zeros, so that a clip must be
+    padded to one length always; numbers in a caption's padding change nothing.
 
     Source: Guo et al. 2022 (HumanML3D), the evaluator of its released code; sizes in ACMDM's evaluation code.
     """
 
     def __init__(self, config: TextMotionConfig, *, rngs: nnx.Rngs):
         width, out = config.movement_width, config.embedding_width
-        self.dropout = config.dropout
+        self.dropout, self.released = config.dropout, config.released
         self.movement = nnx.List(
             [HalvingConvolution(config.features, width, rngs=rngs), HalvingConvolution(width, width, rngs=rngs)]
         )
         self.movement_output = nnx.Linear(width, width, rngs=rngs)
-        self.motion = _BothWays(width, config.motion_hidden, out, rngs=rngs)
-        self.text = _BothWays(config.token_width, config.text_hidden, out, rngs=rngs)
+        self.motion = _BothWays(width, config.motion_hidden, out, config.released, rngs=rngs)
+        self.text = _BothWays(config.token_width, config.text_hidden, out, config.released, rngs=rngs)
+        if config.tag_width:
+            self.tags = nnx.Linear(config.tag_width, config.token_width, rngs=rngs)
 
     def embed_motion(self, features, length, key=None):
         """Return motions as vectors, [B, embedding_width].
@@ -136,18 +149,20 @@ class TextMotionNetwork(nnx.Module):
         for layer, convolution in enumerate(self.movement, 1):
             key_layer = None if key is None else jax.random.fold_in(key, layer)
             z = dropout(nnx.leaky_relu(convolution(z), 0.2), self.dropout, key_layer)
-            left = -(-length // 2**layer)
-            z = jnp.where((jnp.arange(z.shape[1]) < left[:, None])[..., None], z, 0.0)
+            if not self.released:
+                left = -(-length // 2**layer)
+                z = jnp.where((jnp.arange(z.shape[1]) < left[:, None])[..., None], z, 0.0)
         return self.motion(self.movement_output(z), length // 4)
 
-    def embed_text(self, tokens, mask):
+    def embed_text(self, tokens, mask, tags=None):
         """Return captions as vectors, [B, embedding_width].
 
         Args:
           tokens: [B, T, token_width].
           mask: true for tokens, which come first, [B, T].
+          tags: part of speech of each, [B, T, tag_width], where captions are tagged.
         """
-        return self.text(tokens, jnp.sum(mask, axis=1))
+        return self.text(tokens if tags is None else tokens + self.tags(tags), jnp.sum(mask, axis=1))
 
 
 _BATCH = 64
@@ -297,7 +312,10 @@ class TextJudge(CaptionedModel):
         if (least := min(map(len, motions))) < UNIT:
             raise ValueError(f"a motion has {least} frames; the judge needs {UNIT}")
         canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
-        features = [self.normaliser.normalise(essential_features(self.skeleton, motion)) for motion in canonical]
+        features = [
+            self.normaliser.normalise(essential_features(self.skeleton, motion, released=self.config.released))
+            for motion in canonical
+        ]
         return self._embed("motion", lambda rows: pad_motions([features[row] for row in rows])[:2], len(features))
 
     def embed_texts(self, embedded: TextEmbeddings) -> np.ndarray:
@@ -314,12 +332,12 @@ def _embed(what: str, config: TextMotionConfig, params, *given):
     return getattr(network_with(config, params), f"embed_{what}")(*given)
 
 
-def judged_features(data: TextMotions) -> tuple[np.ndarray, AxisNormaliser]:
-    """Return what a judge sees of training clips in its network's units, [N, C], and the normaliser.
+def judged_features(data: TextMotions, released: bool = True) -> tuple[np.ndarray, AxisNormaliser]:
+    """Return what a judge of either form sees of training clips in its network's units, [N, C], and the normaliser.
 
     Deviations are averaged over turn, velocity, height and positions.
     """
-    features = data.essential_features()
+    features = data.essential_features(released=released)
     normaliser = AxisNormaliser.of(features)
     for part in (slice(0, 1), slice(1, 3), slice(3, 4), slice(4, None)):
         normaliser.deviation[part] = normaliser.deviation[part].mean()
@@ -335,10 +353,10 @@ def judge_task(
       data: motions with captions.
       encoder: of the captions.
       training: how long, and from which seed.
-      **sizes: fields of `TextMotionConfig` to change.
+      **sizes: fields of `TextMotionConfig` to change; `released` is true, or false to go on with an earlier state.
     """
-    training_split = data.select(data.members("train"))
-    features, normaliser = judged_features(training_split)
+    training_split, sizes = data.select(data.members("train")), {"released": True} | sizes
+    features, normaliser = judged_features(training_split, sizes["released"])
     table, captions = text_motions.clip_table(training_split, features)
     pairs = [pair for pair, said in zip(training_split.pairs, training_split.captions, strict=True) for _ in said]
     network = TextMotionConfig(features=features.shape[-1], token_width=encoder.width, **sizes)

@@ -112,6 +112,7 @@ class LatentAutoencoderConfig(SkipTransformerConfig):
       path: how movement gets to a token: "attention" alone (MotionLCM V2), or "spans" (ours): a token begins with the
         mean of its span of the clip's frames, and a frame with its span's token. Blocks then begin as the identity,
         and latents with little noise, so that a short training meets movement in its first steps.
+      released_facing: of the vectors that it knows (`redundant.smoothed_yaw`); presets have it, earlier files have not.
     """
 
     family: ClassVar[str] = "latent autoencoder"
@@ -119,6 +120,7 @@ class LatentAutoencoderConfig(SkipTransformerConfig):
 
     features: int = 263
     path: str = "attention"
+    released_facing: bool = False
 
 
 SPAN_LOG_VARIANCE = -5.0

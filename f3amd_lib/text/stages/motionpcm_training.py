@@ -102,9 +102,10 @@ class LatentMotionTraining:
 
 
 @functools.lru_cache(maxsize=1)
-def frame_statistics(data: TextMotions) -> AxisNormaliser:
+def frame_statistics(data: TextMotions, released: bool = True) -> AxisNormaliser:
     """Return mean and deviation of redundant vectors: the data's own, or the training clips', [features]."""
-    mean, deviation = data.statistics or grouped_statistics(data.select(data.members("train")).redundant_vectors())
+    vectors = lambda: data.select(data.members("train")).redundant_vectors(released=released)
+    mean, deviation = data.statistics or grouped_statistics(vectors())
     return AxisNormaliser(jnp.asarray(mean), jnp.maximum(jnp.asarray(deviation), 1e-4))
 
 
@@ -162,10 +163,12 @@ class LatentAutoencoderTask(ClipsTask):
     def of(cls, asked: Asked, split: str | None) -> LatentAutoencoderTask:
         """Return the training on the clips of a split, without any where it is None."""
         data, part, clips, statistics = asked.data, asked.part(split), None, None
+        network = {**asked.preset.network, "features": 12 * data.skeleton.num_joints - 1}
+        model = build_config(asked.preset.name, **network)
         if split is not None:
-            statistics = frame_statistics(data)
-            clips, _ = clip_table(part, statistics.normalise(part.redundant_vectors()))
-        model = build_config(asked.preset.name, features=12 * data.skeleton.num_joints - 1)
+            statistics = frame_statistics(data, model.released_facing)
+            vectors = part.redundant_vectors(released=model.released_facing)
+            clips, _ = clip_table(part, statistics.normalise(vectors))
         return cls(model, asked.config, clips, statistics, dataset_fingerprint=data.fingerprint)
 
     def kept(self, asked: Asked, state: TrainingState, about: dict) -> LatentModel:
@@ -236,7 +239,7 @@ def latent_table(
       num_frames: that clips are cut or padded to.
       batch: clips encoded at a time.
     """
-    vectors = statistics.normalise(data.redundant_vectors())
+    vectors = statistics.normalise(data.redundant_vectors(released=model.config.released_facing))
     rows = [vectors[first:last] for first, last in zip(data.start[:-1], data.start[1:], strict=True)]
     graph, params = nnx.split(model)
     encode = jax.jit(lambda params, *clips: nnx.merge(graph, params).encode(*clips))

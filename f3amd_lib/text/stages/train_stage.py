@@ -8,8 +8,11 @@ Each stage leaves one file that is whole in itself, with the weights of the stag
 
 from __future__ import annotations
 
+import dataclasses
+
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.trees import describe, errors_name
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data.redundant import NUM_JOINT_FEATURES
@@ -131,8 +134,15 @@ def train_stage(
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
     own = None if branch else preset.name
     config = profile_part_recipe(stage.settings, stage.recipe, profile, own, **settings)
-    asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     files = text_models.text_model_files(profile, name, folder=folder)
+    lies = next((file for file in (files.model, files.state) if file.exists()), None)
+    if lies and stage is motionpcm_training.LatentAutoencoderTask:  # it goes on by the facing that it began with
+        with errors_name(lies):
+            said = describe(lies)
+            network = said.get("record", {}).get("identity", said)["model"]["autoencoder"]
+        facing = {"released_facing": network.get("released_facing", False)}
+        preset = dataclasses.replace(preset, network={**preset.network, **facing})
+    asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     if files.model.exists():
         found = load_text_model(files.model)
         if unlike := differences(stage.of(asked, None).identity(), found.record["identity"]):
