@@ -1,5 +1,7 @@
 """The mesh autoencoder: the paper's size by hand, each layer against a loop, and learning."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,8 +59,33 @@ def test_pooling_is_a_mean_by_the_sizes_of_its_weights():
     assert wide(x, np.array([[0, 1], [2, 3]])).shape == (2, 1, 7) and layer.linear is None
 
 
+@pytest.mark.parametrize("linear", [True, False])
+def test_elu_follows_convolutions_alone_and_not_the_decoders_last(linear):
+    """Against numpy; in files of earlier versions it follows poolings, too, but the encoder's last."""
+    network = MeshAutoencoder(dataclasses.replace(CONFIG, linear_pooling=linear), rngs=nnx.Rngs(0))
+    elu = lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
+
+    def convolved(layer, x, near):
+        bases = np.asarray(layer.bases[...]).reshape(CONFIG.num_bases, x.shape[1], -1)
+        return np.einsum("vbk,vkc,bcd->vd", layer.coefficients[...], x[near], bases) + np.asarray(layer.bias[...])
+
+    def pooled(layer, x, near):
+        weights = np.abs(layer.weights[...])
+        x = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), x[near])
+        return x if layer.linear is None else x @ np.asarray(layer.linear.kernel[...])
+
+    mean = lambda x: x if linear else elu(x)
+    lists, (c1, p1, c2, p2), (u2, d2, u1, d1) = MESH.lists, network.encoder, network.decoder
+    (a1, a2), (down1, down2), (up1, up2) = (list(map(np.asarray, few)) for few in (lists.around, lists.down, lists.up))
+    x = mean(pooled(p1, elu(convolved(c1, np.asarray(VERTICES[0]), a1)), down1))
+    latent = pooled(p2, elu(convolved(c2, x, a2)), down2)
+    np.testing.assert_allclose(network.encode(VERTICES[:1], lists)[0], latent, atol=1e-5)
+    x = mean(pooled(u1, elu(convolved(d2, mean(pooled(u2, latent, up2)), a2)), up1))
+    np.testing.assert_allclose(network.decode(latent[None], lists)[0], convolved(d1, x, a1), atol=1e-5)
+
+
 def test_a_mesh_goes_to_its_latent_and_back_and_every_parameter_learns():
-    network = MeshAutoencoder(CONFIG, rngs=nnx.Rngs(0))
+    network = MeshAutoencoder(dataclasses.replace(CONFIG, linear_pooling=True), rngs=nnx.Rngs(0))
     graph, params = nnx.split(network)
     encode = nnx.jit(lambda network, vertices: network.encode(vertices, MESH.lists))
     latent = encode(network, VERTICES)

@@ -262,6 +262,7 @@ class MeshAutoencoderConfig(CheckedConfig):
       latent_channels: of a latent vertex.
       num_bases: matrices that all edges of a convolution share.
       around, down, up: neighbours of a vertex in convolution, pooling and unpooling, by level.
+      linear_pooling: no ELU follows pooling (released code); presets have it, in earlier files one does.
 
     Raises:
       ValueError: for lists of unlike length, levels that do not fall, or more neighbours than there are vertices.
@@ -279,6 +280,7 @@ class MeshAutoencoderConfig(CheckedConfig):
     around: tuple[int, ...] = (10, 21, 26, 19)
     down: tuple[int, ...] = (32, 56, 66, 33)
     up: tuple[int, ...] = (11, 14, 11, 1)
+    linear_pooling: bool = False
 
     def __post_init__(self):
         super().__post_init__()
@@ -339,7 +341,7 @@ class MeshPooling(nnx.Module):
 
 
 class MeshAutoencoder(nnx.Module):
-    """Encoder and decoder of vertices, normalised per axis: ELU after every layer but the last of each."""
+    """Encoder and decoder of vertices, normalised per axis: ELU after every convolution but the decoder's last."""
 
     def __init__(self, config: MeshAutoencoderConfig, *, rngs: nnx.Rngs):
         self.config = config
@@ -369,7 +371,7 @@ class MeshAutoencoder(nnx.Module):
         if vertices.ndim != 3 or vertices.shape[1:] != (self.config.num_vertices, 3):
             raise ValueError(f"vertices must be [N, {self.config.num_vertices}, 3], got {vertices.shape}")
         pairs = zip(lists.around, lists.down, strict=True)
-        return _through(self.encoder, vertices, [one for pair in pairs for one in pair])
+        return self._through(self.encoder, vertices, [one for pair in pairs for one in pair])
 
     def decode(self, latent, lists: MeshLists):
         """Return vertices [N, V, 3], normalised, of a latent; lists and errors as above."""
@@ -377,14 +379,13 @@ class MeshAutoencoder(nnx.Module):
         if latent.ndim != 3 or latent.shape[1:] != wanted:
             raise ValueError(f"latent must be [N, {wanted[0]}, {wanted[1]}], got {latent.shape}")
         pairs = list(zip(lists.up, lists.around, strict=True))[::-1]
-        return _through(self.decoder, latent, [one for pair in pairs for one in pair])
+        return self._through(self.decoder, latent, [one for pair in pairs for one in pair])
 
-
-def _through(layers, x, lists):
-    """Send [N, V, C] through layers, vertices first: neighbours are then whole rows of memory."""
-    x = jnp.swapaxes(x, 0, 1)
-    for number, (layer, neighbours) in enumerate(zip(layers, lists, strict=True)):
-        x = layer(x, np.asarray(neighbours))
-        if number < len(layers) - 1:
-            x = jax.nn.elu(x)
-    return jnp.swapaxes(x, 0, 1)
+    def _through(self, layers, x, lists):
+        """Send [N, V, C] through layers, vertices first: neighbours are then whole rows of memory."""
+        x = jnp.swapaxes(x, 0, 1)
+        for number, (layer, neighbours) in enumerate(zip(layers, lists, strict=True), 1):
+            x = layer(x, np.asarray(neighbours))
+            if number < len(layers) and not (self.config.linear_pooling and isinstance(layer, MeshPooling)):
+                x = jax.nn.elu(x)
+        return jnp.swapaxes(x, 0, 1)

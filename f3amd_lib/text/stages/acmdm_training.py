@@ -255,7 +255,8 @@ class MeshAutoencoderTask(AutoencoderTask):
         # The body stands as people do when clips begin: those of training, whatever the split.
         data = asked.data
         rest = standing(data.skeleton, data.positions[data.start[data.members("train")]])
-        model = presets.build_config(asked.preset.name, num_vertices=len(make_body(rest).vertices))
+        network = {**asked.preset.network, "num_vertices": len(make_body(rest).vertices)}
+        model = presets.build_config(asked.preset.name, **network)
         codec = dataclasses.replace(asked.codec, mesh=BodyMesh.of(rest, model.levels, **model.neighbours))
         return cls(model, asked.config, codec=codec, **cls._clips(asked, split))
 

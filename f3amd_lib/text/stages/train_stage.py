@@ -43,6 +43,10 @@ STAGES = {
 """
 
 
+YOUNGER = {"released_facing", "linear_pooling"}
+"""Forms of networks that files of earlier versions say nothing of: what one of them began goes on without."""
+
+
 def stage_of(name: str) -> str:
     """Return the stage of `STAGES` that trains a preset, with or without a branch; ValueError for others' presets."""
     base, branch = preset_and_branch(name)
@@ -136,12 +140,12 @@ def train_stage(
     config = profile_part_recipe(stage.settings, stage.recipe, profile, own, **settings)
     files = text_models.text_model_files(profile, name, folder=folder)
     lies = next((file for file in (files.model, files.state) if file.exists()), None)
-    if lies and stage is motionpcm_training.LatentAutoencoderTask:  # it goes on by the facing that it began with
+    if lies and (forms := YOUNGER.intersection(preset.network)):
         with errors_name(lies):
             said = describe(lies)
-            network = said.get("record", {}).get("identity", said)["model"]["autoencoder"]
-        facing = {"released_facing": network.get("released_facing", False)}
-        preset = dataclasses.replace(preset, network={**preset.network, **facing})
+            begun = said.get("record", {}).get("identity", said)["model"][stage.part]
+        forms = {form: begun.get(form, False) for form in forms}
+        preset = dataclasses.replace(preset, network={**preset.network, **forms})
     asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     if files.model.exists():
         found = load_text_model(files.model)
