@@ -72,9 +72,16 @@ def test_multimodality_looks_within_a_caption():
     generator = np.random.default_rng(0)
     far_apart = 100.0 * np.arange(5)[:, None, None] + np.zeros((5, 30, 4))
     assert text_metrics.multimodality(far_apart, generator) == 0  # many captions, one motion each
-    two_ways = np.zeros((5, 2, 4))
-    two_ways[:, 1, 0] = 3.0
-    assert text_metrics.multimodality(two_ways, generator) == 3  # never a motion with itself
+    # Of 30 samples at places 0 to 29, 10 pairs: mean |i - j| over all i and j, itself among them, is 899 / 90.
+    line = np.arange(30.0)[None, :, None] + np.zeros((4, 30, 1))
+    drawn = np.array([text_metrics.multimodality(line, generator) for _ in range(4000)])
+    assert drawn.mean() == pytest.approx(899 / 90, abs=0.1)
+    # All captions by one draw: the mean of four varies as that of one, not half as much.
+    apart = np.abs(np.subtract(*generator.integers(0, 30, (2, 4000, 10)))).mean(axis=1)
+    assert drawn.std() > 0.8 * apart.std()
+    # Without replacement: both samples, each beside itself or the other.
+    two = [text_metrics.multimodality([[[0.0], [3.0]]], generator) for _ in range(20)]
+    assert set(two) == {0.0, 3.0}
 
 
 # ------------------------------------------------------------------------------------- joints
@@ -107,7 +114,8 @@ def test_one_foot_is_enough_and_one_jerk_is_not():
 def test_control_errors_by_hand():
     wanted = np.zeros((2, 10, 3, 3))
     given = np.zeros((2, 10, 3), bool)
-    given[:, [2, 5, 7, 9], 1] = True
+    given[0, [2, 5, 7, 9], 1] = True
+    given[1, 5, 1] = True
     made = wanted + [0.0, 0.4, 0.0]  # everywhere, which is less than half a metre
     exact = text_metrics.control_errors(wanted, wanted, given)
     assert set(exact.values()) == {0.0} and set(exact) <= set(registry.METRICS)
@@ -116,5 +124,6 @@ def test_control_errors_by_hand():
     made[0, 5, 1] = [2.0, 0.0, 0.0]
     made[1, :, 0] = 99.0  # a joint that nobody asked for
     one_off = text_metrics.control_errors(made, wanted, given)
+    # A clip counts once, whatever it was told: (1/4 + 0) / 2, not 1/5.
     assert one_off["control_trajectory_error"] == 0.5 and one_off["control_location_error"] == 1 / 8
-    assert one_off["control_average_error"] == pytest.approx((7 * 0.4 + 2.0) / 8)
+    assert one_off["control_average_error"] == pytest.approx(((3 * 0.4 + 2.0) / 4 + 0.4) / 2)
