@@ -1,5 +1,6 @@
 """The judge as a whole, on a small captioned data set of the walker: what it sees, refuses and keeps."""
 
+import dataclasses
 import zlib
 
 import numpy as np
@@ -10,7 +11,7 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample, turn
 from f3amd_lib.text.data.text_encoders import TextEmbeddings
 from f3amd_lib.text.data.text_motions import text_motions
-from f3amd_lib.text.judge import text_judge
+from f3amd_lib.text.judge import text_judge, text_metrics
 from f3amd_lib.text.judge.text_judge import EvaluatorTraining
 from f3amd_lib.text.stages import text_models
 
@@ -93,6 +94,19 @@ def test_a_table_has_real_motion_first_and_every_figure_with_its_interval(judge,
     assert (table["repeats"] == 3).all()
     value = table.set_index(["system", "metric"])["value"]
     assert value["real", "text_FID"] == pytest.approx(0, abs=1e-6) and value["still", "text_FID"] > 1e-3
+
+
+def test_clips_that_share_no_pair_are_all_judged_in_random_groups(data):
+    """HumanML3D says of no clip what it shows."""
+    alone = dataclasses.replace(data, pairs=data.names)
+    real = text_judge.judged_clips(alone)
+    assert real.names == tuple(np.array(data.names)[data.members("test")])
+    groups = [text_metrics.groups_of_unlike_pairs(real.pairs, np.random.default_rng(seed), 3) for seed in range(2)]
+    assert all(one.shape == (2, 3) and len(np.unique(one)) == 6 for one in groups)
+    assert not np.array_equal(*groups)
+    few = dataclasses.replace(data, pairs=("seen twice", "seen twice", *data.names[2:]))
+    with pytest.raises(ValueError, match="no pair of content and style with enough clips"):
+        text_judge.judged_clips(few)
 
 
 def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):

@@ -405,9 +405,10 @@ def load_judge(path: Path) -> TextJudge:
 
 
 def judged_clips(data: TextMotions) -> TextMotions:
-    """Return the test clips that can be judged: those of pairs with enough clips."""
+    """Return the test clips that can be judged: those of pairs with enough clips, or all where none shares its pair."""
     pairs, counts = np.unique(data.pairs, return_counts=True)
-    chosen = [clip for clip in data.members("test") if data.pairs[clip] in pairs[counts >= CLASS_CLIPS]]
+    known = {*pairs[counts >= (CLASS_CLIPS if counts.max() > 1 else 1)]}  # HumanML3D's pairs are names of clips
+    chosen = [clip for clip in data.members("test") if data.pairs[clip] in known]
     if not chosen:
         raise ValueError(f"data set {data.name!r} has no pair of content and style with enough clips to judge by")
     return data.select(chosen)

@@ -32,7 +32,9 @@ def groups_of_unlike_pairs(pairs, generator: np.random.Generator, size: int = GR
       ValueError: if fewer pairs than `size` are there.
     """
     order = generator.permutation(len(pairs))
-    left = {pair: [k for k in order if pairs[k] == pair] for pair in np.unique(np.asarray(pairs)[order])}
+    left = {pair: [] for pair in np.unique(pairs)}
+    for clip in order:
+        left[pairs[clip]].append(clip)
     if len(left) < size:
         raise ValueError(f"groups of {size} need as many pairs of content and style, got {len(left)}")
     groups = []
