@@ -2,6 +2,7 @@
 
 import json
 import socket
+import warnings
 
 import numpy as np
 import pytest
@@ -131,8 +132,21 @@ def test_wordllama_tells_actions_apart(wordllama):
 def test_wordllama_refuses_what_it_cannot_read(wordllama):
     with pytest.raises(ValueError, match="characters unknown to wordllama"):
         wordllama(["a person \U0001f6b6 walks"])
-    with pytest.raises(ValueError, match="more than 32 word pieces"):
-        wordllama(["a person walks " * 20])
+
+
+@pytest.mark.needs("wordllama", "tokenizers")
+def test_a_long_caption_is_cut_and_that_is_said_once(wordllama):
+    said = "a person walks " * 10
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = wordllama([said])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for tail in ("and sits down", "and jumps"):
+            cut = wordllama([3 * said + tail, said])
+            assert cut.mask.sum(axis=1).tolist() == [77, 41]
+            assert np.array_equal(cut.tokens[0, :40], whole.tokens[0, :40])
+    assert [str(one.message) for one in told] == ["captions of more than 77 word pieces are cut there"]
 
 
 @pytest.mark.needs("transformers", "torch")
@@ -156,5 +170,7 @@ def test_clip_by_way_of_transformers(tmp_path, cache_dir):
     embedded = embed_captions(["walk", "he runs"], encoder)
     assert encoder.width == 16 and embedded.tokens.shape[::2] == (2, 16) and embedded.pooled.shape == (2, 12)
     assert embedded.mask.sum(axis=1).tolist() == [6, 8]
+    with pytest.warns(UserWarning, match="cut there"):
+        assert encoder(["walk " * 40]).mask.sum() == 77
     alone = encoder(["walk"])
     assert np.allclose(alone.pooled, embedded.pooled[:1], atol=1e-5)  # padding changes nothing

@@ -15,6 +15,7 @@ round are one to its pooled vector; the token vectors keep their order.
 import hashlib
 import importlib.util
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,8 +28,8 @@ from f3amd_lib.data.packed import cache_folder
 from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.names import check_known, nearest_hint
 
-MOST_TOKENS = 32
-"""Longer captions are refused: what was cut off could not be seen in the motion."""
+MOST_TOKENS = 77
+"""Word pieces of a caption that an encoder reads, those of CLIP; longer ones are cut there."""
 
 
 _PLAIN = dict.fromkeys("‘’‚‛′´`", "'") | dict.fromkeys("“”„‟″«»", '"') | dict.fromkeys("‐‑‒−", "-")
@@ -64,10 +65,10 @@ class TextEncoder:
     embed: Callable[[Sequence[str]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
     def __call__(self, captions: Sequence[str]) -> TextEmbeddings:
-        """Embed captions that `check_captions` has passed; ValueError for one that is too long."""
+        """Embed captions that `check_captions` has passed; a warning, once, where one is too long to be read whole."""
         pieces, pooled = self.embed(captions)
-        if long := [caption for caption, piece in zip(captions, pieces, strict=True) if len(piece) > MOST_TOKENS]:
-            raise ValueError(f"caption {long[0]!r} has more than {MOST_TOKENS} word pieces; say it shorter")
+        if max(map(len, pieces)) >= MOST_TOKENS:
+            warnings.warn(f"captions of more than {MOST_TOKENS} word pieces are cut there", stacklevel=2)
         return _padded(pieces, pooled)
 
 
@@ -152,7 +153,7 @@ def load_wordllama() -> TextEncoder:
             # What the vocabulary does not know is spelled out in bytes.
             if any(re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece) for piece in pieces.tokens):
                 raise ValueError(f"caption {caption!r} holds characters unknown to wordllama; use English")
-        pieces = [vectors[pieces.ids] for pieces in encoded]
+        pieces = [vectors[pieces.ids[:MOST_TOKENS]] for pieces in encoded]
         return pieces, [piece.mean(axis=0) for piece in pieces]
 
     return TextEncoder("wordllama-l2-supercat-256", vectors.shape[1], embed)
@@ -177,7 +178,8 @@ def _load_transformers(kind: str, folder) -> TextEncoder:
     dense = None if kind == "clip" else load_file(needed[1])["linear.weight"].float()
 
     def embed(captions):
-        given = tokenizer(list(captions), padding=True, return_tensors="pt")
+        how = {"padding": True, "truncation": True, "max_length": MOST_TOKENS, "return_tensors": "pt"}
+        given = tokenizer(list(captions), **how)
         with torch.no_grad():
             output = model(**given)
         mask, tokens = given["attention_mask"].bool(), output.last_hidden_state
@@ -214,7 +216,7 @@ def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddi
     The cache (F3AMD_CACHE_DIR overrides its place) has one file for each encoder and list of captions.
 
     Raises:
-      ValueError: for a caption that is empty, too long, or that the encoder cannot read.
+      ValueError: for a caption that is empty, or that the encoder cannot read.
     """
     check_captions(captions)
     captions = [plain_caption(caption) for caption in captions]
