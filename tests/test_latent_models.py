@@ -202,6 +202,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         assert tasks[name].clips.count.tolist() == [1, 1]
         wanted = OneVectorAWord()(["a person walks 0", "a person walks 2"]).pooled
         np.testing.assert_allclose(tasks[name].clips.pooled, wanted, atol=1e-6)
+        np.testing.assert_array_equal(tasks[name].clips.empty, np.ones(8))
     # Losses are watched on the one validation clip; recipes' shares of the 20 steps arrive.
     statistics = frame_statistics(data)
     (frames, mask), *others = watched
@@ -254,6 +255,24 @@ def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data,
     np.testing.assert_allclose(teacher.clips.mean[0], seen[0], atol=1e-4)
 
 
+def test_a_teacher_is_guided_away_from_what_its_encoder_makes_of_no_words(data, tmp_path, monkeypatch):
+    def loop(task, *rest, **leg):
+        return types.SimpleNamespace(step=task.config.num_steps, averaged=optimise.initial_state(task).params), []
+
+    monkeypatch.setattr(train_stage, "train_in_legs", loop)
+    made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-teacher", folder=tmp_path, **QUIET)
+    again = load_text_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
+    network, text, noise = made.network(), np.full((1, 8), 0.5), jax.random.normal(jax.random.key(0), (1, 2, 3))
+    network.output.kernel[...] = jax.random.normal(jax.random.key(1), network.output.kernel.shape)
+    by_hand, zeros = (
+        sample_teacher(network, made.schedule, text, empty, noise, num_steps=2) for empty in (np.ones(8), np.zeros(8))
+    )
+    for model in (made, again):
+        walked = motionpcm_sampling.latent_walk(model, 2)(network, text, noise, None)
+        np.testing.assert_array_equal(walked, by_hand)
+    assert np.abs(by_hand - zeros).max() > 1e-3
+
+
 @pytest.mark.slow
 def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeypatch):
     made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
@@ -294,7 +313,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     text = embed_captions([ONE_CAPTION], OneVectorAWord()).pooled
     start = jax.random.normal(jax.random.key(PROFILE.seed), (1, 2, 3))
     of_student = [network_with(student.config, student.params), student.schedule, text]
-    of_teacher = [network_with(teacher.config, teacher.params), teacher.schedule, text, np.zeros(text.shape[-1])]
+    of_teacher = [network_with(teacher.config, teacher.params), teacher.schedule, text, np.ones(text.shape[-1])]
     wanted = {
         "tiny-M2": (2, sample_student(*of_student, start, num_steps=2, skip=student.training["skip"])),
         "tiny-teacher": (50, sample_teacher(*of_teacher, start)),

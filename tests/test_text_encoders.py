@@ -135,6 +135,11 @@ def test_wordllama_refuses_what_it_cannot_read(wordllama):
 
 
 @pytest.mark.needs("wordllama", "tokenizers")
+def test_no_words_are_the_zero_vector_to_a_mean_of_words(wordllama):
+    assert wordllama.embed([""])[1][0].tolist() == [0.0] * 256 and not wordllama([""]).pooled.any()
+
+
+@pytest.mark.needs("wordllama", "tokenizers")
 def test_a_long_caption_is_cut_and_that_is_said_once(wordllama):
     said = "a person walks " * 10
     with warnings.catch_warnings():

@@ -20,12 +20,14 @@ SIZES = {"movement_width": 16, "motion_hidden": 16, "text_hidden": 16, "embeddin
 
 
 class OneVectorAWord:
-    """Every word is a random vector of its own."""
+    """Every word is a random vector of its own; no words are ones."""
 
     identity, width = "one vector a word", 8
 
     def __call__(self, captions) -> TextEmbeddings:
         words = [[zlib.crc32(word.encode()) for word in caption.split()] for caption in captions]
+        if captions == [""]:
+            return TextEmbeddings(np.ones((1, 1, 8), np.float32), np.ones((1, 1), bool), np.ones((1, 8), np.float32))
         tokens = np.zeros((len(captions), max(map(len, words)), 8), np.float32)
         mask = np.zeros(tokens.shape[:2], bool)
         for row, (told, kept) in enumerate(zip(words, mask, strict=True)):

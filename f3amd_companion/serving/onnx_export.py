@@ -16,8 +16,8 @@ program is from JAX; and, of F3AMD and CAMDM, a worked example in Python and one
 
 `prediction` is what the network was trained to say: x0, the noise or the velocity. A teacher of MotionPCM has no input
 `guidance`; whoever guides it, or ACMDM, calls twice (ACMDM section 4.1, MotionPCM Eq. 11), the second time with zeros
-for the text. The card has the times to ask at, and the shares of signal and noise there, so that the walk is three
-lines:
+for the text, or for a teacher of Sentence-T5 with its vector of the empty caption. The card has the times to ask at,
+and the shares of signal and noise there, so that the walk is three lines:
 
     x0, eps = from prediction, state, alpha, sigma;   state = alpha_next x0 + sigma_next eps
 

@@ -57,7 +57,8 @@ class TextEncoder:
     Attributes:
       identity: name and state of the weights: embeddings of two identities do not mix.
       width: of token vectors.
-      embed: function from captions to their token vectors, [tokens, width] each, and their pooled vectors.
+      embed: function from captions to their token vectors, [tokens, width] each, and their pooled vectors; the empty
+        caption has some, too, with which MotionPCM says nothing.
     """
 
     identity: str
@@ -154,7 +155,7 @@ def load_wordllama() -> TextEncoder:
             if any(re.fullmatch("<0x[0-9A-F]{2}>|<unk>", piece) for piece in pieces.tokens):
                 raise ValueError(f"caption {caption!r} holds characters unknown to wordllama; use English")
         pieces = [vectors[pieces.ids[:MOST_TOKENS]] for pieces in encoded]
-        return pieces, [piece.mean(axis=0) for piece in pieces]
+        return pieces, [piece.mean(axis=0) if len(piece) else np.zeros(piece.shape[1:]) for piece in pieces]
 
     return TextEncoder("wordllama-l2-supercat-256", vectors.shape[1], embed)
 

@@ -39,7 +39,7 @@ def teacher_prediction(teacher: LatentDenoiser, text, empty, guidance=TEACHER_GU
     Args:
       teacher: the network.
       text: embeddings of captions, [B, W].
-      empty: embedding of the empty caption, [W].
+      empty: embedding of the empty caption, [W], or 0.
       guidance: w.
     """
     told, free = teacher.encode(text), teacher.encode(jnp.broadcast_to(empty, text.shape))
@@ -168,9 +168,7 @@ def latent_walk(trained: LatentModel, num_steps: int | None = None, guidance: fl
     steps, schedule = steps_of(trained, num_steps), trained.schedule
     how = {"num_steps": steps, "guidance": guidance_of(trained, steps, guidance)}
     if not trained.config.guidance_features:
-        return lambda network, text, noise, key: sample_teacher(
-            network, schedule, text, jnp.zeros(text.shape[-1]), noise, **how
-        )
+        return lambda network, text, noise, key: sample_teacher(network, schedule, text, trained.empty, noise, **how)
     if trained.training["consistency"] == "latent":
         return lambda network, text, noise, key: sample_latent_student(network, schedule, text, noise, key, **how)
     skip = trained.training["skip"]

@@ -259,8 +259,8 @@ def _latents(asked: Asked, split: str | None) -> LatentTable | None:
         return None
     before, part = asked.before, asked.part(split)
     pooled = asked.pooled([caption for several in part.captions for caption in several])
-    model, nothing = network_with(before.autoencoder, before.autoencoder_params), jnp.zeros_like(pooled[0])
-    return latent_table(model, before.statistics, part, pooled, nothing, asked.config.num_frames)
+    model, empty = network_with(before.autoencoder, before.autoencoder_params), asked.encoder([""]).pooled[0]
+    return latent_table(model, before.statistics, part, pooled, empty, asked.config.num_frames)
 
 
 @frozen_tree("clips")
@@ -287,6 +287,7 @@ class TeacherTask(ClipsTask):
     def kept(self, asked: Asked, state: TrainingState, about: dict) -> LatentModel:
         """Return the trained teacher: its moving average."""
         made = {"schedule": self.schedule, "config": self.model_config, "params": state.averaged}
+        made["empty"] = self.clips.empty
         return dataclasses.replace(asked.before, **made, **asked.told(), **about)
 
     def draw(self, state: TrainingState, key):

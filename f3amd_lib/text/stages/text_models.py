@@ -263,12 +263,13 @@ class TextModel(CaptionedModel):
 class LatentModel(CaptionedModel):
     """A trained model of MotionPCM: an autoencoder, with a teacher or a student or alone.
 
-    Its weights are a teacher's moving average, or a student's own. For the text encoder zeros stand for no caption. The
-    identity of its task, in the record, says M and k of a student.
+    Its weights are a teacher's moving average, or a student's own. The identity of its task, in the record, says M and
+    k of a student.
 
     Attributes:
       autoencoder, autoencoder_params: config and weights.
       statistics: of its features.
+      empty: what its text encoder makes of the empty caption, [W], or 0.
     """
 
     kind: ClassVar[str] = "latent motion model"
@@ -276,6 +277,7 @@ class LatentModel(CaptionedModel):
     autoencoder: CheckedConfig
     autoencoder_params: Any
     statistics: AxisNormaliser
+    empty: Any = 0.0
 
     @property
     def training(self) -> dict:
@@ -289,13 +291,14 @@ class LatentModel(CaptionedModel):
 
     def parts(self) -> tuple[dict, dict, CheckedConfig, dict]:
         """Return what its file has besides, as `TextModel.parts`."""
-        return {"autoencoder": self.autoencoder_params}, self.statistics._asdict(), self.autoencoder, {}
+        empty = {"empty": jnp.asarray(self.empty)} if np.any(self.empty) else {}
+        return {"autoencoder": self.autoencoder_params}, self.statistics._asdict() | empty, self.autoencoder, {}
 
     @classmethod
     def of(cls, tree: dict, autoencoder: CheckedConfig, said: dict, about: dict) -> LatentModel:
         """Return the model of a file, as `TextModel.of`."""
-        statistics = AxisNormaliser(tree["mean"], tree["deviation"])
-        return cls(autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], statistics=statistics, **about)
+        about |= {"statistics": AxisNormaliser(tree["mean"], tree["deviation"]), "empty": tree.get("empty", 0.0)}
+        return cls(autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], **about)
 
 
 def _normaliser(arrays: dict | None) -> AxisNormaliser | None:
