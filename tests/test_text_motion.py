@@ -11,6 +11,7 @@ from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
+from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable
 from f3amd_lib.text.networks.acmdm import (
@@ -35,10 +36,11 @@ from f3amd_lib.text.stages.acmdm_training import (
     frame_error,
     noisy_state,
 )
+from f3amd_lib.text.stages.motionpcm_training import LatentMotionTraining
 from f3amd_lib.text.stages.text_models import MotionCodec, with_latent
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import initial_state, optimise
-from f3amd_lib.training.recipe import part_recipe
+from f3amd_lib.training.recipe import part_recipe, profile_part_recipe
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
 CLIPS, FRAMES, JOINTS = 6, 40, 3
@@ -89,6 +91,25 @@ def recipe(**settings):
 
 
 # -------------------------------------------------------------------------------------------------------------- recipes
+
+
+@pytest.mark.parametrize(
+    "training, part, preset, steps",
+    [
+        (TextMotionTraining, "denoiser", "ACMDM-S-PS22", 23_384 // 64 * 500),
+        (TextMotionTraining, "control", "ACMDM-S-PS22", 23_384 // 64 * 500),
+        (LatentMotionTraining, "autoencoder", "MotionPCM-VAE", 6000 * 192),
+        (LatentMotionTraining, "teacher", "MotionPCM-teacher", 3000 * 384),
+        (LatentMotionTraining, "student", "MotionPCM-M1", 384_000),
+    ],
+)
+def test_the_gpu_trains_as_long_as_the_paper_and_others_as_long_as_they_are_asked(training, part, preset, steps):
+    made = lambda profile, **asked: profile_part_recipe(
+        training, part, load_profile(profile, "bandai", **asked), preset
+    )
+    assert made("gpu").num_steps == steps and made("gpu", train_steps=70).num_steps == 70
+    few, many = (made("laptop", train_steps=count).num_steps for count in (1000, 12_000))
+    assert many == 12 * few < steps
 
 
 def test_recipes_are_the_papers_and_the_presets():

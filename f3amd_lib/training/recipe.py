@@ -17,7 +17,7 @@ from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, var
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, checked_value, refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.ground.profiles import Profile, load_profile
 from f3amd_lib.networks.presets import find_preset
 
 _SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
@@ -236,11 +236,16 @@ def part_recipe(training: type, part: str, num_steps: int, preset: str | None = 
 
 
 def profile_part_recipe(training: type, part: str, profile: Profile, preset: str | None, batch_size=None, **settings):
-    """Return how a profile trains a part: by the paper's recipe on `gpu`, by the short one and its share elsewhere."""
+    """Return how a profile trains a part: by the paper's recipe on `gpu`, by the short one and its share elsewhere.
+
+    Where the profile's number of steps is the usual one, a recipe's own goes before it.
+    """
     settings |= {} if batch_size is None else {"batch_size": batch_size}
     name = part if profile.name == "gpu" else f"short-{part}"
-    share = load_paper_file("recipes", training.paper)[name].get("share", 1.0)
-    num_steps = max(1, round(share * profile.train_steps))
+    recipe, num_steps = load_paper_file("recipes", training.paper)[name], profile.train_steps
+    if num_steps == load_profile(profile.name, profile.dataset).train_steps:
+        num_steps = recipe.get("num_steps", num_steps)
+    num_steps = max(1, round(recipe.get("share", 1.0) * num_steps))
     return part_recipe(training, name, num_steps, preset, seed=profile.seed, **settings)
 
 
