@@ -117,6 +117,16 @@ def test_all_models_of_the_file_are_presets_or_named_as_others():
         check_model(model, "claims.toml")
 
 
+def test_what_hangs_on_how_the_paper_counted_is_open(tmp_path):
+    """Its evaluation divides by coordinates; only the pelvis, trained alone, is ahead by points as well."""
+    c1, c2 = (claims.load_claims(PAPER)[name].judge(paper_evidence(PAPER)) for name in ("C1", "C2"))
+    assert [statement.verdict for statement in c1] == [HOLDS, OPEN, HOLDS, REMARK]
+    assert [statement.verdict for statement in c2] == [OPEN] * 6 + [REMARK]
+    assert "0.0197 (0.0591 if by points) against 0.0404" in c1[1].figure
+    ours = judged(tmp_path, world())  # records count points: there is nothing to ask
+    assert ours["C2"].verdict == HOLDS and "by points" not in ours["C2"].ours[0].figure
+
+
 def test_the_papers_intervals_and_captions_arrive():
     paper = paper_evidence(PAPER)
     found = paper.figure("text_table1", model=f"{S}-raw", metric="text_FID")

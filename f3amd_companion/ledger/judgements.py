@@ -223,18 +223,32 @@ def _times_worse(metric: str, figure: Figure, against: Figure) -> Figure:
     return ratio(against, figure) if METRICS[metric].better == "up" else ratio(figure, against)
 
 
-def ranked(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
-    """Judge whether rows (their columns, and `among` for all) stand in this order, best first."""
-    figures = [evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows]
-    verdict = majority(ordered(_times_worse(metric, second, first)) for first, second in pairwise(figures))
-    return verdict, _values_text(figures)
+def ranked(evidence: Evidence, table: str, metric: str, rows, among=None, coordinates=1) -> Finding:
+    """Judge whether rows (their columns, and `among` for all) stand in this order, best first.
+
+    A paper may have divided the first row's figure by coordinates instead of points, so many of each: where that
+    decides, nothing can be told.
+    """
+    worse = lambda first, second: ordered(_times_worse(metric, second, first))
+    judge = lambda figures: majority(worse(*pair) for pair in pairwise(figures))
+    return _counted(evidence, judge, ", ", table, metric, rows, among, coordinates)
 
 
-def leads(evidence: Evidence, table: str, metric: str, rows, among=None) -> Finding:
+def leads(evidence: Evidence, table: str, metric: str, rows, among=None, coordinates=1) -> Finding:
     """Judge whether the first row is better than every other; arguments as of `ranked`."""
+    judge = lambda figures: every(ordered(_times_worse(metric, other, figures[0])) for other in figures[1:])
+    return _counted(evidence, judge, " against ", table, metric, rows, among, coordinates)
+
+
+def _counted(evidence: Evidence, judge: Callable, between: str, table, metric, rows, among, coordinates) -> Finding:
+    """Return what `judge` says of rows, or that nothing can be told where the count of coordinates decides."""
     first, *others = (evidence.figure(table, **(among or {}), **row, metric=metric) for row in rows)
-    verdict = every(ordered(_times_worse(metric, other, first)) for other in others)
-    return verdict, f"{number_text(first.value)} against {_values_text(others)}"
+    counts = {1, coordinates} if evidence.printed else {1}
+    firsts = [first.map(lambda bound, count=count: count * bound) for count in sorted(counts)]
+    verdicts = {judge([one, *others]) for one in firsts}
+    by_points = "".join(f" ({number_text(one.value)} if by points)" for one in firsts[1:])
+    text = f"{number_text(first.value)}{by_points}{between}{_values_text(others)}"
+    return verdicts.pop() if len(verdicts) == 1 else OPEN, text
 
 
 def _measured(models: Mapping, look: Callable[[Mapping], object]) -> list[Mapping]:
