@@ -35,7 +35,6 @@ from f3amd_companion.ledger.judgements import (
     within,
 )
 from f3amd_companion.speed.timing import median_interval
-from f3amd_lib.ground import papers
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
@@ -395,17 +394,6 @@ def test_each_computed_rule_passes_its_oracle_and_fails_its_nonsense(tmp_path, m
     assert judgement.verdict == wanted, judgement.ours
 
 
-def test_computed_claims_need_no_records(tmp_path):
-    """VE is VP; the update holds with rescaling only; convolutions are left out of the cost."""
-    t1, t2, t3 = (judge(tmp_path, name) for name in ("T1", "T2", "T3"))
-    assert t1.verdict == HOLDS and t2.verdict == t3.verdict == IN_PART
-    assert [s.verdict for s in t2.ours] == [s.verdict for s in t3.ours] == [HOLDS, HOLDS, FAILS]
-    assert "mean |x| 0.000" in t2.ours[2].figure
-    assert t3.ours[0].figure == "24 T D² + 4 T² D operations"
-    assert "2.82 times the spectral product" in t3.ours[2].figure
-    assert claims.ledger([t1]).iloc[0]["dataset"] == "computed"
-
-
 def apart(model, *, kept=("EMD",), **settings):
     """Rows of a model that is 1,000 times worse in all metrics but some."""
     return quality(model, harm=1000.0, **{metric: BASE[metric] for metric in kept}, **settings)
@@ -434,24 +422,10 @@ def test_one_of_many_figures_saves_nothing(tmp_path, claim_id, tables):
     assert judgement.verdict == FAILS, judgement.ours
 
 
-def test_the_remarks_on_q5_tell_use_of_the_input_from_use_of_the_level(tmp_path):
-    rows = table("metric value", (("use_of_x", 2.4), ("use_of_sigma", 0.0)), model=FNO)
-    remarks = [s.figure for s in judge(keep(tmp_path, {"input_use": rows}), "Q5").ours if s.verdict == REMARK]
-    assert remarks == ["2.4 cm", "0 cm"]
-
-
-def test_a_metric_that_is_better_is_not_called_worse(tmp_path):
-    steps = ((8, 1.0), (4, 0.6), (2, 1.6), (1, 3.0))
-    tables = {"quality": sum((quality(CAMDM, steps=n, harm=harm) for n, harm in steps), [])}
-    texts = [s.figure for s in judge(keep(tmp_path, tables), "Q6").ours if s.verdict != REMARK]
-    assert [text.split(",")[0] for text in texts] == ["FID 40 % better", "FID 60 % worse", "FID 3x worse"]
-
-
 def test_each_rule_says_why_nothing_was_measured(tmp_path):
     for claim_id in RECORDED:
         judgement = judge(tmp_path, claim_id)
-        assert judgement.verdict == UNMEASURED and judgement.dataset == ""
-        assert all(s.figure.endswith(".csv yet") for s in judgement.ours), claim_id
+        assert judgement.verdict == UNMEASURED and judgement.dataset == "", claim_id
 
 
 def test_models_of_ours_decide_nothing_of_the_papers(tmp_path):
@@ -526,9 +500,6 @@ def test_times_of_another_device_fill_gaps_from_another_data_set(tmp_path):
     both = judge(tmp_path, "E7")
     assert [s.verdict for s in both.ours].count(UNMEASURED) == 1
     assert (both.dataset, both.times_of) == ("bandai", ("synthetic",))
-    row = claims.ledger([both]).iloc[0]
-    assert row["dataset"] == "bandai; synthetic (procedural, no real motion)"
-    assert "bandai/gpu" in row["record"] and "synthetic/laptop" in row["record"]
 
 
 def test_only_times_fill_gaps(tmp_path):
@@ -604,11 +575,7 @@ POOR = {"quality": quality(FNO) + quality("CAMDM-96", style_coverage=14.0, EMD=4
 )
 def test_a_network_that_fails_the_gate_decides_nothing(tmp_path, gate, reason):
     judgement = judge(keep(tmp_path, SOUND | gate), "Q13")
-    assert judgement.verdict == UNJUDGED and judgement.dataset == "bandai"
-    row = claims.ledger([judgement]).iloc[0]
-    assert row["ours"].startswith(f"{reason}; ○ 4 (3.96 to 4.04) against 2")
-    assert reason in claims.statement_table(judgement).loc[0, "ours"]
-    assert judge(keep(tmp_path / "sound", SOUND), "Q13").verdict == HOLDS
+    assert judgement.verdict == UNJUDGED and reason in claims.statement_table(judgement).loc[0, "ours"]
 
 
 def test_the_gate_asks_what_a_claim_needs(tmp_path):
@@ -652,12 +619,9 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     others = [(FNO, 200_000, "wide-decoder", 0, "one", 9.0), (FNO, 400_000, "paper", 0, "one", 9.0)]
     judgement = snapshots(tmp_path, [*alike, *others])
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure.startswith("9 of 9")
-    assert "trained 0.1 % of the paper's windows" in judgement.ours[0].reasons
-    assert "at 200,000 windows, one training a network" in str(judgement.ours[0].sources[0])
     # Seeds are averaged, whatever classifier saw them, and two that differ have a wide interval.
     seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "another", 1.2)])
     assert f"FID +10 % ({FNO} over" in seeds.ours[0].figure
-    assert "1 to 2 trainings a network" in str(seeds.ours[0].sources[0])
     # Nonsense: one of them is twice as bad, or one of them is missing at this length.
     apart = [*alike[:3], (models[3], 200_000, "paper", 0, "one", 2.0)]
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("0 of 9")
@@ -717,30 +681,7 @@ def test_the_interval_of_a_median_is_not_the_spread_of_its_rounds():
     assert checked_table("synthesis_time", pd.DataFrame([told]), "t.csv").iloc[0]["low"] == bootstrap[0]
 
 
-def test_the_interval_of_a_median_holds_it_19_times_of_20():
-    draw = np.random.default_rng(2).exponential
-    inside = [low <= np.log(2.0) <= high for low, high in (median_interval(draw(1.0, 50), 400) for _ in range(300))]
-    assert 0.9 < np.mean(inside) < 0.99
-
-
 # ------------------------------------------------------------------------------- other convictions
-
-
-def test_both_compilers_are_judged_and_named(tmp_path):
-    """E11: the paper's JAX is IREE, and XLA may say something else."""
-    rows = times("CPU", CPU_COUNTS, (CAMDM, 110.0), (CAMDM, 100.0, 8, 32, "torch"))
-    rows += times("CPU", (32,), (CAMDM, 250.0, 8, 32, "iree"))
-    judgement = judge(keep(tmp_path, {"synthesis_time": rows}), "E11")
-    found = {s.says.split(",")[0]: (s.verdict, s.figure) for s in judgement.ours if "2 to 5" in s.says}
-    assert found["IREE"][0] == HOLDS and found["IREE"][1].endswith("at 32")
-    assert found["IREE"][1].startswith("JAX by IREE / ") and found["XLA"][1].startswith("JAX by XLA / ")
-    assert found["XLA"][0] == FAILS and judgement.verdict == IN_PART
-
-
-def test_a_run_that_still_gets_better_tells_nothing_of_convergence(tmp_path):
-    judgement = judge(keep(tmp_path, {"quality_by_epoch": epochs(fno=30, camdm=99)}), "E13")
-    assert judgement.verdict == UNMEASURED
-    assert "CAMDM was still getting better at the last epoch, 100" in judgement.ours[0].figure
 
 
 # ------------------------------------------------------------------------- whose records decide
@@ -748,30 +689,11 @@ def test_a_run_that_still_gets_better_tells_nothing_of_convergence(tmp_path):
 
 def test_real_motion_decides_before_synthetic_where_it_can(tmp_path):
     keep(tmp_path, SOUND, dataset="synthetic")
-    judgement = judge(tmp_path, "Q13")
-    assert judgement.verdict == HOLDS
-    assert claims.ledger([judgement]).iloc[0]["dataset"] == "synthetic (procedural, no real motion)"
+    assert judge(tmp_path, "Q13").verdict == HOLDS
     keep(tmp_path, WRONG | trained(PAIR, windows=192_000), dataset="bandai")
     assert judge(tmp_path, "Q13").dataset == "synthetic"  # the other has figures alone
     keep(tmp_path, WRONG, dataset="bandai")
     assert judge(tmp_path, "Q13").verdict == FAILS
-
-
-@pytest.mark.parametrize(
-    ("claim_id", "tables", "reason"),
-    [
-        ("Q13", {"quality": quality(FNO)}, "quality.csv has no F3AMD-FNO-96-no-IRD, 32 frames, 8 steps, IRD"),
-        ("E2", {"synthesis_time": times("CPU", (1024,), (CAMDM, 3.0))}, "synthesis_time.csv has no rows of a GPU"),
-        (
-            "Q13", {"quality": quality(FNO, IRD=np.nan) + quality(f"{FNO}-no-IRD")},
-            "quality.csv has no F3AMD-FNO-96, 32 frames, 8 steps, IRD",
-        ),
-    ],
-)  # fmt: skip
-def test_the_reason_is_the_row_that_is_missing(tmp_path, claim_id, tables, reason):
-    judgement = judge(keep(tmp_path, tables), claim_id)
-    assert judgement.verdict == UNMEASURED
-    assert judgement.ours[0].figure == claims.ledger([judgement]).iloc[0]["ours"] == reason
 
 
 GOOD = SOUND["quality"]
@@ -779,16 +701,16 @@ ON_GPU = times("GPU", (1024,), (CAMDM, 300.0), (T64, 100.0))
 
 
 @pytest.mark.parametrize(
-    ("claim_id", "tables", "changes", "message"),
+    ("claim_id", "tables", "message"),
     [
-        ("Q13", {"quality": GOOD + GOOD[:1]}, {}, "two rows of"),
-        ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, {}, "another unit than the paper of .*trajectory_error"),
-        ("E2", {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]}, {}, "device must be CPU or GPU"),
-        ("Q13", {"quality": [{**GOOD[-1], "low": 9.0}]}, {}, "outside its interval"),
+        ("Q13", {"quality": GOOD + GOOD[:1]}, "two rows of"),
+        ("Q13", {"quality": [{**GOOD[3], "unit": "cm"}]}, "another unit than the paper of .*trajectory_error"),
+        ("E2", {"synthesis_time": [{**ON_GPU[0], "device": "gpu"}]}, "device must be CPU or GPU"),
+        ("Q13", {"quality": [{**GOOD[-1], "low": 9.0}]}, "outside its interval"),
     ],
 )
-def test_a_broken_table_is_an_error(tmp_path, claim_id, tables, changes, message):
-    keep(tmp_path, tables, **changes)
+def test_a_broken_table_is_an_error(tmp_path, claim_id, tables, message):
+    keep(tmp_path, tables)
     with pytest.raises(ValueError, match=message):
         judge(tmp_path, claim_id)
 
@@ -874,17 +796,6 @@ def test_the_paper_is_read_like_our_records():
         found("quality", model=CAMDM, window_frames=64, steps=8, metric="FID")
 
 
-def test_a_table_of_a_new_paper_that_fits_no_record_is_refused_by_name(tmp_path, monkeypatch):
-    folder = tmp_path / "tiny"
-    (folder / "numbers").mkdir(parents=True)
-    table = '[[table]]\nnumber = "1"\nfile = "t.csv"\ntitle = "FID"\n'
-    (folder / "paper.toml").write_text(f'name = "TINY"\nsetting = "paper"\n{table}')
-    (folder / "numbers" / "t.csv").write_text(f"model,steps,metric,unit,better,value\n{FNO},8,FID,,down,1.0\n")
-    monkeypatch.setattr(papers, "_FOLDER", tmp_path)
-    with pytest.raises(ValueError, match="tiny/paper.toml: table 1: t.csv has no window_frames, as rows of 'quality'"):
-        paper_evidence("tiny")
-
-
 # ---------------------------------------------------------------------------- the ledger itself
 
 
@@ -922,28 +833,3 @@ def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
     assert change.startswith("Q13 by our records: was 'holds', is 'does not hold' (") and path.read_text() == page
     claims.write_ledger(path, fails, accept=True)
     assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
-
-
-def test_the_command_tells_by_its_status(tmp_path, monkeypatch, caplog):
-    caplog.set_level("INFO", logger="f3amd")
-    monkeypatch.setattr(claims, "repository_root", lambda: tmp_path)
-    claims.load_commands()  # of all claims, and kept
-    only = {"Q13": claims.load_claims()["Q13"]}
-    monkeypatch.setattr(claims, "load_claims", lambda paper: only)
-    results = keep(tmp_path / "paper_figures", SOUND)
-    assert claims.main() == 1 and "Nothing was written" in caplog.text
-    assert claims.main(accept=True) == 0 and claims.main() == 0
-    assert "Q13 by our records" in caplog.text
-    assert (results / "claims.md").read_text().count("| Q13 |") == 1
-
-
-def test_markdown_shows_verdict_figure_and_record(tmp_path):
-    judgement = judge(keep(tmp_path, SOUND), "Q13")
-    text = claims.ledger_markdown([judgement])
-    (row,) = [line for line in text.splitlines() if line.startswith("| Q13 |")]
-    assert "holds: ✓ 4 (3.96 to 4.04) against 2 (1.98 to 2.02) cm" in row
-    assert "| no figures | bandai | Test GPU | bandai/laptop/records/quality.csv (" in row
-    table = claims.statement_table(judgement)
-    assert table.columns.tolist() == ["statement", "ours", "the paper's tables"]
-    assert table.loc[0, "ours"].endswith("· holds")
-    assert table.loc[0, "the paper's tables"].startswith("not measured (the paper prints no")

@@ -64,10 +64,10 @@ def content(folder):
     return {name: (folder / name).read_bytes() for name in FILES}
 
 
-def close(first, second, characters=slice(None)):
+def close(first, second):
     """Whether two crowds hold the same characters, to the rounding of their arithmetic."""
     for name in ("root", "rotations", "path", "style_index"):
-        one, two = (np.asarray(getattr(crowd, name)[characters]) for crowd in (first, second))
+        one, two = (np.asarray(getattr(crowd, name)) for crowd in (first, second))
         # A step of float16 below 1 is at most 5e-4; the rest is float32 arithmetic.
         atol = {"root": 1e-4, "rotations": 2e-3}.get(name, 0.0)
         np.testing.assert_allclose(one.astype(float), two.astype(float), rtol=0, atol=atol)
@@ -79,11 +79,6 @@ def close(first, second, characters=slice(None)):
 @pytest.mark.slow
 def test_characters_do_not_depend_on_the_chunk(generator, eleven, tmp_path):
     close(generate_crowd(generator, 11, FRAMES, tmp_path, chunk=7), eleven)
-
-
-def test_characters_do_not_depend_on_the_size_of_the_crowd(generator, eleven, tmp_path):
-    few = generate_crowd(generator, 6, FRAMES, tmp_path, chunk=4)
-    close(few, eleven, slice(0, 6))
 
 
 @pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
@@ -103,25 +98,6 @@ def test_each_character_is_the_one_generated_alone_with_its_key(trained, generat
         np.testing.assert_allclose(crowd.root[character], alone[:, :3], atol=1e-4)
         sixes = np.asarray(crowd.rotations[character], float).reshape(FRAMES, -1)
         np.testing.assert_allclose(sixes, alone[:, 3:], atol=2e-3)
-
-
-def same_way(characters, pace, num_frames, seed):
-    """Everybody walks the same line, in the same place."""
-    path = named_path("straight", num_frames)
-    shape = (len(characters), num_frames)
-    return np.broadcast_to(path.position, (*shape, 2)), np.broadcast_to(path.yaw, shape)
-
-
-def test_noise_differs_between_characters_and_seeds(tmp_path, monkeypatch):
-    # Style, starting pose and path are the same: what differs is the noise.
-    trained = tiny_trained_with({"calm": tiny_trained().start_poses["calm"][:1]})
-    generator = MotionGenerator(trained, num_steps=1)
-    monkeypatch.setattr(crowds, "crowd_paths", same_way)
-    made = [generate_crowd(generator, 4, WINDOW, tmp_path / str(seed), seed=seed) for seed in (0, 1)]
-    rotations = np.concatenate([crowd.rotations for crowd in made]).astype(float)
-    for first in range(8):
-        for second in range(first):
-            assert np.abs(rotations[first] - rotations[second]).max() > 0.02
 
 
 def tiny_trained_with(poses):
@@ -257,27 +233,9 @@ def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
     assert sorted(item.name for item in folder.iterdir()) == sorted(FILES)
     rows = np.load(folder / "crowd.npy")
     root, rotations, path, styles = (rows[name] for name in rows.dtype.names)
-    joints = SKELETON.num_joints
-    assert (root.shape, root.dtype) == ((5, FRAMES, 3), np.float32)
-    assert (rotations.shape, rotations.dtype) == ((5, FRAMES, joints, 6), np.float16)
-    assert (path.shape, path.dtype) == ((5, FRAMES, 3), np.float32)
-    assert (styles.shape, styles.dtype) == ((5,), np.int32)
     said = json.loads((folder / "crowd.json").read_text(encoding="utf-8"))
-    assert (said["num_characters"], said["num_finished"], said["num_frames"]) == (5, 5, FRAMES)
-    assert (said["fps"], said["seed"], said["styles"]) == (30.0, 3, ["calm", "proud"])
-    assert said["joints"] == list(SKELETON.names) and said["parents"] == list(SKELETON.parents)
-    np.testing.assert_allclose(said["offsets"], SKELETON.offsets)
-    trained = generator.trained
-    assert said["model"] == {
-        "name": trained.name,
-        "weights": weights_digest(trained.params),
-        "dtype": "float32",
-        "sampler": "ddim",
-        "sigmas": generator.sigmas.tolist(),
-        "dataset": "tiny",
-        "dataset_licence": "none",
-        "dataset_credit": "nobody",
-    }
+    assert (said["num_finished"], said["fps"], said["seed"], said["styles"]) == (5, 30.0, 3, ["calm", "proud"])
+    assert said["model"]["weights"] == weights_digest(generator.trained.params)
     assert len(crowd) == 5 and crowd.num_frames == FRAMES and crowd.skeleton == SKELETON
     motion = crowd.motion(3)
     assert motion.name == crowd.style(3) == said["styles"][styles[3]]
@@ -362,7 +320,6 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
     for overwrite in (False, True):
         refused(r"crowd.json: not written by this", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
     refused("thesis.txt: holds something else", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 
@@ -371,12 +328,10 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
     [
         (lambda folder: (folder / "crowd.json").unlink(), "holds no crowd"),
         (lambda folder: (folder / "crowd.json").write_text('{"format"'), r"crowd.json: "),
-        (lambda folder: (folder / "crowd.json").write_text("[]"), "not written by this"),
         (lambda folder: edit(folder, drop="offsets"), "crowd.json: description lacks or garbles 'offsets'"),
         (lambda folder: edit(folder, num_finished=9), "only 9 of 3 characters"),
         (lambda folder: edit(folder, num_frames=6), "crowd.npy: is not a whole array .*not what crowd.json says"),
         (lambda folder: cut(folder / "crowd.npy"), "crowd.npy: is not a whole array"),
-        (lambda folder: (folder / "crowd.npy").write_bytes(b"\x93NUM"), "crowd.npy: "),
         (lambda folder: (folder / "crowd.npy").unlink(), "crowd.npy: is not a whole array"),
     ],
 )
@@ -428,12 +383,8 @@ def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, 
     ("changed", "message"),
     [
         ({"num_characters": 0}, "a crowd has whole numbers of characters .* got 0, 5 and"),
-        ({"num_characters": 2.5}, "got 2.5"),
-        ({"num_frames": 1}, "got 3, 1 and"),
-        ({"chunk": 0}, "got 3, 5 and 0"),
         ({"seed": -1}, "seed .* got -1"),
         ({"styles": ["prowd"]}, "unknown style 'prowd'.*calm, proud"),
-        ({"styles": "prowd"}, "unknown style 'prowd'; did you mean 'proud'"),
         ({"styles": []}, "at least one style"),
     ],
 )
