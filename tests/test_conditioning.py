@@ -114,16 +114,6 @@ def test_section_3_3_cross_attention_equals_a_plain_loop(num_heads):
     np.testing.assert_allclose(got, expected, atol=2e-5)
 
 
-def answer_to_context(encoder, sigma=3.0):
-    """The part of c that the context answers: c less the question itself."""
-    first, second = (encoder(encoder.encode(make_condition(seed=s)), sigma) for s in (0, 10))
-    return first - second
-
-
-def test_c_varies_over_frames():
-    assert float(answer_to_context(make_encoder()).std(axis=1).min()) > 1e-4
-
-
 def test_without_a_position_code_c_is_the_same_in_every_frame(monkeypatch):
     monkeypatch.setattr(conditioning, "position_code", lambda first, last, width: np.zeros((last - first, width)))
     encoder = make_encoder()

@@ -185,9 +185,3 @@ def test_a_batch_carries_the_captions_of_its_clips():
     assert np.array_equal(captions.pair, task.captions.pair[motion.caption])
     rate = np.abs(np.diff(np.unwrap(np.arctan2(motion.motion[:, :20, 0], motion.motion[:, :20, 1]), axis=1)))
     assert np.allclose(rate.mean(axis=1), 0.1 + 0.3 * np.asarray(captions.pair), atol=1e-4)
-
-
-def test_a_training_of_nothing_is_refused():
-    for settings, words in (({"num_steps": 0}, "num_steps must be"), ({"batch_size": 1}, "batches of 2 or more")):
-        with pytest.raises(ValueError, match=words):
-            EvaluatorTraining(**settings)

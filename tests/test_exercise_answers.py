@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from f3amd_notebooks import bimodal_paths
 from f3amd_notebooks.exercises import CHECKS, hint
-from f3amd_notebooks.exercises.course.c03_solvers import _multistep
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
@@ -225,19 +224,6 @@ RIGHT["C3.a"] = [
     lambda *given: jnp.asarray(_two_m(lambda ratio: 0.5 * ratio)(*given)),
 ]
 WRONG["C3.a"] = [_two_m(lambda ratio: 0.0), _two_m(lambda ratio: -0.5 * ratio)]
-
-
-def test_who_takes_the_exact_mean_of_the_line_is_told_so():
-    """It is another solver than 2M, whose value is that of the middle of the step."""
-
-    def exact_mean(x, guess, before, first, sigma, lower):
-        h, h_before = np.log(sigma / lower), np.log(first / sigma)
-        share = np.linspace(0.0, 1.0, 20_001)  # along the step, weighted as the flow weights it
-        weight = np.exp(-h * (1 - share))
-        lean = np.trapezoid(weight * share, share) / np.trapezoid(weight, share) * h / h_before
-        return lower / sigma * x + (1 - lower / sigma) * (guess + lean * (guess - before))
-
-    assert "exact mean of the line" in str(_multistep(exact_mean))
 
 
 def _one_by_one(s, sigmas):

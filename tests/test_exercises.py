@@ -13,7 +13,7 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
-from f3amd_notebooks.exercises import CHECKS, check, hint
+from f3amd_notebooks.exercises import CHECKS, hint
 from f3amd_notebooks.exercises.judging import NotAnswered, agree
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
@@ -119,11 +119,6 @@ def test_a_check_speaks_in_a_script_too(tmp_path):
 def search_path() -> str:
     """Where a script finds the library and the checks: the repository, and its notebooks."""
     return os.pathsep.join(map(str, (NOTEBOOKS.parent, NOTEBOOKS)))
-
-
-def test_a_check_prints_a_sentence_and_returns_nothing(capsys):
-    assert check("11.b", [4.0, 5.0]) is None and check("11.b", 4.0) is None
-    assert capsys.readouterr().out == "11.b: right\n11.b: not yet: two numbers are asked for, in centimetres\n"
 
 
 @pytest.mark.parametrize("number", ["2.z", "2a", "", 2])

@@ -269,20 +269,6 @@ def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
     refused("does not match its checksum", load_artefact, cut.parent)
 
 
-def test_a_missing_runtime_is_named_with_the_remedy(jax_folder, exported, tmp_path, monkeypatch):
-    refused("unknown runtime 'tvm'", load_artefact, jax_folder, runtime="tvm")
-    refused("'llvm-cpu' .*compile some, or pass runtime='jax'", load_artefact, jax_folder)
-    target = {"iree_version": "3.13.0"}
-    copy = altered(jax_folder, tmp_path / "copy", lambda manifest: manifest["targets"].update(x=target))
-    monkeypatch.setitem(sys.modules, "iree", None)
-    monkeypatch.setitem(sys.modules, "iree.runtime", None)
-    with pytest.raises(ImportError, match=r"f3amd_lib\[bench\].*iree-base-runtime==3\.13\.0"):
-        load_artefact(copy, target="x")
-    monkeypatch.setattr(export_module.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"f3amd_lib\[bench\]"):
-        compile_iree(exported.stablehlo)
-
-
 def test_nothing_of_a_user_is_overwritten(exported, tmp_path):
     folder = tmp_path / "round"
     save = lambda **settings: save_artefact(folder, exported, targets=(), **{"name": "tiny", **settings})
@@ -338,12 +324,6 @@ def test_other_devices_are_compiled_for_without_being_there(exported, target, tm
     else:
         mark = {"cuda-sm_80": b".target sm_80", "vulkan-spirv": b"\x03\x02\x23\x07"}[target]
         assert mark in code
-
-
-@pytest.mark.slow
-@needs_iree
-def test_a_gpu_that_iree_does_not_know_is_a_clear_error(exported):
-    refused(r"IREE .* cannot compile .* for cuda-sm_20", compile_iree, exported.stablehlo, "cuda-sm_20")
 
 
 @needs_iree

@@ -97,17 +97,8 @@ def test_feet_held_without_a_look_ahead_slide_less_and_pop_no_more_than_blended_
 
 def test_the_page_of_results_says_what_the_record_says():
     page = (repository_root() / "docs" / "results.md").read_text(encoding="utf-8")
-    table, record = read_table(repository_root() / "paper_figures/bandai/laptop/records/feet.csv")
+    table, _ = read_table(repository_root() / "paper_figures/bandai/laptop/records/feet.csv")
     rows = feet_rows(table)
     assert len(rows) == 13 and all(row in page for row in rows)
-    assert (record["num_seeds"], record["num_frames"], len(record["styles"])) == (3, 640, 7)
     other = table.assign(slide_speed=table.slide_speed + 1)
     assert not any(row in page for row in feet_rows(other))
-    # "about one frame in twenty", "one in thirty to forty", "one in forty"
-    locked = table[table.treatment == "blended, feet locked"].groupby(["model", "steps"]).sliding_share.mean()
-    assert locked["CAMDM"].between(0.04, 0.07).all()
-    assert locked["F3AMD-FNO-96-steady"].between(1 / 42, 1 / 28).all()
-    online = table[table.treatment == "blended, feet locked online"].groupby(["model", "steps"]).sliding_share.mean()
-    assert online["CAMDM"].between(1 / 9, 1 / 6).all()  # "about one in seven"
-    assert online["F3AMD-FNO-96-steady"].between(1 / 25, 1 / 17).all()  # "about one in twenty"
-    assert 1 / 45 < table[table.model == "real"].sliding_share.mean() < 1 / 35

@@ -304,8 +304,6 @@ def test_every_metric_has_a_direction_a_definition_and_a_key_of_its_own():
     for metric in registry.METRICS.values():
         assert metric.better in ("down", "up", "near real") and metric.definition, metric.name
     assert len(registry.BY_KEY) == len(registry.METRICS)
-    titles = {registry.METRICS[name].title for name in ("direction_error", "joint_acceleration", "smoothness")}
-    assert titles == {"Dir. (°)", "joint acceleration (cm/frame²)", "Smooth"}
 
 
 def test_turning_and_moving_the_world_changes_nothing():
@@ -354,7 +352,6 @@ def test_toes_and_floors_that_are_not_there_are_refused():
 
 def test_paths_that_do_not_fit_are_refused():
     refused(r"128 frames .* got \(100, 2\)", metrics.trajectory_error, glide(), np.zeros((100, 2)), WINDOW)
-    refused("RootPath of", metrics.trajectory_error, glide(), np.zeros((128, 3)), WINDOW)
     refused("do not fill a window", metrics.trajectory_error, glide(20), np.zeros((20, 2)), WINDOW)
     refused("finite", metrics.direction_error, np.full(64, np.nan), np.zeros(64), WINDOW)
     refused("window must be", metrics.ird_excess, glide(), 1)

@@ -85,8 +85,3 @@ def test_a_network_is_brought_to_its_target():
     elsewhere = control_distance(CODEC, jnp.ones(SHAPE[:2], bool), target(3, 1, made[0, 3, 1] - 3.0))
     assert np.all(elsewhere(found.state) > 1.0)
     np.testing.assert_allclose(sample(found.noise), found.state, atol=1e-4)
-
-
-def test_no_steps_are_refused():
-    with pytest.raises(ValueError, match="positive decay_steps"):
-        optimise_noise(straight_walk, lambda state: state.sum(), normal(1, *SHAPE), num_steps=0)

@@ -157,19 +157,6 @@ def test_every_input_is_heard(exported):
         assert np.abs(run(**inputs | {name: value[::-1]})[:, :4] - said[:, :4]).max() > 1e-4, name
 
 
-@needs_onnx
-def test_the_card_says_what_the_model_is(exported):
-    trained, folder = exported
-    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-    assert (card["model"], card["terms"], card["batch"]) == (trained.name, "CC BY 4.0", "any")
-    assert card["text_encoder"] == "tiny-8" and card["frames_per_second"] == 20
-    assert 0 < card["largest_error"] < 1e-3 and card["output"] == {"prediction": card["inputs"]["state"]}
-    assert set(card["about"]) - {"normaliser"} == set(card["inputs"])
-    latent = isinstance(trained, LatentModel)
-    assert ("not exported" in card["decoder"]) if latent else card["normaliser"]["deviation"] == [2.0] * 3
-    assert card["predicts"] == trained.config.objective
-
-
 def test_what_is_no_model_of_text_is_left_to_others_or_refused(tmp_path, monkeypatch):
     walker = tiny_trained()
     save_model(tmp_path / "walker.safetensors", walker)

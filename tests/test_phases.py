@@ -109,7 +109,7 @@ def gaussian_noise(state, time, mean=0.3, variance=0.6):
     return sigma * (state - alpha * mean) / (alpha**2 * variance + sigma**2)
 
 
-@pytest.mark.parametrize("skip, wanted", [(100, 1.4150), (50, 1.5023), (20, 1.5600), (1, 1.6001)])
+@pytest.mark.parametrize("skip, wanted", [(100, 1.4150), (20, 1.5600)])
 def test_jumps_through_a_gaussian_end_where_the_sheet_says(skip, wanted):
     phases, state = cut_phases(1000, skip), np.asarray(1.7)
     for time, before in zip(phases.times[::-1], phases.before[::-1], strict=True):

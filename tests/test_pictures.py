@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from builders import refused, straight_motion, wandering_motion
+from builders import straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 
 from f3amd_lib.drawing.diagrams import arrow, boxes
@@ -123,11 +123,6 @@ def test_motion_of_positions_alone_is_drawn_without_its_tips():
     assert drawn_points(tipped, frames).shape[1] == whole.skeleton.num_joints + 1
     np.testing.assert_allclose(drawn_points(alone, frames), whole.positions[:2])
     poses_beside({"alone": alone}, frames)
-
-
-def test_crowds_that_are_none_are_refused():
-    refused("at least one crowd", crowd_figure, {}, 1)
-    refused("at least one crowd, and somebody in each", crowd_figure, {"nobody": ([], [])}, 1)
 
 
 def test_a_kept_figure_names_its_data_set_and_its_light_copy_the_file_in_full_size(tmp_path):

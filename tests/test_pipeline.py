@@ -4,13 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from builders import refused
 
 import f3amd_lib.training.pipeline as pipeline
 from f3amd_companion.__main__ import main
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
-from f3amd_lib.ground import profiles
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.bvh import read_bvh
@@ -128,12 +126,6 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
     assert origin == "trained now"
 
 
-def test_missing_model_says_how_to_make_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(profiles, "runs_dir", lambda dataset, profile: tmp_path / profile)
-    monkeypatch.setattr(profiles, "PRETRAINED_DIR", tmp_path / "pretrained")
-    refused("f3amd train --data bandai", profiles.find_model, "bandai")
-
-
 @pytest.mark.slow
 def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path, capsys):
     _, _, profile, model = trained_once
@@ -151,14 +143,3 @@ def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path
     assert main(command) == 2
     assert "exists already" in capsys.readouterr().err
     assert main([*command, "--overwrite"]) == 0
-
-
-def test_command_refuses_unknown_style_in_one_line(trained_once, same_runs, tmp_path, capsys):
-    profile = trained_once[2]
-    weights = pipeline.model_files(profile).model
-    out = tmp_path / "out"
-    assert main(["rollout", "--style", "Nobody", "--weights", str(weights), "--out", str(out)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "unknown style 'Nobody'" in error
-    assert not out.exists()

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from builders import SKELETON, packed_from, refused, stiff_walk, walks_and_runs
 
-from f3amd_companion.ledger import quality_tables
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.measures import real_clips
 from f3amd_lib.measures.registry import SHOWN
@@ -36,12 +35,6 @@ def test_reference_clips_are_held_out_and_walk_at_the_pace(packed):
         assert real_clips.reference_clips(packed, ["calm"], window=WINDOW) == [4, 5]
     assert real_clips.reference_clips(packed, ["calm"], window=4) == [4, 8]
     assert real_clips.reference_clips(packed, ["calm"], window=WINDOW, split="validation") == [9]
-
-
-def test_reference_clips_say_what_is_missing(packed):
-    with pytest.raises(ValueError, match="no validation clip of proud"):
-        real_clips.reference_clips(packed, ["proud"], window=WINDOW, split="validation")
-    refused("unknown split 'tset'", real_clips.reference_clips, packed, ["calm"], window=WINDOW, split="tset")
 
 
 def test_own_path_keeps_a_line_and_loses_the_sway():
@@ -109,13 +102,3 @@ def test_rounds_show_where_the_path_is_lost():
     np.testing.assert_allclose(table["gap_m"], [0.0, 0.0, 0.25], atol=1e-6)
     np.testing.assert_allclose(table["worst_gap_m"], [0.0, 0.0, 0.5], atol=1e-6)
     np.testing.assert_allclose(table["acceleration_cm"], 0.0, atol=1e-4)
-
-
-def test_quality_table_starts_with_the_real_row(packed):
-    real = real_clips.measure_clips(packed, [4, 9], window=WINDOW)
-    table = quality_tables.quality_table(real, {("F3AMD-FNO-96", 8): real, ("F3AMD-FNO-96", 1): real})
-    assert list(dict.fromkeys(table["label"])) == ["real", "F3AMD-FNO-96, 8 steps", "F3AMD-FNO-96, 1 step"]
-    assert list(dict.fromkeys(table["steps"])) == [0, 8, 1]
-    rows = table[table["label"] == "real"].set_index("metric")
-    assert rows.loc["IRD", "value"] == pytest.approx(real["ird_cm"].mean())
-    assert len(rows) == len(SHOWN["first"])

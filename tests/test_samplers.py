@@ -70,7 +70,7 @@ def test_appendix_f_step_by_hand():
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 2e-4), ("float64", 1e-12)])
-@pytest.mark.parametrize("num_steps", [1, 4, 8, 64, "cosine"])
+@pytest.mark.parametrize("num_steps", [1, 8, "cosine"])
 def test_appendix_f_vp_equals_ve(num_steps, dtype, tolerance):
     cosine = num_steps == "cosine"
     sigmas = variance_preserving_cosine().grid(4) if cosine else SCHEDULE.grid(num_steps)
@@ -151,12 +151,6 @@ def test_appendix_f_literal_walk_feeds_the_state_back_as_it_is(num_steps):
     # Nothing is fed back in a single step. Two end at sigma_min, where little is lost.
     apart = np.abs(x - right).max()
     assert apart == 0.0 if num_steps == 1 else apart < 1e-3 if num_steps == 2 else apart > 0.5
-
-
-@pytest.mark.parametrize("name", DETERMINISTIC)
-@pytest.mark.parametrize("sigmas", [[1.0], [], [[1.0, 0.0]]])
-def test_grids_without_a_step_are_refused(name, sigmas):
-    refused("sigmas", sample, name, two_modes(), jnp.zeros((1, 1, 1)), sigmas)
 
 
 def test_ddpm_posterior_is_camdms():
@@ -290,7 +284,7 @@ def test_order_of_convergence_on_the_mixture_oracle(sampler, order, to_zero):
     assert found == pytest.approx(order, abs=0.1)
 
 
-@pytest.mark.parametrize(("num_steps", "unroll"), [(1, False), (3, True), (5, False)])
+@pytest.mark.parametrize(("num_steps", "unroll"), [(1, False), (3, True)])
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_evaluations_are_as_many_as_promised(name, num_steps, unroll):
     levels = []
@@ -327,23 +321,23 @@ def test_a_walk_in_the_scaled_state_is_the_walk_in_the_unscaled_one():
     assert np.std(walked) > 0.5 and np.abs(untold - unscaled).max() > 0.03
 
 
-def test_shares_of_the_signal_are_for_ddim_and_fit_the_levels():
-    for name, alphas in (("heun", [0.5, 1.0]), ("ddim", [0.5, 0.7, 1.0])):
-        with pytest.raises(ValueError, match="alphas are for 'ddim' alone, one for each of the 2"):
-            sample(name, two_modes(), jnp.zeros((1, 1, 1)), [1.0, 0.0], alphas=alphas)
-
-
-def test_unknown_samplers_and_missing_keys_are_refused():
-    x_init, sigmas = jnp.zeros((1, 1, 1)), [1.0, 0.0]
-    refused("'hein'.*did you mean 'heun'", sample, "hein", two_modes(), x_init, sigmas)
-    refused("did you mean 'ddim'", num_evaluations, "dim", 4)
-    refused("'ddpm'.*give it a key", sample, "ddpm", two_modes(), x_init, sigmas)
-    refused("sigmas", sample, "ddpm", two_modes(), x_init, [1.0], key=jax.random.key(0))
-    refused("num_steps=0", num_evaluations, "ddim", 0)
+@pytest.mark.parametrize(
+    ("name", "sigmas", "settings", "message"),
+    [
+        ("hein", [1.0, 0.0], {}, "did you mean 'heun'"),
+        ("ddpm", [1.0, 0.0], {}, "give it a key"),
+        ("ddim", [1.0], {}, "sigmas"),
+        ("ddim", [[1.0, 0.0]], {}, "sigmas"),
+        ("heun", [1.0, 0.0], {"alphas": [0.5, 1.0]}, "alphas are for 'ddim' alone"),
+        ("ddim", [1.0, 0.0], {"alphas": [0.5, 0.7, 1.0]}, "one for each of the 2"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(name, sigmas, settings, message):
+    refused(message, sample, name, two_modes(), jnp.zeros((1, 1, 1)), sigmas, **settings)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
-@pytest.mark.parametrize("num_steps", [1, 2, 5])
+@pytest.mark.parametrize("num_steps", [1, 3])
 def test_the_walk_in_python_visits_what_the_scan_goes_through(name, num_steps):
     sigmas, x_init, key = SCHEDULE.grid(num_steps), jnp.asarray(start(16), jnp.float32), jax.random.key(4)
     visited = list(walk(name, two_modes(), x_init, sigmas, key=key))

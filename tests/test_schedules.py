@@ -147,16 +147,11 @@ def test_every_schedule_goes_from_noise_to_data_in_one_language(schedule):
     ("num_steps", "spacing", "levels"),
     [
         (1, "endpoints", [7]),
-        (2, "endpoints", [7, 0]),
         (4, "endpoints", [7, 5, 2, 0]),  # 7, 4.67, 2.33, 0
         (8, "endpoints", [7, 6, 5, 4, 3, 2, 1, 0]),
-        (1, "uniform", [7]),
-        (2, "uniform", [7, 3]),
         (3, "uniform", [7, 4, 2]),  # 7, 4.33, 1.67
         (4, "uniform", [7, 5, 3, 1]),
-        (8, "uniform", [7, 6, 5, 4, 3, 2, 1, 0]),
         (1, "leading", [0]),
-        (2, "leading", [4, 0]),
         (3, "leading", [4, 2, 0]),
         (8, "leading", [7, 6, 5, 4, 3, 2, 1, 0]),
     ],
@@ -224,9 +219,7 @@ def test_schedules_go_through_json_and_come_back(schedule, values):
     [
         ({"sigma_max": 64.0}, "unknown noise schedule None.*variance_exploding"),
         ({"kind": "variance_preserving_cosin"}, "did you mean 'variance_preserving_cosine'"),
-        ({"kind": "variance_exploding", "sigma_mx": 64.0}, "did you mean 'sigma_max'"),
         ({"kind": "variance_preserving_cosine", "sigma_max": 64.0}, "unknown.*'sigma_max'"),
-        ({"kind": "variance_exploding", "sampler": "ddpm"}, "unknown.*'sampler'"),
         ({"kind": "variance_exploding", "rho": "3"}, "'rho' must be a number"),
     ],
 )

@@ -38,9 +38,7 @@ def fft_convolution(z, weight_real, weight_imag):
     return np.fft.irfft(spectrum, n=num_frames, axis=1)
 
 
-@pytest.mark.parametrize(
-    ("num_frames", "modes"), [(32, 17), (32, 12), (32, 1), (31, 16), (31, 5), (7, 4), (8, 5), (2, 2), (1, 1)]
-)
+@pytest.mark.parametrize(("num_frames", "modes"), [(32, 17), (32, 1), (31, 16), (7, 3), (1, 1)])
 def test_eq02_equals_numpy_fft(num_frames, modes):
     z = draw(3, num_frames, 5)
     weight_real, weight_imag = draw(modes, 5, 4, seed=1), draw(modes, 5, 4, seed=2)
@@ -98,7 +96,7 @@ def test_table_8_modes_there_are(num_frames, fourier, cosine):
     assert counted == {"fourier": fourier, "cosine": cosine, "reduced_rank": fourier, "weighted": fourier}
 
 
-@pytest.mark.parametrize("num_frames", [1, 2, 7, 8, 32])
+@pytest.mark.parametrize("num_frames", [1, 7, 32])
 def test_table_8_cosine_basis_is_orthonormal(num_frames):
     basis = cosine_basis(num_frames)
     np.testing.assert_allclose(basis @ basis.T, np.eye(num_frames), atol=1e-12)
@@ -107,13 +105,7 @@ def test_table_8_cosine_basis_is_orthonormal(num_frames):
         basis[0] = 7.0
 
 
-@pytest.mark.parametrize("modes", [0, 9])
-def test_table_8_cosine_modes_out_of_range_are_refused(modes):
-    layer = SpectralConvolution(3, 4, modes, "cosine", rngs=nnx.Rngs(params=0))
-    refused(f"between 1 and 8 for 8 frames, got {modes}", layer, draw(2, 8, 3))
-
-
-@pytest.mark.parametrize(("num_frames", "modes"), [(8, 8), (8, 3), (9, 9), (9, 4), (1, 1)])
+@pytest.mark.parametrize(("num_frames", "modes"), [(8, 8), (9, 4), (1, 1)])
 def test_table_8_cosine_layer_equals_scipys_transform(num_frames, modes):
     layer = SpectralConvolution(3, 4, modes, "cosine", rngs=nnx.Rngs(params=0))
     z, weight = draw(2, num_frames, 3), np.asarray(layer.weight[...])
@@ -134,7 +126,7 @@ def test_eq02_gains_start_at_seven_tenths_and_scale_one_mode_each():
     np.testing.assert_allclose(layer(z), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("num_frames", "modes"), [(8, 5), (9, 5), (9, 2)])
+@pytest.mark.parametrize(("num_frames", "modes"), [(8, 5), (9, 2)])
 def test_eq02_factors_of_a_kernel_of_rank_eight_equal_the_dense_layer(num_frames, modes):
     rng = np.random.default_rng(0)
     complex_normal = lambda *shape: rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
@@ -174,7 +166,7 @@ def flax_convolution(layer):
     return conv
 
 
-@pytest.mark.parametrize("kernel_size", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("kernel_size", [1, 2, 5])
 @pytest.mark.parametrize("num_frames", [2, 9])
 def test_eq03_convolution_equals_flax(kernel_size, num_frames):
     layer = TemporalConvolution(3, 4, kernel_size, rngs=nnx.Rngs(params=0))

@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
@@ -80,10 +79,8 @@ def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
 @pytest.mark.parametrize(
     ("names", "models", "told"),
     [
-        ([], [A], "name what to sweep: campaign, noise_use"),
         (["wolking"], [A], "walking"),
         (["recipes"], [A], "unknown measurement by preset 'recipes'"),
-        (["walking"], ["F3AMD-FNO-33"], "F3AMD-FNO-32"),
         (["campaign"], ["CAMDM"], "unknown name in the queue 'CAMDM'"),
     ],
 )
@@ -256,23 +253,6 @@ def test_a_failed_leg_stops_only_what_stands_on_it(work, monkeypatch, threads):
     assert told.pop(f"train-{A}") == "failed, the loss stopped being a number"
     assert told.pop(f"walking-{A}").startswith("failed, ")
     assert told == {f"train-{B}": "done before", f"walking-{B}": "done"}
-
-
-@pytest.mark.needs("distributed")
-def test_a_scheduler_that_does_not_answer_is_one_line(work, monkeypatch, capsys):
-    monkeypatch.setattr(sweep, "CONNECT_S", 0.3)
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"tcp://localhost:{free.getsockname()[1]}"
-    for wrong in (address, "nonsense://somewhere"):
-        refused(f"--scheduler {wrong}: not reached", lambda wrong=wrong: list(run_sweep(work, [], scheduler=wrong)))
-
-
-def test_without_workers_or_engine_the_answer_is_one_line(work, monkeypatch):
-    refused("--workers must be at least 1, got 0", lambda: list(run_sweep(work, [], workers=0)))
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match="make sweep-tools"):
-        list(run_sweep(work, []))
 
 
 @pytest.mark.needs("distributed")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from test_text_judge import OneVectorAWord
 
-from f3amd_companion.__main__ import main
 from f3amd_companion.measuring import text_tables
 from f3amd_companion.measuring.text_tables import counted_hands, measure_hands, mirrored_positions, probes_of
 from f3amd_lib.ground.profiles import load_profile
@@ -115,12 +114,3 @@ def test_hands_of_clips_and_of_models_are_kept_in_one_table(data, cache_dir, mon
     of_model = table[table["model"] == "as told"]
     assert of_model.groupby("wording")["caption"].nunique().to_dict() == {"held out": 4, "training": 8}
     assert record["measurement"] == "hands" and record["raised_from"] < 0
-
-
-def test_the_command_knows_them_and_refuses_what_makes_no_sense(capsys):
-    assert main(["measure", "hends", "--data", "bandai"]) == 2
-    assert "did you mean 'hands'" in capsys.readouterr().err
-    assert main(["measure", "hands", "quality", "--data", "bandai"]) == 2
-    assert "by a call of its own" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="leave --model out"):
-        text_tables.measure_judge(None, None, PROFILE, models=["ACMDM-S-PS22"])

@@ -75,15 +75,7 @@ def test_section_4_5_defaults_are_the_papers():
     assert config.loss == LossWeights()
 
 
-def test_recipes_keep_the_papers_loss_except_for_plus():
-    paper, plus = (short_recipe(f"F3AMD-FNO-96{end}", 1000) for end in ("", "-plus"))
-    assert paper.loss == LossWeights() and paper.noise == "schedule"
-    assert paper.history_noise == paper.own_history_share == 0.0
-    assert plus.loss.ird_form == "excess" and plus.own_history_share > 0
-    assert short_recipe("F3AMD-FNO-96", 1000, batch_size=7).batch_size == 7
-
-
-@pytest.mark.parametrize("preset", ["F3AMD-FNO-96", "F3AMD-FNO-96-plus", "CAMDM-code"])
+@pytest.mark.parametrize("preset", ["F3AMD-FNO-96-plus", "CAMDM-code"])
 def test_config_survives_json(preset):
     config = short_recipe(preset, 1000, seed=3)
     assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
@@ -93,26 +85,15 @@ def test_config_survives_json(preset):
     ("settings", "message"),
     [
         ({"schedule": "invers_square"}, "'invers_square'.*'inverse_square'"),
-        ({"noise": "mixd"}, "'mixd'.*'mixed'"),
-        ({"noise_weighting": "low_nose"}, "'low_nose'.*'low_noise'"),
-        ({"num_steps": 0}, "num_steps must be above 0"),
         ({"batch_size": -1}, "batch_size must be above 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be a finite number"),
-        ({"learning_rate": "1e-3"}, "learning_rate must be a finite number"),
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"own_history_share": 1.5}, "own_history_share"),
-        ({"captured_path_share": -0.1}, "captured_path_share"),
-        ({"history_dropout": 2.0}, "history_dropout"),
         ({"noise": "mixed", "diffusion": variance_preserving_cosine(8)}, "mixed noise needs"),
     ],
 )
 def test_impossible_configs_are_refused(settings, message):
     refused(message, TrainingConfig, **{"num_steps": 10, **settings})
-
-
-def test_config_names_unknown_keys():
-    with pytest.raises(ValueError, match="'learning_rat'; did you mean 'learning_rate'"):
-        TrainingConfig.from_dict({"num_steps": 10, "learning_rat": 1e-3})
 
 
 def test_network_inputs_by_hand(task):
@@ -168,22 +149,6 @@ def test_a_state_keeps_the_names_that_earlier_files_have(task, finished, tmp_pat
         names = set(file.keys())
     assert {f"{of}['encoder']['local_second']['kernel'].value" for of in (".params", ".ema")} <= names
     assert {name.split("[")[0] for name in names} == {".params", ".ema", ".optimiser", ".step"}
-
-
-@pytest.mark.parametrize(
-    ("model", "settings", "name"),
-    [
-        ({}, {"learning_rate": 1e-3}, "training settings .*learning_rate"),
-        ({}, {"loss": LossWeights(ird=0.5)}, "training settings .*loss"),
-        ({"sigma_data": 0.5}, {}, "model settings .*sigma_data"),
-        ({"depth": 2}, {}, "model settings .*depth"),
-    ],
-)
-def test_states_of_other_settings_are_refused(task, tmp_path, model, settings, name):
-    path = tmp_path / "state.safetensors"
-    save_state(path, task, initial_state(task))
-    other = tiny_task(tiny_config(**model), **{"num_steps": STEPS, "learning_rate": 1e-2, "ema_decay": 0.9, **settings})
-    refused(rf"state\.safetensors.*other {name}", restore_state, path, other)
 
 
 def test_tasks_of_equal_numbers_are_one_program_and_others_are_not(task):
