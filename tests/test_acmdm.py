@@ -19,7 +19,6 @@ from f3amd_lib.text.networks.acmdm import (
     control_branch,
     controlled,
     draw_hidden,
-    frames_known,
     rotary_angles,
     rotary_base,
     rotated,
@@ -80,14 +79,6 @@ def test_parameters_are_those_of_the_released_sizes(size, million):
 @pytest.mark.parametrize(("tokens", "base"), [(49, 200), (98, 300), (539, 1400), (196, 500), (15, 100), (50, 200)])
 def test_rotary_bases_are_the_released_ones(tokens, base):
     assert rotary_base(tokens) == base
-
-
-def test_patches_are_the_papers_at_22_joints_and_fill_up_at_21():
-    for joints, sizes in ((22, (22, 11, 2)), (21, (21, 11, 2)), (1, (1, 1, 1))):
-        configs = [config_of(num_joints=joints, patch=patch) for patch in ("whole", "half", "pair")]
-        assert tuple(config.patch_joints for config in configs) == sizes
-    assert [config_of(num_joints=22, patch=patch).num_patches for patch in ("whole", "half", "pair")] == [1, 2, 11]
-    assert config_of(num_joints=21, patch="pair").num_patches == 11
 
 
 @pytest.mark.parametrize("patch", ["whole", "half", "pair"])
@@ -305,13 +296,6 @@ def test_hidden_frames_follow_the_cosine_and_stay_within_the_clip():
     assert float(vector.sum() / hidden.sum()) == pytest.approx(0.9 * 0.88, abs=0.01)
 
 
-def test_rounds_reveal_few_frames_first_and_all_at_last():
-    known = np.asarray(frames_known(jnp.asarray([49, 6]), 18))
-    assert known.shape == (18, 2) and known[-1].tolist() == [49, 6]
-    steps = np.diff(known[:, 0])
-    assert (steps >= 0).all() and steps[:5].sum() < steps[-5:].sum()
-
-
 # --------------------------------------------------------------------------------------------------- presets, refusals
 
 
@@ -340,16 +324,3 @@ def test_every_preset_of_acmdm_survives_json_and_is_counted():
 def test_settings_that_make_no_sense_are_refused(family, settings, message):
     with pytest.raises(ValueError, match=message):
         config_of(family, **settings)
-
-
-def test_arrays_that_do_not_fit_are_refused():
-    network = fresh(config_of())
-    context = network.encode(condition())
-    for state in (STATE[:, :, :3], normal(0, 2, 9, 5, 4), STATE[:, :4]):
-        with pytest.raises(ValueError):
-            network(state, TIME, context)
-    for broken in (condition()._replace(pooled=jnp.ones((2, 7))), condition()._replace(mask=jnp.ones((2, 9), bool))):
-        with pytest.raises(ValueError):
-            network.encode(broken)
-    with pytest.raises(ValueError, match="block_frames 0"):
-        control_branch(fresh(config_of(block_frames=4)), 4, jax.random.key(0))

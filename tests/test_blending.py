@@ -90,12 +90,6 @@ def test_what_comes_out_are_rotations_whatever_goes_in():
     np.testing.assert_allclose(one[keep], frames[0, keep], atol=1e-12)
 
 
-def test_each_character_is_blended_alone():
-    frames = random_frames((3, 3 * T), seed=5)
-    together = blend_seams(frames, T, 6)
-    np.testing.assert_allclose(together[1], blend_seams(frames[1], T, 6), atol=1e-12)
-
-
 def test_history_makes_the_first_frame_a_seam():
     frames = frames_of(np.tile([1.0, 0.0, 0.0], (T, 1)))
     history = frames_of(np.zeros((4, 3)))

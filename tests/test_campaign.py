@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pandas as pd
 import pytest
 from builders import packed_from, refused
@@ -210,15 +209,6 @@ def test_a_leg_that_was_stopped_goes_on_to_the_same_weights_and_measures_nothing
     # A nonsense must show: another seed gives other weights.
     _, (other, _) = run(packed, judges, tmp_path / "other", [(Run("F3AMD-FNO-32", seed=5), 8)], monkeypatch)
     assert other["weights"][0] not in set(table["weights"])
-
-
-@pytest.mark.slow
-def test_windows_of_64_frames_and_only_one_preset(packed, judges, small, tmp_path, monkeypatch):
-    snapshots = [(Run("F3AMD-FNO-32"), 4), (Run("F3AMD-FNO-48", window=64), 4)]
-    states, (table, _) = run(packed, judges, tmp_path, chosen(snapshots, ["F3AMD-FNO-48"]), monkeypatch)
-    assert [name for name, *_ in states] == ["F3AMD-FNO-48-64frames-seed0"]
-    assert set(table["window_frames"]) == {64} and np.isfinite(table.query("metric == 'held_out_loss'")["value"]).all()
-    assert table["device"].unique().tolist() == [jax.devices()[0].device_kind]
 
 
 MIXED, SEEDED = Run("F3AMD-FNO-32", "mixed-noise"), Run("F3AMD-FNO-32", seed=1)

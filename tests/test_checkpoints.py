@@ -90,12 +90,6 @@ def test_everything_but_the_weights_comes_back_exactly(trained, saved):
     np.testing.assert_allclose(loaded.skeleton.offsets, SKELETON.offsets, atol=1e-7)
 
 
-def test_model_can_be_kept_in_full_precision(trained, tmp_path):
-    save_model(tmp_path / "model.safetensors", trained, dtype=jnp.float32)
-    loaded = load_model(tmp_path / "model.safetensors")
-    assert same_tree(loaded.params, trained.params)
-
-
 def test_a_models_denoiser_has_its_weights_its_condition_and_its_level(trained):
     x_noisy, condition = draw(2, WINDOW, CHANNELS), make_condition()
     network, denoise = trained.network(), trained.denoiser(condition)
@@ -177,14 +171,6 @@ def test_flipped_bytes_among_the_weights_are_noticed(copied):
     content[-2000:-1990] = b"\x3f" * 10
     copied.write_bytes(bytes(content))
     refused(r"copy\.safetensors", load_model, copied)
-
-
-def test_networks_of_a_model_share_nothing():
-    trained = tiny_trained()
-    first, second = trained.network(), trained.network()
-    first.encoder.local_first.bias[...] = jnp.ones(CHANNELS)
-    for network in (second, trained.network()):
-        assert float(jnp.abs(network.encoder.local_first.bias[...]).max()) == 0.0
 
 
 def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Figures about one window, on denoisers whose answers are known."""
 
-import dataclasses
 import math
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from builders import refused, tiny_camdm, tiny_trained, tiny_windows
+from builders import tiny_camdm, tiny_trained, tiny_windows
 from scipy.stats import norm
 
 from f3amd_lib.data.windows import spread_windows
@@ -181,10 +180,3 @@ def test_use_of_inputs_is_told_on_held_out_windows(model_that, answer, uses_x, u
     assert (value["use_of_sigma"] > 0.5 * max(1.0, value["use_of_x"])) == uses_sigma
     if not uses_x:
         assert value["use_of_x"] < 1e-3
-
-
-def test_windows_of_other_sizes_are_refused():
-    trained = tiny_trained()
-    longer = dataclasses.replace(trained, config=dataclasses.replace(trained.config, window=trained.config.window + 2))
-    refused("windows are of", denoising.held_out_condition, tiny_windows(), longer)
-    refused("windows are of", denoising.x0_error_by_sigma, longer, tiny_windows(), SIGMAS)

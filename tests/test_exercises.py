@@ -4,10 +4,7 @@ Every cell tagged `exercise` or `solution` is run alone, as a reader would who j
 """
 
 import ast
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import nbformat
@@ -104,27 +101,6 @@ def test_solutions_lie_in_notebooks_of_their_own_each_with_its_reason():
 
 
 # The check itself.
-
-
-def test_a_check_speaks_in_a_script_too(tmp_path):
-    script = tmp_path / "homework.py"
-    script.write_text('from f3amd_notebooks.exercises import check\ncheck("11.b", [4.0, 5.0])\ncheck("11.b", ...)\n')
-    ran = subprocess.run(
-        [sys.executable, str(script)], cwd=NOTEBOOKS, env=os.environ | {"PYTHONPATH": search_path()},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert ran.stdout == "11.b: right\n11.b: not yet: put your answer in the place of `...`\n"
-
-
-def search_path() -> str:
-    """Where a script finds the library and the checks: the repository, and its notebooks."""
-    return os.pathsep.join(map(str, (NOTEBOOKS.parent, NOTEBOOKS)))
-
-
-@pytest.mark.parametrize("number", ["2.z", "2a", "", 2])
-def test_an_unknown_number_is_refused_with_the_nearest(number):
-    with pytest.raises(ValueError, match=r"no exercise .*2\.[a-g]"):
-        hint(number, 1.0)
 
 
 @pytest.mark.parametrize("number", list(CHECKS))

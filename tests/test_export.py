@@ -19,7 +19,7 @@ from builders import refused
 from f3amd_companion.serving import artefact as artefact_module
 from f3amd_companion.serving import export as export_module
 from f3amd_companion.serving.artefact import load_artefact, manifest_digest
-from f3amd_companion.serving.export import compile_iree, export_model, export_round, save_artefact
+from f3amd_companion.serving.export import export_model, export_round, save_artefact
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rounds import sample_round
@@ -184,14 +184,6 @@ def test_scales_and_styles_travel_with_a_trained_model(trained, jax_folder):
     assert record["dataset"] == "tiny" and record["dataset_licence"] == "CC BY 4.0"
 
 
-def test_a_bare_network_takes_network_units(exported, tmp_path):
-    folder = save_artefact(tmp_path / "round", exported, name="tiny", targets=())
-    artefact, numbers = load_artefact(folder, runtime="jax"), builders.draw(2, 39, seed=1)
-    for same in (artefact.normalise, artefact.denormalise, artefact.normalise_path):
-        np.testing.assert_array_equal(same(numbers), numbers)
-    refused("knows none", artefact.one_hot, ["calm"])
-
-
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_a_wrong_input_is_named(runtime, request):
     artefact = load_artefact(request.getfixturevalue(f"{runtime}_folder"), runtime=runtime)
@@ -201,18 +193,6 @@ def test_a_wrong_input_is_named(runtime, request):
             bad = [*given[:number], wrong, *given[number + 1 :]]
             refused(rf"{name} must have shape \(2, .*got \(1, ", artefact, *bad)
     refused("it was given 5 inputs", artefact, *given, given[3][None])
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"batch": 0}, "batch must be a whole number"),
-        ({"batch": 1.0}, "batch must be a whole number"),
-        ({"sampler": "ddin"}, "unknown sampler 'ddin'; did you mean 'ddim'"),
-    ],
-)
-def test_what_makes_no_round_is_refused(trained, settings, message):
-    refused(message, export_round, trained.network(), **{"sigmas": SIGMAS, "batch": BATCH, **settings})
 
 
 def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path):
@@ -324,21 +304,3 @@ def test_other_devices_are_compiled_for_without_being_there(exported, target, tm
     else:
         mark = {"cuda-sm_80": b".target sm_80", "vulkan-spirv": b"\x03\x02\x23\x07"}[target]
         assert mark in code
-
-
-@needs_iree
-def test_a_program_that_does_not_compile_in_tiles_is_compiled_without(monkeypatch):
-    seen, tiling = [], export_module.TARGETS["llvm-cpu"]["tiling"]
-
-    def run(command, **settings):
-        seen.append(command)
-        tiled = any(flag in tiling for flag in command) or "vmvx" in " ".join(command)
-        if not tiled:
-            Path(command[command.index("-o") + 1]).write_bytes(b"module")
-        return subprocess.CompletedProcess(command, int(tiled), "", "error: large vector sizes")
-
-    monkeypatch.setattr(export_module.subprocess, "run", run)
-    module, flags = compile_iree(b"program", "llvm-cpu")
-    assert module == b"module" and len(seen) == 2
-    assert not set(flags) & set(tiling)
-    refused("large vector sizes", compile_iree, b"program", "vmvx")

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from builders import refused, wandering_motion
+from builders import wandering_motion
 from scipy.spatial.transform import Rotation
 from test_skeleton import BANDAI, random_motion
 
@@ -129,15 +129,6 @@ def test_a_skeleton_of_more_joints_than_a_byte_counts_keeps_them_apart(tmp_path)
     (part,) = file.json["meshes"][0]["primitives"]
     joints = file.values(part["attributes"]["JOINTS_0"])
     assert joints.max() == count - 1 or joints.max() == count - 2  # the last may bear no limb
-
-
-def test_what_cannot_be_written_is_refused(tmp_path):
-    motion = wandering_motion(4)
-    refused("written as .glb", write_glb, tmp_path / "walk.gltf", motion)
-    write_glb(tmp_path / "walk.glb", motion)
-    refused("exists already", write_glb, tmp_path / "walk.glb", motion)
-    alone = Motion.from_positions(motion.skeleton, motion.positions)
-    refused("needs rotations", write_glb, tmp_path / "other.glb", alone)
 
 
 def test_a_table_has_every_joint_of_every_frame(tmp_path):

@@ -53,5 +53,6 @@ def test_what_cannot_be_laid_out_is_refused(gpu_package, tmp_path, monkeypatch):
     refused("is there already", gpu_package.lay_out, tmp_path, "A", 9.0, packed)
     refused("no such file", gpu_package.lay_out, tmp_path / "x", "A", 9.0, tmp_path / "none.safetensors")
     monkeypatch.setattr(gpu_package, "MOST_BYTES", 1_000_000)
-    refused(r"MB, more than 1; the largest: bandai.safetensors 2.0 MB", gpu_package.lay_out, tmp_path / "x", "A", 9.0, packed)
+    message = r"MB, more than 1; the largest: bandai.safetensors 2.0 MB"
+    refused(message, gpu_package.lay_out, tmp_path / "x", "A", 9.0, packed)
     assert not (tmp_path / "x").exists()

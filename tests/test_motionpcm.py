@@ -196,13 +196,3 @@ def test_a_discriminator_reads_every_block_and_lets_the_gradient_through(teacher
     spoilt = [features[0] + normal(5, 2, 4, 16), *features[1:]]
     changed = np.abs(critic(spoilt) - scores(state)).max(axis=(0, 2, 3))
     assert changed[0] > 1e-3 and not changed[1:].any()
-
-
-def test_positions_may_begin_as_waves():
-    sizes = {"window": 2, "channels": 3, "latent_width": 8, "depth": 3, "num_heads": 2, "hidden_width": 8}
-    coder = presets.build_config("MotionPCM-VAE", features=11, position_start="waves", **sizes)
-    table = presets.build_from_config(coder, jax.random.key(0)).decoder_positions[...]
-    apart = np.linalg.norm(table[:40] - table[0], axis=-1)
-    assert apart[1] < apart[2] < apart[3]  # neighbours in time are neighbours here
-    with pytest.raises(ValueError, match="unknown position_start 'wave'; did you mean 'waves'"):
-        presets.build_config("MotionPCM-VAE", features=11, position_start="wave", **sizes)

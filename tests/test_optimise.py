@@ -210,13 +210,6 @@ def test_an_infinite_update_is_found_and_never_reaches_the_checkpoint(tmp_path, 
     assert int(state.step) == 2 and all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 
 
-def test_stopping_after_no_steps_makes_none():
-    state, history = optimise(line(), stop_after=0, **QUIET)
-    assert int(state.step) == 0 and history == []
-    for wrong in ({"chunk": 0}, {"checkpoint_every": -1}):
-        refused("chunk and checkpoint_every must be at least 1", optimise, line(), **QUIET | wrong)
-
-
 def test_checkpoints_are_written_though_chunks_end_elsewhere(tmp_path):
     checkpoint, steps = tmp_path / "state.safetensors", []
 

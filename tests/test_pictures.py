@@ -8,7 +8,6 @@ import pytest
 from builders import straight_motion, wandering_motion
 from matplotlib.collections import LineCollection
 
-from f3amd_lib.drawing.diagrams import arrow, boxes
 from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
@@ -99,20 +98,6 @@ def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_s
 
 
 # --- diagrams ----------------------------------------------------------------------------------
-
-
-def test_arrows_run_from_edge_to_edge_of_boxes():
-    figure, axis = new_figure(4.0, 2.0)
-    axis.set(xlim=(0, 4), ylim=(0, 2))
-    first, second, third = boxes(axis, 0.5, [(0.5, "one", "white"), (2.0, "+", "dashed"), (3.5, "end", "none")])
-    arrow(axis, first, third, bend="arc3,rad=-0.3")
-    figure.draw_without_rendering()
-    drawn = [text.arrow_patch for text in axis.texts if getattr(text, "arrow_patch", None)]
-    assert len(drawn) == 3
-    edges = [text.get_bbox_patch() for text in (first, second)]
-    left, right = (edge.get_window_extent().transformed(axis.transData.inverted()) for edge in edges)
-    assert left.x1 < right.x0 and drawn[0].patchA is edges[0] and drawn[0].patchB is edges[1]
-    assert third.get_bbox_patch().get_edgecolor()[3] == 0
 
 
 def test_motion_of_positions_alone_is_drawn_without_its_tips():

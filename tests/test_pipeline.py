@@ -94,13 +94,6 @@ def test_a_finished_model_without_its_state_is_not_overwritten(trained_once, sam
     assert files.model.read_bytes() == before
 
 
-def test_presets_may_be_called_by_the_papers_names(trained_once):
-    profile = trained_once[2]
-    name = "F3AMD-FNO-96, m=14"
-    assert pipeline.model_files(profile, name).model.name == "F3AMD-FNO-96-m14.safetensors"
-    assert pipeline.profile_recipe(profile, name) == pipeline.profile_recipe(profile, "F3AMD-FNO-96-m14")
-
-
 def test_models_that_lie_there_are_listed(trained_once, same_runs, monkeypatch, tmp_path):
     profile = trained_once[2]
     assert pipeline.available_models(profile) == [profile.preset]

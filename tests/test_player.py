@@ -6,7 +6,6 @@ import re
 import subprocess
 import zlib
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -186,11 +185,6 @@ def test_unlike_skeletons_share_a_page():
     assert tracks["contacts"] is None and data["skeletons"][1]["toes"] is None
 
 
-def test_one_frame_is_enough():
-    data = page_data(player_page(wandering_motion(1)))
-    assert data["frames"] == 1 and read_tracks(data)[0][0]["global"].shape[0] == 1
-
-
 # -------------------------------------------------------------------------------------------- text
 
 
@@ -283,17 +277,6 @@ def test_a_film_strip_stands_beside_the_page(tmp_path):
     write_player(tmp_path / "alone.html", scene, strip=False)
     assert not (tmp_path / "alone.png").exists()
     refused(r"players are written as \.html", write_player, tmp_path / "walk.htm", scene)
-
-
-def test_the_page_is_made_of_files_that_are_installed():
-    import tomllib
-
-    root = Path(__file__).resolve().parents[1]
-    listed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
-    patterns = listed["package-data"]["f3amd_companion"]
-    package = root / "f3amd_companion"
-    found = {path for pattern in patterns for path in package.glob(pattern)}
-    assert set((package / "serving" / "web").iterdir()) <= found
 
 
 def test_three_is_the_bundle_that_was_checked():

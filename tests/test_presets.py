@@ -152,13 +152,6 @@ def test_a_preset_that_makes_no_sense_is_refused_by_file_and_name(tmp_path, wron
         presets.read_presets(path)
 
 
-def test_unknown_names_are_refused_with_the_nearest():
-    with pytest.raises(ValueError, match="'F3AMD-FNO-69'; did you mean 'F3AMD-FNO-96'"):
-        presets.build_config("F3AMD-FNO-69", **SIZE)
-    with pytest.raises(ValueError, match="'latent_with'; did you mean 'latent_width'"):
-        presets.build_config("F3AMD-FNO-96", **SIZE, latent_with=8)
-
-
 def test_configs_of_every_family_survive_json():
     for name in presets.of_paper():
         config = presets.build_config(name, **SIZE)

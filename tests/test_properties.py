@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import runpy
 import string
 import sys
 import warnings
-from importlib.machinery import PathFinder
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -173,15 +171,3 @@ def test_any_clips_go_through_a_folder_of_humanml3d(tmp_path_factory, lengths, s
         other = again.names.index(name)
         assert again.captions[other] == data.captions[number] and again.splits[other] == data.splits[number]
         np.testing.assert_array_equal(again.clip(other), data.clip(number)[:-1])
-
-
-@pytest.mark.parametrize("script", ["fuzz", "scaling", "side_by_side"])
-def test_scripts_use_the_library_beside_them(tmp_path, monkeypatch, script):
-    """And not one that is installed."""
-    (tmp_path / "f3amd_lib").mkdir()
-    installed = tmp_path / "f3amd_lib" / "__init__.py"
-    installed.touch()
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    assert Path(PathFinder.find_spec("f3amd_lib").origin) == installed
-    runpy.run_path(str(_FUZZ.with_name(f"{script}.py")), run_name="not called")
-    assert Path(PathFinder.find_spec("f3amd_lib").origin).parents[1] == _FUZZ.parents[1]

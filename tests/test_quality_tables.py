@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-from builders import refused
 
 from f3amd_companion.ledger.quality_tables import (
     FIGURES,
@@ -13,7 +12,6 @@ from f3amd_companion.ledger.quality_tables import (
     beside_paper,
     figure_text,
     of_queue,
-    wide_rows,
 )
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
@@ -77,13 +75,6 @@ def test_table_5_ours_are_means_with_intervals_and_the_rest_is_not_measured():
     assert line_of(rows, LABEL, model="CAMDM", steps=8)["value"].isna().all()
 
 
-def test_a_data_set_without_a_real_row_says_so():
-    rows = beside_paper(12, figures(), LABEL)
-    assert (rows[rows["line"] == 0]["model"] == "real").all()
-    assert (rows[rows["line"] == 0]["printed"] == NOT_MEASURED).all()
-    assert wide_rows(rows)["source"][0] == f"{LABEL}: {NOT_MEASURED}"
-
-
 def test_the_papers_names_are_ours_by_find_preset_and_ours_alone_are_in_no_row_of_the_paper():
     pytorch = line_of(beside_paper(6, QUALITY, LABEL), LABEL, model="CAMDM-code")
     assert pytorch.loc["FID", "value"] == 30.0
@@ -105,11 +96,6 @@ def test_the_papers_names_are_ours_by_find_preset_and_ours_alone_are_in_no_row_o
 )
 def test_figures_have_four_digits_and_as_many_decimals_in_the_interval(value, low, high, text):
     assert figure_text(value, low, high) == text
-
-
-def test_bad_input_is_refused():
-    refused("unique", beside_paper, 3, table_of(QUALITY, figures()), LABEL)
-    refused("middle of its interval", figure_text, 5.0, 4.0, 9.0)
 
 
 def test_rows_of_the_queue_are_means_over_trainings():

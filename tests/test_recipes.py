@@ -53,11 +53,6 @@ def test_every_recipe_changes_one_thing(prepared):
     ]  # fmt: skip
 
 
-def test_unknown_recipe_names_the_nearest():
-    refused("'wide-decodr'; did you mean 'wide-decoder'", campaign.find_recipe, "wide-decodr")
-    refused("'residual-prio'; did you mean", campaign.find_recipe, "higher-learning-rate+residual-prio")
-
-
 def test_two_changes_in_one_recipe_are_both_made(prepared):
     both = campaign.find_recipe("residual-prior+higher-learning-rate")
     one, other = (campaign.RECIPES[name] for name in both.name.split("+"))

@@ -6,10 +6,9 @@ import sys
 import textwrap
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, WINDOW, make_condition, network_of, refused, tiny_config
+from builders import CHANNELS, WINDOW, make_condition, network_of, tiny_config
 
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding
@@ -42,14 +41,6 @@ def test_noise_may_be_given(network):
     noise = jax.random.normal(jax.random.split(key)[0], (BATCH, WINDOW, CHANNELS))
     found = sample_round(network, given, SIGMAS, noise=noise)
     np.testing.assert_array_equal(found, sample_round(network, given, SIGMAS, key))
-
-
-def test_wrong_noise_or_none_is_refused(network):
-    given = make_condition(BATCH)
-    refused("key, or the noise", sample_round, network, given, SIGMAS)
-    with pytest.raises(ValueError, match="noise must have shape"):
-        sample_round(network, given, SIGMAS, noise=jnp.zeros((BATCH, WINDOW - 1, CHANNELS)))
-    refused("key", sample_round, network, given, SIGMAS, noise=jnp.zeros((BATCH, WINDOW, CHANNELS)), sampler="ddpm")
 
 
 ON_TWO_DEVICES = """

@@ -46,22 +46,6 @@ def settings(monkeypatch) -> dict:
     return runpy.run_path(str(DOCS / "conf.py"))
 
 
-def launching(monkeypatch, address: str) -> dict:
-    """The theme's options about the repository, for an address of it."""
-    monkeypatch.setenv("F3AMD_REPOSITORY", address)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    options = runpy.run_path(str(DOCS / "conf.py"))["html_theme_options"]
-    return {name: value for name, value in options.items() if name.startswith(("repository", "launch"))}
-
-
-def test_notebooks_open_elsewhere_where_an_address_is_known_and_nowhere_else(monkeypatch):
-    assert launching(monkeypatch, "") == {}
-    buttons = lambda address: launching(monkeypatch, address)["launch_buttons"]
-    assert set(buttons("https://example.org/owner/name")) & {"colab_url", "binderhub_url"} == {"binderhub_url"}
-    assert "colab_url" in buttons("https://github.com/owner/name")  # which opens notebooks of GitHub alone
-    assert "colab_url" not in buttons("https://github.com.example.org/owner/name")
-
-
 def toctree_entries(path: Path) -> list[str]:
     """What the tables of contents of a page name, as paths from the root of the repository."""
     entries = []
@@ -211,28 +195,7 @@ def test_setup_is_folded_and_only_the_very_same_figure_is_shown_in_full_size():
     assert other.data == data and "width" not in other.metadata["image/png"]
 
 
-def test_an_unknown_insert_is_refused():
-    assert pages.insert("a\nb") == "a\nb"
-    refused("insert: galery: unknown; there are room, gallery", pages.insert, "<!-- insert: galery bandai -->")
-    refused("room f3amd_lib.motoin: there is no such", pages.insert, "<!-- insert: room f3amd_lib.motoin -->")
-
-
 # Docstrings
-
-
-@pytest.mark.parametrize(
-    "line, expected",
-    [
-        ("x0 * sigma and |x|^2", r"x0 \* sigma and \|x\|^2"),
-        ("see `a * b` and trailing_ name", r"see `a * b` and trailing\_ name"),
-        ("snake_case stays", "snake_case stays"),
-        ("trees of `Array`s", r"trees of `Array`\ s"),
-        ("  * an item", "  * an item"),
-        ("  *arguments: more * than", r"  *arguments: more \* than"),
-    ],
-)
-def test_marks_in_a_docstring_mean_themselves(line, expected):
-    assert pages.plain_line(line) == expected
 
 
 # Nothing from outside
@@ -308,23 +271,6 @@ def test_a_whole_site_has_no_faults(tmp_path):
 def test_each_fault_of_a_site_is_found(tmp_path, body, fault):
     (found,) = links.check_site(write_site(tmp_path, body))[0]
     assert found.startswith("index.html: ") and fault in found
-
-
-def test_style_sheets_are_followed_from_where_they_stand(tmp_path):
-    write_site(tmp_path, "<p>")
-    sheet = tmp_path / "sub" / "own.css"
-    sheet.write_text("@import url(../style.css); @font-face { src: url(../f.woff2?v=1#x) }")
-    assert links.check_site(tmp_path)[0] == ["sub/own.css: ../f.woff2?v=1#x leads nowhere"]
-    (tmp_path / "f.woff2").write_bytes(b"")
-    assert links.check_site(tmp_path)[0] == []
-    sheet.write_text("@import '//example.org/a.css'; p { background: URL('../../x.png') }")
-    assert links.check_site(tmp_path) == (
-        [
-            "sub/own.css: ../../x.png leads out of the site's folder",
-            "sub/own.css: asks //example.org/a.css from outside",
-        ],
-        1,
-    )
 
 
 # Building and publishing

@@ -7,7 +7,6 @@ import re
 import nbformat
 import numpy as np
 import pytest
-from builders import refused
 from f3amd_notebooks.sliders import slide
 
 from f3amd_lib.drawing.style import new_figure
@@ -72,13 +71,6 @@ def test_every_frame_is_there_and_lies_where_matplotlib_would_draw_it(drawn):
         places = line.axes.transData.transform(expected)
         places[:, 1] = figure.bbox.height - places[:, 1]
         np.testing.assert_allclose(stroke[1:], fine * places, atol=0.51)  # the first stands twice
-
-
-def test_frames_that_do_not_fit_are_refused(drawn):
-    figure, line, frames = drawn
-    refused("'short'", slide, figure, [line], frames | {"short": []}, label="k", alt="")
-    refused("[n, 2]", slide, figure, [line], {"flat": [np.zeros(4)]}, label="k", alt="")
-    refused("start", slide, figure, [line], frames, label="k", alt="", start=3)
 
 
 def sliders(name: str) -> list[str]:

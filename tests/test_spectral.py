@@ -90,12 +90,6 @@ def test_default_layer_has_the_weights_that_files_hold():
     }
 
 
-@pytest.mark.parametrize(("num_frames", "fourier", "cosine"), [(32, 17, 32), (31, 16, 31)])
-def test_table_8_modes_there_are(num_frames, fourier, cosine):
-    counted = {variant: count_modes(variant, num_frames) for variant in SPECTRAL_VARIANTS}
-    assert counted == {"fourier": fourier, "cosine": cosine, "reduced_rank": fourier, "weighted": fourier}
-
-
 @pytest.mark.parametrize("num_frames", [1, 7, 32])
 def test_table_8_cosine_basis_is_orthonormal(num_frames):
     basis = cosine_basis(num_frames)
@@ -150,11 +144,6 @@ def test_eq02_factors_of_a_kernel_of_rank_eight_equal_the_dense_layer(num_frames
 def test_eq02_rank_out_of_range_is_refused(rank):
     with pytest.raises(ValueError, match=f"between 1 and 3 for 3 to 4, got {rank}"):
         SpectralConvolution(3, 4, 5, "reduced_rank", rank=rank, rngs=nnx.Rngs(params=0))
-
-
-def test_unknown_variant_names_the_nearest():
-    refused("'cosines'; did you mean 'cosine'", FNOBlock, 3, 4, 5, variant="cosines", rngs=nnx.Rngs(params=0))
-    refused("did you mean 'reduced_rank'", count_modes, "reduced-rank", 32)
 
 
 def flax_convolution(layer):

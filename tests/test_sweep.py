@@ -163,14 +163,6 @@ def test_a_second_start_measures_nothing_again_but_what_has_other_weights(work, 
     assert table.groupby("model", sort=False)["weights"].first()[[A, B]].tolist() == ["w1", "w5"] and len(table) == 10
 
 
-def test_rows_that_were_there_before_stay_and_come_first(work):
-    do(work, [B])
-    do(work, [A])
-    table, record = read_table(where(work))
-    assert list(dict.fromkeys(table["model"])) == ["real", B, A] and len(table) == 10
-    assert set(record["weights_digests"]) == {"real", A, B}
-
-
 def test_a_leg_that_was_killed_is_measured_from_its_beginning(work):
     do(work, [A])
     whole, leg = contents(where(work)), Leg("walking", A, after=f"train-{A}")

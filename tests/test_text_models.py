@@ -148,16 +148,6 @@ def test_models_come_back_from_their_files(folder, tmp_path):
     assert describe(tmp_path / "small")["weights"] == "int8"
 
 
-def test_other_files_are_refused(folder, tmp_path):
-    cut = tmp_path / "cut.safetensors"
-    cut.write_bytes((folder / "tiny.safetensors").read_bytes()[:-9])
-    for path, words in ((cut, "not a whole safetensors"), (folder / "tiny.state.safetensors", "not a text-to-motion")):
-        with pytest.raises(ValueError, match=words):
-            load_text_model(path)
-    with pytest.raises(ValueError, match=r"tiny has no control branch.*train --preset tiny\+control"):
-        load(folder, "tiny").control_branch()
-
-
 # ------------------------------------------------------------------------------------------------------------- training
 
 
@@ -223,16 +213,6 @@ def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(fo
     with pytest.raises(ValueError, match=r"training settings \(seed\) lies there.*--out"):
         train(dataclasses.replace(PROFILE, seed=5))
     assert (folder / "tiny.safetensors").read_bytes() == before
-
-
-def test_a_branch_stands_beside_a_finished_model_of_any_settings_but_of_the_same_data(folder, data, tmp_path):
-    (tmp_path / "tiny.safetensors").write_bytes((folder / "tiny.safetensors").read_bytes())
-    train = lambda data: train_stage.train_stage(
-        data, ENCODER, dataclasses.replace(PROFILE, seed=5), "tiny+control", folder=tmp_path, stop_at=0.0, **QUIET
-    )
-    assert train(data) is None  # begun, and not refused
-    with pytest.raises(ValueError, match=r"tiny.safetensors: was trained on other data.*--out"):
-        train(data.select(range(1, data.num_clips)))
 
 
 @pytest.mark.parametrize(
@@ -319,13 +299,6 @@ def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
         find_text_model("bandai", "ACMDM-S-PS22")
 
 
-def test_only_data_with_captions_open():
-    with pytest.raises(ValueError, match="data set 'synthetic' has no captions"):
-        text_models.open_text_motions("synthetic")
-    with pytest.raises(ValueError, match="needs --source"):
-        text_models.open_text_motions("folder")
-
-
 # ---------------------------------------------------------------------------------------------------------- told motion
 
 
@@ -375,22 +348,6 @@ def test_a_stream_goes_straight_on_wherever_it_walks(folder, name, monkeypatch):
         step = np.diff(positions[:, 0], axis=0)
         np.testing.assert_allclose(step, np.tile(step[0], (len(step), 1)), atol=1e-4)
         np.testing.assert_allclose(positions[:first], line, atol=1e-5)
-
-
-STARTED = f"a person walks {STYLES[0]}"
-
-
-def test_a_stream_begins_near_its_first_caption(folder):
-    trained = load(folder, "tiny-prefix")
-    far = {f"far {k}": state + 9.0 for k, state in enumerate(5 * list(trained.starts.values()))}
-    near = dataclasses.replace(trained, starts={**{f"near {k}": trained.starts[STARTED] for k in range(4)}, **far})
-    starts = np.concatenate([np.ones((4, 8)), -np.ones((10, 8))]).astype(np.float32)
-    go = lambda seed: captioned_motion.stream_motions(near, starts[:1], [0], jax.random.key(seed), starts=starts)
-    np.testing.assert_array_equal(go(0), go(1))
-    with pytest.raises(ValueError, match="a stream needs the prefix form: --model ACMDM-n4-PS22-prefix"):
-        captioned_motion.stream_motions(load(folder, "tiny"), starts[:1], [1], jax.random.key(0))
-    with pytest.raises(ValueError, match="goes on from earlier frames"):
-        captioned_motion.draw_motions(trained, starts[:1], 24, jax.random.key(0))
 
 
 # --------------------------------------------------------------------------------------------------------- command line

@@ -112,25 +112,6 @@ def test_the_gpu_trains_as_long_as_the_paper_and_others_as_long_as_they_are_aske
     assert many == 12 * few < steps
 
 
-def test_recipes_are_the_papers_and_the_presets():
-    paper = part_recipe(TextMotionTraining, "denoiser", 1000)
-    assert (paper.batch_size, paper.learning_rate, paper.warmup_steps, paper.drops) == (64, 2e-4, 2000, (50_000,))
-    assert (paper.weight_decay, paper.ema_decay, paper.text_dropout, paper.seed) == (1e-5, 0.9999, 0.1, 3407)
-    auto = part_recipe(TextMotionTraining, "autoencoder", 1000)
-    assert (auto.batch_size, auto.window, auto.weight_decay, auto.drop_factor) == (256, 64, 0.0, 0.05)
-    assert part_recipe(TextMotionTraining, "control", 10).control_weight == 1.0
-    assert part_recipe(TextMotionTraining, "short-denoiser", 10, "ACMDM-n4-PS22-prefix").prefix_frames == 5
-    assert part_recipe(TextMotionTraining, "denoiser", 10, learning_rate=1.0).learning_rate == 1.0
-    for part, settings, message in (
-        ("denoser", {}, "did you mean 'denoiser'"), ("denoiser", {"bach_size": 2}, "'batch_size'"),
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=message):
-            part_recipe(TextMotionTraining, part, 10, **settings)
-    for broken in ({"schedule": "step"}, {"batch_size": 0}, {"text_dropout": 2.0}, {"ema_decay": 1.0}):
-        with pytest.raises(ValueError):
-            recipe(**broken)
-
-
 def test_the_rate_warms_up_and_drops_as_told():
     paper = dataclasses.replace(part_recipe(TextMotionTraining, "denoiser", 100_000), drops=(50_000, 70_000))
     steps = (0, 999, 1999, 49_999, 50_000, 70_000)
