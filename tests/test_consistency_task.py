@@ -148,8 +148,5 @@ def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learn
     for stride, (_, _, sigmas, _) in zip((1, 8, 4, 2), walked, strict=False):
         np.testing.assert_allclose(sigmas, levels.grid(8)[::stride])
     # The students walk, not their teachers; rows carry the teacher's weights, which they go stale with.
-    digest = weights_digest(models["CAMDM"].params)
-    assert walked[0][3] == digest and len({one[3] for one in walked}) == 5
-    table, told = read_table(path)
-    assert table["steps"].tolist() == [8, 1, 2, 4, 1]
-    assert told["weights_digests"]["CAMDM, distilled"] == [digest]
+    assert walked[0][3] == weights_digest(models["CAMDM"].params) and len({one[3] for one in walked}) == 5
+    assert read_table(path)[0]["steps"].tolist() == [8, 1, 2, 4, 1]

@@ -46,30 +46,6 @@ def known_mentions(text, paper="f3amd"):
     return {label for folder, label in mentioned_equations(text) if folder == paper} & set(equation_labels(paper))
 
 
-def test_a_small_checkout_is_mapped(tmp_path):
-    for folder in ("f3amd_lib/networks", "tests", "notebooks"):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "f3amd_lib/networks/block.py").write_text(
-        'class Block:\n    """Sum (Eq. 4)."""\n\n    def local(self):\n        """Eq. 3."""\n\n\n'
-        'class Config:\n    """Settings.\n\n    Attributes:\n      k: of Eq. 3.\n    """\n'
-    )
-    (tmp_path / "tests/test_block.py").write_text(
-        "def test_eq03_to_eq04_sum():\n    pass\n\n\ndef test_appendix_f_step():\n    pass\n"
-    )
-    cells = [
-        {"cell_type": "markdown", "source": ["# Blocks (Eqs 3, 4)"]},
-        {"cell_type": "code", "source": ["x = 1  # Eq. 9"]},
-    ]
-    (tmp_path / "notebooks/03_blocks.ipynb").write_text(json.dumps({"cells": cells}))
-    rows = equation_map(root=tmp_path).set_index("equation")
-    assert rows.loc["Eq. 3", "functions"] == "networks/block: Block.local"
-    assert rows.loc["Eq. 4", "functions"] == "networks/block: Block"
-    assert rows.loc["Eq. 3", "tests"] == "test_block: test_eq03_to_eq04_sum"
-    assert rows.loc["Appendix F", "tests"] == "test_block: test_appendix_f_step"
-    assert rows.loc["Eq. 4", "notebooks"] == "03_blocks"
-    assert (rows.loc["Eq. 9", ["functions", "tests", "notebooks", "cells"]] == "").all()
-
-
 def write_notebook(path, *cells):
     """A notebook of (kind, source) cells, "text" or "code"."""
     kinds = {"text": "markdown", "code": "code"}

@@ -1,7 +1,6 @@
 """The F3AMD network as a whole, its variants and its config (section 3.4, Tables 8 to 11)."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -45,13 +44,6 @@ def run(network, x_noisy, sigma=SIGMA, condition=None):
     return evaluate(network, x_noisy, sigma, condition)
 
 
-@pytest.mark.parametrize("changes", [{}, {"history_anchor": True, "sigma_data": 0.5, "conditioning": "adaln_zero"}])
-def test_config_survives_json(changes):
-    config = tiny_config(**changes)
-    again = config_from_dict(json.loads(json.dumps(config.to_dict())))
-    assert again == config and type(again) is type(config)
-
-
 OPTIONS = {
     field.name: field.default for field in dataclasses.fields(VariantConfig)[len(dataclasses.fields(F3AMDConfig)) :]
 }
@@ -83,28 +75,18 @@ def test_shipped_files_make_the_network_that_their_name_says(name):
     ("changes", "message"),
     [
         ({"depth": 0}, "depth must be above 0"),
-        ({"channels": -3}, "channels must be above 0"),
         ({"latent_width": 8.0}, "latent_width must be a whole number"),
-        ({"depth": True}, "depth must be a whole number"),
         ({"normalise": 1}, "normalise must be true or false"),
-        ({"sigma_data": "1"}, "sigma_data must be a finite number"),
         ({"sigma_data": 0}, "sigma_data must be above 0"),
         ({"num_kept_modes": 6}, "at most 5 for blocks of 8 frames"),
         ({"num_kept_modes": 9, "spectral_variant": "cosine"}, "at most 8 for blocks of 8"),
         ({"num_kept_modes": 10, "conditioning": "concatenation"}, "at most 9 for blocks of 16"),
-        ({"num_condition_heads": 3}, "num_(condition_)?heads"),
         ({"num_heads": 3}, "num_heads must divide the width 8"),
         ({"base_block": "transfomer"}, "'transfomer'; did you mean 'transformer'"),
-        ({"conditioning": "adaln-zero"}, "'adaln-zero'; did you mean 'adaln_zero'"),
-        ({"encoder_decoder": "cnn"}, "unknown encoder_decoder 'cnn'"),
-        ({"spectral_variant": "dct"}, "unknown spectral_variant 'dct'"),
         ({"dropout": 1.0}, "dropout must be below 1"),
-        ({"dropout": -0.1}, "dropout must be 0 or more"),
         ({"pre_norm": True, "conditioning": "adaln_zero"}, "pre_norm contradicts adaln_zero"),
-        ({"film_from_identity": True, "conditioning": "concatenation"}, "film_from_identity contradicts concatenation"),
         ({"history_input": True, "conditioning": "concatenation"}, "history_input contradicts concatenation"),
         ({"block_bypass": True, "block_residual": True}, "block_bypass contradicts"),
-        ({"encoder_hidden_width": -1}, "encoder_hidden_width must be"),
     ],
 )
 def test_impossible_configs_are_refused(changes, message):
@@ -130,15 +112,6 @@ def test_wrong_shapes_are_refused_by_name():
     refused(rf"\[B, {WINDOW}, {CHANNELS}\]", run, network, draw(2, WINDOW + 1, CHANNELS), condition=condition)
 
 
-def test_characters_do_not_mix():
-    network, x_noisy, condition = make_network(), draw(2, WINDOW, CHANNELS), make_condition()
-    both = run(network, x_noisy, condition=condition)
-    for k in range(2):
-        part = slice(k, k + 1)
-        alone = run(network, x_noisy[part], SIGMA[part], Condition(*(a[part] for a in condition)))
-        np.testing.assert_allclose(both[part], alone, atol=2e-5)
-
-
 def test_input_scaling_is_c_in():
     x_noisy = draw(2, WINDOW, CHANNELS)
     for sigma_data in (1.0, 0.5):
@@ -149,16 +122,16 @@ def test_input_scaling_is_c_in():
         assert float(jnp.abs(run(scaled, x_noisy) - run(raw, x_noisy)).max()) > 1e-2
 
 
-@pytest.mark.parametrize("conditioning", ["film", "concatenation", "cross_attention"])
-def test_block_residual_starts_as_decoder_of_encoder(conditioning):
-    network = make_network(block_residual=True, depth=3, conditioning=conditioning)
+@pytest.mark.parametrize(
+    ("conditioning", "residual"),
+    [("film", True), ("concatenation", True), ("cross_attention", True), ("adaln_zero", False), ("film", False)],
+)
+def test_table_11_residual_and_adaln_zero_blocks_start_as_decoder_of_encoder(conditioning, residual):
+    network = make_network(block_residual=residual, depth=3, conditioning=conditioning)
     x_noisy = draw(2, WINDOW, CHANNELS)
-    scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
-    expected = network.decoder(network.encoder(scaled))
-    np.testing.assert_allclose(run(network, x_noisy), expected, atol=1e-5)
-    plain = make_network(depth=3, conditioning=conditioning)
-    bare = plain.decoder(plain.encoder(scaled))
-    assert float(jnp.abs(run(plain, x_noisy) - bare).max()) > 1e-2
+    bare = network.decoder(network.encoder(x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]))
+    apart = float(jnp.abs(run(network, x_noisy) - bare).max())
+    assert apart < 1e-5 if residual or conditioning == "adaln_zero" else apart > 1e-2
 
 
 def test_history_anchor_adds_the_last_history_frame():
@@ -244,12 +217,6 @@ def test_table_11_concatenation_runs_its_blocks_on_twice_the_frames():
     block = network.conditionings[0](network.blocks[0], sequence, None)
     np.testing.assert_allclose(stages["block 1"], block, atol=1e-5)
     np.testing.assert_allclose(stages["x0_hat"], network.decoder(block[:, -WINDOW:]), atol=1e-5)
-
-
-def test_table_11_adaln_zero_starts_as_decoder_of_encoder():
-    network, x_noisy = make_network(conditioning="adaln_zero", depth=3), draw(2, WINDOW, CHANNELS)
-    scaled = x_noisy / jnp.sqrt(SIGMA**2 + 1.0)[:, None, None]
-    np.testing.assert_allclose(run(network, x_noisy), network.decoder(network.encoder(scaled)), atol=1e-5)
 
 
 def test_section_3_4_1_transformer_blocks_see_the_order_of_frames():

@@ -1,8 +1,9 @@
-"""Who may know whom: the library its core alone, its wing on text both, the companion all of it."""
+"""Who may know whom: a room those below it, the library its core and its wing on text, the companion all of it."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 import json
 import re
 import subprocess
@@ -12,17 +13,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-MAY_KNOW = {
-    "core": {"core"},
-    "text": {"core", "text"},
-    "notebooks": {"core", "text", "notebooks"},
-    "companion": {"core", "text", "companion"},
+HOUSES = {"f3amd_lib": ROOT, "f3amd_companion": ROOT, "f3amd_notebooks": ROOT / "notebooks"}
+"""Our packages -> the folder that each lies in."""
+
+ROOMS = {
+    "f3amd_lib": "ground motion data diffusion networks training rollout measures drawing papers",
+    "f3amd_lib.text": "data networks phases stages judge sampling",
+    "f3amd_companion": "serving speed measuring ledger reproduce terminal __main__",
 }
+"""From the ground up: a room knows itself and those before it."""
+
+FLOORS = [f"{house}.{room}" for house, rooms in ROOMS.items() for room in rooms.split()]
 OF_THE_LIBRARY = ("01", "02", "03", "04", "11", "12", "13", "16", "17", "18", "19", "20", "21")
 """Notebooks that import the library alone, as all of the course do; the others may import the companion."""
-
-ALLOWED: dict[str, str] = {}
-"""Imports that break the rule, "module -> module", each with the reason why it must."""
 
 FOREIGN = (
     "papermill nbconvert nbformat nbclient ipykernel jupyterlab selenium dask distributed tyro pygltflib onnx "
@@ -31,13 +34,11 @@ FOREIGN = (
 """What runs notebooks, drives pages, serves or exports."""
 
 
-def house(name: str) -> str | None:
-    """Which part a module belongs to, None if it is none of ours."""
-    for part, prefix in (("text", "f3amd_lib.text"), ("core", "f3amd_lib"), ("companion", "f3amd_companion"),
-                         ("notebooks", "f3amd_notebooks")):  # fmt: skip
-        if name == prefix or name.startswith(f"{prefix}."):
-            return part
-    return None
+def modules() -> dict[str, Path]:
+    """Every module of ours by name."""
+    files = [(path, root) for house, root in HOUSES.items() for path in sorted((root / house).rglob("*.py"))]
+    named = {".".join(path.relative_to(root).with_suffix("").parts): path for path, root in files}
+    return {name.removesuffix(".__init__"): path for name, path in named.items()}
 
 
 def imported(source: str) -> set[str]:
@@ -51,19 +52,49 @@ def imported(source: str) -> set[str]:
     return found
 
 
-def broken(name: str, source: str, part: str) -> list[str]:
-    """Imports of a source that its part may not have."""
-    known = {other for other in imported(source) if house(other) and house(other) not in MAY_KNOW[part]}
-    return [f"{name} -> {other}" for other in sorted(known) if f"{name} -> {other}" not in ALLOWED]
+def import_graph() -> dict[str, set[str]]:
+    """Each module of the packages -> those of ours that it imports."""
+    files = {name: path for name, path in modules().items() if path.name != "__init__.py"}
+    return {name: imported(path.read_text(encoding="utf-8")) & set(files) for name, path in files.items()}
 
 
-def modules() -> dict[str, Path]:
-    """Every module of ours by name."""
-    folders = {ROOT / "f3amd_lib": ROOT, ROOT / "f3amd_companion": ROOT}
-    folders |= {ROOT / "notebooks" / "f3amd_notebooks": ROOT / "notebooks"}
-    files = [(path, root) for folder, root in folders.items() for path in sorted(folder.rglob("*.py"))]
-    named = {".".join(path.relative_to(root).with_suffix("").parts): path for path, root in files}
-    return {name.removesuffix(".__init__"): path for name, path in named.items()}
+def floor(name: str) -> int:
+    """The number of a module's room; the checks and drawings of notebooks stand on the library alone."""
+    if name.startswith("f3amd_notebooks."):
+        return len(FLOORS) - len(ROOMS["f3amd_companion"].split()) - 1
+    return next(number for number, room in enumerate(FLOORS) if f"{name}.".startswith(f"{room}."))
+
+
+def arrows_up(graph) -> list[tuple[str, str]]:
+    """Imports of a room further up; neither companion nor library knows the notebooks' modules."""
+    up = lambda name, other: floor(other) > floor(name) or "f3amd_notebooks" in other and "f3amd_notebooks" not in name
+    return [(name, other) for name, known in graph.items() for other in known if up(name, other)]
+
+
+def circle(graph) -> list[str]:
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_every_room_stands_on_those_below_it_and_no_files_import_each_other_in_a_circle():
+    graph = import_graph()
+    assert len(graph) > 80 and arrows_up(graph) == [] and circle(graph) == []
+    graph["f3amd_lib.motion.skeleton"] |= {"f3amd_lib.rollout.rollout"}
+    assert arrows_up(graph) == [("f3amd_lib.motion.skeleton", "f3amd_lib.rollout.rollout")] and circle(graph)
+    for wrong in ("f3amd_companion.ledger.claims", "f3amd_lib.text.phases", "f3amd_notebooks.exercises.judging"):
+        assert arrows_up({"f3amd_lib.ground.files": {wrong}})
+    assert arrows_up({"f3amd_notebooks.sliders": {"f3amd_companion.serving.player"}})
+
+
+@pytest.mark.parametrize("room, may_know", [("diffusion", {"ground"}), ("networks", {"ground", "diffusion"})])
+def test_networks_and_samplers_know_no_data(room, may_know):
+    """Arrays in, arrays out."""
+    for name, known in import_graph().items():
+        if name.startswith(f"f3amd_lib.{room}."):
+            assert {other.split(".")[1] for other in known} <= may_know | {room}, name
 
 
 def code_of(path: Path) -> str:
@@ -79,66 +110,49 @@ def library_notebooks() -> list[Path]:
     return sorted([*numbered, *(ROOT / "notebooks" / "course").glob("*.ipynb")])
 
 
-def test_every_file_imports_what_its_part_may_know():
-    named = modules()
-    assert len(named) > 150
-    wrong = [
-        line for name, path in named.items() for line in broken(name, path.read_text(encoding="utf-8"), house(name))
-    ]
-    assert wrong == []
-
-
 @pytest.mark.parametrize("path", library_notebooks(), ids=lambda path: path.stem)
 def test_these_notebooks_import_the_library_alone(path):
-    assert broken(path.stem, code_of(path), "notebooks") == []
+    assert not [name for name in imported(code_of(path)) if name.startswith("f3amd_companion")]
 
 
 def test_all_that_is_imported_of_ours_is_there():
     """An import inside a function fails only where it is called."""
-    named = modules()
-    packages = {name for name, path in named.items() if path.name == "__init__.py"}
-    sources = {name: path.read_text(encoding="utf-8") for name, path in named.items()}
-    sources |= {path.stem: code_of(path) for path in (ROOT / "notebooks").rglob("*.ipynb")}
+    texts = {name: path.read_text(encoding="utf-8") for name, path in modules().items()}
+    sources = texts | {path.stem: code_of(path) for path in (ROOT / "notebooks").rglob("*.ipynb")}
     wrong = []
     for name, source in sources.items():
         for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.ImportFrom) and node.module and house(node.module):
-                found = node.module in named and (
-                    node.module not in packages
-                    or all(
-                        f"{node.module}.{alias.name}" in named
-                        or re.search(rf"\b{alias.name}\b", named[node.module].read_text(encoding="utf-8"))
-                        for alias in node.names
-                    )
-                )
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in HOUSES:
+                there = lambda word, of=node.module: f"{of}.{word}" in texts or re.search(rf"\b{word}\b", texts[of])
+                found = node.module in texts and all(there(alias.name) for alias in node.names)
                 wrong += [] if found else [f"{name}: {ast.unparse(node)}"]
     assert wrong == []
 
 
-def test_a_wrong_import_is_found():
-    assert broken("f3amd_lib.a", "def f():\n    from f3amd_companion.ledger import claims\n", "core") == [
-        "f3amd_lib.a -> f3amd_companion.ledger",
-        "f3amd_lib.a -> f3amd_companion.ledger.claims",
-    ]
-    assert broken("f3amd_lib.a", "import f3amd_lib.text.phases", "core")
-    assert not broken("f3amd_lib.text.a", "import f3amd_lib.networks.presets\nimport f3amd_library", "text")
-    assert broken("03", "import f3amd_companion", "notebooks") and house("numpy") is None
+def modules_after(script: str) -> list[str]:
+    """What a script says in a fresh process, word by word."""
+    return subprocess.check_output([sys.executable, "-c", f"import sys\n{script}"], text=True).split()
 
 
 def test_the_core_runs_without_the_rest():
     """Every module of the core in a fresh process: no wing, no companion, nothing that serves, exports or prints."""
-    names = [name for name in modules() if house(name) == "core"]
+    names = [
+        name for name in modules() if name.startswith("f3amd_lib") and not f"{name}.".startswith("f3amd_lib.text.")
+    ]
     refused = ("f3amd_companion", "f3amd_notebooks", *FOREIGN)
-    script = (
-        "import importlib, sys\n"
-        f"for name in {names!r}:\n    importlib.import_module(name)\n"
-        f"print(*sorted(name for name in sys.modules if name.split('.')[0] in {refused!r}"
-        " or name.startswith('f3amd_lib.text')))"
-    )
-    assert subprocess.check_output([sys.executable, "-c", script], text=True).split() == []
+    loaded = "[name for name in sys.modules if name.split('.')[0] in {} or name.startswith('f3amd_lib.text')]"
+    load = f"import importlib\nfor name in {names!r}:\n    importlib.import_module(name)\n"
+    assert len(names) > 40 and modules_after(f"{load}print(*{loaded.format(refused)})") == []
 
 
 @pytest.mark.parametrize("package", ["f3amd_lib", "f3amd_companion"])
 def test_a_package_alone_imports_nothing(package):
-    script = f"import sys; bare = set(sys.modules); import {package}; print(*sorted(set(sys.modules) - bare))"
-    assert subprocess.check_output([sys.executable, "-c", script], text=True).split() == [package]
+    assert modules_after(f"bare = set(sys.modules)\nimport {package}\nprint(*set(sys.modules) - bare)") == [package]
+
+
+def test_the_four_roads_are_short_and_lead_through_files_that_exist():
+    text = (ROOT / "docs" / "house.md").read_text(encoding="utf-8").split("## Four roads\n")[1].split("\n## ")[0]
+    roads = [re.findall(r"`([\w/]+\.\w+)`", line) for line in text.split("\n- ")[1:]]
+    assert len(roads) == 4 and all(2 <= len(files) <= 4 for files in roads)
+    there = lambda file: any((ROOT / package / file).is_file() for package in HOUSES)
+    assert [file for files in roads for file in files if not there(file)] == []

@@ -93,19 +93,6 @@ def test_page_of_results_shows_what_is_on_record():
     assert fill_tables(page, {"measured": table}, "results.md") == page, "write the table anew: f3amd cards"
 
 
-def test_intervals_of_walks_are_students_over_seeds():
-    """Three seeds, of two styles each: their means 1, 2 and 3 lie 4.303 / sqrt(3) about 2, not 1.96 / sqrt(3)."""
-    keys = {"model": "CAMDM", "window_frames": 32, "steps": 8, "weights": "w"}
-    rows = [
-        keys | {"seed": seed, "slide_speed": seed + 1 + side, "joint_acceleration": 1.0}
-        for seed in range(3)
-        for side in (-0.5, 0.5)
-    ]
-    (row,) = model_cards._walking_rows(pd.DataFrame(rows)).to_dict("records")
-    assert (row["metric"], row["value"], row["repeats"]) == ("slide_speed", 2.0, 3)
-    assert [row["high"] - 2.0, 2.0 - row["low"]] == pytest.approx([4.303 / 3**0.5] * 2, abs=1e-3)
-
-
 def test_checksums_are_those_of_the_files():
     lines = (PRETRAINED_DIR / "checksums.txt").read_text(encoding="utf-8").splitlines()
     listed = dict(reversed(line.split("  ")) for line in lines)

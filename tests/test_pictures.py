@@ -4,11 +4,10 @@ import dataclasses
 import hashlib
 
 import numpy as np
-import pytest
-from builders import straight_motion, wandering_motion
+from builders import wandering_motion
 from matplotlib.collections import LineCollection
 
-from f3amd_lib.drawing.pictures import SLOT, crowd_colors, crowd_figure, draw_toes, poses_beside
+from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion
@@ -30,24 +29,6 @@ def test_perspective_by_hand():
 
 def bodies(axis) -> list[LineCollection]:
     return [item for item in axis.collections if isinstance(item, LineCollection) and item.get_zorder() == 5]
-
-
-def test_toes_stand_below_their_poses_and_are_thick_where_they_rest():
-    motions = {"walks": wandering_motion(30), "": None, "frozen pose": straight_motion(30)}
-    frames = range(0, 30, 10)
-    figure = poses_beside(motions, frames, below=1.1)
-    draw_toes(figure, motions, frames)
-    assert not figure.axes[1].lines and [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "left toe", "right toe", "a toe rests",
-    ]  # fmt: skip
-    motion, lines = motions["walks"], figure.axes[0].lines[-5:-1]  # the last is in the legend alone
-    toes = motion.positions[:21][:, list(motion.skeleton.toes), 1]
-    for foot, (thin, thick) in enumerate((lines[:2], lines[2:])):
-        along, height = map(np.asarray, thin.get_data())
-        assert along[[0, 10, 20]] == pytest.approx([0.0, SLOT, 2 * SLOT])  # under the poses of frames 0, 10 and 20
-        assert np.diff(height) == pytest.approx(4.0 * np.diff(toes[:, foot]), abs=1e-6)
-        np.testing.assert_array_equal(np.isfinite(thick.get_ydata()), motion.contacts[:21, foot])
-        assert thick.get_linewidth() > 2 * thin.get_linewidth()
 
 
 # --- crowds ------------------------------------------------------------------------------------

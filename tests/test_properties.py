@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import string
 import sys
@@ -47,16 +46,6 @@ def test_damaged_files_are_read_or_refused_by_name(tmp_path, name):
         assert error is None, f"case {number}, {path.name}, {data[:200]!r}: {error!r}"
 
 
-def test_every_reader_was_attacked_and_its_counts_are_kept(tmp_path):
-    with fuzz.COUNTS.open(encoding="utf-8") as file:
-        kept = {row["reader"]: row for row in csv.DictReader(file)}
-    assert list(kept) == list(fuzz.READERS)
-    assert all(int(row["files"]) > 1000 and int(row["other_errors"]) == 0 for row in kept.values())
-    for row in [{"reader": "path", "files": 1}, {"reader": "bvh", "files": 2}, {"reader": "path", "files": 3}]:
-        fuzz.keep(row, tmp_path / "fuzz.csv")
-    assert (tmp_path / "fuzz.csv").read_text() == "reader,files\nbvh,2\npath,3\n"
-
-
 @st.composite
 def motions(draw):
     """A tree of some joints that moves at random."""
@@ -91,17 +80,6 @@ def test_any_path_goes_through_csv(tmp_path_factory, steps):
     np.testing.assert_allclose(path.position, place, atol=1e-12)
     wanted = np.deg2rad([yaw for *_, yaw in steps])
     np.testing.assert_allclose(np.exp(1j * path.yaw), np.exp(1j * wanted), atol=1e-9)
-
-
-@few
-@given(st.text(max_size=80))
-def test_any_text_is_a_path_or_refused_with_its_line(tmp_path_factory, text):
-    file = tmp_path_factory.mktemp("paths") / "path.csv"
-    file.write_bytes(b"x,z\n" + text.encode("utf-8", "surrogatepass"))
-    try:
-        assert read_path_csv(file).num_frames >= 2
-    except ValueError as error:
-        assert "path.csv" in str(error)
 
 
 @few
@@ -142,16 +120,6 @@ def test_any_tree_goes_through_a_file_of_weights(tmp_path_factory, tree, about):
 @given(st.text(st.characters(codec="utf-8", exclude_characters="#", exclude_categories=("C", "Z")), min_size=1))
 def test_any_caption_goes_through_its_line(caption):
     assert read_caption_line(write_caption_line(caption) + "\n", "here") == (caption, 0.0, 0.0)
-
-
-@few
-@given(st.text(max_size=60))
-def test_any_line_is_a_caption_or_refused_with_its_place(line):
-    try:
-        caption, begin, end = read_caption_line(line, "texts/a.txt, line 1")
-        assert caption and 0 <= begin <= end
-    except ValueError as error:
-        assert "texts/a.txt, line 1" in str(error)
 
 
 @settings(few, max_examples=6)
