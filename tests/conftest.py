@@ -22,6 +22,7 @@ if f"jaxlib=={version('jaxlib')} " in (Path(__file__).resolve().parents[1] / "re
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["MPLBACKEND"] = "Agg"
+sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts"))  # which tests import by name
 
 import pytest
 

@@ -41,13 +41,6 @@ def test_the_mean_of_all_paths_runs_straight_into_the_wall():
     assert toy.outcome_shares(DATA, middle[None])["wall"] == 1.0
 
 
-def test_paths_scatter_about_their_mean_by_the_wobble_and_have_unit_size():
-    paths, side = real_paths()
-    apart = paths - DATA.mean_paths[side - 1]
-    assert np.sqrt(np.mean(apart**2)) == pytest.approx(DATA.wobble, rel=0.02)
-    assert paths.std() == pytest.approx(1.0, abs=0.1)  # so that metres are network units
-
-
 # ------------------------------------------------------------------------------- exact denoiser
 
 

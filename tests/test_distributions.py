@@ -68,6 +68,11 @@ def test_fid_of_a_cloud_with_itself_is_zero(count):
     assert 0.0 <= d.frechet_distance(features, again) < 1e-8
 
 
+def test_fid_in_the_scale_of_camdm_has_a_name_of_its_own():
+    one, two = cloud(30, 8, 1), cloud(30, 8, 2, shift=1.0)
+    assert d.frechet_distance_per_dimension(one, two) == pytest.approx(d.frechet_distance(one, two) / 8)
+
+
 # -------------------------------------------------------------------------------------------- EMD
 
 

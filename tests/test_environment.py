@@ -5,13 +5,13 @@ version inside each range for every supported Python and processor, and behind t
 """
 
 import ast
-import importlib.util
 import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import lock_extras
 import pytest
 import yaml
 from packaging.markers import Marker
@@ -44,15 +44,6 @@ LOCK_TEXT = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 ENVIRONMENT = (ROOT / "environment.yml").read_text(encoding="utf-8")
 
 
-def load(path: Path):
-    """A script as a module."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-lock_extras = load(ROOT / "scripts" / "lock_extras.py")
 PLAIN = lock_extras.without_extras(LOCK_TEXT)
 
 
@@ -140,21 +131,6 @@ def test_every_lock_entry_is_hashed_but_those_of_two_extras_and_none_says_where_
     assert not re.search(r"://|--find|index", LOCK_TEXT)
 
 
-def test_extras_are_put_behind_the_plain_install():
-    pin = "{0}==1.0 ; python_version < '3.12' \\\n    --hash=sha256:aa \\\n    --hash=sha256:bb\n"
-    lock = "numpy==2.2 \\\n    --hash=sha256:cc\n    # via x\n# Extras\ntorch==2.0 ; extra == 'bench'\n"
-    other = "numpy==2.2 \\\n    --hash=sha256:cc\nzict==2.0 \\\n    --hash=sha256:dd\n"
-    made = lock_extras.with_extras(lock, {"sweep": pin.format("zict"), "web": pin.format("zict"), "site": other})
-    asked = "(python_version < '3.12') and extra == 'sweep' or (python_version < '3.12') and extra == 'web'"
-    assert lock_extras.entries(made) == [
-        ("numpy==2.2", "", ["--hash=sha256:cc"]),
-        ("torch==2.0", "extra == 'bench'", []),
-        ("zict==1.0", asked, ["--hash=sha256:aa", "--hash=sha256:bb"]),
-        ("zict==2.0", "extra == 'site'", ["--hash=sha256:dd"]),
-    ]
-    assert lock_extras.without_extras(made) == lock_extras.without_extras(lock)
-
-
 @pytest.mark.parametrize("extra", [*EXTRAS, "nonsense"])
 def test_an_extra_is_handed_to_pip_with_its_hashes(extra, tmp_path):
     """A stand-in for the environment's Python repeats what it was told."""
@@ -191,7 +167,7 @@ def imported_packages(paths) -> set[str]:
 
 def test_what_is_imported_is_declared():
     own = {"f3amd_lib", "f3amd_companion", "f3amd_notebooks", "tests", "conftest"}
-    own |= {path.stem for path in (ROOT / "tests").glob("*.py")}
+    own |= {path.stem for folder in ("tests", "scripts") for path in (ROOT / folder).glob("*.py")}
     declared = {IMPORT_NAMES.get(name, name) for name in ALL}
     folders = ("f3amd_lib", "f3amd_companion", "notebooks/f3amd_notebooks", "tests")
     files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]

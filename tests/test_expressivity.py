@@ -25,27 +25,6 @@ def test_keeping_fourier_modes_is_cutting_an_fft(num_frames):
         np.testing.assert_allclose(ex.keep_modes(x, modes), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("num_frames", [7, 8])
-def test_every_band_keeps_as_many_numbers_and_all_modes_keep_everything(num_frames):
-    for modes in (1, 2, 3):
-        for band in ("fourier", "cosine"):
-            kept = ex.kept_projection(num_frames, modes, band)
-            assert np.linalg.matrix_rank(kept) == 2 * modes - 1
-            np.testing.assert_allclose(kept @ kept, kept, atol=1e-12)
-    for band in ex.BANDS:
-        everything = ex.kept_projection(num_frames, num_frames // 2 + 1, band)
-        np.testing.assert_allclose(everything, np.eye(num_frames), atol=1e-12)
-
-
-def test_beside_a_line_a_straight_walk_loses_nothing_and_others_cut_the_rest():
-    walk = np.linspace(0.2, 1.5, 16)[:, None]
-    np.testing.assert_allclose(ex.keep_modes(walk, 1, "fourier beside a line"), walk, atol=1e-12)
-    x = np.random.default_rng(1).standard_normal((16, 1))
-    line = np.linspace(x[0, 0], x[-1, 0], 16)[:, None]
-    expected = line + ex.keep_modes(x - line, 3)
-    np.testing.assert_allclose(ex.keep_modes(x, 3, "fourier beside a line"), expected, atol=1e-12)
-
-
 # ------------------------------------------------------------------------------------- motion
 
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
+import faults
 import pytest
 from builders import refused
 
 ROOT = Path(__file__).resolve().parents[1]
-_spec = importlib.util.spec_from_file_location("faults", ROOT / "scripts" / "faults.py")
-faults = sys.modules["faults"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(faults)
 
 
 @pytest.fixture(scope="module")

@@ -1,27 +1,14 @@
 """`scripts/gpu_package.py`: what a GPU elsewhere needs, whole and small enough."""
 
-import importlib.util
 import os
 import subprocess
 import sys
 
-import pytest
+import gpu_package
 from builders import refused
 
-from f3amd_lib.ground.profiles import repository_root
 
-ROOT = repository_root()
-
-
-@pytest.fixture
-def gpu_package():
-    spec = importlib.util.spec_from_file_location("gpu_package", ROOT / "scripts" / "gpu_package.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(gpu_package, tmp_path, cache_dir, capsys):
+def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(tmp_path, cache_dir, capsys):
     folder = tmp_path / "away"
     words = [str(folder), "--package", "A", "--minutes", "9"]
     assert gpu_package.main(words) == 2 and "no packed clips of Bandai" in capsys.readouterr().err
@@ -46,7 +33,7 @@ def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(gpu_pac
     assert ran.returncode == 2 and f"{packed.name}: " in ran.stderr, ran.stderr  # all it lacks are clips
 
 
-def test_what_cannot_be_laid_out_is_refused(gpu_package, tmp_path, monkeypatch):
+def test_what_cannot_be_laid_out_is_refused(tmp_path, monkeypatch):
     packed = tmp_path / "bandai.safetensors"
     packed.write_bytes(b"0" * 2_000_000)
     refused("package 'a'", gpu_package.lay_out, tmp_path / "x", "a", 9.0, packed)

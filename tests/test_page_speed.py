@@ -1,18 +1,10 @@
 """What the documentation says of the pages' speed is what was measured."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
+import page_speed
 import pandas as pd
 
 from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.tables import fill_tables
-
-ROOT = Path(__file__).resolve().parents[1]
-_spec = importlib.util.spec_from_file_location("page_speed", ROOT / "scripts" / "page_speed.py")
-page_speed = sys.modules["page_speed"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(page_speed)
 
 
 def test_the_page_has_the_tables_of_the_records():

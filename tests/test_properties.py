@@ -5,12 +5,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import string
-import sys
 import warnings
-from pathlib import Path
 
+import fuzz
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -28,11 +26,6 @@ from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.text.data.humanml3d import read_caption_line, read_humanml3d
 from f3amd_lib.text.data.text_motions import text_motions
-
-_FUZZ = Path(__file__).resolve().parents[1] / "scripts" / "fuzz.py"
-_spec = importlib.util.spec_from_file_location("fuzz", _FUZZ)
-fuzz = sys.modules["fuzz"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(fuzz)
 
 few = settings(max_examples=20, deadline=None, derandomize=True, database=None)
 words = st.text(st.characters(codec="utf-8", categories=("L", "N")), min_size=1, max_size=12)

@@ -10,7 +10,6 @@ from f3amd_companion.ledger.quality_tables import (
     PAPER_SOURCE,
     QUALITY_TABLES,
     beside_paper,
-    figure_text,
     of_queue,
 )
 from f3amd_lib.ground.papers import load_paper_table
@@ -82,20 +81,6 @@ def test_the_papers_names_are_ours_by_find_preset_and_ours_alone_are_in_no_row_o
     assert line_of(many, LABEL, model="F3AMD-FNO-96").loc["FID", "value"] == 10.0
     for number in QUALITY_TABLES:
         assert "F3AMD-FNO-96-steady" not in set(beside_paper(number, QUALITY, LABEL)["model"])
-
-
-@pytest.mark.parametrize(
-    "value, low, high, text",
-    [
-        (7.3861, 7.2651, 7.5071, "7.386 ± 0.121"),
-        (32.66, 26.72, 38.6, "32.66 ± 5.94"),
-        (2237.7, 2041.7, 2433.7, "2238 ± 196"),
-        (0.531, np.nan, np.nan, "0.531"),
-        (np.nan, np.nan, np.nan, "–"),
-    ],
-)
-def test_figures_have_four_digits_and_as_many_decimals_in_the_interval(value, low, high, text):
-    assert figure_text(value, low, high) == text
 
 
 def test_rows_of_the_queue_are_means_over_trainings():

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 
+import fill_numbers as fill
 import numpy as np
 import pytest
 from builders import refused
@@ -21,16 +21,7 @@ HERO = ROOT / "paper_figures/bandai/laptop/media/side_by_side.webp"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def fill():
-    """`scripts/fill_numbers.py`."""
-    spec = importlib.util.spec_from_file_location("fill_numbers", ROOT / "scripts" / "fill_numbers.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_numbers_of_the_pages_are_those_on_record(fill):
+def test_numbers_of_the_pages_are_those_on_record():
     known = fill.numbers()
     for path in fill.PAGES:
         page = path.read_text(encoding="utf-8")

@@ -250,21 +250,6 @@ def count_near(image, color, tolerance=12):
     return int((np.abs(pixels - wanted).max(axis=-1) <= tolerance).sum())
 
 
-def test_film_strip_has_a_row_a_motion(tmp_path):
-    motion = make_motion()
-    figure = pictures.film_strip([motion, motion.slice(0, 60)], paths=[named_path("straight", 120), None], num_poses=5)
-    assert len(figure.axes) == 4
-    assert figure.axes[0].get_title(loc="left") == "test walk"
-    shown = [text.get_text() for text in figure.axes[0].texts]
-    assert shown[0] == "1" and "4.0 s" in shown and len(shown) == 10
-    low, high = figure.axes[1].get_xlim()
-    assert low > high  # +X to the left, as seen from above
-    path = figures.save_figure(figure, tmp_path / "strip.png")
-    with Image.open(path) as image:
-        for side in ("left", "right", "middle"):
-            assert count_near(image, stick_figures.LIMB_COLORS[side]) > 200
-
-
 def test_gif_plays_in_real_time_and_stays_small(tmp_path):
     motion = make_motion(240)
     path = pictures.write_gif(tmp_path / "deep" / "walk.gif", motion, target_paths=named_path("slalom", 240))
@@ -278,11 +263,3 @@ def test_gif_plays_in_real_time_and_stays_small(tmp_path):
         image.seek(40)
         for side in ("left", "right"):
             assert count_near(image, stick_figures.LIMB_COLORS[side], tolerance=25) > 100
-
-
-def test_gif_of_several_motions_and_its_limits(tmp_path):
-    motions = [make_motion(60), make_motion(90)]
-    path = pictures.write_gif(tmp_path / "two.gif", motions, size=(120, 140), max_seconds=2.0)
-    with Image.open(path) as image:
-        assert image.size == (240, 140) and image.n_frames == 20
-    refused("one frame rate", pictures.write_gif, tmp_path / "x.gif", [make_motion(), make_motion(fps=60.0)])

@@ -1,18 +1,10 @@
 """What more machines bring: the arithmetic by hand, and a page that says what the records say."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
+import scaling
 from builders import refused
 
 from f3amd_companion.measuring.sweep import Leg
-
-ROOT = Path(__file__).resolve().parents[1]
-_spec = importlib.util.spec_from_file_location("scaling", ROOT / "scripts" / "scaling.py")
-scaling = sys.modules["scaling"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(scaling)
 
 LEGS = [Leg("one", "a"), Leg("two", "a", after="one-a"), Leg("one", "b"), Leg("one", "c")]
 SECONDS = {"one-a": 2.0, "two-a": 5.0, "one-b": 4.0, "one-c": 1.0}
