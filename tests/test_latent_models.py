@@ -42,7 +42,6 @@ from f3amd_lib.text.stages.text_models import (
     named_model,
     text_model_files,
 )
-from f3amd_lib.text.stages.train_stage import stage_of, stands_on
 from f3amd_lib.training import optimise
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -65,18 +64,6 @@ TINY = {
 PROFILE = load_profile("smoke", "bandai", train_steps=20)
 SPLITS = ("train", "test", "train", "validation")
 QUIET = {"progress": False, "batch_size": 2}
-
-
-def test_a_preset_knows_what_it_stands_on():
-    chain = {}
-    for name in ("MotionPCM-VAE", "MotionPCM-teacher-small", "MotionPCM-M4", "MotionLCM-V2-small"):
-        chain[name] = stage_of(name), stands_on(name)
-    assert chain == {
-        "MotionPCM-VAE": ("latent autoencoder", ""),
-        "MotionPCM-teacher-small": ("latent denoiser", "MotionPCM-VAE-small-spans"),
-        "MotionPCM-M4": ("student", "MotionPCM-teacher"),
-        "MotionLCM-V2-small": ("student", "MotionPCM-teacher-small"),
-    }
 
 
 def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
@@ -137,18 +124,6 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     # The file itself says whose it is.
     assert command_line.main([*words, "--weights", str(SHIPPED / "MotionPCM-M1-small.safetensors")]) == 0
     np.testing.assert_array_equal(made[1][1].positions, motion.positions)
-
-
-@pytest.mark.parametrize("presets", [[], ["F3AMD-FNO-96"], ["ACMDM-S-PS22-n2"], ["MotionPCM-M1-small", "CAMDM"]])
-def test_a_teacher_is_given_to_students_of_motionpcm_alone(presets, tmp_path, capsys):
-    words = ["train", "--data", "synthetic", "--profile", "smoke", "--out", str(tmp_path)]
-    words += [word for name in presets for word in ("--preset", name)]
-    words += ["--teacher", str(SHIPPED / "MotionPCM-teacher-small.safetensors")]
-    assert command_line.main(words) == 2
-    assert "--teacher is for students of MotionPCM: leave it out" in capsys.readouterr().err
-    assert command_line.main(["train", "--preset", "ACMDM-causal-AE-w64", "--all-devices"]) == 2
-    assert "models of captioned motion train on one device" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_student_is_told_no_guidance_that_it_has_never_heard():

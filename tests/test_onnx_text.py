@@ -1,26 +1,15 @@
 """ACMDM and MotionPCM as ONNX: the card's times and a few lines of NumPy give the motion that JAX gives."""
 
-import dataclasses
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import refused, tiny_trained
 from flax import nnx
 
 from f3amd_companion.__main__ import main
-from f3amd_companion.serving.onnx_export import (
-    CARD,
-    PROGRAM,
-    OnnxProgram,
-    denoiser_program,
-    export_onnx,
-    load_text_or_latent,
-    seeded_inputs,
-    signature,
-)
+from f3amd_companion.serving.onnx_export import CARD, PROGRAM, OnnxProgram, seeded_inputs
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
@@ -30,7 +19,7 @@ from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDen
 from f3amd_lib.text.sampling.motionpcm_sampling import sample_student, sample_teacher
 from f3amd_lib.text.sampling.text_to_motion import text_prediction
 from f3amd_lib.text.stages.text_models import LatentModel, MotionCodec, TextModel, save_text_model
-from f3amd_lib.training.checkpoints import network_with, save_model, weights_shapes
+from f3amd_lib.training.checkpoints import network_with, weights_shapes
 
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
 ABOUT = {"skeleton": SYNTHETIC_SKELETON, "fps": 20.0, "text_encoder": "tiny-8"}
@@ -155,16 +144,3 @@ def test_every_input_is_heard(exported):
     for name in sorted(heard):
         value = inputs[name]
         assert np.abs(run(**inputs | {name: value[::-1]})[:, :4] - said[:, :4]).max() > 1e-4, name
-
-
-def test_what_is_no_model_of_text_is_left_to_others_or_refused(tmp_path, monkeypatch):
-    walker = tiny_trained()
-    save_model(tmp_path / "walker.safetensors", walker)
-    assert load_text_or_latent(tmp_path / "walker.safetensors") is None
-    refused("other.safetensors", load_text_or_latent, tmp_path / "other.safetensors")
-    refused("got LatentAutoencoderConfig", signature, motionpcm(0).autoencoder, 2)
-    alone = dataclasses.replace(motionpcm(0), config=None, params=None)
-    refused("autoencoder alone", export_onnx, alone, tmp_path / "out")
-    network = network_with(acmdm().config, acmdm().params)
-    refused("at least 1", denoiser_program, network, batch=0)
-    refused("unknown weights", denoiser_program, network, weights="int4")

@@ -14,7 +14,6 @@ from builders import refused, same_tree
 
 from f3amd_lib.training.optimise import (
     TrainingDiverged,
-    _with_fast_gradients,
     differences,
     held_out_terms,
     initial_state,
@@ -108,20 +107,6 @@ def test_first_step_is_adams_and_average_follows_by_formula():
         np.testing.assert_allclose(ema_one, expected, atol=1e-7)
         np.testing.assert_allclose(ema_two, 0.9 * expected + 0.1 * third, atol=1e-7)
     assert same_tree(start.ema, start.params) and one.averaged is one.ema
-
-
-def test_what_makes_gradients_fast_changes_no_number():
-    """Weights of any rank and their gradients stay; a barrier stands in the gradient of matrices."""
-    shapes = {"scalar": (), "bias": (5,), "matrix": (3, 5), "stack": (4, 3, 5), "kernel": (2, 2, 3, 5)}
-    keys = jax.random.split(jax.random.key(0), len(shapes))
-    params = {name: jax.random.normal(key, shape) for key, (name, shape) in zip(keys, shapes.items(), strict=True)}
-    z = jax.random.normal(jax.random.key(1), (7, 3))
-    loss = lambda params: sum(jnp.sum(jnp.sin(z @ w if w.ndim > 1 else w)) for w in params.values())
-    assert same_tree(_with_fast_gradients(params), params)
-    fast = jax.grad(lambda params: loss(_with_fast_gradients(params)))
-    for found, wanted in zip(*map(jax.tree.leaves, (fast(params), jax.grad(loss)(params))), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
-    assert str(jax.make_jaxpr(fast)(params)).count("optimization_barrier") == 1
 
 
 def test_without_an_average_the_weights_are_what_is_evaluated(finished):

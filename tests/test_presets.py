@@ -54,7 +54,6 @@ def test_table_is_the_committed_one():
         ("F3AMD-reduced-rank-FNO-96", {"spectral_variant": "reduced_rank"}),
         ("F3AMD-weighted-FNO-96", {"spectral_variant": "weighted"}),
         ("F3AMD-FNO-96 (linear enc/dec)", {"encoder_decoder": "linear"}),
-        ("F3AMD-FNO-96, m=14", {"num_kept_modes": 14}),
         ("F3AMD-FNO-96, m=1", {"num_kept_modes": 1}),
         ("F3AMD-FNO-96, m=17", {}),
         ("F3AMD-FNO-96 (concatenation)", {"conditioning": "concatenation", "num_kept_modes": 33}),

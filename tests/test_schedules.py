@@ -194,10 +194,6 @@ def test_variance_preserving_training_draws_every_level_alike():
             {"kind": "variance_preserving_cosine", "num_levels": 4, "offset": 0.01, "max_beta": 0.99},
         ),
         (
-            variance_preserving_linear(50, 0.2, 12.0),
-            {"kind": "variance_preserving_linear", "num_levels": 50, "beta_min": 0.2, "beta_max": 12.0},
-        ),
-        (
             variance_preserving_betas(50, 0.01, 0.2, 1.0),
             {"kind": "variance_preserving_betas", "num_levels": 50, "first": 0.01, "last": 0.2, "power": 1.0},
         ),

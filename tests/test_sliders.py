@@ -1,6 +1,5 @@
 """A figure with a slider: every frame is in the output, at the right place, and nothing is asked of anybody."""
 
-import html.parser
 import json
 import re
 
@@ -8,6 +7,7 @@ import nbformat
 import numpy as np
 import pytest
 from f3amd_notebooks.sliders import slide
+from test_player import Elements
 
 from f3amd_lib.drawing.style import new_figure
 from f3amd_lib.ground.profiles import repository_root
@@ -16,22 +16,9 @@ NOTEBOOKS = {"02_sampler_theory": (17, 10), "12_spectral_and_film": (17,)}
 """Notebooks with sliders -> how many places each slider has."""
 
 
-class Elements(html.parser.HTMLParser):
-    """Attributes of the elements of a page, by name of the element."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.found, self.texts = [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.found.append((tag, dict(attributes)))
-
-    def handle_data(self, data):
-        self.texts.append(data)
-
-    def all(self, tag):
-        return [attributes for name, attributes in self.found if name == tag]
+def all_of(page: Elements, tag: str) -> list[dict]:
+    """Attributes of all elements with this tag."""
+    return [attributes for name, attributes in page.tags if name == tag]
 
 
 def points(path: str) -> list[np.ndarray]:
@@ -58,12 +45,12 @@ def drawn():
 def test_every_frame_is_there_and_lies_where_matplotlib_would_draw_it(drawn):
     figure, line, frames = drawn
     page = Elements(slide(figure, [line], frames, label="k <3", start=1, alt="A 'sine'").data)
-    (setter,), (picture,), (path,) = page.all("input"), page.all("svg"), page.all("path")
+    (setter,), (picture,), (path,) = (all_of(page, tag) for tag in ("input", "svg", "path"))
     moved = json.loads(setter["data-frames"])
     assert [name for name, _ in moved] == list(frames)
     assert (setter["type"], setter["min"], setter["max"], setter["value"]) == ("range", "0", "2", "1")
     assert setter["aria-valuetext"] == "<1> & 'so'" and path["d"] == moved[1][1][0]
-    assert "k <3 " in page.texts and page.all("img")[0]["alt"] == "A 'sine'"
+    assert "k <3 " in page.text and all_of(page, "img")[0]["alt"] == "A 'sine'"
     height = float(picture["viewbox"].split()[3])
     fine = height / figure.bbox.height
     for (_, paths), (expected,) in zip(moved, frames.values(), strict=True):
@@ -86,13 +73,13 @@ def test_committed_sliders_have_all_their_frames_and_no_address(name):
     found = sliders(name)
     for text, places in zip(found, NOTEBOOKS[name], strict=True):
         page = Elements(text)
-        (setter,) = page.all("input")
+        (setter,) = all_of(page, "input")
         moved = json.loads(setter["data-frames"])
         assert len(moved) == places == int(setter["max"]) + 1
         assert len({json.dumps(paths) for _, paths in moved}) == places  # no two are alike
-        assert all(len(paths) == len(page.all("path")) and all(map(points, paths)) for _, paths in moved)
-        assert addresses(text) == [] and page.all("script") == []
-        assert page.all("img")[0]["alt"]
+        assert all(len(paths) == len(all_of(page, "path")) and all(map(points, paths)) for _, paths in moved)
+        assert addresses(text) == [] and all_of(page, "script") == []
+        assert all_of(page, "img")[0]["alt"]
 
 
 def addresses(text: str) -> list[str]:

@@ -61,14 +61,10 @@ def tables(data, tmp_path_factory):
             if name == "text_table1":
                 # What is measured is not measured again, and a leg without time stops before the next row.
                 before = path.read_bytes()
-                patch.setattr(text_tables, "KINDS", {})
-                again = measure_text_table(name, data, ENCODER, PROFILE, folder=root / "models", rows=rows, **QUIET)
+                with pytest.MonkeyPatch.context() as inner:
+                    inner.setattr(text_tables, "KINDS", {})
+                    again = measure_text_table(name, data, ENCODER, PROFILE, folder=root / "models", rows=rows, **QUIET)
                 assert again == path and path.read_bytes() == before
-                patch.undo()
-                patch.setenv("F3AMD_CACHE_DIR", str(root / "cache"))
-                patch.setenv("F3AMD_RESULTS_DIR", str(root / "results"))
-                for tiny, preset in FORMS.items():
-                    patch.setitem(presets.PRESETS, tiny, preset)
         over = {"stop_at": time.monotonic() - 1.0, **QUIET}
         assert measure_text_table("text_table1", data, ENCODER, PROFILE, folder=root / "other", **over) is None
         yield made
